@@ -1,0 +1,1 @@
+"""Mechanical search on cluttered shelves, in JAX."""
