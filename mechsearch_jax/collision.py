@@ -7,9 +7,12 @@ decide every cloud except those that graze the surface.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax import superquadric
 from mechsearch_jax.masked import masked_vmap
@@ -46,49 +49,55 @@ def _transform_cloud(T, cloud):
     return [sum(T[i, k] * cloud[k] for k in range(3)) + T[i, 3] for i in range(3)]
 
 
-def _bounds(clouds, entry):
-    """Whether a cloud certainly is clear of an object, and whether it certainly hits it: no power evaluated per point."""
-    index, T_object_cloud, size, exponents = entry
+def _bounds(cloud, T_object_cloud, size, exponents):
+    """Bounds on the least gauge of a cloud's points, with no power evaluated per point."""
     p, r = 2.0 / exponents[1], 2.0 / exponents[0]
-    x, y, z = (jnp.abs(q) / size[k] for k, q in enumerate(_transform_cloud(T_object_cloud, clouds[index])))
+    x, y, z = (jnp.abs(q) / size[k] for k, q in enumerate(_transform_cloud(T_object_cloud, cloud)))
     most, two = jnp.maximum(x, y), jnp.sqrt(x * x + y * y)
     below = jnp.where(p > 2.0, most, two)
     above = jnp.where(p >= 2.0, jnp.minimum(two, 2.0 ** (1.0 / p) * most), x + y)
-    lower = jnp.min(jnp.maximum(below, z))
-    upper = jnp.min(jnp.maximum(above, z)) * 2.0 ** (1.0 / r)
-    return lower, upper
+    # The axis and the plane are joined by an r-norm with r >= 1: at least the larger of the two, at most 2^(1/r) times it.
+    return jnp.min(jnp.maximum(below, z)), jnp.min(jnp.maximum(above, z)) * 2.0 ** (1.0 / r)
 
 
-def _least_gauge(clouds, entry):
-    index, T_object_cloud, size, exponents = entry
-    points = jnp.stack(_transform_cloud(T_object_cloud, clouds[index]), axis=-1)
+def _least_gauge(cloud, T_object_cloud, size, exponents):
+    points = jnp.stack(_transform_cloud(T_object_cloud, cloud), axis=-1)
     return jnp.min(superquadric.gauge(size[None], exponents[None], points))
 
 
+class Pair(NamedTuple):
+    """A cloud and a superquadric that may collide.
+
+    Attributes:
+      cloud: the cloud's coordinates in its own frame, three rows [m].
+      T_object_cloud: pose of the cloud in the object's frame.
+      size: half-extents of the superquadric [m].
+      exponents: its exponents.
+    """
+
+    cloud: Array
+    T_object_cloud: Array
+    size: Array
+    exponents: Array
+
+
 def any_inside(
-    clouds: Float[Array, "c 3 p"],
-    index: Int[Array, " n"],
-    T_object_cloud: Float[Array, "n 4 4"],
-    size: Float[Array, "n 3"],
-    exponents: Float[Array, "n 2"],
-    mask: Bool[Array, " n"],
+    mask: Bool[Array, " n"], pair: Callable[[Any, Any, Array], Pair], shared: Any, row: Any, block: int = 256
 ) -> Bool[Array, " n"]:
-    """Whether any point of a cloud lies inside a superquadric, for `n` pairs of them.
+    """Whether any point of a cloud lies inside a superquadric, for the masked ones of `n` pairs.
 
     Args:
-      clouds: point clouds as three rows of coordinates, in their own frames [m].
-      index: which cloud each pair uses.
-      T_object_cloud: pose of the cloud in the object's frame.
-      size, exponents: the superquadric of each pair.
       mask: pairs that are worth a look; the others are reported as free of collision.
+      pair: makes pair `i` from `shared`, `row` and `i`; see `masked.masked_vmap`.
+      shared, row: what pairs are made from.
+      block: how many pairs are evaluated at once.
 
     Returns:
       True where a masked pair collides.
     """
-    arguments = (index, T_object_cloud, size, exponents)
-    lower, upper = masked_vmap(_bounds, mask, clouds, arguments)
+    lower, upper = masked_vmap(lambda *a: _bounds(*pair(*a)), mask, shared, row, block)
     grazes = mask & (lower < 1.0) & (upper >= 1.0)
-    least = masked_vmap(_least_gauge, grazes, clouds, arguments, block=64)
+    least = masked_vmap(lambda *a: _least_gauge(*pair(*a)), grazes, shared, row, min(block, 64))
     return mask & ((upper < 1.0) | (grazes & (least < 1.0)))
 
 

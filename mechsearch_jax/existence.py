@@ -1,0 +1,235 @@
+"""The existence function f: where can the target still be? (paper section 4.2 and appendix B.2, DESIGN.md section 5)
+
+A candidate pose stands for its whole grid cell, so the target is tried at several places of the cell. At each it must
+be hidden (it would show no more pixels than the detector needs) and free of collision (with the target drawn in by a
+margin for what lies between those places and for the uncertainty of the shapes). f is 1 if any of the places passes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from typing import Literal
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax import render, superquadric
+from mechsearch_jax.camera import Camera, project
+from mechsearch_jax.collision import Pair, any_inside, relative_pose
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.masked import masked_vmap
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.target import Target
+
+FAR = 1.5
+
+
+@dataclasses.dataclass(frozen=True)
+class ExistenceConfig:
+    """How f is decided.
+
+    Attributes:
+      criterion: what makes the target visible: "detector" counts the pixels it would show at full resolution;
+        "depth-mse" is the paper's mean squared difference of the two depth images; "depth-norm" their Euclidean distance.
+      found_pixels: more pixels than this at full resolution and the detector finds the target.
+      depth_threshold: threshold of "depth-mse" [m^2] and "depth-norm" [m].
+      downscale: how much coarser than the camera f is rendered.
+      spread: where in a cell the target is tried, as fractions of half a cell along x and y; one place is its centre.
+      erosion: by how much the target is drawn in for the collision test [m].
+      depth_margin: by how much nearer than an object the target must be to count as visible [m].
+      window: rows and columns of the window an object is rendered in, at the coarse resolution.
+      points: points on the target's surface for the collision test.
+    """
+
+    criterion: Literal["detector", "depth-mse", "depth-norm"] = "detector"
+    found_pixels: int = 100
+    depth_threshold: float = 0.001
+    downscale: int = 7
+    spread: tuple[tuple[float, float], ...] = ((0.0, 0.0), (-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5))
+    erosion: float = 0.001
+    depth_margin: float = 0.001
+    window: tuple[int, int] = (48, 48)
+    points: int = 512
+
+    def __post_init__(self):
+        if self.criterion not in ("detector", "depth-mse", "depth-norm"):
+            raise InputError(f'criterion "{self.criterion}" is unknown; use "detector", "depth-mse" or "depth-norm"')
+        if self.downscale < 1 or not self.spread:
+            raise InputError("ExistenceConfig: downscale must be at least 1 and spread hold at least one place")
+
+
+@flax.struct.dataclass
+class ExistenceTables:
+    """What f needs of the candidate poses, the camera and the target: constants of a `Problem`.
+
+    Attributes:
+      T_world_target: the places where the target is tried, shape (X, S, 4, 4).
+      depth: the target's depth in a window at each place, infinite around it, shape (X, S, h, w) [m].
+      corner: first row and column of that window in the coarse image, shape (X, S, 2).
+      cloud: surface of the drawn-in target in its own frame as rows of coordinates, shape (3, P) [m].
+      radius: radius of a sphere that holds the target [m].
+    """
+
+    T_world_target: jax.Array
+    depth: jax.Array
+    corner: jax.Array
+    cloud: jax.Array
+    radius: jax.Array
+
+
+@flax.struct.dataclass
+class ObjectViews:
+    """Per object, what f needs of it; only what moved has to be computed anew.
+
+    Attributes:
+      depth: the object's depth in its window, shape (N, h, w) [m].
+      corner: first row and column of the window, shape (N, 2).
+      collides: whether the target at a place would run into the object, shape (X, S, N).
+      overflow: whether the object's image did not fit the window, shape (N,): f may then be too small.
+    """
+
+    depth: jax.Array
+    corner: jax.Array
+    collides: jax.Array
+    overflow: jax.Array
+
+
+def upright_pose(x: Array, y: Array, z: Array, yaw: Array) -> Float[Array, "*batch 4 4"]:
+    """`T_world_target` of a target that stands upright."""
+    x, y, z, yaw = jnp.broadcast_arrays(*map(jnp.asarray, (x, y, z, yaw)))
+    c, s, zero, one = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(x), jnp.ones_like(x)
+    rows = [[c, -s, zero, x], [s, c, zero, y], [zero, zero, one, z], [zero, zero, zero, one]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: ExistenceConfig) -> ExistenceTables:
+    """Precompute, for every candidate pose, the target's own depth image and collision cloud."""
+    poses = target.candidate_poses(shelf)
+    cell = target.cell(shelf)
+    offsets = np.array([(a * cell[0] / 2, b * cell[1] / 2) for a, b in config.spread], np.float32)
+    x = poses[:, None, 0] + offsets[None, :, 0]
+    y = poses[:, None, 1] + offsets[None, :, 1]
+    T = upright_pose(x, y, jnp.float32(target.height(shelf)), jnp.broadcast_to(poses[:, None, 2], x.shape))
+    coarse = camera.scaled(config.downscale)
+    half = np.array(target.half_size, np.float32)
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
+    world = jnp.einsum("xsij,cj->xsci", T[..., :3, :3], corners, precision="highest") + T[:, :, None, :3, 3]
+    pixels, _ = project(coarse, world)
+    extent = np.asarray(jnp.max(jnp.max(pixels, axis=2) - jnp.min(pixels, axis=2), axis=(0, 1)))
+    window = (int(np.ceil(extent[0])) + 2, int(np.ceil(extent[1])) + 2)
+
+    def view(pose):
+        one = Superquadrics(
+            size=jnp.asarray(half),
+            exponents=jnp.array(target.exponents),
+            position=pose[:3, 3],
+            rotation=pose[:3, :3],
+            valid=jnp.array(True),
+        )
+        return render.object_window(coarse, one, window)
+
+    depth, corner = jax.jit(jax.vmap(jax.vmap(view)))(T)
+    eroded = jnp.asarray(half - config.erosion)
+    cloud = superquadric.sample_surface(eroded, jnp.array(target.exponents), config.points)
+    return ExistenceTables(T, depth, corner, cloud.T, jnp.float32(np.linalg.norm(half)))
+
+
+def object_views(
+    tables: ExistenceTables,
+    camera: Camera,
+    scene: Superquadrics,
+    exists: Bool[Array, " x"],
+    config: ExistenceConfig,
+    previous: ObjectViews | None = None,
+    moved: Bool[Array, " n"] | None = None,
+) -> ObjectViews:
+    """Render the objects and test them against the target's places.
+
+    Args:
+      tables: constants of the problem.
+      camera: the camera at full resolution; static.
+      scene: the objects, fields (N, ...).
+      exists: poses that matter; collisions at the others are not computed and read False.
+      config: static.
+      previous: views of the same objects before some of them moved.
+      moved: which objects moved since; only they are computed anew.
+
+    Returns:
+      The views of all objects.
+    """
+    coarse = camera.scaled(config.downscale)
+    fresh = scene.valid if moved is None else moved & scene.valid
+
+    def view(_, scene, i):
+        one = jax.tree.map(lambda a: a[i], scene)
+        depth, corner = render.object_window(coarse, one, config.window)
+        return depth, corner, jnp.any(render.window_corner(coarse, one, config.window)[1] > 0)
+
+    depth, corner, overflow = masked_vmap(view, fresh, None, scene, block=8)
+    depth = jnp.where(fresh[:, None, None], depth, jnp.inf)
+
+    places, spread = tables.T_world_target.shape[:2]
+    n = scene.capacity
+
+    def pair(tables, scene, i):
+        place, k = i // n, i % n
+        T = tables.T_world_target.reshape(-1, 4, 4)[place]
+        return Pair(tables.cloud, relative_pose(scene.rotation[k], scene.position[k], T), scene.size[k], scene.exponents[k])
+
+    offset = tables.T_world_target[:, :, None, :3, 3] - scene.position
+    reach = superquadric.bounding_radius(scene.size) + tables.radius
+    near = jnp.sum(offset**2, axis=-1) < reach**2
+    mask = near & exists[:, None, None] & fresh
+    collides = any_inside(mask.reshape(-1), pair, tables, scene).reshape(places, spread, n)
+    views = ObjectViews(depth, corner, collides, overflow)
+    if previous is None or moved is None:
+        return views
+    return ObjectViews(
+        depth=jnp.where(moved[:, None, None], views.depth, previous.depth),
+        corner=jnp.where(moved[:, None], views.corner, previous.corner),
+        collides=jnp.where(moved, views.collides, previous.collides),
+        overflow=jnp.where(moved, views.overflow, previous.overflow),
+    )
+
+
+def _depth_hidden(tables: ExistenceTables, image: Array, config: ExistenceConfig) -> Bool[Array, "x s"]:
+    """Whether a target at each place would go unnoticed in a depth image, by the configured criterion."""
+    h, w = tables.depth.shape[-2:]
+    rows = tables.corner[..., 0, None, None] + jnp.arange(h)[:, None]
+    columns = tables.corner[..., 1, None, None] + jnp.arange(w)
+    inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
+    behind = image[jnp.clip(rows, 0, image.shape[0] - 1), jnp.clip(columns, 0, image.shape[1] - 1)]
+    if config.criterion == "detector":
+        visible = inside & (tables.depth + config.depth_margin < behind)
+        pixels = jnp.sum(visible, axis=(-1, -2)) * config.downscale**2
+        return pixels <= config.found_pixels
+    difference = jnp.where(inside, jnp.maximum(jnp.minimum(behind, FAR) - tables.depth, 0.0), 0.0)
+    square = jnp.sum(jnp.where(jnp.isfinite(tables.depth), difference, 0.0) ** 2, axis=(-1, -2))
+    if config.criterion == "depth-mse":
+        return square / image.size < config.depth_threshold
+    return jnp.sqrt(square) < config.depth_threshold
+
+
+def existence(
+    tables: ExistenceTables, camera: Camera, views: ObjectViews, exists: Bool[Array, " x"], config: ExistenceConfig
+) -> Bool[Array, " x"]:
+    """`f_t` from `f_{t-1}` and the views of the objects (equation 4 with c = 0): it can only shrink.
+
+    Args:
+      tables: constants of the problem.
+      camera: the camera at full resolution; static.
+      views: of all objects, with the collisions of every pose where `exists`.
+      exists: `f_{t-1}`; all True at the start.
+      config: static.
+
+    Returns:
+      Where the target can be.
+    """
+    image = render.merge_windows(camera.scaled(config.downscale), views.depth, views.corner)
+    hidden = _depth_hidden(tables, image, config)
+    return exists & jnp.any(hidden & ~jnp.any(views.collides, axis=-1), axis=-1)
