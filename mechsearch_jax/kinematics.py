@@ -1,20 +1,20 @@
-"""Forward and inverse kinematics of the Franka Emika Panda, batched and differentiable in structure.
+"""Forward and inverse kinematics of the Franka Emika Panda, in closed form and batched.
 
-The arm is described by modified Denavit-Hartenberg parameters (Craig's convention, from the maker's documentation). Its
-seventh joint is redundant: with joint 7 given, the hand's pose fixes the wrist centre W, where the axes of joints 5 and 6
-meet; the shoulder S, the elbow E (on the axis of joint 4) and W form a triangle with known sides, which gives joint 4 and
-the angle between the forearm and the line WS; two directions of the forearm have that angle and are perpendicular to the
-axis of joint 6; and the upper arm's orientation is then a rotation about z, y and z by joints 1, 2 and 3, in two ways.
+The arm is described by modified Denavit-Hartenberg parameters (Craig's convention, from the maker's documentation).
+Its seventh joint is redundant: with joint 7 given, the hand's pose fixes the wrist centre W, where the axes of joints
+5 and 6 meet; the shoulder S, the elbow E (on the axis of joint 4) and W form a triangle with known sides, which gives
+joint 4 and the angle between the forearm and the line WS; two directions of the forearm have that angle and are
+perpendicular to the axis of joint 6; and the upper arm's orientation is then a rotation about z, y and z by joints 1,
+2 and 3, in two ways.
 
-Frames: the base frame is the world. The hand frame is the flange turned by -45 degrees about z, the gripper frame is the
-hand frame moved to between the finger tips: z is the approach direction, y the direction in which the fingers open.
+Frames: the base frame is the world. The hand frame is the flange turned by -45 degrees about z; the gripper frame is
+the hand frame moved to between the finger tips: z is the approach direction, y the one in which the fingers open.
 """
 
 from __future__ import annotations
 
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -43,7 +43,7 @@ FINGER_TIPS = 0.1034
 
 POSITION_TOLERANCE = 1e-4
 ROTATION_TOLERANCE = 1e-3
-# A joint may turn this far between neighbouring waypoints of a path: [rad], and [rad] for each metre and radian of motion.
+# How far a joint may turn between neighbouring waypoints of a path [rad]: at rest, and for each metre and radian moved.
 STEP_FLOOR = 0.1
 STEP_PER_METRE = 6.0
 STEP_PER_RADIAN = 3.0
