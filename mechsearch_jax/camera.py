@@ -68,7 +68,8 @@ def pixel_rays(camera: Camera, rows: Float[Array, "*batch"], columns: Float[Arra
     x = (columns + 0.5 - camera.cx) / camera.fx
     y = (rows + 0.5 - camera.cy) / camera.fy
     right, down, forward = (jnp.array([row[i] for row in camera.rotation]) for i in range(3))
-    return x[..., None] * right + y[..., None] * down + forward
+    shape = [1] * x.ndim + [3]
+    return x[..., None] * right.reshape(shape) + y[..., None] * down.reshape(shape) + forward.reshape(shape)
 
 
 def rays(camera: Camera) -> Float[Array, "h w 3"]:
@@ -82,8 +83,9 @@ def project(camera: Camera, points: Float[Array, "*batch 3"]) -> tuple[Float[Arr
 
     Points at or behind the camera's plane have no image: theirs is computed at a depth of 1 micrometre.
     """
-    offset = points - jnp.array(camera.position)
-    x, y, z = (sum(offset[..., i] * camera.rotation[i][k] for i in range(3)) for k in range(3))
+    x, y, z = (
+        sum((points[..., i] - camera.position[i]) * camera.rotation[i][k] for i in range(3)) for k in range(3)
+    )
     safe = jnp.maximum(z, 1e-6)
     row = camera.fy * y / safe + camera.cy - 0.5
     column = camera.fx * x / safe + camera.cx - 0.5

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -18,30 +17,6 @@ from mechsearch_jax import superquadric
 from mechsearch_jax.masked import masked_vmap
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
-
-
-def rotate(rotation: Float[Array, "*#batch 3 3"], vectors: Float[Array, "*#batch 3"]) -> Float[Array, "*batch 3"]:
-    """`rotation @ vector`, as explicit sums so that float32 is not rounded to TF32 on an accelerator."""
-    return sum(rotation[..., :, k] * vectors[..., None, k] for k in range(3))
-
-
-def compose(a: Float[Array, "*#batch 4 4"], b: Float[Array, "*#batch 4 4"]) -> Float[Array, "*batch 4 4"]:
-    """`T_a @ T_b` at full float32 precision."""
-    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
-
-
-def relative_pose(
-    rotation: Float[Array, "*#batch 3 3"], position: Float[Array, "*#batch 3"], T_world_cloud: Float[Array, "*#batch 4 4"]
-) -> Float[Array, "*batch 4 4"]:
-    """`T_object_cloud` from an object's rotation and position and a cloud's pose, both in the world."""
-    shape = jnp.broadcast_shapes(rotation.shape[:-2], position.shape[:-1], T_world_cloud.shape[:-2])
-    rotation = jnp.broadcast_to(rotation, (*shape, 3, 3))
-    T_world_cloud = jnp.broadcast_to(T_world_cloud, (*shape, 4, 4))
-    inverse = jnp.swapaxes(rotation, -1, -2)
-    turned = jnp.matmul(inverse, T_world_cloud[..., :3, :3], precision=jax.lax.Precision.HIGHEST)
-    moved = rotate(inverse, T_world_cloud[..., :3, 3] - position)
-    top = jnp.concatenate([turned, moved[..., None]], axis=-1)
-    return jnp.concatenate([top, jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), (*shape, 1, 4))], axis=-2)
 
 
 def _transform_cloud(T, cloud):

@@ -19,12 +19,13 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax import render, superquadric
 from mechsearch_jax.camera import Camera, project
-from mechsearch_jax.collision import Pair, any_inside, relative_pose
+from mechsearch_jax.collision import Pair, any_inside
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.masked import masked_vmap
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.target import Target
+from mechsearch_jax.transforms import compose, inverse, make, transform, upright_pose
 
 FAR = 1.5
 
@@ -99,27 +100,18 @@ class ObjectViews:
     overflow: jax.Array
 
 
-def upright_pose(x: Array, y: Array, z: Array, yaw: Array) -> Float[Array, "*batch 4 4"]:
-    """`T_world_target` of a target that stands upright."""
-    x, y, z, yaw = jnp.broadcast_arrays(*map(jnp.asarray, (x, y, z, yaw)))
-    c, s, zero, one = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(x), jnp.ones_like(x)
-    rows = [[c, -s, zero, x], [s, c, zero, y], [zero, zero, one, z], [zero, zero, zero, one]]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: ExistenceConfig) -> ExistenceTables:
     """Precompute, for every candidate pose, the target's own depth image and collision cloud."""
     poses = target.candidate_poses(shelf)
     cell = target.cell(shelf)
     offsets = np.array([(a * cell[0] / 2, b * cell[1] / 2) for a, b in config.spread], np.float32)
-    x = poses[:, None, 0] + offsets[None, :, 0]
-    y = poses[:, None, 1] + offsets[None, :, 1]
-    T = upright_pose(x, y, jnp.float32(target.height(shelf)), jnp.broadcast_to(poses[:, None, 2], x.shape))
+    places = np.repeat(poses[:, None, :], len(offsets), axis=1)
+    places[..., :2] += offsets[None]
+    T = upright_pose(jnp.asarray(places), target.height(shelf))
     coarse = camera.scaled(config.downscale)
     half = np.array(target.half_size, np.float32)
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
-    world = jnp.einsum("xsij,cj->xsci", T[..., :3, :3], corners, precision="highest") + T[:, :, None, :3, 3]
-    pixels, _ = project(coarse, world)
+    pixels, _ = project(coarse, transform(T[:, :, None], jnp.asarray(corners)))
     extent = np.asarray(jnp.max(jnp.max(pixels, axis=2) - jnp.min(pixels, axis=2), axis=(0, 1)))
     window = (int(np.ceil(extent[0])) + 2, int(np.ceil(extent[1])) + 2)
 
@@ -179,12 +171,13 @@ def object_views(
     def pair(tables, scene, i):
         place, k = i // n, i % n
         T = tables.T_world_target.reshape(-1, 4, 4)[place]
-        return Pair(tables.cloud, relative_pose(scene.rotation[k], scene.position[k], T), scene.size[k], scene.exponents[k])
+        T_object_world = inverse(make(scene.rotation[k], scene.position[k]))
+        return Pair(tables.cloud, compose(T_object_world, T), scene.size[k], scene.exponents[k])
 
-    offset = tables.T_world_target[:, :, None, :3, 3] - scene.position
+    offset = tables.T_world_target[:, :, None, :3, 3] - scene.position[None, None]
     reach = superquadric.bounding_radius(scene.size) + tables.radius
-    near = jnp.sum(offset**2, axis=-1) < reach**2
-    mask = near & exists[:, None, None] & fresh
+    near = jnp.sum(offset**2, axis=-1) < reach[None, None] ** 2
+    mask = near & exists[:, None, None] & fresh[None, None]
     collides = any_inside(mask.reshape(-1), pair, tables, scene).reshape(places, spread, n)
     views = ObjectViews(depth, corner, collides, overflow)
     if previous is None or moved is None:
@@ -192,7 +185,7 @@ def object_views(
     return ObjectViews(
         depth=jnp.where(moved[:, None, None], views.depth, previous.depth),
         corner=jnp.where(moved[:, None], views.corner, previous.corner),
-        collides=jnp.where(moved, views.collides, previous.collides),
+        collides=jnp.where(moved[None, None], views.collides, previous.collides),
         overflow=jnp.where(moved, views.overflow, previous.overflow),
     )
 
@@ -200,8 +193,8 @@ def object_views(
 def _depth_hidden(tables: ExistenceTables, image: Array, config: ExistenceConfig) -> Bool[Array, "x s"]:
     """Whether a target at each place would go unnoticed in a depth image, by the configured criterion."""
     h, w = tables.depth.shape[-2:]
-    rows = tables.corner[..., 0, None, None] + jnp.arange(h)[:, None]
-    columns = tables.corner[..., 1, None, None] + jnp.arange(w)
+    rows = tables.corner[..., 0, None, None] + jnp.arange(h)[None, None, :, None]
+    columns = tables.corner[..., 1, None, None] + jnp.arange(w)[None, None, None, :]
     inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
     behind = image[jnp.clip(rows, 0, image.shape[0] - 1), jnp.clip(columns, 0, image.shape[1] - 1)]
     if config.criterion == "detector":

@@ -10,29 +10,27 @@ from jaxtyping import Array, Float, Int
 
 from mechsearch_jax import superquadric
 from mechsearch_jax.camera import Camera, pixel_rays, project, rays
-from mechsearch_jax.collision import rotate
 from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.transforms import make, rotate, transform
 
 SHARPNESS = 1000.0
 TAU = 100.0
+SAMPLES = 64
 NEWTON_STEPS = 8
 GRAZING = 2e-3
 
 
 def _slab_chord(size, origin, direction):
-    """Where rays enter and leave the box around a superquadric; `enter > leave` for those that miss it."""
+    """Where a ray enters and leaves the box around a superquadric; `enter > leave` if it misses."""
     safe = jnp.where(jnp.abs(direction) < 1e-9, jnp.where(direction < 0, -1e-9, 1e-9), direction)
     a, b = (-size - origin) / safe, (size - origin) / safe
-    return jnp.max(jnp.minimum(a, b), axis=-1), jnp.min(jnp.maximum(a, b), axis=-1)
+    return jnp.max(jnp.minimum(a, b)), jnp.min(jnp.maximum(a, b))
 
 
 def cast(
-    size: Float[Array, "3"],
-    exponents: Float[Array, "2"],
-    origin: Float[Array, "3"],
-    direction: Float[Array, "*batch 3"],
-) -> Float[Array, "*batch"]:
-    """First crossing of rays with one superquadric, all in its own frame.
+    size: Float[Array, "3"], exponents: Float[Array, "2"], origin: Float[Array, "3"], direction: Float[Array, "3"]
+) -> Float[Array, ""]:
+    """First crossing of a ray with one superquadric, in its own frame.
 
     The gauge is convex along a ray, and at least 1 where the ray enters the bounding box: Newton's method from there
     approaches the first crossing from the near side, and a gauge that stops falling before it reaches 1 is a miss.
@@ -40,13 +38,10 @@ def cast(
     Returns:
       The ray parameter of the crossing, infinite for a miss; differentiable in all arguments where it is finite.
     """
-    size, exponents = (jnp.broadcast_to(a, (*direction.shape[:-1], a.shape[-1])) for a in (size, exponents))
-    start = jnp.broadcast_to(origin, direction.shape)
-    enter, leave = _slab_chord(size, start, direction)
+    enter, leave = _slab_chord(size, origin, direction)
 
     def value_and_slope(t):
-        along = lambda t: superquadric.gauge(size, exponents, start + t[..., None] * direction)  # noqa: E731
-        return jax.jvp(along, (t,), (jnp.ones_like(t),))
+        return jax.jvp(lambda t: superquadric.gauge(size, exponents, origin + t * direction), (t,), (jnp.ones_like(t),))
 
     def newton(_, t):
         value, slope = value_and_slope(t)
@@ -64,35 +59,28 @@ def cast(
 
 
 def integrate(
-    size: Float[Array, "3"],
-    exponents: Float[Array, "2"],
-    origin: Float[Array, "3"],
-    direction: Float[Array, "*batch 3"],
-    samples: int = 64,
-) -> Float[Array, "*batch"]:
+    size: Float[Array, "3"], exponents: Float[Array, "2"], origin: Float[Array, "3"], direction: Float[Array, "3"]
+) -> Float[Array, ""]:
     """The volumetric depth of equations 10 to 12 of one superquadric, in its own frame and in units of the ray parameter.
 
     Integrated over the chord through the ellipsoid of equation 13. The finite `TAU` lets a ray sink in by 1 / TAU = 10 mm
     in the mean, which is this method's bias.
     """
     scaled_o, scaled_d = origin / (3.0**0.5 * size), direction / (3.0**0.5 * size)
-    a = jnp.sum(scaled_d**2, axis=-1)
-    b = jnp.sum(scaled_o * scaled_d, axis=-1)
+    a, b = jnp.sum(scaled_d**2), jnp.sum(scaled_o * scaled_d)
     square = b**2 - a * (jnp.sum(scaled_o**2) - 1.0)
     meets = square > 0
     half = jnp.sqrt(jnp.where(meets, square, 1.0)) / a
     start = jnp.maximum(-b / a - half, 0.0)
     length = jnp.maximum(-b / a + half - start, 0.0)
-    metres = jnp.sqrt(jnp.sum(direction**2, axis=-1))
-    step = (length / samples)[..., None]
-    t = start[..., None] + (jnp.arange(samples) + 0.5) * step
-    points = origin + t[..., None] * direction[..., None, :]
+    step = length / SAMPLES
+    t = start + (jnp.arange(SAMPLES) + 0.5) * step
+    points = origin[None] + t[:, None] * direction[None]
     value = jnp.minimum(superquadric.gauge(size, exponents, points) ** 2, 1e6)
     occupancy = jax.nn.sigmoid(SHARPNESS * (1.0 - value))
-    optical = TAU * jnp.cumsum(occupancy * step * metres[..., None], axis=-1)
-    transparent = jnp.exp(-optical)
-    depth = start + jnp.sum(transparent * step, axis=-1)
-    return jnp.where(meets & (transparent[..., -1] < 0.5), depth, jnp.inf)
+    metres = jnp.sqrt(jnp.sum(direction**2))
+    transparent = jnp.exp(-TAU * jnp.cumsum(occupancy) * step * metres)
+    return jnp.where(meets & (transparent[-1] < 0.5), start + jnp.sum(transparent) * step, jnp.inf)
 
 
 METHODS = {"root": cast, "volumetric": integrate}
@@ -107,9 +95,10 @@ def object_depth(
     """Depth of one object (a `Superquadrics` without its object axis) along world rays; infinite where there is none."""
     inverse = scene_object.rotation.T
     local_origin = rotate(inverse, origin - scene_object.position)
-    local = rotate(jnp.broadcast_to(inverse, (*directions.shape, 3)), directions)
-    depth = METHODS[method](scene_object.size, scene_object.exponents, local_origin, local)
-    return jnp.where(scene_object.valid, depth, jnp.inf)
+    local = rotate(inverse, directions)
+    trace = jax.vmap(METHODS[method], in_axes=(None, None, None, 0))
+    depth = trace(scene_object.size, scene_object.exponents, local_origin, local.reshape(-1, 3))
+    return jnp.where(scene_object.valid, depth, jnp.inf).reshape(local.shape[:-1])
 
 
 def render_depth(
@@ -141,8 +130,8 @@ def window_corner(
       (0 where it fits).
     """
     corners = jnp.stack(jnp.meshgrid(*[jnp.array([-1.0, 1.0])] * 3, indexing="ij"), axis=-1).reshape(8, 3)
-    world = rotate(jnp.broadcast_to(scene_object.rotation, (8, 3, 3)), corners * scene_object.size)
-    pixels, _ = project(camera, world + scene_object.position)
+    T_world_object = make(scene_object.rotation, scene_object.position)
+    pixels, _ = project(camera, transform(T_world_object, corners * scene_object.size[None]))
     low, high = jnp.min(pixels, axis=0), jnp.max(pixels, axis=0)
     extent = jnp.array(window, jnp.float32)
     corner = jnp.round((low + high) / 2.0 - (extent - 1.0) / 2.0)

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.transforms import align, inverse, make, transform
 
 BOX_EXPONENTS = (0.2, 0.2)
 CYLINDER_EXPONENTS = (0.2, 1.0)
@@ -82,8 +83,8 @@ def _norm2(a: Array, b: Array, p: Array) -> Array:
 
 
 def gauge(
-    size: Float[Array, "*#batch 3"], exponents: Float[Array, "*#batch 2"], points: Float[Array, "*#batch 3"]
-) -> Float[Array, "*batch"]:
+    size: Float[Array, "... 3"], exponents: Float[Array, "... 2"], points: Float[Array, "... 3"]
+) -> Float[Array, "..."]:
     """The factor by which a superquadric must be scaled about its centre for its surface to pass through a point.
 
     Args:
@@ -94,25 +95,29 @@ def gauge(
     Returns:
       0 at the centre, 1 on the surface, more outside; broadcast over the leading axes.
     """
+    size, exponents, points = align((size, 1), (exponents, 1), (points, 1))
     x = jnp.abs(points / size)
     p, r = 2.0 / exponents[..., 1], 2.0 / exponents[..., 0]
     return _norm2(_norm2(x[..., 0], x[..., 1], p), x[..., 2], r)
 
 
 def implicit(
-    size: Float[Array, "*#batch 3"], exponents: Float[Array, "*#batch 2"], points: Float[Array, "*#batch 3"]
-) -> Float[Array, "*batch"]:
+    size: Float[Array, "... 3"], exponents: Float[Array, "... 2"], points: Float[Array, "... 3"]
+) -> Float[Array, "..."]:
     """`S` of equation 5: below 1 inside, 1 on the surface, above 1 outside. Arguments as in `gauge`."""
-    return _power(gauge(size, exponents, points), 2.0 / exponents[..., 0])
+    value = gauge(size, exponents, points)
+    value, e1 = align((value, 0), (exponents[..., 0], 0))
+    return _power(value, 2.0 / e1)
 
 
 def radial_distance(
-    size: Float[Array, "*#batch 3"], exponents: Float[Array, "*#batch 2"], points: Float[Array, "*#batch 3"]
-) -> Float[Array, "*batch"]:
+    size: Float[Array, "... 3"], exponents: Float[Array, "... 2"], points: Float[Array, "... 3"]
+) -> Float[Array, "..."]:
     """Distance from a point to the surface along the ray from the centre (equation 6) [m]. Arguments as in `gauge`.
 
     At the centre itself, where every ray is as good as another, it is the smallest half-extent.
     """
+    size, exponents, points = align((size, 1), (exponents, 1), (points, 1))
     scale = gauge(size, exponents, points)
     square = jnp.sum(points**2, axis=-1)
     centre = (square <= 0) | (scale <= 0)
@@ -122,12 +127,8 @@ def radial_distance(
 
 
 def to_object_frame(superquadrics: Superquadrics, points: Float[Array, "... 3"]) -> Float[Array, "... n 3"]:
-    """World points in the frame of every superquadric [m].
-
-    Written as sums of products rather than a matrix product, so that no accelerator rounds the rotation to TF32.
-    """
-    offset = points[..., None, :] - superquadrics.position
-    return sum(offset[..., i, None] * superquadrics.rotation[..., i, :] for i in range(3))
+    """World points in the frame of every superquadric [m]."""
+    return transform(inverse(make(superquadrics.rotation, superquadrics.position)), points[..., None, :])
 
 
 def bounding_radius(size: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
@@ -154,5 +155,6 @@ def sample_surface(
     """
     direction = jnp.asarray(surface_directions(count))
     cube = direction / jnp.max(jnp.abs(direction), axis=-1, keepdims=True)
+    cube = cube.reshape(*[1] * (size.ndim - 1), count, 3)
     points = cube * size[..., None, :]
     return points / gauge(size[..., None, :], exponents[..., None, :], points)[..., None]

@@ -1,0 +1,274 @@
+"""What an action does to the objects: S of equation 4. F and G follow from it with `existence` and `graspability`."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.transforms import compose, inverse, transform, yaw_rotation
+
+ROUND_EXPONENT = 0.6
+BOUNDARY_POINTS = 24
+
+
+@flax.struct.dataclass
+class PushOutcome:
+    """What a push is predicted to do.
+
+    Attributes:
+      scene: the objects afterwards.
+      residual: deepest penetration that the model could not resolve [m]: objects jammed against a wall or one another.
+    """
+
+    scene: Superquadrics
+    residual: jax.Array
+
+
+class PushModel(Protocol):
+    """Predicts a push; interchangeable (DESIGN.md section 5)."""
+
+    def __call__(
+        self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array
+    ) -> PushOutcome:
+        """Predict a push.
+
+        Args:
+          shelf: walls; static.
+          scene: objects before the push, fields (N, ...).
+          pusher: surface of the closed gripper in its own frame, shape (P, 3) [m].
+          T_world_gripper: where the push starts, shape (4, 4).
+          displacement: how the gripper moves, shape (3,) [m].
+        """
+        ...
+
+
+@flax.struct.dataclass
+class Footprints:
+    """Objects seen from above: a rectangle or an ellipse and a range of heights, every field with leading axis N."""
+
+    half: jax.Array
+    round: jax.Array
+    position: jax.Array
+    yaw: jax.Array
+    low: jax.Array
+    high: jax.Array
+    valid: jax.Array
+
+
+def footprints(scene: Superquadrics) -> Footprints:
+    """Footprints of objects; of one that lies tilted, those of its bounding box's projection.
+
+    An approximation: exponents e2 above 0.6 about a vertical axis count as round, everything else as a rectangle.
+    """
+    rows = jnp.arange(scene.capacity)
+    vertical = jnp.argmax(jnp.abs(scene.rotation[:, 2, :]), axis=-1)
+    first, second = (vertical + 1) % 3, (vertical + 2) % 3
+    axis = scene.rotation[rows, :, first]
+    yaw = jnp.arctan2(axis[:, 1], axis[:, 0])
+    along = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
+    across = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)], axis=-1)
+    upright = jnp.abs(scene.rotation[rows, 2, vertical]) > 0.98
+    projected = [
+        jnp.sum(jnp.abs(jnp.sum(scene.rotation[:, :2, :] * u[:, :, None], axis=1)) * scene.size, axis=-1)
+        for u in (along, across)
+    ]
+    own = [scene.size[rows, first], scene.size[rows, second]]
+    half = jnp.stack([jnp.where(upright, o, p) for o, p in zip(own, projected, strict=True)], axis=-1)
+    height = jnp.sum(jnp.abs(scene.rotation[:, 2, :]) * scene.size, axis=-1)
+    z = scene.position[:, 2]
+    is_round = upright & (vertical == 2) & (scene.exponents[:, 1] > ROUND_EXPONENT)
+    return Footprints(half, is_round, scene.position[:, :2], yaw, z - height, z + height, scene.valid)
+
+
+def _turn(yaw, v):
+    c, s = (a.reshape(a.shape + (1,) * (v.ndim - 1 - a.ndim)) for a in (jnp.cos(yaw), jnp.sin(yaw)))
+    return jnp.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], axis=-1)
+
+
+def _contact(half, is_round, points):
+    """Depth and outward normal of points inside a footprint, in its own frame; broadcast, depth negative outside."""
+    gap = half - jnp.abs(points)
+    sign = jnp.where(points < 0, -1.0, 1.0)
+    x_is_nearer = gap[..., 0] < gap[..., 1]
+    flat = jnp.stack([jnp.where(x_is_nearer, sign[..., 0], 0.0), jnp.where(x_is_nearer, 0.0, sign[..., 1])], axis=-1)
+    scaled = points / half
+    square = jnp.sum(scaled**2, axis=-1)
+    norm = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    mean = 0.5 * (half[..., 0] + half[..., 1])
+    gradient = scaled / half
+    length = jnp.sqrt(jnp.maximum(jnp.sum(gradient**2, axis=-1), 1e-12))
+    depth = jnp.where(is_round, (1.0 - jnp.where(square > 0, norm, 0.0)) * mean, jnp.min(gap, axis=-1))
+    return depth, jnp.where(is_round[..., None], gradient / length[..., None], flat)
+
+
+def _deepest(depth, normal, point):
+    """The deepest of the contacts along the last axis of `depth`."""
+    i = jnp.argmax(depth, axis=-1)[..., None]
+    pick = lambda v: jnp.take_along_axis(v, i[..., None], axis=-2)[..., 0, :]  # noqa: E731
+    return jnp.max(depth, axis=-1), pick(normal), pick(point)
+
+
+def _yield_to(prints, depth, direction, arm):
+    """Move footprints by `depth` at a contact, as a quasi-static slider under an ellipsoidal limit surface does.
+
+    `direction` is the unit vector along which the contact point at `arm` from the centre has to give way. The ratio of
+    torque to force is that of a uniform pressure distribution, 0.6 of the footprint's half diagonal.
+    """
+    lever = arm[..., 0] * direction[..., 1] - arm[..., 1] * direction[..., 0]
+    c2 = 0.36 * jnp.sum(prints.half**2, axis=-1)
+    share = jnp.maximum(depth, 0.0) / (1.0 + lever**2 / c2)
+    # A disc pushed by a point does not turn in a way that matters: its footprint stays the same.
+    turn = jnp.where(prints.round, 0.0, share * lever / c2)
+    return prints.replace(
+        position=prints.position + share[..., None] * direction, yaw=prints.yaw + jnp.clip(turn, -0.2, 0.2)
+    )
+
+
+def _outline(prints):
+    angle = np.arange(BOUNDARY_POINTS) * 2 * np.pi / BOUNDARY_POINTS
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    square = circle / np.abs(circle).max(axis=-1, keepdims=True)
+    unit = jnp.where(prints.round[:, None, None], jnp.float32(circle)[None], jnp.float32(square)[None])
+    return _turn(prints.yaw[:, None], unit * prints.half[:, None, :]) + prints.position[:, None, :]
+
+
+def _resolve_pusher(prints, points):
+    local = _turn(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
+    depth, normal = _contact(prints.half[:, None, :], prints.round[:, None], local)
+    level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
+    depth = jnp.where(level & prints.valid[:, None], depth, -1.0)
+    depth, normal, point = _deepest(depth, normal, local)
+    away = -_turn(prints.yaw, normal)
+    return _yield_to(prints, depth, away, _turn(prints.yaw, point)), jnp.max(depth)
+
+
+def _pair_contacts(prints):
+    """For every ordered pair (i, j): the deepest contact, and the direction in which j has to give way."""
+    outline = _outline(prints)
+    into_j = _turn(-prints.yaw[None, :, None], outline[:, None] - prints.position[None, :, None, :])
+    depth, normal = _contact(prints.half[None, :, None, :], prints.round[None, :, None], into_j)
+    depth, normal, point = _deepest(depth, normal, into_j)
+    yaw = jnp.broadcast_to(prints.yaw[None, :], depth.shape)
+    direction, arm = -_turn(yaw, normal), _turn(yaw, point)
+    # The same the other way round: a corner of j inside a face of i, where j gives way along i's normal.
+    other_direction = -jnp.swapaxes(direction, 0, 1)
+    world = arm + prints.position[None, :, :]
+    other_arm = jnp.swapaxes(world, 0, 1) - prints.position[None, :, :]
+    swap = depth.T > depth
+    deeper = jnp.where(swap[..., None], other_direction, direction), jnp.where(swap[..., None], other_arm, arm)
+    both = prints.valid[:, None] & prints.valid[None, :] & ~jnp.eye(prints.valid.size, dtype=bool)
+    return jnp.where(both, jnp.maximum(depth, depth.T), -1.0), *deeper
+
+
+def _resolve_neighbours(prints, heading):
+    """Objects further along the push give way to those behind them."""
+    depth, direction, arm = _pair_contacts(prints)
+    along = jnp.sum((prints.position[None] - prints.position[:, None]) * heading[None, None], axis=-1)
+    depth = jnp.where(along > 0, depth, -1.0)
+    i = jnp.argmax(depth, axis=0)
+    j = jnp.arange(prints.valid.size)
+    return _yield_to(prints, depth[i, j], direction[i, j], arm[i, j])
+
+
+def _wall_depth(shelf, prints):
+    outline = _outline(prints)
+    x, y = outline[..., 0], outline[..., 1]
+    return jnp.stack([x - shelf.back, shelf.right - y, y - shelf.left], axis=-1), outline
+
+
+def _resolve_walls(shelf, prints):
+    inward = jnp.array([[-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    depth, outline = _wall_depth(shelf, prints)
+    for wall in range(3):
+        deepest, _, point = _deepest(depth[..., wall], outline, outline)
+        direction = jnp.broadcast_to(inward[wall], point.shape)
+        prints = _yield_to(prints, jnp.where(prints.valid, deepest, -1.0), direction, point - prints.position)
+    return prints
+
+
+@dataclasses.dataclass(frozen=True)
+class QuasiStatic:
+    """An analytic `PushModel`: the gripper moves in small steps, and what it runs into gives way.
+
+    Objects are planar footprints that slide under an ellipsoidal limit surface without inertia; toppling, friction at
+    the contacts and objects pushed back by others are neglected.
+
+    Attributes:
+      steps: number of steps of the gripper.
+      sweeps: how often contacts are resolved in each.
+    """
+
+    steps: int = 16
+    sweeps: int = 2
+
+    def __call__(
+        self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array
+    ) -> PushOutcome:
+        """See `PushModel`."""
+        start = transform(T_world_gripper, pusher)
+        length = jnp.sqrt(jnp.maximum(jnp.sum(displacement**2), 1e-12))
+        heading = displacement[:2] / length
+
+        def sweep(_, carry):
+            prints, points = carry
+            prints, _ = _resolve_pusher(prints, points)
+            return _resolve_walls(shelf, _resolve_neighbours(prints, heading)), points
+
+        def step(prints, fraction):
+            points = start + fraction * displacement[None]
+            prints, _ = jax.lax.fori_loop(0, self.sweeps, sweep, (prints, points))
+            return prints, None
+
+        before = footprints(scene)
+        after, _ = jax.lax.scan(step, before, (jnp.arange(self.steps) + 1.0) / self.steps)
+        _, held = _resolve_pusher(after, start + displacement[None])
+        jammed = jnp.max(_pair_contacts(after)[0]) - jnp.maximum(jnp.max(_pair_contacts(before)[0]), 0.0)
+        wall = jnp.max(jnp.where(after.valid[:, None], jnp.max(_wall_depth(shelf, after)[0], axis=1), -1.0))
+        turn = after.yaw - before.yaw
+        moved = (jnp.abs(turn) > 1e-3) | (jnp.max(jnp.abs(after.position - before.position), axis=-1) > 1e-4)
+        moved_scene = rigid_motion(scene, before.position, after.position, turn)
+        pick = lambda new, old: jnp.where(moved.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
+        residual = jnp.maximum(jnp.maximum(held, jammed), wall)
+        return PushOutcome(jax.tree.map(pick, moved_scene, scene), jnp.maximum(residual, 0.0))
+
+
+def rigid_motion(
+    scene: Superquadrics, before: Float[Array, "n 2"], after: Float[Array, "n 2"], turn: Float[Array, " n"]
+) -> Superquadrics:
+    """Objects moved in the plane from `before` to `after` [m] and turned about the vertical through `before` [rad]."""
+    arm = _turn(turn, scene.position[:, :2] - before) + after
+    return scene.replace(
+        position=jnp.concatenate([arm, scene.position[:, 2:]], axis=-1),
+        rotation=jnp.matmul(yaw_rotation(turn), scene.rotation, precision=jax.lax.Precision.HIGHEST),
+    )
+
+
+def pick_and_place(
+    scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Array, "4 4"], T_world_place: Float[Array, "4 4"]
+) -> Superquadrics:
+    """The scene after an object has moved rigidly with the gripper from one pose to the other."""
+    motion = compose(T_world_place, inverse(T_world_grasp))
+    position = transform(motion, scene.position[index])
+    rotation = jnp.matmul(motion[:3, :3], scene.rotation[index], precision=jax.lax.Precision.HIGHEST)
+    return scene.replace(
+        position=scene.position.at[index].set(position), rotation=scene.rotation.at[index].set(rotation)
+    )
+
+
+def changed(before: Superquadrics, after: Superquadrics) -> Bool[Array, " n"]:
+    """Which objects differ in pose between two scenes."""
+    return jnp.any(before.position != after.position, axis=-1) | jnp.any(before.rotation != after.rotation, axis=(-1, -2))
+
+
+def bounding_half_extents(scene: Superquadrics) -> Float[Array, "n 3"]:
+    """Half-extents of the objects' bounding boxes along the world's axes [m]."""
+    return jnp.sum(jnp.abs(scene.rotation) * scene.size[:, None, :], axis=-1)
+

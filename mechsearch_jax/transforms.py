@@ -1,0 +1,71 @@
+"""Rigid transforms as (..., 4, 4) matrices named `T_a_b`: the pose of frame b in frame a.
+
+Leading axes broadcast against each other, whatever their number. Products are at full float32 precision: the default of
+recent GPUs rounds the factors to TF32 and would move points by millimetres.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def align(*arrays_and_ranks: tuple[Array, int]) -> list[Array]:
+    """Arrays of as many leading axes each, from pairs of an array and the number of its own trailing axes."""
+    leading = max(a.ndim - rank for a, rank in arrays_and_ranks)
+    return [a.reshape((1,) * (leading - (a.ndim - rank)) + a.shape) for a, rank in arrays_and_ranks]
+
+
+def rotate(rotation: Float[Array, "... 3 3"], vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    """`rotation @ vector`, as explicit sums that a compiler fuses with what surrounds them."""
+    rotation, vectors = align((rotation, 2), (vectors, 1))
+    return sum(rotation[..., :, k] * vectors[..., None, k] for k in range(3))
+
+
+def transform(T_a_b: Float[Array, "... 4 4"], points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    """Points given in frame b, in frame a."""
+    T_a_b, points = align((T_a_b, 2), (points, 1))
+    return rotate(T_a_b[..., :3, :3], points) + T_a_b[..., :3, 3]
+
+
+def compose(T_a_b: Float[Array, "... 4 4"], T_b_c: Float[Array, "... 4 4"]) -> Float[Array, "... 4 4"]:
+    """`T_a_c`."""
+    a, b = align((T_a_b, 2), (T_b_c, 2))
+    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
+
+
+def make(rotation: Float[Array, "*batch 3 3"], position: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4 4"]:
+    """The transform of a rotation and a position."""
+    top = jnp.concatenate([rotation, position[..., None]], axis=-1)
+    bottom = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0], top.dtype), (*top.shape[:-2], 1, 4))
+    return jnp.concatenate([top, bottom], axis=-2)
+
+
+def inverse(T_a_b: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
+    """`T_b_a`."""
+    rotation = jnp.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    return make(rotation, -rotate(rotation, T_a_b[..., :3, 3]))
+
+
+def translate(T_a_b: Float[Array, "*batch 4 4"], offset: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4 4"]:
+    """The same frame moved by an offset given in frame a."""
+    return T_a_b.at[..., :3, 3].add(offset)
+
+
+def back_off(T_a_b: Float[Array, "*batch 4 4"], distance: Float[Array, "*batch"]) -> Float[Array, "*batch 4 4"]:
+    """The same frame moved by a distance along its own -z."""
+    return T_a_b.at[..., :3, 3].add(-distance[..., None] * T_a_b[..., :3, 2])
+
+
+def yaw_rotation(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
+    """Rotation about the vertical by an angle [rad]."""
+    c, s, zero, one = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw), jnp.ones_like(yaw)
+    rows = [[c, -s, zero], [s, c, zero], [zero, zero, one]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def upright_pose(pose: Float[Array, "*batch 3"], z: float) -> Float[Array, "*batch 4 4"]:
+    """`T_world_target` of a target that stands upright at `pose` = x, y [m], yaw [rad], its centre at height `z` [m]."""
+    height = jnp.full(pose.shape[:-1], z, pose.dtype)
+    return make(yaw_rotation(pose[..., 2]), jnp.stack([pose[..., 0], pose[..., 1], height], axis=-1))
