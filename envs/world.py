@@ -1,0 +1,79 @@
+"""The true state of the shelf: every body's shape and pose, in fixed slots."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mechsearch_jax import superquadric
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
+from mechsearch_jax.superquadric import Superquadrics
+
+BOX, CYLINDER = 0, 1
+TARGET = MAX_OBJECTS
+BODIES = MAX_OBJECTS + 1
+
+
+@flax.struct.dataclass
+class World:
+    """All bodies on the shelf. Every field has the leading axes (..., 9): eight slots for objects, then the target.
+
+    Attributes:
+      kind: 0 for a box, 1 for a cylinder, int32.
+      half_size: half-extents along the body's own axes [m], shape (..., 9, 3).
+      position: `t_world_body` [m], shape (..., 9, 3).
+      rotation: `R_world_body`, shape (..., 9, 3, 3).
+      valid: whether the slot holds a body.
+    """
+
+    kind: jax.Array
+    half_size: jax.Array
+    position: jax.Array
+    rotation: jax.Array
+    valid: jax.Array
+
+
+def slots(scenario: Scenario) -> list[Body | None]:
+    """The scenario's bodies in the order of a `World`'s slots, None where a slot is empty.
+
+    Raises:
+      InputError: there are more objects than slots.
+    """
+    missing = MAX_OBJECTS - len(scenario.objects)
+    if missing < 0:
+        raise InputError(f"{scenario.name}: {len(scenario.objects)} objects are too many; at most {MAX_OBJECTS} fit")
+    return [*scenario.objects, *[None] * missing, scenario.target]
+
+
+def from_scenario(scenario: Scenario) -> World:
+    """The world as a scenario describes it.
+
+    Raises:
+      InputError: there are more objects than slots.
+    """
+    empty = Body("box", (1e-3, 1e-3, 1e-3), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    bodies = slots(scenario)
+    filled = [body or empty for body in bodies]
+    return World(
+        kind=jnp.array([CYLINDER if b.shape == "cylinder" else BOX for b in filled], jnp.int32),
+        half_size=jnp.array([b.half_size for b in filled], jnp.float32),
+        position=jnp.array([b.position for b in filled], jnp.float32),
+        rotation=jnp.array(np.stack([rotation_matrix(b.quaternion) for b in filled]), jnp.float32),
+        valid=jnp.array([b is not None for b in bodies]),
+    )
+
+
+def true_superquadrics(world: World) -> Superquadrics:
+    """The surrounding objects, without the target, as a recogniser that knows the truth would report them."""
+    box, cylinder = jnp.array(superquadric.BOX_EXPONENTS), jnp.array(superquadric.CYLINDER_EXPONENTS)
+    kind = world.kind[..., :TARGET, None]
+    return Superquadrics(
+        size=world.half_size[..., :TARGET, :],
+        exponents=jnp.where(kind == CYLINDER, cylinder, box),
+        position=world.position[..., :TARGET, :],
+        rotation=world.rotation[..., :TARGET, :, :],
+        valid=world.valid[..., :TARGET],
+    )
