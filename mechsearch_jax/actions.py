@@ -2,11 +2,38 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
+import math
+from typing import Literal
 
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax import superquadric
+from mechsearch_jax.collision import Pair, any_inside, hits_shelf
+from mechsearch_jax.dynamics import Footprints, bounding_half_extents, footprints
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.graspability import boxes_overlap, gripper_rotation
+from mechsearch_jax.gripper import Gripper, arm_hits_shelf, gripper_cloud, swept_cloud
+from mechsearch_jax.kinematics import line_kinematics, path_kinematics
+from mechsearch_jax.masked import masked_vmap
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.transforms import (
+    back_off,
+    compose,
+    inverse,
+    make,
+    matmul,
+    rotate,
+    transform,
+    translate,
+    yaw_rotation,
+)
 
 
 class ActionKind(enum.IntEnum):
@@ -49,3 +76,637 @@ def no_action() -> Action:
         q7=jnp.float32(0.0),
         opening=jnp.float32(0.0),
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionConfig:
+    """Which actions there are.
+
+    Attributes:
+      kinds: "both", "push" or "pick-and-place".
+      push_distances: how far the gripper travels in a push [m].
+      push_tilt: angle by which the pushing gripper points downwards [rad]. The paper's 30 degrees bring the palm to
+        within 13 mm of an object that the fingers touch; 20 degrees leave twice that.
+      push_height: height of the finger tips above the board in a push [m].
+      push_gap: distance between gripper and object where a push starts [m].
+      push_depths: how far the finger tips reach past the object's front, or past its centre, in a push [m].
+      grasp_yaws: number of approach directions for round objects, and of places to grasp on a box.
+      grasp_depth: how far the finger tips reach past the front of a deep object [m].
+      placements: how many places are tried for a picked object, and how many of those are tested for collision.
+      place_yaw: largest angle by which a picked object is turned [rad].
+      clearance: distance to keep from neighbours when placing [m].
+      jam: deepest unresolved penetration of a predicted push that is still executed [m].
+      cloud_points: points on the swept gripper.
+      object_points: points on an object.
+    """
+
+    kinds: Literal["both", "push", "pick-and-place"] = "both"
+    push_distances: tuple[float, ...] = (0.05, 0.10, 0.15)
+    push_tilt: float = math.radians(20)
+    push_height: float = 0.03
+    push_gap: float = 0.01
+    push_depths: tuple[float, float] = (0.02, 0.02)
+    grasp_yaws: int = 6
+    grasp_depth: float = 0.035
+    placements: tuple[int, int] = (32, 4)
+    place_yaw: float = math.radians(30)
+    clearance: float = 0.005
+    jam: float = 0.006
+    cloud_points: int = 1024
+    object_points: int = 128
+
+    def __post_init__(self):
+        if self.kinds not in ("both", "push", "pick-and-place"):
+            raise InputError(f'actions "{self.kinds}" are unknown; use "both", "push" or "pick-and-place"')
+        if not self.push_distances or min(self.push_distances) <= 0:
+            raise InputError(f"push_distances {self.push_distances} must be one or more positive lengths in metres")
+
+
+@flax.struct.dataclass
+class ActionTables:
+    """Constants of the actions.
+
+    Attributes:
+      q7: angles of joint 7, shape (W,) [rad].
+      clouds: what the gripper sweeps on its way in, in its own frame, open and then closed: shape (2, W, 3, P) [m].
+      low, high: boxes around them, shape (2, W, 3) [m].
+      pusher: surface of the closed gripper in its own frame, by wrist, shape (W, Q, 3) [m].
+    """
+
+    q7: jax.Array
+    clouds: jax.Array
+    low: jax.Array
+    high: jax.Array
+    pusher: jax.Array
+
+
+def action_tables(gripper: Gripper, q7: Float[Array, " w"], config: ActionConfig) -> ActionTables:
+    """Sample the clouds of the open and the closed gripper for every wrist angle [rad]."""
+    angles = [float(a) for a in np.asarray(q7)]
+    clouds = np.stack(
+        [
+            [swept_cloud(gripper, opening, a, config.cloud_points) for a in angles]
+            for opening in (gripper.max_opening, 0.0)
+        ]
+    )
+    pusher = np.stack([gripper_cloud(gripper, 0.0, a, 256) for a in angles])
+    return ActionTables(
+        q7=jnp.float32(angles),
+        clouds=jnp.float32(np.swapaxes(clouds, -1, -2)),
+        low=jnp.float32(clouds.min(axis=-2)),
+        high=jnp.float32(clouds.max(axis=-2)),
+        pusher=jnp.float32(pusher),
+    )
+
+
+@flax.struct.dataclass
+class PossibleSpace:
+    """Where a target that has not been ruled out would stand, as a raster at the spacing of the candidate poses.
+
+    Attributes:
+      occupied: shape (rows along x, columns along y).
+      origin: centre of the first cell [m], shape (2,).
+      cell: spacing [m], shape (2,).
+      top: height up to which a target reaches [m].
+    """
+
+    occupied: jax.Array
+    origin: jax.Array
+    cell: jax.Array
+    top: jax.Array
+
+
+def _enters(space: PossibleSpace, points: Float[Array, "... 3"]) -> Bool[Array, "..."]:
+    """Whether world points lie in possible space."""
+    flat = points.reshape(-1, 3)
+    index = jnp.round((flat[:, :2] - space.origin[None]) / space.cell[None]).astype(jnp.int32)
+    inside = jnp.all((index >= 0) & (index < jnp.array(space.occupied.shape)[None]), axis=-1)
+    index = jnp.clip(index, 0, jnp.array(space.occupied.shape)[None] - 1)
+    return (space.occupied[index[:, 0], index[:, 1]] & inside & (flat[:, 2] < space.top)).reshape(points.shape[:-1])
+
+
+@flax.struct.dataclass
+class Candidates:
+    """The pushes and grasps of every object in a scene, and what stands in their way.
+
+    Attributes:
+      grasp: gripper poses, shape (N, A, 4, 4).
+      grasp_reached: whether the gripper opens wide enough, the arm reaches and the shelf leaves room, shape (N, A).
+      grasp_hits: which objects the gripper, or the object on its way out, would hit, shape (N, A, N).
+      grasp_enters: whether the gripper would enter possible space, shape (N, A).
+      push: gripper poses where pushes start, shape (N, B, 4, 4).
+      push_reached: by distance, shape (N, B, D).
+      push_hits: which objects the gripper would hit on its way in, shape (N, B, N).
+      push_enters: whether gripper or object would enter possible space, by distance, shape (N, B, D).
+    """
+
+    grasp: jax.Array
+    grasp_reached: jax.Array
+    grasp_hits: jax.Array
+    grasp_enters: jax.Array
+    push: jax.Array
+    push_reached: jax.Array
+    push_hits: jax.Array
+    push_enters: jax.Array
+
+
+def _wrap(angle):
+    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
+
+
+def _grasp_variants(config: ActionConfig, tilts: tuple[float, ...], wrists: int):
+    """Slot, tilt and wrist of each candidate grasp of an object."""
+    grid = np.meshgrid(np.arange(config.grasp_yaws), np.arange(len(tilts)), np.arange(wrists), indexing="ij")
+    slot, tilt, wrist = (g.reshape(-1) for g in grid)
+    return slot, np.float32(tilts)[tilt], wrist
+
+
+def object_grasps(
+    shelf: Shelf,
+    gripper: Gripper,
+    prints: Footprints,
+    config: ActionConfig,
+    max_yaw: float,
+    tilts: tuple[float, ...],
+    wrists: int,
+) -> tuple[Float[Array, "n a 4 4"], Bool[Array, "n a"]]:
+    """Side grasps of objects that stand or lie on the board.
+
+    Round objects are grasped through their axis from directions spread over `max_yaw`; others square to the side that
+    faces the robot, at several heights and depths.
+
+    Returns:
+      Gripper poses in the world, and whether the object is thin enough to be grasped so.
+    """
+    slot, tilt, _ = _grasp_variants(config, tilts, wrists)
+    n, a = prints.yaw.shape[0], len(slot)
+    count = config.grasp_yaws
+    spread = np.linspace(-max_yaw, max_yaw, count) if count > 1 else np.zeros(1)
+    quarter = jnp.arange(4) * (jnp.pi / 2)
+    faces = _wrap(prints.yaw[:, None] + quarter[None])
+    face = jnp.argmin(jnp.abs(faces), axis=1)
+    square_yaw = jnp.take_along_axis(faces, face[:, None], axis=1)
+    yaw = jnp.where(prints.round[:, None], jnp.float32(spread[slot])[None], square_yaw)
+    depth = jnp.where(face % 2 == 0, prints.half[:, 0], prints.half[:, 1])
+    width = jnp.where(face % 2 == 0, prints.half[:, 1], prints.half[:, 0])
+    fits = (2 * width <= gripper.usable_opening)[:, None] & (jnp.abs(yaw) <= max_yaw + 1e-3)
+
+    height = (prints.high - prints.low)[:, None]
+    fraction = jnp.float32(0.5 + 0.25 * np.array([0, 1, -1])[slot % 3])[None]
+    fraction = jnp.where(prints.round[:, None], jnp.float32(0.5 + 0.2 * (slot % 2))[None], fraction)
+    z = jnp.maximum(prints.low[:, None] + fraction * height, shelf.board + 0.025)
+    reach = jnp.float32(np.where(slot < 3, config.grasp_depth, 0.6 * config.grasp_depth))[None]
+    offset = jnp.where(prints.round[:, None], 0.0, jnp.maximum(depth[:, None] - reach, 0.0))
+    centre = jnp.stack(
+        [
+            prints.position[:, None, 0] - offset * jnp.cos(yaw),
+            prints.position[:, None, 1] - offset * jnp.sin(yaw),
+            z,
+        ],
+        axis=-1,
+    )
+    rotation = gripper_rotation(yaw, jnp.broadcast_to(jnp.asarray(tilt)[None], (n, a)))
+    return make(rotation, centre), fits & prints.valid[:, None]
+
+
+def _exit_distance(half, is_round, points, direction):
+    """How far points must move along a direction to leave a footprint, in its own frame; 0 if they never are inside."""
+    safe = jnp.where(jnp.abs(direction) < 1e-6, 1e-6, direction)
+    a, b = (-half - points) / safe, (half - points) / safe
+    enter, leave = jnp.max(jnp.minimum(a, b), axis=-1), jnp.min(jnp.maximum(a, b), axis=-1)
+    flat = jnp.where(enter < leave, leave, 0.0)
+    p, d = points / half, direction / half
+    dd, pd, pp = jnp.sum(d * d, axis=-1), jnp.sum(p * d, axis=-1), jnp.sum(p * p, axis=-1)
+    square = pd**2 - dd * (pp - 1.0)
+    meets = square > 0
+    circle = jnp.where(meets, (-pd + jnp.sqrt(jnp.where(meets, square, 1.0))) / dd, 0.0)
+    return jnp.maximum(jnp.where(is_round, circle, flat), 0.0)
+
+
+def object_pushes(
+    shelf: Shelf, tables: ActionTables, scene: Superquadrics, prints: Footprints, config: ActionConfig
+) -> Float[Array, "n b 4 4"]:
+    """Gripper poses where pushes start: beside each object, at `push_gap` from it.
+
+    For each side (pushing towards +y, then -y), for two depths (fingers just past the object's front, then past its
+    centre so that the palm pushes), for each wrist.
+    """
+    wrists = tables.q7.shape[0]
+    side, deep, wrist = (g.reshape(-1) for g in np.meshgrid([1.0, -1.0], [0, 1], np.arange(wrists), indexing="ij"))
+    rotation = gripper_rotation(jnp.float32(0.0), jnp.float32(config.push_tilt))
+    extent = bounding_half_extents(scene)[:, 0]
+    x = jnp.where(
+        jnp.asarray(deep == 0)[None],
+        (prints.position[:, 0] - extent + config.push_depths[0])[:, None],
+        (prints.position[:, 0] + config.push_depths[1])[:, None],
+    )
+    z = shelf.board + config.push_height
+    b = len(side)
+    shape = (scene.capacity, b)
+    centre = jnp.stack([x, jnp.broadcast_to(prints.position[:, 1:2], shape), jnp.full(shape, z)], axis=-1)
+    T = make(jnp.broadcast_to(rotation, (*shape, 3, 3)), centre)
+
+    # The palm and the fingers decide how close the gripper can get; the wrist makes no difference to them.
+    points = rotate(rotation, tables.pusher[0])
+
+    def beside(half, is_round, position, yaw, low, high, centre, side):
+        world = points + centre[None]
+        level = (world[:, 2] > low - config.push_gap) & (world[:, 2] < high + config.push_gap)
+        turn = yaw_rotation(-yaw)[:2, :2]
+        local = rotate2(turn, world[:, :2] - position[None])
+        heading = rotate2(turn, jnp.array([0.0, 1.0]) * -side)
+        grown = half + config.push_gap
+        away = _exit_distance(grown[None], is_round, local, jnp.broadcast_to(heading[None], local.shape))
+        return jnp.max(jnp.where(level, away, 0.0))
+
+    rotate2 = lambda R, v: jnp.stack([R[0, 0] * v[..., 0] + R[0, 1] * v[..., 1], R[1, 0] * v[..., 0] + R[1, 1] * v[..., 1]], -1)  # noqa: E731, E501
+    each = jax.vmap(beside, in_axes=(None,) * 6 + (0, 0))
+    distance = jax.vmap(each, in_axes=(0,) * 7 + (None,))(
+        prints.half, prints.round, prints.position, prints.yaw, prints.low, prints.high, centre, jnp.float32(side)
+    )
+    return T.at[..., 1, 3].add(-jnp.float32(side)[None] * distance)
+
+
+def push_variants(config: ActionConfig, wrists: int) -> tuple[np.ndarray, np.ndarray]:
+    """Side (+1 or -1 along y) and wrist of each push of `object_pushes`, each of shape (B,)."""
+    side, _, wrist = np.meshgrid([1.0, -1.0], [0, 1], np.arange(wrists), indexing="ij")
+    return np.float32(side.reshape(-1)), wrist.reshape(-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionSpace:
+    """All that is static about actions, gathered so that it can be passed on as one argument.
+
+    Attributes:
+      shelf, gripper, config: as elsewhere.
+      max_yaw, tilts: of grasps, as in `graspability.GraspConfig`.
+      waypoints: poses at which an approach has to be reachable.
+    """
+
+    shelf: Shelf
+    gripper: Gripper
+    config: ActionConfig
+    max_yaw: float
+    tilts: tuple[float, ...]
+    waypoints: int
+
+
+def _object_cloud(scene: Superquadrics, count: int) -> Float[Array, "n 3 p"]:
+    return jnp.swapaxes(superquadric.sample_surface(scene.size, scene.exponents, count), -1, -2)
+
+
+def _swept_object(cloud, R_object_gripper, distance, steps=7):
+    """An object's surface at several places on its way along the gripper's -z, in its own frame, as rows."""
+    shift = -R_object_gripper[:, 2, None] * (jnp.arange(steps) * (distance / (steps - 1)))[None]
+    return (cloud[:, :, None] + shift[:, None, :]).reshape(3, -1)
+
+
+def _gripper_hits(tables, opening, wrist, T, scene, mask):
+    """Which objects the swept gripper hits: poses (C, 4, 4) against objects (N), where the mask (C, N) is true."""
+    c, n = mask.shape
+
+    def pair(tables, row, i):
+        T, scene = row
+        k, j = i // n, i % n
+        cloud = tables.clouds[opening, jnp.asarray(wrist)[k]]
+        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
+        return Pair(cloud, compose(T_object_world, T[k]), scene.size[j], scene.exponents[j])
+
+    T_gripper_object = compose(inverse(T)[:, None], make(scene.rotation, scene.position)[None])
+    low, high = tables.low[opening][jnp.asarray(wrist)], tables.high[opening][jnp.asarray(wrist)]
+    near = boxes_overlap(low[:, None], high[:, None], T_gripper_object, scene.size[None])
+    return any_inside((mask & near).reshape(-1), pair, tables, (T, scene)).reshape(c, n)
+
+
+def _object_hits(T, owner, scene, clouds, distance, mask, grow=0.0):
+    """Which others an object hits on its way along the gripper's -z: (C,) grasps of objects `owner` against (N).
+
+    `scene` has the owner at its place before that motion; its own column has to be masked out.
+    """
+    c, n = mask.shape
+
+    def pair(_, row, i):
+        T, scene, clouds, owner = row
+        k, j = i // n, i % n
+        o = owner[k]
+        cloud = _swept_object(clouds[o], matmul(scene.rotation[o].T, T[k][:3, :3]), distance)
+        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
+        T_object_owner = compose(T_object_world, make(scene.rotation[o], scene.position[o]))
+        return Pair(cloud, T_object_owner, scene.size[j] + grow, scene.exponents[j])
+
+    # A sphere around the owner, swept along a segment, against a sphere around the other.
+    start = scene.position[owner]
+    along = -T[:, :3, 2] * distance
+    offset = scene.position[None] - start[:, None]
+    t = jnp.clip(jnp.sum(offset * along[:, None], axis=-1) / distance**2, 0.0, 1.0)
+    gap2 = jnp.sum((offset - t[..., None] * along[:, None]) ** 2, axis=-1)
+    radius = superquadric.bounding_radius(scene.size)
+    near = gap2 < (radius[owner][:, None] + radius[None]) ** 2
+    return any_inside((mask & near).reshape(-1), pair, None, (T, scene, clouds, owner)).reshape(c, n)
+
+
+def _approach_clear(space: ActionSpace, tables: ActionTables, opening: int, wrist, T, mask):
+    """Whether the arm reaches along the approaches to poses (C, 4, 4) and nothing of it touches the shelf."""
+
+    def clear(tables, row, i):
+        T = row[i]
+        w = jnp.asarray(wrist)[i]
+        q, reachable = line_kinematics(T, jnp.float32(space.gripper.approach), tables.q7[w], space.waypoints)
+        return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf))
+
+    def touches(tables, row, i):
+        points = transform(row[i], tables.clouds[opening, jnp.asarray(wrist)[i]].T)
+        return jnp.any(hits_shelf(space.shelf, points))
+
+    reached = masked_vmap(clear, mask, tables, T)
+    return reached & ~masked_vmap(touches, reached, tables, T)
+
+
+def _enters_possible(tables: ActionTables, space: PossibleSpace, opening: int, wrist, T, mask):
+    """Whether the swept gripper enters possible space, for poses (C, 4, 4) where the mask is true."""
+
+    def enters(tables, row, i):
+        T, space = row
+        points = transform(T[i], tables.clouds[opening, jnp.asarray(wrist)[i]].T)
+        return jnp.any(_enters(space, points))
+
+    return masked_vmap(enters, mask, tables, (T, space))
+
+
+def candidates(
+    space: ActionSpace,
+    tables: ActionTables,
+    scene: Superquadrics,
+    possible: PossibleSpace,
+    previous: Candidates | None = None,
+    moved: Bool[Array, " n"] | None = None,
+) -> Candidates:
+    """All pushes and grasps of all objects, and what stands in their way.
+
+    Args:
+      space: static.
+      tables: constants of the problem.
+      scene: the objects, fields (N, ...).
+      possible: where the target may be.
+      previous: candidates before some objects moved.
+      moved: which moved since; only what concerns them is computed anew.
+    """
+    n, config = scene.capacity, space.config
+    wrists = tables.q7.shape[0]
+    prints = footprints(scene)
+    fresh = scene.valid if moved is None else moved & scene.valid
+    concerns = fresh[:, None] | fresh[None, :]
+    others = scene.valid[:, None] & scene.valid[None, :]
+    clouds = _object_cloud(scene, config.object_points)
+
+    grasp, fits = object_grasps(space.shelf, space.gripper, prints, config, space.max_yaw, space.tilts, wrists)
+    a = grasp.shape[1]
+    wrist = np.tile(_grasp_variants(config, space.tilts, wrists)[2], n)
+    owner = np.repeat(np.arange(n), a)
+    flat = grasp.reshape(-1, 4, 4)
+    new = (fits & fresh[:, None]).reshape(-1) & (config.kinds != "push")
+    reached = _approach_clear(space, tables, 0, wrist, flat, new)
+    if previous is not None:
+        reached = jnp.where(fresh[:, None], reached.reshape(n, a), previous.grasp_reached).reshape(-1)
+    # An open hand is around the object that it grasps, so that object is no obstacle.
+    mask = reached[:, None] & (concerns & others & ~jnp.eye(n, dtype=bool))[owner]
+    hits = _gripper_hits(tables, 0, wrist, flat, scene, mask)
+    hits |= _object_hits(flat, jnp.asarray(owner), scene, clouds, space.gripper.approach, mask & ~hits)
+    hits = hits.reshape(n, a, n)
+    if previous is not None:
+        hits = jnp.where(concerns[:, None, :], hits, previous.grasp_hits)
+    usable = reached & ~jnp.any(hits, axis=-1).reshape(-1)
+    grasp_enters = _enters_possible(tables, possible, 0, wrist, flat, usable).reshape(n, a)
+
+    push = object_pushes(space.shelf, tables, scene, prints, config)
+    side, push_wrist = push_variants(config, wrists)
+    b, d = push.shape[1], len(config.push_distances)
+    flat = push.reshape(-1, 4, 4)
+    owner_b = np.repeat(np.arange(n), b)
+    wrist_b = np.tile(push_wrist, n)
+    new = jnp.broadcast_to(fresh[:, None], (n, b)).reshape(-1) & (config.kinds != "pick-and-place")
+    starts = _approach_clear(space, tables, 1, wrist_b, flat, new)
+    displacement = jnp.asarray(np.tile(side, n))[:, None] * jnp.float32(config.push_distances)[None]
+    shift = jnp.stack([jnp.zeros_like(displacement), displacement, jnp.zeros_like(displacement)], axis=-1)
+    ends = translate(jnp.broadcast_to(flat[:, None], (n * b, d, 4, 4)), shift)
+
+    def push_path(tables, row, i):
+        starts, ends = row
+        T, end = starts[i // d], ends.reshape(-1, 4, 4)[i]
+        w = jnp.asarray(wrist_b)[i // d]
+        back = jnp.float32(space.gripper.approach)
+        middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
+        q, reachable = path_kinematics(jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)]), tables.q7[w])
+        points = transform(end, tables.clouds[1, w].T)
+        return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf)) & ~jnp.any(hits_shelf(space.shelf, points))
+
+    travels = masked_vmap(push_path, jnp.repeat(starts, d), tables, (flat, ends)).reshape(n, b, d)
+    if previous is not None:
+        travels = jnp.where(fresh[:, None, None], travels, previous.push_reached)
+    mask = jnp.any(travels, axis=-1).reshape(-1)[:, None] & (concerns & others)[owner_b]
+    push_hits = _gripper_hits(tables, 1, wrist_b, flat, scene, mask).reshape(n, b, n)
+    if previous is not None:
+        push_hits = jnp.where(concerns[:, None, :], push_hits, previous.push_hits)
+    usable = travels & ~jnp.any(push_hits, axis=-1)[..., None]
+
+    def push_enters(tables, row, i):
+        flat, shift, space, scene, clouds = row
+        k, j = i // d, i % d
+        w, o = jnp.asarray(wrist_b)[k], jnp.asarray(owner_b)[k]
+        # Places on the way less than two finger widths apart.
+        way = shift[k, j][None] * jnp.linspace(0.0, 1.0, 5)[:, None]
+        gripper = transform(flat[k], tables.clouds[1, w].T)
+        body = transform(make(scene.rotation[o], scene.position[o]), clouds[o].T)
+        both = jnp.concatenate([gripper[None] + way[:, None], body[None] + way[:, None]], axis=1)
+        return jnp.any(_enters(space, both))
+
+    entering = masked_vmap(push_enters, usable.reshape(-1), tables, (flat, shift, possible, scene, clouds), block=64)
+    return Candidates(
+        grasp=grasp,
+        grasp_reached=reached.reshape(n, a),
+        grasp_hits=hits,
+        grasp_enters=grasp_enters,
+        push=push,
+        push_reached=travels,
+        push_hits=push_hits,
+        push_enters=entering.reshape(n, b, d),
+    )
+
+
+@flax.struct.dataclass
+class Sample:
+    """A sampled action.
+
+    Attributes:
+      action: the action; of kind NONE where none is possible.
+      wrist: index of its wrist angle.
+      intrudes: whether it enters possible space, because nothing else was possible.
+    """
+
+    action: Action
+    wrist: jax.Array
+    intrudes: jax.Array
+
+
+def _choose(key, weight):
+    """A random index in proportion to weights, and whether any weight is positive."""
+    logits = jnp.where(weight > 0, jnp.log(jnp.where(weight > 0, weight, 1.0)), -jnp.inf)
+    return jnp.argmax(logits + jax.random.gumbel(key, weight.shape)), jnp.any(weight > 0)
+
+
+def _weights(clean, dirty):
+    """Equal weight for every object that has an action, shared evenly among its actions; dirty ones only in need."""
+    usable = jnp.where(jnp.any(clean), clean, dirty)
+    return usable / jnp.maximum(jnp.sum(usable, axis=-1, keepdims=True), 1)
+
+
+def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
+    """A place for a picked object, and the gripper pose that puts it there: (found, T_world_place, intrudes)."""
+    shelf, config = space.shelf, space.config
+    tries, tests = config.placements
+    n = scene.capacity
+    key_x, key_y, key_yaw, key_turn, key_order = jax.random.split(key, 5)
+    x = jax.random.uniform(key_x, (tries,), minval=shelf.front, maxval=shelf.back)
+    y = jax.random.uniform(key_y, (tries,), minval=shelf.right, maxval=shelf.left)
+    turn = jax.random.uniform(key_yaw, (tries,), minval=-config.place_yaw, maxval=config.place_yaw)
+    turn = jnp.where(jax.random.bernoulli(key_turn, 0.5, (tries,)), turn, 0.0)
+    approach = jnp.arctan2(T_grasp[1, 2], T_grasp[0, 2])
+    turn = jnp.clip(turn, -space.max_yaw - approach, space.max_yaw - approach)
+
+    position = jnp.stack([x, y, jnp.full(tries, scene.position[index, 2])], axis=-1)
+    rotation = matmul(yaw_rotation(turn), scene.rotation[index])
+    cloud = superquadric.sample_surface(scene.size[index], scene.exponents[index], config.object_points)
+    points = transform(make(rotation, position)[:, None], cloud[None])
+    on_board = ~jnp.any(hits_shelf(shelf, points + jnp.array([0.0, 0.0, 1e-3])[None, None]), axis=1)
+    on_board &= jnp.min(points[..., 0], axis=1) > shelf.front + config.clearance
+    other = scene.replace(size=scene.size + config.clearance, valid=scene.valid.at[index].set(False))
+    offset = position[:, None] - scene.position[None]
+    reach = superquadric.bounding_radius(other.size) + superquadric.bounding_radius(scene.size[index])
+    near = (jnp.sum(offset**2, axis=-1) < reach[None] ** 2) & other.valid[None] & on_board[:, None]
+
+    def overlap(_, row, i):
+        position, rotation, cloud, other = row
+        k, j = i // n, i % n
+        T_object_world = inverse(make(other.rotation[j], other.position[j]))
+        return Pair(cloud.T, compose(T_object_world, make(rotation[k], position[k])), other.size[j], other.exponents[j])
+
+    row = (position, rotation, cloud, other)
+    overlapping = jnp.any(any_inside(near.reshape(-1), overlap, None, row).reshape(near.shape), axis=1)
+    intrudes = jnp.any(_enters(possible, points), axis=1)
+
+    # The most promising places, those clear of possible space first, have their approach tested.
+    score = jax.random.uniform(key_order, (tries,)) - 2.0 * intrudes - 8.0 * (overlapping | ~on_board)
+    _, best = jax.lax.top_k(score, tests)
+    candidate = (~overlapping & on_board)[best]
+    intrudes = intrudes[best]
+    # The object turns about its own centre, and the gripper with it.
+    arm = T_grasp[:3, 3] - scene.position[index]
+    T_place = make(
+        matmul(yaw_rotation(turn[best]), T_grasp[:3, :3]),
+        rotate(yaw_rotation(turn[best]), arm) + position[best],
+    )
+    wrist_b = jnp.full(tests, wrist)
+
+    def clear(tables, row, i):
+        T, wrist = row
+        q, reachable = line_kinematics(T[i], jnp.float32(space.gripper.approach), tables.q7[wrist], space.waypoints)
+        points = transform(T[i], tables.clouds[0, wrist].T)
+        return reachable & ~jnp.any(arm_hits_shelf(q, shelf)) & ~jnp.any(hits_shelf(shelf, points))
+
+    clear_way = masked_vmap(clear, candidate, tables, (T_place, wrist))
+
+    def gripper_pair(tables, row, i):
+        T, wrist, other = row
+        k, j = i // n, i % n
+        T_object_world = inverse(make(other.rotation[j], other.position[j]))
+        return Pair(tables.clouds[0, wrist], compose(T_object_world, T[k]), other.size[j], other.exponents[j])
+
+    T_gripper_object = compose(inverse(T_place)[:, None], make(scene.rotation, scene.position)[None])
+    low = jnp.broadcast_to(tables.low[0][wrist_b][:, None], (tests, 1, 3))
+    high = jnp.broadcast_to(tables.high[0][wrist_b][:, None], (tests, 1, 3))
+    near = boxes_overlap(low, high, T_gripper_object, scene.size[None])
+    mask = near & clear_way[:, None] & other.valid[None]
+    hits = any_inside(mask.reshape(-1), gripper_pair, tables, (T_place, wrist, other)).reshape(mask.shape)
+
+    def body_pair(_, row, i):
+        T, position, rotation, cloud, scene = row
+        k, j = i // n, i % n
+        swept = _swept_object(cloud.T, matmul(rotation[k].T, T[k][:3, :3]), space.gripper.approach)
+        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
+        T_object_body = compose(T_object_world, make(rotation[k], position[k]))
+        return Pair(swept, T_object_body, scene.size[j], scene.exponents[j])
+
+    row = (T_place, position[best], rotation[best], cloud, scene)
+    mask = clear_way[:, None] & other.valid[None] & ~hits
+    hits |= any_inside(mask.reshape(-1), body_pair, None, row, block=32).reshape(mask.shape)
+    free = clear_way & ~jnp.any(hits, axis=1)
+    first = jnp.argmax(free)
+    return jnp.any(free), T_place[first], intrudes[first]
+
+
+def sample_action(
+    key: Array,
+    space: ActionSpace,
+    tables: ActionTables,
+    scene: Superquadrics,
+    possible: PossibleSpace,
+    options: Candidates,
+    available: Bool[Array, " n"],
+) -> Sample:
+    """Draw an action: an object and a kind with equal weight (the multi-set of B.5), then one of its ways at random.
+
+    Args:
+      key: PRNG key.
+      space: static.
+      tables: constants of the problem.
+      scene: the objects.
+      possible: where the target may be. Actions that enter it are drawn only if there are no others.
+      options: of this scene.
+      available: which objects may be moved.
+    """
+    config = space.config
+    wrists = tables.q7.shape[0]
+    n, a = options.grasp_reached.shape
+    b, d = options.push_reached.shape[1:]
+    key_choice, key_place = jax.random.split(key)
+    grasps = options.grasp_reached & ~jnp.any(options.grasp_hits, axis=-1) & available[:, None]
+    pushes = options.push_reached & ~jnp.any(options.push_hits, axis=-1)[..., None] & available[:, None, None]
+    ways = jnp.concatenate([jnp.pad(grasps, ((0, 0), (0, b * d - a))), pushes.reshape(n, -1)]) if b * d >= a else None
+    if ways is None:
+        ways = jnp.concatenate([grasps, jnp.pad(pushes.reshape(n, -1), ((0, 0), (0, a - b * d)))])
+    width = max(a, b * d)
+    enters = jnp.concatenate(
+        [
+            jnp.pad(options.grasp_enters, ((0, 0), (0, width - a))),
+            jnp.pad(options.push_enters.reshape(n, -1), ((0, 0), (0, width - b * d))),
+        ]
+    )
+    choice, possible_at_all = _choose(key_choice, _weights(ways & ~enters, ways).reshape(-1))
+    row, way = choice // width, choice % width
+    is_grasp = row < n
+    index = row % n
+
+    grasp_wrist = jnp.asarray(_grasp_variants(config, space.tilts, wrists)[2])
+    side, push_wrist = (jnp.asarray(v) for v in push_variants(config, wrists))
+    grasp = jnp.clip(way, 0, a - 1)
+    push, distance = jnp.clip(way, 0, b * d - 1) // d, jnp.clip(way, 0, b * d - 1) % d
+    T_grasp, T_push = options.grasp[index, grasp], options.push[index, push]
+    wrist = jnp.where(is_grasp, grasp_wrist[grasp], push_wrist[push])
+    length = side[push] * jnp.float32(config.push_distances)[distance]
+    displacement = jnp.stack([jnp.zeros_like(length), length, jnp.zeros_like(length)])
+    placed, T_place, place_intrudes = _placement(
+        key_place, space, tables, scene, possible, index, T_grasp, grasp_wrist[grasp]
+    )
+    able = possible_at_all & (~is_grasp | placed)
+    kind = jnp.where(is_grasp, ActionKind.PICK_AND_PLACE, ActionKind.PUSH)
+    action = Action(
+        kind=jnp.where(able, kind, ActionKind.NONE).astype(jnp.int32),
+        object=index.astype(jnp.int32),
+        T_world_gripper=jnp.where(is_grasp, T_grasp, T_push),
+        displacement=jnp.where(is_grasp, jnp.zeros(3), displacement),
+        T_world_place=jnp.where(is_grasp, T_place, translate(T_push, displacement)),
+        q7=tables.q7[wrist],
+        opening=jnp.where(is_grasp, space.gripper.max_opening, 0.0).astype(jnp.float32),
+    )
+    intrudes = enters.reshape(-1)[choice] | (is_grasp & place_intrudes)
+    return Sample(action, wrist, able & intrudes)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import compose, inverse, transform, yaw_rotation
+from mechsearch_jax.transforms import compose, inverse, matmul, transform, yaw_rotation
 
 ROUND_EXPONENT = 0.6
 BOUNDARY_POINTS = 24
@@ -247,7 +247,7 @@ def rigid_motion(
     arm = _turn(turn, scene.position[:, :2] - before) + after
     return scene.replace(
         position=jnp.concatenate([arm, scene.position[:, 2:]], axis=-1),
-        rotation=jnp.matmul(yaw_rotation(turn), scene.rotation, precision=jax.lax.Precision.HIGHEST),
+        rotation=matmul(yaw_rotation(turn), scene.rotation),
     )
 
 
@@ -257,7 +257,7 @@ def pick_and_place(
     """The scene after an object has moved rigidly with the gripper from one pose to the other."""
     motion = compose(T_world_place, inverse(T_world_grasp))
     position = transform(motion, scene.position[index])
-    rotation = jnp.matmul(motion[:3, :3], scene.rotation[index], precision=jax.lax.Precision.HIGHEST)
+    rotation = matmul(motion[:3, :3], scene.rotation[index])
     return scene.replace(
         position=scene.position.at[index].set(position), rotation=scene.rotation.at[index].set(rotation)
     )

@@ -1,0 +1,291 @@
+"""The graspability function g: could the target be grasped where it is? (paper appendix B.3, DESIGN.md section 5)
+
+Everything that a grasp sweeps (hand, fingers, links 7 and 6 on their straight way in, and the target on its way out) is
+a constant point cloud in the target's frame. Which grasps the arm can make at a candidate pose, and which the shelf
+leaves room for, does not depend on the objects, so the pairs of a pose and a grasp that are feasible are listed once, and
+a scene only adds the table H[pair, object] of who is hit. Moving one object recomputes its column.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.collision import Pair, any_inside, hits_shelf
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.gripper import Gripper, arm_hits_shelf, swept_cloud
+from mechsearch_jax.kinematics import line_kinematics
+from mechsearch_jax.masked import masked_vmap
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.target import Target
+from mechsearch_jax.transforms import compose, inverse, make, transform, upright_pose
+
+WRIST_ORIGIN = math.pi / 4
+
+
+@dataclasses.dataclass(frozen=True)
+class GraspConfig:
+    """The candidate grasps and how finely they are tested.
+
+    Attributes:
+      yaws: number of approach directions seen from above, for round objects; boxes are grasped square to their faces.
+      max_yaw: largest angle between the approach and +x, seen from above [rad].
+      tilts: angles by which the gripper points downwards [rad].
+      wrists: angles of joint 7 relative to 45 degrees [rad]; each holds link 6 elsewhere beside the hand. The three
+        defaults together reach 97% of what any angle reaches.
+      points: points on the swept gripper.
+      target_points: points on the swept target.
+      waypoints: poses on an approach at which inverse kinematics must succeed.
+      erosion: by how much the target is drawn in for the collision test of its way out [m].
+    """
+
+    yaws: int = 7
+    max_yaw: float = math.radians(45)
+    tilts: tuple[float, ...] = (math.radians(20), math.radians(30))
+    wrists: tuple[float, ...] = (math.radians(-60), math.radians(15), math.radians(60))
+    points: int = 2048
+    target_points: int = 512
+    waypoints: int = 4
+    erosion: float = 0.001
+
+    def __post_init__(self):
+        if self.yaws < 1 or not self.tilts or not self.wrists:
+            raise InputError("GraspConfig: yaws must be at least 1, and tilts and wrists hold at least one angle")
+        if self.waypoints < 2:
+            raise InputError(f"GraspConfig: {self.waypoints} waypoints make no line; use at least 2")
+
+
+@flax.struct.dataclass
+class GraspTables:
+    """The target's grasps: constants of a `Problem`.
+
+    Attributes:
+      T_target_gripper: candidate grasps, shape (G, 4, 4).
+      q7: angle of joint 7 in each, shape (G,).
+      wrist: index of the wrist's swept gripper cloud, shape (G,).
+      clouds: what each grasp sweeps, in the target's frame as rows of coordinates, shape (G, 3, P) [m].
+      low, high: box around each cloud in the gripper's frame, shape (G, 3) [m].
+      gripper_clouds: what the open gripper sweeps in its own frame, by wrist, shape (W, 3, P') [m].
+      T_world_target: candidate poses, shape (X, 4, 4).
+      pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose.
+    """
+
+    T_target_gripper: jax.Array
+    q7: jax.Array
+    wrist: jax.Array
+    clouds: jax.Array
+    low: jax.Array
+    high: jax.Array
+    gripper_clouds: jax.Array
+    T_world_target: jax.Array
+    pair_pose: jax.Array
+    pair_grasp: jax.Array
+
+
+def gripper_rotation(yaw: Float[Array, "*batch"], tilt: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
+    """`R_world_gripper` that approaches along `yaw` from +x, points down by `tilt` and closes horizontally [rad].
+
+    The gripper's y points to the right of the approach, as it does in the home configuration.
+    """
+    c, s, cosine, sine, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.cos(tilt), jnp.sin(tilt), jnp.zeros_like(yaw)
+    x = jnp.stack([c * sine, s * sine, cosine], axis=-1)
+    y = jnp.stack([s, -c, zero], axis=-1)
+    z = jnp.stack([c * cosine, s * cosine, -sine], axis=-1)
+    return jnp.stack([x, y, z], axis=-1)
+
+
+def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):
+    if target.shape == "cylinder":
+        yaws = np.linspace(-config.max_yaw, config.max_yaw, config.yaws) if config.yaws > 1 else np.zeros(1)
+        widths = np.full(len(yaws), 2 * target.half_size[0])
+    else:
+        yaws = np.arange(4) * np.pi / 2
+        widths = 2 * np.array(target.half_size)[[1, 0, 1, 0]]
+    yaws = yaws[widths <= gripper.usable_opening]
+    if len(yaws) == 0:
+        raise InputError(
+            f"Target: {min(widths):.3f} m wide, but the gripper opens only {gripper.usable_opening} m; use a thinner target"
+        )
+    grasps = np.stack(np.meshgrid(yaws, config.tilts, np.arange(len(config.wrists)), indexing="ij"), -1).reshape(-1, 3)
+    yaw, tilt, wrist = jnp.float32(grasps[:, 0]), jnp.float32(grasps[:, 1]), grasps[:, 2].astype(int)
+    T = make(gripper_rotation(yaw, tilt), jnp.zeros((len(grasps), 3)))
+    return T, yaw, wrist
+
+
+def swept_target(target: Target, direction: np.ndarray, distance: float, count: int, erosion: float) -> np.ndarray:
+    """Surface of what the target sweeps when it is moved along a direction, in its own frame, shape (count, 3) [m]."""
+    a, b, c = (h - erosion for h in target.half_size)
+    if target.shape == "cylinder":
+        mesh = trimesh.creation.cylinder(radius=a, height=2 * c, sections=32)
+    else:
+        mesh = trimesh.creation.box(extents=(2 * a, 2 * b, 2 * c))
+    both = np.concatenate([mesh.vertices, mesh.vertices + distance * np.asarray(direction)])
+    points, _ = trimesh.sample.sample_surface(trimesh.convex.convex_hull(both), count, seed=0)
+    return np.asarray(points, np.float32)
+
+
+def feasible_grasps(
+    tables: GraspTables, shelf: Shelf, gripper: Gripper, config: GraspConfig, T_world_target: Float[Array, "n 4 4"]
+) -> Bool[Array, "n g"]:
+    """Which grasps the arm can make at target poses and the shelf leaves room for, whatever the objects.
+
+    The approach has to be within `max_yaw` of +x, reachable along its whole length, and neither the arm nor anything
+    that is swept may touch the shelf.
+    """
+    n, g = T_world_target.shape[0], tables.q7.shape[0]
+    T = compose(T_world_target[:, None], tables.T_target_gripper[None])
+    ahead = T[..., 0, 2] >= jnp.cos(config.max_yaw + 1e-4) * jnp.sqrt(T[..., 0, 2] ** 2 + T[..., 1, 2] ** 2)
+
+    def reach(_, row, i):
+        T, q7 = row[0][i], row[1][i % g]
+        q, reachable = line_kinematics(T, jnp.float32(gripper.approach), q7, config.waypoints)
+        return reachable & ~jnp.any(arm_hits_shelf(q, shelf))
+
+    reachable = masked_vmap(reach, ahead.reshape(-1), None, (T.reshape(-1, 4, 4), tables.q7), block=1024)
+
+    def touches(tables, T_world_target, i):
+        points = transform(T_world_target[i // g], tables.clouds[i % g].T)
+        return jnp.any(hits_shelf(shelf, points))
+
+    touching = masked_vmap(touches, reachable, tables, T_world_target)
+    return (reachable & ~touching).reshape(n, g)
+
+
+def grasp_tables(shelf: Shelf, gripper: Gripper, target: Target, config: GraspConfig) -> GraspTables:
+    """Precompute the target's grasps, their swept clouds and the feasible pairs of a pose and a grasp.
+
+    Raises:
+      InputError: the target is too wide for the gripper.
+    """
+    T_target_gripper, _, wrist = _target_grasps(target, gripper, config)
+    angles = [WRIST_ORIGIN + a for a in config.wrists]
+    swept = [swept_cloud(gripper, gripper.max_opening, a, config.points) for a in angles]
+    outward = -np.asarray(T_target_gripper)[:, :3, 2]
+    clouds, low, high = [], [], []
+    for T, w, direction in zip(np.asarray(T_target_gripper), wrist, outward, strict=True):
+        own = swept_target(target, direction, gripper.approach, config.target_points, config.erosion)
+        inside = (own - T[:3, 3]) @ T[:3, :3]
+        both = np.concatenate([swept[w], inside])
+        clouds.append(np.concatenate([swept[w] @ T[:3, :3].T + T[:3, 3], own]).T)
+        low.append(both.min(axis=0))
+        high.append(both.max(axis=0))
+    poses = upright_pose(jnp.asarray(target.candidate_poses(shelf)), target.height(shelf))
+    tables = GraspTables(
+        T_target_gripper=T_target_gripper,
+        q7=jnp.float32(angles)[wrist],
+        wrist=jnp.int32(wrist),
+        clouds=jnp.float32(np.stack(clouds)),
+        low=jnp.float32(np.stack(low)),
+        high=jnp.float32(np.stack(high)),
+        gripper_clouds=jnp.float32(np.stack([s.T for s in swept])),
+        T_world_target=poses,
+        pair_pose=jnp.zeros(0, jnp.int32),
+        pair_grasp=jnp.zeros(0, jnp.int32),
+    )
+    feasible = jax.jit(lambda tables: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))(tables)
+    pose, grasp = np.nonzero(np.asarray(feasible))
+    return tables.replace(pair_pose=jnp.int32(pose), pair_grasp=jnp.int32(grasp))
+
+
+def boxes_overlap(
+    low: Float[Array, "... 3"], high: Float[Array, "... 3"], T_box_object: Float[Array, "... 4 4"], size: Float[Array, "... 3"]
+) -> Bool[Array, "..."]:
+    """Whether a box and the bounding box of an object may overlap: not separated along any of the box's own axes."""
+    reach = jnp.sum(jnp.abs(T_box_object[..., :3, :3]) * size[..., None, :], axis=-1)
+    centre = T_box_object[..., :3, 3]
+    return jnp.all((centre - reach < high) & (centre + reach > low), axis=-1)
+
+
+@flax.struct.dataclass
+class FoundGrasps:
+    """The grasps of a target that has been found, whose pose need not be a candidate.
+
+    Attributes:
+      T_world_target: pose of the target, shape (4, 4).
+      feasible: which grasps the arm and the shelf allow, shape (G,).
+    """
+
+    T_world_target: jax.Array
+    feasible: jax.Array
+
+
+def pairs(
+    tables: GraspTables, found: FoundGrasps
+) -> tuple[Int[Array, " k"], Int[Array, " k"], Bool[Array, " k"], Float[Array, "y 4 4"]]:
+    """Pose index, grasp index and feasibility of all pairs, and all poses: the candidates, then the found target."""
+    x, g = tables.T_world_target.shape[0], tables.q7.shape[0]
+    pose = jnp.concatenate([tables.pair_pose, jnp.full(g, x, jnp.int32)])
+    grasp = jnp.concatenate([tables.pair_grasp, jnp.arange(g, dtype=jnp.int32)])
+    allowed = jnp.concatenate([jnp.ones(tables.pair_pose.shape[0], bool), found.feasible])
+    return pose, grasp, allowed, jnp.concatenate([tables.T_world_target, found.T_world_target[None]])
+
+
+def grasp_hits(
+    tables: GraspTables,
+    found: FoundGrasps,
+    scene: Superquadrics,
+    exists: Bool[Array, " y"],
+    previous: Bool[Array, "k n"] | None = None,
+    moved: Bool[Array, " n"] | None = None,
+) -> Bool[Array, "k n"]:
+    """H: which objects the grasp of each feasible pair would hit.
+
+    Args:
+      tables: constants of the problem.
+      found: the found target, or anything if there is none.
+      scene: the objects, fields (N, ...).
+      exists: at which of the poses of `pairs` H matters; it reads False elsewhere.
+      previous: H before some objects moved.
+      moved: which objects moved since; only their columns are computed anew.
+
+    Returns:
+      H, shape (pairs, N).
+    """
+    pose, grasp, allowed, T_world_target = pairs(tables, found)
+    n = scene.capacity
+    fresh = scene.valid if moved is None else moved & scene.valid
+    T_gripper_world = inverse(compose(T_world_target[pose], tables.T_target_gripper[grasp]))
+    T_world_object = make(scene.rotation, scene.position)
+    T = compose(T_gripper_world[:, None], T_world_object[None])
+    near = boxes_overlap(tables.low[grasp][:, None], tables.high[grasp][:, None], T, scene.size[None])
+    mask = near & (exists[pose] & allowed)[:, None] & fresh[None]
+
+    def pair(tables, row, i):
+        scene, T_world_target, pose, grasp = row
+        k, j = i // n, i % n
+        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
+        T = compose(T_object_world, T_world_target[pose[k]])
+        return Pair(tables.clouds[grasp[k]], T, scene.size[j], scene.exponents[j])
+
+    hit = any_inside(mask.reshape(-1), pair, tables, (scene, T_world_target, pose, grasp)).reshape(mask.shape)
+    if previous is None or moved is None:
+        return hit
+    return jnp.where(moved[None], hit, previous)
+
+
+def graspability(tables: GraspTables, found: FoundGrasps, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:
+    """g at all poses of `pairs` from H: 1 minus the least number of objects that a feasible grasp hits (equation 17).
+
+    A pose where no grasp is feasible counts as hitting one object more than there can be.
+    """
+    pose, _, allowed, T_world_target = pairs(tables, found)
+    worst = hits.shape[1] + 1
+    count = jnp.where(allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), worst)
+    least = jax.ops.segment_min(count, pose, num_segments=T_world_target.shape[0], indices_are_sorted=True)
+    return 1 - jnp.minimum(least, worst)
+
+
+def find_grasps(
+    tables: GraspTables, shelf: Shelf, gripper: Gripper, config: GraspConfig, T_world_target: Float[Array, "4 4"]
+) -> FoundGrasps:
+    """The feasible grasps of a target at any pose."""
+    return FoundGrasps(T_world_target, feasible_grasps(tables, shelf, gripper, config, T_world_target[None])[0])
+

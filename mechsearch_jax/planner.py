@@ -1,0 +1,517 @@
+"""Sampling-based model predictive control of mechanical search (paper sections 3 and 4.4, appendix B.4).
+
+`build_problem` gathers what an episode never changes, `observe_belief` folds an observation into what is known of the
+target, `plan` decides on the next action, and `graspable_at` says how to take out a target that has been found.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Literal
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.actions import (
+    Action,
+    ActionConfig,
+    ActionKind,
+    ActionSpace,
+    ActionTables,
+    Candidates,
+    PossibleSpace,
+    action_tables,
+    candidates,
+    sample_action,
+)
+from mechsearch_jax.camera import Camera
+from mechsearch_jax.dynamics import PushModel, QuasiStatic, changed, pick_and_place
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.existence import (
+    ExistenceConfig,
+    ExistenceTables,
+    ObjectViews,
+    existence,
+    existence_tables,
+    object_views,
+)
+from mechsearch_jax.graspability import (
+    FoundGrasps,
+    GraspConfig,
+    GraspTables,
+    find_grasps,
+    grasp_hits,
+    grasp_tables,
+    graspability,
+)
+from mechsearch_jax.gripper import Gripper
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.target import Target
+from mechsearch_jax.transforms import compose, upright_pose
+
+CLEARANCES = (0.0, 0.004, 0.008, 0.012, 0.02)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannerConfig:
+    """How the planner decides; hashable, passed as a static argument.
+
+    Attributes:
+      method: "search-for-grasp" minimises where the target can be and how far it is from graspable, together;
+        "search-and-grasp" first the one, and the other once the target is found.
+      gamma: discount of equation 2, in (0, 1].
+      horizon: M, actions in a sequence.
+      sequences: how many sequences are sampled for a decision.
+      actions: "both", "push" or "pick-and-place".
+      criterion: how f decides what is visible; see `existence.ExistenceConfig`.
+      push_distances: how far pushes go [m].
+      max_steps: T, actions in an episode.
+    """
+
+    method: Literal["search-for-grasp", "search-and-grasp"] = "search-for-grasp"
+    gamma: float = 0.9
+    horizon: int = 3
+    sequences: int = 30
+    actions: Literal["both", "push", "pick-and-place"] = "both"
+    criterion: Literal["detector", "depth-mse", "depth-norm"] = "detector"
+    push_distances: tuple[float, ...] = (0.05, 0.10, 0.15)
+    max_steps: int = 10
+
+    def __post_init__(self):
+        if self.method not in ("search-for-grasp", "search-and-grasp"):
+            raise InputError(f'method "{self.method}" is unknown; use "search-for-grasp" or "search-and-grasp"')
+        if not 0.0 < self.gamma <= 1.0:
+            raise InputError(f"gamma {self.gamma} is outside (0, 1]; the paper uses 0.9")
+        for name in ("horizon", "sequences", "max_steps"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} {getattr(self, name)} must be at least 1")
+        # Both check what they are given.
+        ActionConfig(kinds=self.actions, push_distances=self.push_distances)
+        ExistenceConfig(criterion=self.criterion)
+
+    @classmethod
+    def paper(cls, **changes) -> PlannerConfig:
+        """The paper's settings (appendix B.4 and B.5), with changes."""
+        return cls(**changes)
+
+
+@flax.struct.dataclass
+class Problem:
+    """What does not change in an episode: the world around the objects, and all that follows from it.
+
+    Attributes:
+      existence, grasps, actions: constants of f, of g and of the actions.
+      poses: the candidate poses X as x, y [m], yaw [rad], shape (X, 3).
+      camera, shelf, gripper, target, existence_config, grasp_config, action_config: static.
+    """
+
+    existence: ExistenceTables
+    grasps: GraspTables
+    actions: ActionTables
+    poses: jax.Array
+    camera: Camera = flax.struct.field(pytree_node=False)
+    shelf: Shelf = flax.struct.field(pytree_node=False)
+    gripper: Gripper = flax.struct.field(pytree_node=False)
+    target: Target = flax.struct.field(pytree_node=False)
+    existence_config: ExistenceConfig = flax.struct.field(pytree_node=False)
+    grasp_config: GraspConfig = flax.struct.field(pytree_node=False)
+    action_config: ActionConfig = flax.struct.field(pytree_node=False)
+
+
+@flax.struct.dataclass
+class Belief:
+    """What is known of the target.
+
+    Attributes:
+      exists: f_t, shape (X,). It only ever shrinks, unless it contradicts every pose: see `observe_belief`.
+      found: c_t, whether the target has been seen.
+      found_pose: where, as x, y [m], yaw [rad].
+      grasps: the grasps that arm and shelf allow there.
+      restarts: how often f became empty and was started anew.
+    """
+
+    exists: jax.Array
+    found: jax.Array
+    found_pose: jax.Array
+    grasps: FoundGrasps
+    restarts: jax.Array
+
+
+@flax.struct.dataclass
+class Sequences:
+    """Sampled sequences of actions, best first; leading axis S, and M within.
+
+    Attributes:
+      actions: shape (S, M), of kind NONE from where a sequence found nothing more to do.
+      cost: J after each action, shape (S, M).
+      value: equation 2 of the best prefix, shape (S,); infinite if there was no first action.
+      length: number of actions in that prefix, shape (S,).
+    """
+
+    actions: Action
+    cost: jax.Array
+    value: jax.Array
+    length: jax.Array
+
+
+@flax.struct.dataclass
+class Plan:
+    """A decision.
+
+    Attributes:
+      action: what to do next; of kind NONE if nothing is possible.
+      value: equation 2 of the sequence it begins: the change of the cost, negative is good.
+      cost: J now.
+      predicted_cost: J that is expected after the action.
+      sequences: all sampled sequences, best first.
+      overflow: whether an object's image outgrew its window (see `existence.ObjectViews`): f may be too small.
+    """
+
+    action: Action
+    value: jax.Array
+    cost: jax.Array
+    predicted_cost: jax.Array
+    sequences: Sequences
+    overflow: jax.Array
+
+
+@flax.struct.dataclass
+class GraspChoice:
+    """How to take out a found target.
+
+    Attributes:
+      success: whether there is a grasp that hits nothing.
+      hits: number of objects that the best grasp hits; one more than there can be if no grasp is feasible.
+      T_world_gripper: the best grasp, of those that hit fewest the one that keeps furthest from the objects.
+      q7: angle of joint 7 [rad].
+      opening: distance between the fingers on the way in [m].
+    """
+
+    success: jax.Array
+    hits: jax.Array
+    T_world_gripper: jax.Array
+    q7: jax.Array
+    opening: jax.Array
+
+
+def build_problem(
+    camera: Camera | None = None,
+    shelf: Shelf | None = None,
+    gripper: Gripper | None = None,
+    target: Target | None = None,
+    existence_config: ExistenceConfig | None = None,
+    grasp_config: GraspConfig | None = None,
+    action_config: ActionConfig | None = None,
+) -> Problem:
+    """Precompute everything about a camera, a shelf, a gripper and a target that no object changes.
+
+    Takes seconds; what is left out takes its default. Not to be called inside `jit`.
+
+    Raises:
+      InputError: the target cannot be grasped by the gripper.
+    """
+    camera, shelf = camera or Camera(), shelf or Shelf()
+    gripper, target = gripper or Gripper(), target or Target()
+    existence_config, grasp_config = existence_config or ExistenceConfig(), grasp_config or GraspConfig()
+    action_config = action_config or ActionConfig()
+    grasps = grasp_tables(shelf, gripper, target, grasp_config)
+    wrists = jnp.asarray([grasps.q7[grasps.wrist == w][0] for w in range(len(grasp_config.wrists))])
+    return Problem(
+        existence=existence_tables(camera, shelf, target, existence_config),
+        grasps=grasps,
+        actions=action_tables(gripper, wrists, action_config),
+        poses=jnp.asarray(target.candidate_poses(shelf)),
+        camera=camera,
+        shelf=shelf,
+        gripper=gripper,
+        target=target,
+        existence_config=existence_config,
+        grasp_config=grasp_config,
+        action_config=action_config,
+    )
+
+
+def _existence_config(problem: Problem, config: PlannerConfig) -> ExistenceConfig:
+    return dataclasses.replace(problem.existence_config, criterion=config.criterion)
+
+
+def initial_belief(problem: Problem) -> Belief:
+    """Nothing is known: the target can be at every candidate pose."""
+    g = problem.grasps.q7.shape[0]
+    return Belief(
+        exists=jnp.ones(problem.poses.shape[0], bool),
+        found=jnp.array(False),
+        found_pose=jnp.zeros(3),
+        grasps=FoundGrasps(jnp.eye(4), jnp.zeros(g, bool)),
+        restarts=jnp.int32(0),
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("config",))
+def observe_belief(
+    problem: Problem,
+    belief: Belief,
+    scene: Superquadrics,
+    found: Bool[Array, ""],
+    found_pose: Float[Array, "3"],
+    config: PlannerConfig,
+) -> Belief:
+    """Fold an observation into the belief: `f_t = f_{t-1} * f_hat(s_t)` (equation 4), or the target's pose once it is seen.
+
+    A target that was pushed without having been seen may leave f empty, which is a contradiction; f then starts anew from
+    what the objects allow now, and `restarts` counts it.
+
+    Args:
+      problem: what does not change.
+      belief: before the observation.
+      scene: the objects as recognised, without the target.
+      found: whether the target is seen now.
+      found_pose: where, as x, y [m], yaw [rad]; ignored if it is not.
+      config: static.
+    """
+    everywhere = jnp.ones_like(belief.exists)
+    settings = _existence_config(problem, config)
+    views = object_views(problem.existence, problem.camera, scene, everywhere, settings)
+    now = existence(problem.existence, problem.camera, views, everywhere, settings)
+    both = belief.exists & now
+    seen = belief.found | found
+    contradiction = ~jnp.any(both) & ~seen
+    exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, belief.exists), both)
+    pose = jnp.where(found, found_pose, belief.found_pose)
+    T_world_target = upright_pose(pose, problem.target.height(problem.shelf))
+    grasps = find_grasps(problem.grasps, problem.shelf, problem.gripper, problem.grasp_config, T_world_target)
+    return Belief(
+        exists=jnp.where(seen, belief.exists, exists),
+        found=seen,
+        found_pose=pose,
+        grasps=grasps.replace(feasible=grasps.feasible & seen),
+        restarts=belief.restarts + contradiction,
+    )
+
+
+def _everywhere_it_can_be(belief: Belief, exists: Array) -> Bool[Array, " y"]:
+    """f at the candidate poses and at the found pose: one or the other."""
+    return jnp.concatenate([exists & ~belief.found, belief.found[None]])
+
+
+def _possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) -> PossibleSpace:
+    """Raster of the space that the target may take: the cells of its poses and those next to them.
+
+    A cell is 15 mm and the target's radius 20 mm, so one cell more on every side covers it.
+    """
+    rows, columns = problem.target.grid
+    grid = jnp.any(exists.reshape(rows, columns, -1), axis=-1)
+    cell = jnp.float32(problem.target.cell(problem.shelf)[:2])
+    origin = problem.poses[0, :2]
+    row, column = jnp.round((belief.found_pose[:2] - origin) / cell).astype(jnp.int32)
+    here = (jnp.arange(rows) == row)[:, None] & (jnp.arange(columns) == column)[None]
+    grid = jnp.where(belief.found, here, grid)
+    wide = jax.lax.reduce_window(grid, False, jax.lax.bitwise_or, (3, 3), (1, 1), "SAME")
+    top = problem.shelf.board + 2 * problem.target.half_size[2]
+    return PossibleSpace(wide, origin, cell, jnp.float32(top))
+
+
+def _cost(problem: Problem, belief: Belief, exists: Array, hits: Array, method: str) -> Float[Array, ""]:
+    """J of equation 2 with g extended below zero (B.4)."""
+    f = _everywhere_it_can_be(belief, exists).astype(jnp.float32)
+    g = graspability(problem.grasps, belief.grasps, hits).astype(jnp.float32)
+    both = jnp.sum(f * (1.0 + (1.0 - g)))
+    if method == "search-for-grasp":
+        return both
+    return jnp.where(belief.found, 1.0 - g[-1], jnp.sum(f))
+
+
+def _where_g_counts(belief: Belief, exists: Array, method: str) -> Bool[Array, " y"]:
+    """Poses whose graspability enters the cost: search-and-grasp needs none until the target is found."""
+    f = _everywhere_it_can_be(belief, exists)
+    return f if method == "search-for-grasp" else f.at[:-1].set(False)
+
+
+@flax.struct.dataclass
+class _Node:
+    """A predicted state on the way through a sequence."""
+
+    scene: Superquadrics
+    exists: jax.Array
+    views: ObjectViews
+    hits: jax.Array
+    options: Candidates
+    moved: jax.Array
+    available: jax.Array
+    alive: jax.Array
+    cost: jax.Array
+
+
+def action_space(problem: Problem, config: PlannerConfig) -> ActionSpace:
+    """The static part of the actions of a problem under a configuration."""
+    changes = {"kinds": config.actions, "push_distances": config.push_distances}
+    return ActionSpace(
+        shelf=problem.shelf,
+        gripper=problem.gripper,
+        config=dataclasses.replace(problem.action_config, **changes),
+        max_yaw=problem.grasp_config.max_yaw,
+        tilts=problem.grasp_config.tilts,
+        waypoints=problem.grasp_config.waypoints,
+    )
+
+
+def _predict(problem: Problem, space: ActionSpace, push_model: PushModel, scene: Superquadrics, sample):
+    """S of equation 4, and whether the action can be executed as predicted."""
+    action = sample.action
+    pusher = problem.actions.pusher[sample.wrist]
+    pushed = push_model(problem.shelf, scene, pusher, action.T_world_gripper, action.displacement)
+    placed = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
+    is_push = action.kind == ActionKind.PUSH
+    possible = (action.kind != ActionKind.NONE) & ~(is_push & (pushed.residual > space.config.jam))
+    after = jax.tree.map(lambda a, b: jnp.where(is_push, a, b), pushed.scene, placed)
+    after = jax.tree.map(lambda new, old: jnp.where(possible, new, old), after, scene)
+    return after, possible
+
+
+def _root(problem: Problem, belief: Belief, scene: Superquadrics, space: ActionSpace, config: PlannerConfig) -> _Node:
+    settings = _existence_config(problem, config)
+    nowhere = jnp.zeros_like(belief.exists)
+    counts = _where_g_counts(belief, belief.exists, config.method)
+    hits = grasp_hits(problem.grasps, belief.grasps, scene, counts)
+    possible = _possible_space(problem, belief, belief.exists)
+    return _Node(
+        scene=scene,
+        exists=belief.exists,
+        views=object_views(problem.existence, problem.camera, scene, nowhere, settings),
+        hits=hits,
+        options=candidates(space, problem.actions, scene, possible),
+        moved=jnp.zeros_like(scene.valid),
+        available=scene.valid,
+        alive=jnp.array(True),
+        cost=_cost(problem, belief, belief.exists, hits, config.method),
+    )
+
+
+def _step(problem, belief, space, config, push_model, node: _Node, key) -> tuple[_Node, tuple[Action, Array]]:
+    possible = _possible_space(problem, belief, node.exists)
+    options = candidates(space, problem.actions, node.scene, possible, node.options, node.moved)
+    sample = sample_action(
+        key, space, problem.actions, node.scene, possible, options, node.available & node.alive
+    )
+    scene, acted = _predict(problem, space, push_model, node.scene, sample)
+    acted &= node.alive
+    moved = changed(node.scene, scene) & acted
+    settings = _existence_config(problem, config)
+    # What an action covers is not ruled out: a target there would be pushed along, not found to be elsewhere. So only
+    # what it uncovers counts, and collisions (empty in these views) do not.
+    views = object_views(
+        problem.existence, problem.camera, scene, jnp.zeros_like(node.exists), settings, node.views, moved
+    )
+    seen = existence(problem.existence, problem.camera, views, node.exists, settings)
+    exists = jnp.where(acted, seen, node.exists)
+    counts = _where_g_counts(belief, exists, config.method)
+    hits = grasp_hits(problem.grasps, belief.grasps, scene, counts, node.hits, moved)
+    action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
+    node = _Node(
+        scene=scene,
+        exists=exists,
+        views=views,
+        hits=hits,
+        options=options,
+        moved=moved,
+        available=node.available & (jnp.arange(scene.capacity) != action.object),
+        alive=acted,
+        cost=_cost(problem, belief, exists, hits, config.method),
+    )
+    return node, (action, node.cost)
+
+
+def _prefix_values(cost_now: Array, cost: Float[Array, " m"], acted: Bool[Array, " m"], gamma: float):
+    """Equation 2 for every prefix of a sequence, and the best: its value and its length."""
+    before = jnp.concatenate([cost_now[None], cost[:-1]])
+    discount = gamma ** jnp.arange(cost.shape[0], dtype=jnp.float32)
+    values = jnp.where(acted, jnp.cumsum(discount * (cost - before)), jnp.inf)
+    return jnp.min(values), jnp.argmin(values) + 1
+
+
+@functools.partial(jax.jit, static_argnames=("config", "push_model"))
+def plan(
+    key: Array,
+    problem: Problem,
+    belief: Belief,
+    scene: Superquadrics,
+    config: PlannerConfig,
+    push_model: PushModel | None = None,
+) -> Plan:
+    """Decide on the next action by sampling sequences and keeping the first action of the best (B.4).
+
+    Args:
+      key: PRNG key of the planner.
+      problem: what does not change.
+      belief: what is known of the target, after the latest observation.
+      scene: the objects as recognised, fields (N, ...).
+      config: static.
+      push_model: predicts pushes; static; `dynamics.QuasiStatic()` if left out.
+
+    Returns:
+      The decision and everything that was considered. The same arguments give the same decision, also under `vmap`.
+    """
+    push_model = push_model or QuasiStatic()
+    space = action_space(problem, config)
+    root = _root(problem, belief, scene, space, config)
+
+    def rollout(key):
+        step = functools.partial(_step, problem, belief, space, config, push_model)
+        _, (actions, cost) = jax.lax.scan(step, root, jax.random.split(key, config.horizon))
+        value, length = _prefix_values(root.cost, cost, actions.kind != ActionKind.NONE, config.gamma)
+        return Sequences(actions, cost, value, length)
+
+    sequences = jax.vmap(rollout)(jax.random.split(key, config.sequences))
+    order = jnp.argsort(sequences.value, stable=True)
+    sequences = jax.tree.map(lambda a: a[order], sequences)
+    first = jax.tree.map(lambda a: a[0, 0], sequences.actions)
+    return Plan(
+        action=first,
+        value=sequences.value[0],
+        cost=root.cost,
+        predicted_cost=sequences.cost[0, 0],
+        sequences=sequences,
+        overflow=jnp.any(root.views.overflow),
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("config",))
+def graspability_map(problem: Problem, belief: Belief, scene: Superquadrics, config: PlannerConfig) -> Int[Array, " x"]:
+    """g at every candidate pose, whether the target can be there or not: 1, 0, -1, ... (section B.4), shape (X,)."""
+    everywhere = jnp.ones(problem.poses.shape[0] + 1, bool)
+    hits = grasp_hits(problem.grasps, belief.grasps, scene, everywhere)
+    return graspability(problem.grasps, belief.grasps, hits)[:-1]
+
+
+@jax.jit
+def graspable_at(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"]) -> GraspChoice:
+    """Whether and how a target at a pose can be grasped without hitting anything.
+
+    Args:
+      problem: what does not change.
+      scene: the objects, without the target.
+      pose: of the target as x, y [m], yaw [rad]; need not be a candidate.
+    """
+    T_world_target = upright_pose(pose, problem.target.height(problem.shelf))
+    found = find_grasps(problem.grasps, problem.shelf, problem.gripper, problem.grasp_config, T_world_target)
+    here = jnp.zeros(problem.poses.shape[0] + 1, bool).at[-1].set(True)
+    g = problem.grasps.q7.shape[0]
+
+    def count(clearance):
+        hits = grasp_hits(problem.grasps, found, scene.replace(size=scene.size + clearance), here)
+        return jnp.where(found.feasible, jnp.sum(hits[-g:], axis=1), scene.capacity + 1)
+
+    counts = jax.lax.map(count, jnp.float32(CLEARANCES))
+    order = counts[0] * 1000 + jnp.sum(counts[1:], axis=0)
+    best = jnp.argmin(order)
+    return GraspChoice(
+        success=counts[0, best] == 0,
+        hits=counts[0, best].astype(jnp.int32),
+        T_world_gripper=compose(T_world_target, problem.grasps.T_target_gripper[best]),
+        q7=problem.grasps.q7[best],
+        opening=jnp.float32(problem.gripper.max_opening),
+    )
