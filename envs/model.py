@@ -26,6 +26,8 @@ from mechsearch_jax.scenario import Body
 from mechsearch_jax.shelf import Shelf
 
 BOX_DENSITY, CYLINDER_DENSITY = 737.0, 585.0
+# Torsional friction of a rubber pad of about 18 x 18 mm that is pressed evenly: two thirds of its mean radius [m].
+FINGER_TORSION = 0.006
 BOX_FRICTION, CYLINDER_FRICTION, FINGER_FRICTION = 0.4, 0.6, 1.0
 
 ARM_STIFFNESS = (18000.0, 18000.0, 14000.0, 14000.0, 8000.0, 8000.0, 8000.0)
@@ -35,6 +37,11 @@ ARM_FORCE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 FINGER_STIFFNESS, FINGER_VELOCITY_GAIN, FINGER_FORCE = 1000.0, 40.0, 70.0
 FINGER_TRAVEL = 0.04
 
+# Contacts are found, and push, at MARGIN from either geometry, which is that much smaller than what it stands for:
+# resting things touch where they should, yet what collision detection sees is always a little apart.
+MARGIN = 5e-4
+# Keeps tall cylinders from rolling on their rim for ever [N m s, N s/m]; too little to be noticed otherwise.
+BODY_DAMPING = 2e-3
 TINY = 1e-3
 OBJECT_BIT, ROBOT_BIT = 1, 2
 
@@ -95,7 +102,7 @@ def _solids(body: ElementTree.Element, solids: Sequence[_Solid]) -> None:
             "geom",
             class_="robot",
             type=solid.kind,
-            size=_text(*solid.size),
+            size=_text(*(s - MARGIN for s in solid.size)),
             pos=_text(*solid.position),
             quat=_text(*solid.quaternion),
         )
@@ -103,10 +110,18 @@ def _solids(body: ElementTree.Element, solids: Sequence[_Solid]) -> None:
 
 def _add_defaults(root: ElementTree.Element) -> None:
     default = _element(root, "default")
-    _element(default, "geom", condim="4", margin="0.0005")
+    _element(default, "geom", condim="4", margin=_text(MARGIN))
     robot = _element(default, "default", class_="robot")
+    # The robot's own contact parameters count, stiffer than the default: a soft grip lets what it holds creep and turn.
     _element(
-        robot, "geom", contype=str(ROBOT_BIT), conaffinity=str(OBJECT_BIT), friction=_text(FINGER_FRICTION), group="3"
+        robot,
+        "geom",
+        contype=str(ROBOT_BIT),
+        conaffinity=str(OBJECT_BIT),
+        priority="1",
+        friction=_text(FINGER_FRICTION, FINGER_TORSION, 0.0),
+        solref="0.01 1",
+        group="3",
     )
     objects = _element(default, "default", class_="object")
     _element(objects, "geom", contype=str(OBJECT_BIT), conaffinity=str(OBJECT_BIT), size=_text(*[TINY] * 3), group="0")
@@ -126,7 +141,7 @@ def _add_shelf(world: ElementTree.Element, shelf: Shelf) -> None:
         ("left", 1, shelf.left, (0.0, -1.0, 0.0)),
     ):
         position = [0.0, 0.0, 0.0]
-        position[axis] = value
+        position[axis] = value - MARGIN * sum(normal)
         _element(
             world,
             "geom",
@@ -138,7 +153,7 @@ def _add_shelf(world: ElementTree.Element, shelf: Shelf) -> None:
         )
     for name, (low, high) in shelf_boxes(shelf).items():
         centre, half = (high + low) / 2, (high - low) / 2
-        _element(world, "geom", class_="board", name=f"{name}_box", pos=_text(*centre), size=_text(*half))
+        _element(world, "geom", class_="board", name=f"{name}_box", pos=_text(*centre), size=_text(*(half - MARGIN)))
 
 
 def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
@@ -206,7 +221,7 @@ def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
 def _add_bodies(world: ElementTree.Element) -> None:
     for i in range(BODIES):
         body = _element(world, "body", name=f"body{i}", pos=_text(*parking_place(i)), gravcomp="1")
-        _element(body, "freejoint", name=f"body{i}")
+        _element(body, "joint", name=f"body{i}", type="free", damping=_text(BODY_DAMPING))
         _element(body, "inertial", mass="0.001", pos="0 0 0", diaginertia="1e-6 1e-6 1e-6")
         _element(body, "geom", class_="object", name=f"box{i}", type="box", friction=_text(BOX_FRICTION))
         _element(body, "geom", class_="object", name=f"cylinder{i}", type="cylinder", friction=_text(CYLINDER_FRICTION))
@@ -288,12 +303,13 @@ def mass_and_inertia(body: Body) -> tuple[float, Float[np.ndarray, " 3"]]:
     return mass, np.array([across, across, mass * a * a / 2])
 
 
-def with_bodies(model: mujoco.MjModel, bodies: Sequence[Body | None]) -> mujoco.MjModel:
+def with_bodies(model: mujoco.MjModel, bodies: Sequence[Body | None], skin: float = MARGIN) -> mujoco.MjModel:
     """A copy of the model whose slots have the shapes and masses of `bodies`; poses are part of the state, not of it.
 
     Args:
       model: the compiled model.
       bodies: one for each slot, the target last; None leaves a slot empty.
+      skin: how much smaller the contact geometry is than the bodies [m]; 0 for pictures.
     """
     model = copy.copy(model)
     for i, body in enumerate(bodies):
@@ -303,7 +319,7 @@ def with_bodies(model: mujoco.MjModel, bodies: Sequence[Body | None]) -> mujoco.
         model.body_gravcomp[index] = 0.0 if body else 1.0
         for shape in ("box", "cylinder"):
             used = body is not None and body.shape == shape
-            half = np.array(body.half_size) if body is not None and used else np.full(3, TINY)
+            half = np.array(body.half_size) - skin if body is not None and used else np.full(3, TINY)
             size = half if shape == "box" else np.array([half[0], half[2], 0.0])
             geom = model.geom(f"{shape}{i}").id
             model.geom_size[geom] = size

@@ -324,9 +324,7 @@ class _Recorder:
         self.steps += len(states)
 
     def trace(self, model: mujoco.MjModel) -> Trace:
-        states = np.array(self._kept).reshape(len(self._kept), -1)
-        if not self._kept:
-            states = np.empty((0, 1 + model.nq))
+        states = np.array(self._kept) if self._kept else np.empty((0, 1 + model.nq))
         qpos = states[:, 1 : 1 + model.nq]
         bodies = qpos[:, ROBOT:].reshape(-1, BODIES, 7)
         time = states[:, 0] - self._begin
