@@ -18,6 +18,7 @@ from mechsearch_jax.camera import Camera, pixel_rays, project, rays
 from mechsearch_jax.envs.model import shelf_boxes
 from mechsearch_jax.envs.world import BODIES, CYLINDER, TARGET, World
 from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.transforms import rotate
 
 BACKGROUND, SHELF = -1, BODIES
 FOUND_PIXELS = 100
@@ -60,7 +61,8 @@ class Observation:
 
 def _local(rotation: Array, vector: Array) -> list[Array]:
     """The components of world vectors (..., 3) in a body's frame."""
-    return [sum(rotation[k, i] * vector[..., k] for k in range(3)) for i in range(3)]
+    x, y, z = (vector[..., k] for k in range(3))
+    return [rotation[0, i] * x + rotation[1, i] * y + rotation[2, i] * z for i in range(3)]
 
 
 def _slab(origin: Array, direction: Array, low: Array | float, high: Array | float) -> tuple[Array, Array]:
@@ -137,7 +139,7 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
     slot = jnp.clip(owner, 0, TARGET)
     rotation = world.rotation[slot]
     offset = point - world.position[slot]
-    local = sum(rotation[..., k, :] * offset[..., k, None] for k in range(3))
+    local = rotate(jnp.swapaxes(rotation, -1, -2), offset)
     half = world.half_size[slot]
     share = jnp.abs(local) / half
     face = jnp.sign(local) * (share >= jnp.max(share, axis=-1, keepdims=True))
@@ -145,7 +147,7 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
     side = jnp.where(round_side[..., None], local * jnp.array([1.0, 1.0, 0.0]), face * jnp.array([0.0, 0.0, 1.0]))
     chosen = jnp.where((world.kind[slot] == CYLINDER)[..., None], side, face)
     chosen = chosen / jnp.maximum(jnp.linalg.norm(chosen, axis=-1, keepdims=True), 1e-9)
-    body = sum(rotation[..., :, k] * chosen[..., k, None] for k in range(3))
+    body = rotate(rotation, chosen)
 
     x, y, z = (point[..., k] for k in range(3))
     gaps = jnp.stack(

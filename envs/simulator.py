@@ -210,6 +210,17 @@ class NativeSimulator:
         failure = "missed" if not held else "inside" if not outside else "fallen" if fallen.any() else None
         return Retrieval(failure is None, held, outside, failure, outcome.steps, fallen, outcome.trace)
 
+    def scenario(self, name: str) -> Scenario:
+        """The present state as a scenario, its numbers rounded to a micrometre."""
+        found = []
+        for i, body in enumerate(self._bodies):
+            if body is not None:
+                position, quaternion = np.split(self._data.joint(f"body{i}").qpos, [3])
+                place = tuple(round(float(p), 6) for p in position)
+                turn = tuple(round(float(q), 9) for q in quaternion / np.linalg.norm(quaternion))
+                found.append(dataclasses.replace(body, position=place, quaternion=turn))
+        return Scenario(name, tuple(found[:-1]), found[-1])
+
     def _run(self, controls: np.ndarray, recorder: _Recorder) -> np.ndarray:
         """Step with one row of controls per step; the states after each step."""
         size = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)

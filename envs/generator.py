@@ -1,0 +1,228 @@
+"""Random scenarios as in the paper's appendix C.2: drop objects on the shelf, then hide the target behind them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull
+
+from mechsearch_jax.camera import Camera
+from mechsearch_jax.envs.observation import target_pixels
+from mechsearch_jax.envs.simulator import NativeSimulator
+from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.graspability import GraspConfig, grasp_tables
+from mechsearch_jax.gripper import Gripper
+from mechsearch_jax.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.target import Target
+
+# Full sizes [m]; a box's x and y may be swapped.
+BOXES = (
+    (0.104, 0.058, 0.076),
+    (0.084, 0.036, 0.07),
+    (0.06, 0.024, 0.12),
+    (0.108, 0.05, 0.108),
+    (0.096, 0.056, 0.16),
+    (0.156, 0.044, 0.192),
+)
+# Radius and height [m].
+CYLINDERS = ((0.034, 0.214), (0.032, 0.134), (0.032, 0.122), (0.024, 0.134), (0.028, 0.06))
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class GeneratorConfig:
+    """How scenarios are made.
+
+    Attributes:
+      drop: height above the board from which objects are dropped [m].
+      gap: least distance between what is dropped, and between the target and its neighbours, seen from above [m].
+      visible: a target that shows more pixels than this is not hidden.
+      drift: bodies that move farther than this once the target is in place were not at rest [m].
+      placements: how often one object's place is drawn before the scene is given up.
+      attempts: how many scenes are tried for one seed.
+    """
+
+    drop: float = 0.02
+    gap: float = 0.002
+    visible: int = 0
+    drift: float = 1e-3
+    placements: int = 200
+    attempts: int = 200
+
+
+def outline(body: Body) -> Float[np.ndarray, "corners 2"]:
+    """The body's outline seen from above, as a convex polygon that holds it [m]."""
+    a, b, c = body.half_size
+    if body.shape == "box":
+        rim = np.array([(a, b), (-a, b), (-a, -b), (a, -b)])
+    else:
+        angle = np.arange(24) * (2 * np.pi / 24)
+        rim = np.stack([np.cos(angle), np.sin(angle)], axis=1) * a / np.cos(np.pi / 24)
+    corners = np.concatenate([np.insert(rim, 2, z, axis=1) for z in (-c, c)])
+    flat = (corners @ rotation_matrix(body.quaternion).T + np.array(body.position))[:, :2]
+    return flat[ConvexHull(flat).vertices]
+
+
+def separation(first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "m 2"]) -> float:
+    """The widest gap between two convex polygons along a normal of one of their sides [m]; negative if they overlap."""
+    sides = np.concatenate([np.roll(p, -1, axis=0) - p for p in (first, second)])
+    normals = np.stack([sides[:, 1], -sides[:, 0]], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    a, b = first @ normals.T, second @ normals.T
+    return float(np.max(np.maximum(a.min(axis=0) - b.max(axis=0), b.min(axis=0) - a.max(axis=0))))
+
+
+def _on_board(polygon: np.ndarray, shelf: Shelf, gap: float) -> bool:
+    low, high = polygon.min(axis=0), polygon.max(axis=0)
+    inner = np.array([shelf.front, shelf.right + gap]), np.array([shelf.back - gap, shelf.left - gap])
+    return bool((low >= inner[0]).all() and (high <= inner[1]).all())
+
+
+def graspable_alone(shelf: Shelf, target: Target, gripper: Gripper | None = None) -> Bool[np.ndarray, " x"]:
+    """At which of its candidate poses the target could be grasped if there were no other objects."""
+    tables = grasp_tables(shelf, gripper or Gripper(), target, GraspConfig())
+    graspable = np.zeros(len(tables.T_world_target), bool)
+    graspable[np.asarray(tables.pair_pose)] = True
+    return graspable
+
+
+class ScenarioGenerator:
+    """Makes scenarios; the same seed gives the same scenario on the same machine.
+
+    Attributes:
+      target, config: as given.
+    """
+
+    def __init__(
+        self,
+        target: Target | None = None,
+        shelf: Shelf | None = None,
+        camera: Camera | None = None,
+        config: GeneratorConfig | None = None,
+        graspable: Callable[[Float[np.ndarray, 3]], bool] | None = None,
+    ):
+        """Args:
+        target: what is hidden; the cylinder by default.
+        shelf, camera: the scene.
+        config: how scenarios are made.
+        graspable: tells from a candidate pose (x, y [m], yaw [rad]) whether the shelf alone leaves the target
+          graspable there; by default `graspable_alone`.
+        """
+        self.target = target or Target.cylinder()
+        self.config = config or GeneratorConfig()
+        self._shelf = shelf or Shelf()
+        self._camera = camera or Camera()
+        self._simulator = NativeSimulator(self._shelf, self._camera)
+        poses = self.target.candidate_poses(self._shelf).astype(float)
+        if graspable is None:
+            allowed = graspable_alone(self._shelf, self.target)
+        else:
+            allowed = np.array([graspable(pose) for pose in poses], bool)
+        self._poses = poses[allowed]
+
+    def generate(self, seed: int, objects: int, name: str | None = None) -> Scenario:
+        """A scenario whose bodies rest on the board, with a target that the camera does not see.
+
+        Args:
+          seed: any whole number from 0.
+          objects: number of surrounding objects.
+          name: of the scenario; made from the other two by default.
+
+        Raises:
+          InputError: the seed is negative, the number of objects does not fit, or no place hides a graspable target.
+        """
+        if not 1 <= objects <= MAX_OBJECTS:
+            raise InputError(f"objects: {objects} is not between 1 and {MAX_OBJECTS}")
+        if seed < 0:
+            raise InputError(f"seed: {seed} is negative; use a whole number from 0")
+        name = name or f"generated-{objects}-{seed}"
+        rng = np.random.default_rng([seed, objects])
+        for _ in range(self.config.attempts):
+            scene = self._drop(rng, objects, name)
+            hidden = scene and self._hide(rng, scene)
+            if hidden:
+                return hidden
+        raise InputError(f"{name}: no graspable place is hidden in {self.config.attempts} scenes; try another seed")
+
+    def _drop(self, rng: np.random.Generator, objects: int, name: str) -> Scenario | None:
+        """Objects at rest on the board, and the target wherever it does not touch them."""
+        dropped: list[Body] = []
+        outlines: list[np.ndarray] = []
+        for _ in range(objects):
+            shape, half = _draw_shape(rng)
+            for _ in range(self.config.placements):
+                body = self._draw_body(rng, shape, half)
+                polygon = outline(body)
+                clear = all(separation(polygon, other) > self.config.gap for other in outlines)
+                if clear and _on_board(polygon, self._shelf, self.config.gap):
+                    dropped.append(body)
+                    outlines.append(polygon)
+                    break
+            else:
+                return None
+        self._simulator.reset(Scenario(name, tuple(dropped), self._target_at(np.array([-2.0, 0.0, 0.0]))))
+        outcome = self._simulator.settle()
+        at_rest = outcome.settled and not outcome.fallen[:objects].any()
+        return self._simulator.scenario(name) if at_rest else None
+
+    def _draw_body(self, rng: np.random.Generator, shape: str, half: tuple[float, float, float]) -> Body:
+        x, y = rng.uniform(*self._shelf.spawn_x), rng.uniform(*self._shelf.spawn_y)
+        yaw = rng.uniform(-np.pi, np.pi)
+        height = self._shelf.board + half[2] + self.config.drop
+        return Body(shape, half, (x, y, height), (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)))  # pyright: ignore
+
+    def _target_at(self, pose: np.ndarray) -> Body:
+        x, y, yaw = (float(p) for p in pose)
+        turn = (float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2)))
+        height = self.target.height(self._shelf)
+        return Body(self.target.shape, self.target.half_size, (round(x, 6), round(y, 6), round(height, 6)), turn)
+
+    def _hide(self, rng: np.random.Generator, scene: Scenario) -> Scenario | None:
+        """The scene with the target at a random pose out of the camera's sight, if there is one."""
+        outlines = [outline(body) for body in scene.objects]
+        for pose in rng.permutation(self._poses):
+            candidate = dataclasses.replace(scene, target=self._target_at(pose))
+            polygon = outline(candidate.target)
+            if any(separation(polygon, other) <= self.config.gap for other in outlines):
+                continue
+            if self._is_hidden(candidate) and self._is_at_rest(candidate):
+                return candidate
+        return None
+
+    def _is_hidden(self, scene: Scenario) -> bool:
+        return int(target_pixels(self._camera, from_scenario(scene))) <= self.config.visible
+
+    def _is_at_rest(self, scene: Scenario) -> bool:
+        before = np.asarray(self._simulator.reset(scene).position)
+        outcome = self._simulator.settle()
+        world = self._simulator.world
+        still = world is not None and np.abs(np.asarray(world.position) - before).max() <= self.config.drift
+        return outcome.settled and still and self._is_hidden(self._simulator.scenario(scene.name))
+
+
+def _draw_shape(rng: np.random.Generator) -> tuple[str, tuple[float, float, float]]:
+    """One of the paper's eleven objects and its half-extents."""
+    kind = int(rng.integers(len(BOXES) + len(CYLINDERS)))
+    if kind < len(BOXES):
+        x, y, z = (side / 2 for side in BOXES[kind])
+        return "box", (y, x, z) if rng.random() < 0.5 else (x, y, z)
+    radius, height = CYLINDERS[kind - len(BOXES)]
+    return "cylinder", (radius, radius, height / 2)
+
+
+def generate_scenario(seed: int, objects: int, target: str = "cylinder", name: str | None = None) -> Scenario:
+    """One scenario with the paper's cylinder or box as its target; see `ScenarioGenerator.generate`.
+
+    Raises:
+      InputError: the target is neither "cylinder" nor "box", or as `ScenarioGenerator.generate`.
+    """
+    targets = {"cylinder": Target.cylinder, "box": Target.box}
+    if target not in targets:
+        raise InputError(f'target: "{target}" is unknown; use "cylinder" or "box"')
+    return ScenarioGenerator(targets[target]()).generate(seed, objects, name)
