@@ -1,0 +1,384 @@
+"""The closed loop: look, recognise, update the belief, decide, act; once the target can be taken out, take it out.
+
+Two verdicts are passed on an episode, both on the true state: `graspable` (the target is in sight and a collision-free
+grasp exists) and `retrieved` (the hand took it out of the shelf, and no object fell). An action that fails costs a step
+and leaves the world as it made it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mechsearch_jax import planner, results
+from mechsearch_jax.actions import Action, ActionKind
+from mechsearch_jax.camera import Camera
+from mechsearch_jax.envs.observation import Observation, is_found, observe
+from mechsearch_jax.envs.simulator import Outcome, Retrieval
+from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
+from mechsearch_jax.planner import Belief, GraspChoice, Plan, PlannerConfig, Problem
+from mechsearch_jax.results import ActionRecord, Episode, Step
+from mechsearch_jax.scenario import Scenario
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.target import Target
+
+MAX_TILT = math.radians(15)
+BOX_YAWS = 6
+
+
+class Simulator(Protocol):
+    """What an episode needs of a simulator; `NativeSimulator` is one."""
+
+    world: World | None
+
+    def reset(self, scenario: Scenario) -> World: ...
+
+    def execute(self, action: Action) -> Outcome: ...
+
+    def retrieve(self, T_world_gripper: Array, q7: Array | float, opening: Array | float) -> Retrieval: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Snapshot:
+    """The shelf at one moment, as the camera can see it; images are ray-cast only when they are asked for.
+
+    Attributes:
+      camera, shelf: of the problem.
+      world: the true state, for a recogniser that may know it.
+    """
+
+    camera: Camera
+    shelf: Shelf
+    world: World
+
+    @functools.cached_property
+    def observation(self) -> Observation:
+        """Depth, segmentation and colour at full resolution."""
+        return observe(self.camera, self.world, self.shelf)
+
+    @functools.cached_property
+    def target_seen(self) -> bool:
+        """Whether the detector finds the target in the image; much cheaper than the image."""
+        return bool(is_found(self.camera, self.world))
+
+
+@dataclasses.dataclass(frozen=True)
+class Recognition:
+    """What a recogniser makes of a snapshot.
+
+    Attributes:
+      scene: the objects, without the target.
+      found: whether the target is seen.
+      target_pose: where, as x, y [m] and yaw [rad]; anything if it is not seen.
+    """
+
+    scene: Superquadrics
+    found: bool
+    target_pose: Float[Array, " 3"]
+
+
+class Recogniser(Protocol):
+    """Turns what the camera sees into what the planner plans with."""
+
+    def __call__(self, key: Array, snapshot: Snapshot) -> Recognition: ...
+
+
+def oracle(key: Array, snapshot: Snapshot) -> Recognition:
+    """Knows the true shapes and poses, of the target once the detector sees it. Needs no key."""
+    scene = objects_on_the_board(snapshot)
+    return Recognition(scene, snapshot.target_seen, true_target_pose(snapshot.world))
+
+
+def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:
+    """The true objects, without those that have fallen off the board."""
+    scene, shelf = true_superquadrics(snapshot.world), snapshot.shelf
+    fallen = (scene.position[:, 0] < shelf.front) | (scene.position[:, 2] < shelf.board)
+    return scene.replace(valid=scene.valid & ~fallen)
+
+
+def true_target_pose(world: World) -> Float[Array, " 3"]:
+    """x, y [m] and yaw [rad] of the target."""
+    R, t = world.rotation[TARGET], world.position[TARGET]
+    return jnp.stack([t[0], t[1], jnp.arctan2(R[1, 0], R[0, 0])])
+
+
+def target_of(scenario: Scenario) -> Target:
+    """The target of a scenario as the planner knows it: its shape, and how finely its yaw is searched."""
+    body = scenario.target
+    return Target(shape=body.shape, half_size=body.half_size, yaws=BOX_YAWS if body.shape == "box" else 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Moment:
+    """All that is known at one step, for who looks on.
+
+    Attributes:
+      index: number of actions before it.
+      snapshot: what the camera sees.
+      scene: the objects as recognised.
+      belief: where the target can be.
+      plan: the decision; None where none was needed.
+      grasp: how the target is taken out; None where it cannot be.
+      record: what is written down; its `observed_cost` comes later.
+      outcome: what the simulator said of the action or the retrieval; None before it was executed, or without one.
+    """
+
+    index: int
+    snapshot: Snapshot
+    scene: Superquadrics
+    belief: Belief
+    plan: Plan | None
+    grasp: GraspChoice | None
+    record: Step
+    outcome: Outcome | Retrieval | None
+
+
+class Watcher(Protocol):
+    """Looks on while an episode runs."""
+
+    def busy(self, stage: str) -> None:
+        """A stage begins: "recognise", "believe", "grasp", "plan" or "simulate"."""
+        ...
+
+    def decided(self, moment: Moment) -> None:
+        """The robot has looked and decided, and is about to act."""
+        ...
+
+    def acted(self, moment: Moment) -> None:
+        """The action is over. Also called, without an action, when the episode ends."""
+        ...
+
+
+class _Blind:
+    def busy(self, stage: str) -> None: ...
+
+    def decided(self, moment: Moment) -> None: ...
+
+    def acted(self, moment: Moment) -> None: ...
+
+
+class _Stopwatch:
+    """Wall time of the stages of a step."""
+
+    def __init__(self, busy: Callable[[str], None]) -> None:
+        self.seconds: dict[str, float] = {}
+        self._busy = busy
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        self._busy(stage)
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = round(time.perf_counter() - start, 4)
+
+
+def run_episode(
+    seed: int,
+    scenario: Scenario,
+    problem: Problem,
+    config: PlannerConfig,
+    simulator: Simulator,
+    recogniser: Recogniser = oracle,
+    recognition: str = "oracle",
+    watcher: Watcher | None = None,
+) -> Episode:
+    """Run one episode to its end, whatever that is.
+
+    Args:
+      seed: of the planner's and of the environment's random numbers, which are independent of each other.
+      scenario: where everything stands at the start.
+      problem: built for the scenario's target.
+      config: the planner's options.
+      simulator: executes the actions; reset first.
+      recogniser: what the planner sees the world through.
+      recognition: what the record calls it.
+      watcher: told of every step.
+    """
+    planner_key, environment_key = jax.random.split(jax.random.key(seed))
+    watcher = watcher or _Blind()
+    world = simulator.reset(scenario)
+    belief = planner.initial_belief(problem)
+    steps: list[Step] = []
+    found_step = graspable_step = None
+    failure: str | None = None
+    retrieved = False
+
+    for index in range(config.max_steps + 1):
+        clock = _Stopwatch(watcher.busy)
+        snapshot = Snapshot(problem.camera, problem.shelf, world)
+        with clock("recognise"):
+            seen = recogniser(jax.random.fold_in(environment_key, index), snapshot)
+            jax.block_until_ready(seen.scene)
+        with clock("believe"):
+            found = jnp.asarray(seen.found)
+            belief = planner.observe_belief(problem, belief, seen.scene, found, seen.target_pose, config)
+            jax.block_until_ready(belief)
+        with clock("grasp"):
+            grasp = _grasp(problem, seen.scene, belief.found_pose) if belief.found else None
+        graspable = bool(belief.found) and _truly_graspable(problem, snapshot)
+        if belief.found and found_step is None:
+            found_step = index
+        if graspable and graspable_step is None:
+            graspable_step = index
+
+        last = index == config.max_steps
+        decision = None
+        if grasp is None and not last:
+            with clock("plan"):
+                key = jax.random.fold_in(planner_key, index)
+                decision = jax.block_until_ready(planner.plan(key, problem, belief, seen.scene, config))
+        record = _record(belief, graspable, grasp, decision, config, clock.seconds)
+        moment = Moment(index, snapshot, seen.scene, belief, decision, grasp, record, None)
+        if steps:
+            steps[-1] = dataclasses.replace(steps[-1], observed_cost=record.cost)
+
+        outcome = None
+        if grasp is not None:
+            watcher.decided(moment)
+            with clock("simulate"):
+                outcome = retrieval = simulator.retrieve(grasp.T_world_gripper, grasp.q7, grasp.opening)
+            retrieved = retrieval.retrieved
+            failure = retrieval.failure and f"retrieval: {retrieval.failure}"
+        elif decision is not None:
+            watcher.decided(moment)
+            with clock("simulate"):
+                outcome = simulator.execute(decision.action)
+            failure = "no action is possible" if decision.action.kind == ActionKind.NONE else outcome.failure
+        step = dataclasses.replace(record, failure=failure, timings=dict(clock.seconds))
+        steps.append(step)
+        watcher.acted(dataclasses.replace(moment, record=step, outcome=outcome))
+        failure = _end(problem, simulator, belief, step, retrieved, last)
+        if retrieved or failure is not None:
+            break
+        world = simulator.world or world
+
+    return Episode(
+        scenario=scenario.name,
+        objects=len(scenario.objects),
+        config=describe(seed, problem, config, recognition, simulator),
+        versions=results.versions(),
+        steps=tuple(steps),
+        found_step=found_step,
+        graspable_step=graspable_step,
+        retrieved=retrieved,
+        failure=failure,
+    )
+
+
+def _grasp(problem: Problem, scene: Superquadrics, pose: Array) -> GraspChoice | None:
+    choice = jax.block_until_ready(planner.graspable_at(problem, scene, pose))
+    return choice if choice.success else None
+
+
+def _truly_graspable(problem: Problem, snapshot: Snapshot) -> bool:
+    """Whether a collision-free grasp of the target exists, whatever anybody believes."""
+    return (
+        _target_trouble(problem.shelf, snapshot.world) is None
+        and _grasp(problem, objects_on_the_board(snapshot), true_target_pose(snapshot.world)) is not None
+    )
+
+
+def _target_trouble(shelf: Shelf, world: World) -> str | None:
+    """Why the target can no longer be taken out as the planner knows it; None if it can."""
+    position, rotation = np.asarray(world.position[TARGET]), np.asarray(world.rotation[TARGET])
+    if position[0] < shelf.front or position[2] < shelf.board:
+        return "the target fell off the board"
+    return "the target fell over" if abs(rotation[2, 2]) < math.cos(MAX_TILT) else None
+
+
+def _end(problem: Problem, simulator: Simulator, belief: Belief, step: Step, retrieved: bool, last: bool) -> str | None:
+    """Why the episode ends here without a retrieval; None if it goes on, or ends with one."""
+    if retrieved:
+        return None
+    # Trying the same grasp in the same world once more would not make it reachable.
+    if step.action is not None and step.action.kind == "retrieve" and step.failure == "retrieval: unreachable":
+        return step.failure
+    if simulator.world is not None and belief.found:
+        trouble = _target_trouble(problem.shelf, simulator.world)
+        if trouble is not None:
+            return trouble
+    if not last:
+        return None
+    return step.failure or ("found, but not graspable" if belief.found else "not found")
+
+
+def _record(
+    belief: Belief,
+    graspable: bool,
+    grasp: GraspChoice | None,
+    decision: Plan | None,
+    config: PlannerConfig,
+    timings: dict[str, float],
+) -> Step:
+    cost = predicted = None
+    action, sequences = None, 0
+    if grasp is not None:
+        cost = 1.0 if config.method == "search-for-grasp" else 0.0
+        T = np.asarray(grasp.T_world_gripper).tolist()
+        action = ActionRecord("retrieve", None, T, [0.0, 0.0, 0.0], T, float(grasp.q7), float(grasp.opening))
+    elif decision is not None:
+        cost, predicted = float(decision.cost), float(decision.predicted_cost)
+        action = results.record_action(decision.action)
+        sequences = int(jnp.sum(jnp.isfinite(decision.sequences.value)))
+    return Step(
+        belief_size=1 if belief.found else int(jnp.sum(belief.exists)),
+        found=bool(belief.found),
+        graspable=graspable,
+        cost=cost,
+        action=action,
+        predicted_cost=predicted,
+        observed_cost=None,
+        sequences=sequences,
+        failure=None,
+        timings=timings,
+    )
+
+
+def describe(
+    seed: int, problem: Problem, config: PlannerConfig, recognition: str, simulator: Simulator
+) -> dict[str, Any]:
+    """The options of an episode, as its record keeps them."""
+    return {
+        **dataclasses.asdict(config),
+        "target": problem.target.shape,
+        "recognition": recognition,
+        "simulator": type(simulator).__name__,
+        "seed": seed,
+    }
+
+
+def row(episode: Episode) -> results.Row:
+    """An episode as a line of a table."""
+    config = episode.config
+    planning = ("recognise", "believe", "grasp", "plan")
+    seconds = {name: sum(s.timings.get(name, 0.0) for s in episode.steps) for name in (*planning, "simulate")}
+    return results.Row(
+        scenario=episode.scenario,
+        objects=episode.objects,
+        target=config["target"],
+        method=config["method"],
+        recognition=config["recognition"],
+        gamma=config["gamma"],
+        horizon=config["horizon"],
+        sequences=config["sequences"],
+        actions=config["actions"],
+        seed=config["seed"],
+        found_step=episode.found_step,
+        graspable_step=episode.graspable_step,
+        retrieved=episode.retrieved,
+        steps=sum(step.action is not None for step in episode.steps),
+        failure=episode.failure,
+        planning_seconds=sum(seconds[name] for name in planning),
+        simulation_seconds=seconds["simulate"],
+    )

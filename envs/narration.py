@@ -1,0 +1,100 @@
+"""Tells on the screen how an episode goes: what the robot sees, what it chose and why, and how long each stage took."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.status import Status
+
+from mechsearch_jax.envs import pictures
+from mechsearch_jax.envs.episode import Moment
+from mechsearch_jax.planner import PlannerConfig, Problem
+from mechsearch_jax.results import Episode
+from mechsearch_jax.viz.filmstrip import Frame
+
+STAGES = {
+    "recognise": "looking",
+    "believe": "working out where the target can be",
+    "grasp": "looking for a grasp",
+    "plan": "planning",
+    "simulate": "acting",
+}
+
+
+class Narrator:
+    """A `Watcher` that prints a few lines for every step and keeps a frame of it for the filmstrip.
+
+    Attributes:
+      frames: of the steps so far.
+    """
+
+    def __init__(self, console: Console, status: Status, problem: Problem, config: PlannerConfig):
+        self.frames: list[Frame] = []
+        self._console = console
+        self._status = status
+        self._problem = problem
+        self._config = config
+
+    def busy(self, stage: str) -> None:
+        patience = " (compiling first, once)" if stage == "plan" and not self.frames else ""
+        self._status.update(f"{STAGES[stage]}{patience}")
+
+    def decided(self, moment: Moment) -> None:
+        record = moment.record
+        self._sees(moment)
+        if moment.plan is None:
+            self._line("does", "take the target out: a grasp that hits nothing is known")
+            return
+        lengths = np.asarray(moment.plan.sequences.length)
+        self._line("does", pictures.describe_action(moment.plan.action))
+        if record.sequences:
+            self._line(
+                "why",
+                f"cost {record.cost:.0f} now, {record.predicted_cost:.0f} expected after it; the best of "
+                f"{record.sequences} sequences, {lengths[0]} action{'s' if lengths[0] > 1 else ''} long",
+            )
+
+    def acted(self, moment: Moment) -> None:
+        record = moment.record
+        if record.action is None:
+            self._sees(moment)
+        if record.failure:
+            self._line("failed", record.failure, "red")
+        stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in record.timings.items())
+        self._line("time", stages, "dim")
+        self._status.update("drawing")
+        self.frames.append(pictures.frame(moment, self._problem, self._config))
+
+    def ended(self, episode: Episode) -> None:
+        """Say how it ended."""
+        self._console.print(f"\n[bold]{escape(verdict(episode))}[/bold]")
+
+    def _sees(self, moment: Moment) -> None:
+        shown = np.unique(np.asarray(moment.snapshot.observation.segmentation))
+        objects = np.flatnonzero(np.asarray(moment.scene.valid))
+        seen = int(np.isin(objects, shown).sum())
+        if moment.record.found:
+            x, y, _ = np.asarray(moment.belief.found_pose)
+            known = f"the target at x {x:.3f}, y {y:.3f} m"
+        else:
+            known = f"no target; it can be at {moment.record.belief_size} of {len(moment.belief.exists)} poses"
+        self._console.print(f"\n[bold]step {moment.index + 1}[/bold]")
+        self._line("sees", f"{seen} of {len(objects)} objects, {known}")
+
+    def _line(self, label: str, text: str, style: str = "") -> None:
+        self._console.print(f"  [cyan]{label:>6}[/cyan]  [{style or 'default'}]{escape(text)}[/]", soft_wrap=True)
+
+
+def verdict(episode: Episode) -> str:
+    """How an episode ended, in one sentence."""
+
+    def after(step: int) -> str:
+        return f"after {step} action{'' if step == 1 else 's'}"
+
+    if episode.found_step is None:
+        return f"{episode.scenario}: not found ({episode.failure})"
+    parts = [f"found {after(episode.found_step)}"]
+    parts.append("never graspable" if episode.graspable_step is None else f"graspable {after(episode.graspable_step)}")
+    parts.append("retrieved" if episode.retrieved else f"not retrieved ({episode.failure})")
+    return f"{episode.scenario}: {', '.join(parts)}"

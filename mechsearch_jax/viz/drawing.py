@@ -1,0 +1,353 @@
+"""The pieces that pictures are made of: the shelf from above, the camera's view, actions drawn into both.
+
+From above, the picture is oriented as the robot sees the shelf: its open front at the bottom, +y to the left.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from matplotlib import patches
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.path import Path
+from matplotlib.patheffects import Normal, Stroke
+from scipy.spatial import ConvexHull
+
+from mechsearch_jax.actions import Action, ActionKind
+from mechsearch_jax.camera import Camera, project
+from mechsearch_jax.results import PathLike, replacing
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.target import Target
+
+INK = "#22303c"
+MUTED = "#75828e"
+PAPER = "#ffffff"
+BOARD = "#f3f1ec"
+WALL = "#a9a294"
+OBJECT = "#5b6b7a"
+ACTION = "#1b5fc1"
+TARGET = "#d1344b"
+GRASPABLE = "#2a9d78"
+BLOCKED = ("#f2c14e", "#ee9b3a", "#d9622b", "#9c3d2e")
+NO_GRASP = "#8d7b9c"
+
+_APPROACH = 0.12
+
+
+@dataclasses.dataclass(frozen=True)
+class Band:
+    """A colour of the map, what it stands for, and the values of g that it stands for, `low` to `high`."""
+
+    colour: str
+    label: str
+    low: int
+    high: int
+
+
+def bands(capacity: int) -> tuple[Band, ...]:
+    """The colours of g for scenes of `capacity` slots, from the best to the worst value."""
+    return (
+        Band(GRASPABLE, "graspable", 1, 1),
+        Band(BLOCKED[0], "1 object in the way", 0, 0),
+        Band(BLOCKED[1], "2 objects", -1, -1),
+        Band(BLOCKED[2], "3 objects", -2, -2),
+        Band(BLOCKED[3], "more", 1 - capacity, -3),
+        Band(NO_GRASP, "out of reach", -(10**6), -capacity),
+    )
+
+
+def rgb(colour: str) -> np.ndarray:
+    """Red, green and blue of "#rrggbb", 0 to 1."""
+    return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+
+
+def outlines(scene: Superquadrics) -> list[Float[np.ndarray, "corners 2"] | None]:
+    """Each object's outline seen from above in x and y [m], counter-clockwise; None for absent objects."""
+    elevation = np.linspace(-np.pi / 2, np.pi / 2, 33)[:, None]
+    azimuth = np.linspace(-np.pi, np.pi, 97)[None, :]
+
+    def power(base: np.ndarray, exponent: float) -> np.ndarray:
+        return np.sign(base) * np.abs(base) ** exponent
+
+    result: list[np.ndarray | None] = []
+    fields = (scene.size, scene.exponents, scene.position, scene.rotation, scene.valid)
+    for size, (e1, e2), position, rotation, valid in zip(*(np.asarray(f, float) for f in fields), strict=True):
+        if not valid:
+            result.append(None)
+            continue
+        across = power(np.cos(elevation), e1)
+        surface = [
+            across * power(np.cos(azimuth), e2),
+            across * power(np.sin(azimuth), e2),
+            power(np.sin(elevation), e1) + 0 * azimuth,
+        ]
+        points = (np.stack(surface, axis=-1).reshape(-1, 3) * size) @ rotation.T + position
+        points = points[:, :2]
+        result.append(points[ConvexHull(points).vertices])
+    return result
+
+
+def placed_scene(scene: Superquadrics, action: Action) -> Superquadrics:
+    """The scene after a pick-and-place has moved its object rigidly."""
+    T = np.asarray(action.T_world_place, float) @ np.linalg.inv(np.asarray(action.T_world_gripper, float))
+    i = int(action.object)
+    position, rotation = np.array(scene.position, float), np.array(scene.rotation, float)
+    position[i] = T[:3, :3] @ position[i] + T[:3, 3]
+    rotation[i] = T[:3, :3] @ rotation[i]
+    return dataclasses.replace(scene, position=position, rotation=rotation)
+
+
+def map_image(
+    shown: Bool[np.ndarray, " x"],
+    graspability: Int[np.ndarray, " x"],
+    target: Target,
+    capacity: int,
+) -> Float[np.ndarray, "rows columns 4"]:
+    """Colours of the candidate positions as an image: rows along x, columns along y, see-through where not `shown`.
+
+    Of several yaw angles at a position, the best graspability among those shown counts; the fewer of the angles are
+    shown, the paler the colour.
+    """
+    rows, columns = target.grid
+    shown, g = (a.reshape(rows, columns, target.yaws) for a in (shown, graspability))
+    best = np.max(np.where(shown, g, -(10**6)), axis=-1)
+    image = np.zeros((rows, columns, 4))
+    for band in bands(capacity):
+        image[(best >= band.low) & (best <= band.high), :3] = rgb(band.colour)
+    share = np.mean(shown, axis=-1)
+    image[..., 3] = np.where(share > 0, 0.35 + 0.6 * share, 0.0)
+    return image
+
+
+def draw_shelf(axes: Axes, shelf: Shelf) -> None:
+    """The empty shelf from above, and the limits and looks of the axes."""
+    front, back, right, left = shelf.front, shelf.back, shelf.right, shelf.left
+    axes.add_patch(
+        patches.Rectangle((right, front), left - right, back - front, facecolor=BOARD, linewidth=0, zorder=0)
+    )
+    axes.plot(
+        [left, left, right, right], [front, back, back, front], color=WALL, linewidth=3.5, solid_joinstyle="miter"
+    )
+    axes.plot([left, right], [front, front], color=WALL, linewidth=1, linestyle=(0, (4, 3)))
+    axes.set_xlim(left + 0.012, right - 0.012)
+    axes.set_ylim(front - 0.075, back + 0.012)
+    axes.set_aspect("equal")
+    axes.axis("off")
+
+
+def draw_map(axes: Axes, image: Float[np.ndarray, "rows columns 4"], shelf: Shelf, target: Target) -> None:
+    """An image of `map_image`, each candidate position as a cell of its grid."""
+    dx, dy, _ = target.cell(shelf)
+    poses = target.candidate_poses(shelf)
+    low, high = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
+    extent = (low[1] - dy / 2, high[1] + dy / 2, low[0] - dx / 2, high[0] + dx / 2)
+    limits = axes.get_xlim(), axes.get_ylim()
+    axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1, aspect="auto")
+    axes.set_xlim(limits[0])
+    axes.set_ylim(limits[1])
+    axes.set_aspect("equal")
+
+
+def draw_objects(axes: Axes, scene: Superquadrics, labels: bool = True) -> None:
+    """The objects as outlines with their numbers."""
+    for i, outline in enumerate(outlines(scene)):
+        if outline is None:
+            continue
+        axes.add_patch(
+            patches.Polygon(
+                outline[:, ::-1], closed=True, facecolor=(*rgb(OBJECT), 0.22), edgecolor=OBJECT, lw=1.3, zorder=3
+            )
+        )
+        if labels:
+            x, y = np.asarray(scene.position)[i, :2]
+            _number(axes, (y, x), i)
+
+
+def _number(axes: Axes, place: tuple[float, float], index: int) -> None:
+    text = axes.text(place[0], place[1], str(index), color=INK, fontsize=8.5, ha="center", va="center", zorder=10)
+    text.set_path_effects([Stroke(linewidth=2.2, foreground=PAPER, alpha=0.75), Normal()])
+
+
+def draw_target(axes: Axes, pose: Float[np.ndarray, " 3"], target: Target, certain: bool) -> None:
+    """The target from above: filled where it has been found, an open outline where only the picture knows it."""
+    x, y, yaw = (float(v) for v in pose)
+    a, b, _ = target.half_size
+    style = {"edgecolor": TARGET, "linewidth": 1.6, "zorder": 5, "facecolor": TARGET if certain else "none"}
+    if not certain:
+        style["linestyle"] = (0, (2, 1.5))
+    if target.shape == "cylinder":
+        outline = patches.Circle((y, x), a, **style)
+    else:
+        c, s = np.cos(yaw), np.sin(yaw)
+        corners = np.array([(a, b), (-a, b), (-a, -b), (a, -b)]) @ np.array([[c, s], [-s, c]]) + (x, y)
+        outline = patches.Polygon(corners[:, ::-1], closed=True, **style)
+    outline.set_path_effects(_halo(1.6))
+    axes.add_patch(outline)
+
+
+def _halo(width: float) -> list:
+    return [Stroke(linewidth=width + 2.6, foreground=PAPER), Normal()]
+
+
+def _arrow(axes: Axes, start, end, bend: float = 0.0, width: float = 2.4) -> None:
+    arrow = patches.FancyArrowPatch(
+        tuple(start),
+        tuple(end),
+        connectionstyle=f"arc3,rad={bend}",
+        arrowstyle="-|>",
+        mutation_scale=13,
+        shrinkA=0,
+        shrinkB=0,
+        color=ACTION,
+        linewidth=width,
+        joinstyle="miter",
+        zorder=8,
+        clip_on=False,
+    )
+    arrow.set_path_effects(_halo(width))
+    axes.add_patch(arrow)
+
+
+def draw_action(axes: Axes, scene: Superquadrics, action: Action) -> None:
+    """An action from above: a push as an arrow with the hand's way in dotted, a pick-and-place with the new outline."""
+    kind = ActionKind(int(action.kind))
+    if kind is ActionKind.NONE:
+        return
+    T = np.asarray(action.T_world_gripper, float)
+    start, inward = T[:2, 3], T[:2, 2]
+    if kind is ActionKind.PUSH:
+        end = start + np.asarray(action.displacement, float)[:2]
+        before = start - _APPROACH * inward
+        axes.plot([before[1], start[1]], [before[0], start[0]], color=ACTION, lw=1.6, linestyle=(0, (1, 1.2)), zorder=7)
+        axes.plot(start[1], start[0], "o", color=ACTION, markersize=4, zorder=9)
+        _arrow(axes, start[::-1], end[::-1])
+        return
+    after = placed_scene(scene, action)
+    outline = outlines(after)[int(action.object)]
+    if outline is not None:
+        axes.add_patch(
+            patches.Polygon(outline[:, ::-1], closed=True, facecolor=(*rgb(ACTION), 0.12), edgecolor=ACTION, lw=1.4,
+                            linestyle=(0, (3, 2)), zorder=6)
+        )  # fmt: skip
+    begin, end = np.asarray(scene.position)[int(action.object), :2], after.position[int(action.object), :2]
+    _arrow(axes, begin[::-1], end[::-1], bend=0.25)
+
+
+def draw_retrieval(axes: Axes, T_world_gripper: Float[np.ndarray, "4 4"]) -> None:
+    """The hand taking the target out, from above."""
+    T = np.asarray(T_world_gripper, float)
+    _arrow(axes, T[:2, 3][::-1], (T[:2, 3] - 0.3 * T[:2, 2])[::-1])
+
+
+def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """(column, row) of world points."""
+    pixels, _ = project(camera, jnp.asarray(points, jnp.float32))
+    return np.asarray(pixels)[..., ::-1]
+
+
+def _path_in_view(axes: Axes, camera: Camera, points: np.ndarray, dotted: bool = False) -> None:
+    pixels = _pixels(camera, points)
+    if dotted:
+        axes.plot(*pixels.T, color=ACTION, lw=1.6, linestyle=(0, (1, 1.2)), zorder=7)
+        return
+    codes = [Path.MOVETO, *[Path.LINETO] * (len(pixels) - 1)]
+    arrow = patches.FancyArrowPatch(
+        path=Path(pixels, codes), arrowstyle="-|>", mutation_scale=13, color=ACTION, linewidth=2.4, fill=False, zorder=8
+    )
+    arrow.set_path_effects(_halo(2.4))
+    axes.add_patch(arrow)
+
+
+def view_window(camera: Camera, shelf: Shelf) -> tuple[int, int, int, int]:
+    """The part of the camera's image that shows the shelf: first and last column, first and last row."""
+    corners = np.array(
+        [
+            (x, y, z)
+            for x in (shelf.front, shelf.back)
+            for y in (shelf.right, shelf.left)
+            for z in (shelf.board, shelf.ceiling)
+        ]
+    )
+    pixels = _pixels(camera, corners)
+    low = np.clip(np.floor(pixels.min(axis=0)) - 10, 0, None).astype(int)
+    high = np.clip(np.ceil(pixels.max(axis=0)) + 10, None, (camera.width, camera.height)).astype(int)
+    return low[0], high[0], low[1], high[1]
+
+
+def draw_view(axes: Axes, image: UInt8[np.ndarray, "h w 3"], camera: Camera, shelf: Shelf) -> None:
+    """The camera's image, cut to the shelf."""
+    left, right, top, bottom = view_window(camera, shelf)
+    axes.imshow(image[top:bottom, left:right], extent=(left, right, bottom, top), interpolation="antialiased")
+    axes.set_xlim(left, right)
+    axes.set_ylim(bottom, top)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color(WALL)
+
+
+def draw_numbers_in_view(axes: Axes, owner: Int[np.ndarray, "h w"], count: int) -> None:
+    """The numbers of the objects in the camera's image, each amid the pixels that show it.
+
+    Args:
+      axes: where the image is drawn.
+      owner: index of the object that each pixel shows; anything else where there is none.
+      count: number of objects.
+    """
+    for i in range(count):
+        rows, columns = np.nonzero(owner == i)
+        if len(rows) > 200:
+            _number(axes, (float(np.median(columns)), float(np.median(rows))), i)
+
+
+def draw_action_in_view(axes: Axes, scene: Superquadrics, action: Action, camera: Camera) -> None:
+    """An action in the camera's image: the way of the gripper in a push, the way of the object in a pick-and-place."""
+    kind = ActionKind(int(action.kind))
+    if kind is ActionKind.NONE:
+        return
+    T = np.asarray(action.T_world_gripper, float)
+    start = T[:3, 3]
+    share = np.linspace(0.0, 1.0, 40)[:, None]
+    if kind is ActionKind.PUSH:
+        _path_in_view(axes, camera, start - (1 - share) * _APPROACH * T[:3, 2], dotted=True)
+        axes.plot(*_pixels(camera, start), "o", color=ACTION, markersize=4, zorder=9)
+        _path_in_view(axes, camera, start + share * np.asarray(action.displacement, float))
+        return
+    begin = np.asarray(scene.position, float)[int(action.object)]
+    end = placed_scene(scene, action).position[int(action.object)]
+    arch = 4 * share * (1 - share) * np.array([-0.12, 0.0, 0.06])
+    _path_in_view(axes, camera, begin + share * (end - begin) + arch)
+
+
+def draw_retrieval_in_view(axes: Axes, T_world_gripper: Float[np.ndarray, "4 4"], camera: Camera) -> None:
+    """The hand taking the target out, in the camera's image."""
+    T = np.asarray(T_world_gripper, float)
+    _path_in_view(axes, camera, T[:3, 3] - np.linspace(0.0, 0.25, 40)[:, None] * T[:3, 2])
+
+
+def draw_legend(figure: Figure, capacity: int, y: float) -> None:
+    """What the colours mean, in one line at the height `y` of the figure (0 to 1)."""
+    marks = [patches.Patch(facecolor=(*rgb(b.colour), 0.95), label=b.label) for b in bands(capacity)]
+    marks.append(patches.Patch(facecolor=TARGET, label="target, found"))
+    marks.append(patches.Patch(facecolor="none", edgecolor=TARGET, linestyle=(0, (2, 1.5)), label="target, hidden"))
+    legend = figure.legend(
+        handles=marks, loc="center", bbox_to_anchor=(0.5, y), ncols=len(marks), frameon=False, fontsize=8.5,
+        handlelength=1.1, handleheight=1.1, columnspacing=1.3, labelcolor=INK, borderpad=0,
+        title="Where the target can be, and what a grasp there would meet", title_fontsize=8.5,
+    )  # fmt: skip
+    legend.get_title().set_color(MUTED)
+
+
+def save_figure(figure: Figure, path: PathLike, dpi: int = 110) -> None:
+    """Write a figure as PNG.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    with replacing(path) as file:
+        figure.savefig(file, format="png", dpi=dpi, facecolor=PAPER)

@@ -1,0 +1,176 @@
+"""Result files: what is written is read back, a file is whole or not there, and what is wrong is one line."""
+
+import dataclasses
+import json
+import stat
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+
+from mechsearch_jax import results, superquadric
+from mechsearch_jax.actions import ActionKind, no_action
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.results import Episode, Maps, Row, Step
+
+PUSH = no_action().replace(
+    kind=jnp.int32(ActionKind.PUSH), object=jnp.int32(3), displacement=jnp.array([0.0, 0.1, 0.0]), q7=jnp.float32(0.75)
+)
+STEPS = (
+    Step(40, False, False, 52.0, results.record_action(PUSH), 31.0, 33.0, 24, None, {"plan": 0.5}),
+    Step(17, True, True, 33.0, None, None, None, 0, "the object slipped", {"plan": 0.25}),
+)
+EPISODE = Episode("two-things", 2, {"gamma": 0.9}, {"jax": "1.2.3"}, STEPS, 1, 1, True, None)
+ROW = Row(
+    scenario="two-things",
+    objects=2,
+    target="cylinder",
+    method="search-for-grasp",
+    recognition="oracle",
+    gamma=0.9,
+    horizon=3,
+    sequences=30,
+    actions="both",
+    seed=0,
+    found_step=1,
+    graspable_step=None,
+    retrieved=False,
+    steps=2,
+    failure="no grasp after 2 actions",
+    planning_seconds=1.5,
+    simulation_seconds=3.0,
+)
+
+
+def maps():
+    return Maps(
+        poses=np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32),
+        existence=np.array([True, False, True, True, False]),
+        graspability=np.array([1, 0, -1, -2, 1]),
+        scene=jax.tree.map(np.asarray, superquadric.empty(4)),
+    )
+
+
+def test_an_episode_is_read_back(tmp_path):
+    results.save_episode(EPISODE, tmp_path / "new" / "episode.json")
+    assert results.load_episode(tmp_path / "new" / "episode.json") == EPISODE
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["episode.json"]
+
+
+def test_an_episode_has_the_documented_keys(tmp_path):
+    results.save_episode(EPISODE, tmp_path / "episode.json")
+    value = json.loads((tmp_path / "episode.json").read_text())
+    assert {"scenario", "config", "versions", "steps", "found_step", "graspable_step", "retrieved", "failure"} <= set(
+        value
+    )
+    assert value["steps"][0]["action"]["kind"] == "push"
+    assert value["steps"][0]["action"]["object"] == 3
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "3", '{"steps": [{}]}', '{"steps": []}', "[" * 100_000])
+def test_what_is_no_episode_is_one_line(tmp_path, text):
+    (tmp_path / "episode.json").write_text(text)
+    with pytest.raises(InputError) as error:
+        results.load_episode(tmp_path / "episode.json")
+    assert str(tmp_path / "episode.json") in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "episode.json"
+    results.save_episode(EPISODE, path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError):
+        results.save_episode(dataclasses.replace(EPISODE, config={"gamma": float("nan")}), path)
+
+    def fail_halfway():
+        with results.replacing(path) as file:
+            file.write(b"half")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail_halfway()
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["episode.json"]
+
+
+def test_a_file_gets_ordinary_permissions(tmp_path):
+    (tmp_path / "plain").write_text("")
+    results.save_episode(EPISODE, tmp_path / "episode.json")
+    modes = {stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("plain", "episode.json")}
+    assert len(modes) == 1
+
+
+def test_an_unwritable_place_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    for write in (
+        lambda: results.save_episode(EPISODE, tmp_path / "file" / "episode.json"),
+        lambda: results.check_writable(tmp_path / "file"),
+    ):
+        with pytest.raises(InputError, match="cannot be written"):
+            write()
+
+
+def test_maps_are_read_back(tmp_path):
+    results.save_maps(maps(), tmp_path / "maps.npz")
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        dataclasses.asdict(results.load_maps(tmp_path / "maps.npz")),
+        dataclasses.asdict(maps()),
+    )
+    with np.load(tmp_path / "maps.npz") as file:
+        assert set(file) == {
+            "poses", "existence", "graspability", "size", "exponents", "position", "rotation", "valid",
+        }  # fmt: skip
+
+
+def test_what_holds_no_maps_is_one_line(tmp_path):
+    (tmp_path / "text.npz").write_text("no")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    for name in ("text.npz", "other.npz", "none.npz"):
+        with pytest.raises(InputError, match=name) as error:
+            results.load_maps(tmp_path / name)
+        assert "\n" not in str(error.value)
+
+
+def test_rows_are_read_back(tmp_path):
+    rows = [ROW, dataclasses.replace(ROW, seed=1, found_step=None, failure=None, graspable_step=2, retrieved=True)]
+    results.write_rows(rows, tmp_path / "new" / "rows.parquet")
+    assert results.read_rows(tmp_path / "new" / "rows.parquet") == rows
+    assert pyarrow.parquet.read_schema(tmp_path / "new" / "rows.parquet").equals(results.SCHEMA)
+
+
+def test_the_schema_is_the_row():
+    assert results.SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
+
+
+def test_what_is_no_table_of_episodes_is_one_line(tmp_path):
+    (tmp_path / "text.parquet").write_text("no")
+    pyarrow.parquet.write_table(pyarrow.table({"a": [1]}), tmp_path / "other.parquet")
+    for name in ("text.parquet", "other.parquet", "none.parquet"):
+        with pytest.raises(InputError, match=name) as error:
+            results.read_rows(tmp_path / name)
+        assert "\n" not in str(error.value)
+
+
+def test_rows_are_summarised_by_method_and_number_of_objects():
+    rows = [
+        ROW,
+        dataclasses.replace(ROW, seed=1, graspable_step=2, retrieved=True, steps=4),
+        dataclasses.replace(ROW, objects=8, found_step=None, steps=10),
+        dataclasses.replace(ROW, method="search-and-grasp"),
+    ]
+    summary = results.summarise(rows)
+    assert [(r.method, r.objects, r.episodes) for r in summary] == [
+        ("search-and-grasp", 2, 1),
+        ("search-and-grasp", None, 1),
+        ("search-for-grasp", 2, 2),
+        ("search-for-grasp", 8, 1),
+        ("search-for-grasp", None, 3),
+    ]
+    two = summary[2]
+    assert (two.found, two.graspable, two.retrieved, two.steps) == (1.0, 0.5, 0.5, 3.0)
+    assert two.planning_seconds == pytest.approx(0.5)
