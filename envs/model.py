@@ -153,7 +153,7 @@ def _add_shelf(world: ElementTree.Element, shelf: Shelf) -> None:
         )
     for name, (low, high) in shelf_boxes(shelf).items():
         centre, half = (high + low) / 2, (high - low) / 2
-        _element(world, "geom", class_="board", name=f"{name}_box", pos=_text(*centre), size=_text(*(half - MARGIN)))
+        _element(world, "geom", class_="board", name=f"{name}_box", pos=_text(*centre), size=_text(*half))
 
 
 def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
@@ -279,7 +279,7 @@ def panda_shelf_mjcf(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> s
         name="camera",
         pos=_text(*camera.position),
         xyaxes=_text(*right, *-down),
-        fovy=_text(2 * np.arctan(camera.height / 2 / camera.fy)),
+        fovy=_text(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))),
     )
     _add_shelf(world, shelf)
     _add_robot(root, world)

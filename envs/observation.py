@@ -116,7 +116,7 @@ def _cast_bodies(
         candidate = jax.lax.cond(
             world.valid[i], cut, lambda _: jnp.full(directions.shape[:-1], jnp.inf, directions.dtype), i
         )
-        return jnp.minimum(depth, candidate), jnp.where(candidate < depth, i.astype(jnp.int8), owner)
+        return jnp.minimum(depth, candidate), jnp.where(candidate < depth, jnp.int8(i), owner)
 
     nothing = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
     none = jnp.full(directions.shape[:-1], BACKGROUND, jnp.int8)
@@ -135,7 +135,9 @@ def _cast_shelf(camera: Camera, shelf: Shelf, directions: Float[Array, "*pixels 
 
 def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, depth: Array, owner: Array) -> Array:
     """Outward normals in the world, found from where on its body, or in the shelf, each point lies."""
-    point = jnp.array(camera.position) + directions * jnp.where(jnp.isfinite(depth), depth, 0.0)[..., None]
+    flat = depth.shape
+    directions, depth, owner = directions.reshape(-1, 3), depth.reshape(-1), owner.reshape(-1)
+    point = jnp.array([camera.position]) + directions * jnp.where(jnp.isfinite(depth), depth, 0.0)[:, None]
     slot = jnp.clip(owner, 0, TARGET)
     rotation = world.rotation[slot]
     offset = point - world.position[slot]
@@ -144,7 +146,7 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
     share = jnp.abs(local) / half
     face = jnp.sign(local) * (share >= jnp.max(share, axis=-1, keepdims=True))
     round_side = jnp.sqrt(local[..., 0] ** 2 + local[..., 1] ** 2) / half[..., 0] >= share[..., 2]
-    side = jnp.where(round_side[..., None], local * jnp.array([1.0, 1.0, 0.0]), face * jnp.array([0.0, 0.0, 1.0]))
+    side = jnp.where(round_side[..., None], local * jnp.array([[1.0, 1.0, 0.0]]), face * jnp.array([[0.0, 0.0, 1.0]]))
     chosen = jnp.where((world.kind[slot] == CYLINDER)[..., None], side, face)
     chosen = chosen / jnp.maximum(jnp.linalg.norm(chosen, axis=-1, keepdims=True), 1e-9)
     body = rotate(rotation, chosen)
@@ -155,7 +157,7 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
     )
     walls = jnp.array([(-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)])
     wall = jnp.where(jnp.min(gaps, axis=-1) < 1e-4, jnp.argmin(gaps, axis=-1), 4)
-    return jnp.where((owner == SHELF)[..., None], walls[wall], body)
+    return jnp.where((owner == SHELF)[:, None], walls[wall], body).reshape(*flat, 3)
 
 
 @partial(jax.jit, static_argnames=("camera", "shelf"))
@@ -178,7 +180,7 @@ def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Observa
     normals = _normals(camera, shelf, world, directions, depth, owner)
     shade = AMBIENT + (1.0 - AMBIENT) * jnp.maximum(sum(normals[..., k] * light[k] for k in range(3)), 0.0)
     colour = jnp.asarray(PALETTE)[jnp.clip(owner, 0, SHELF)] * shade[..., None]
-    colour = jnp.where((owner == BACKGROUND)[..., None], jnp.array(BACKGROUND_COLOUR), colour)
+    colour = jnp.where((owner == BACKGROUND)[..., None], jnp.array([[BACKGROUND_COLOUR]]), colour)
     return Observation(depth, owner, colour)
 
 

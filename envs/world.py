@@ -68,11 +68,10 @@ def from_scenario(scenario: Scenario) -> World:
 
 def true_superquadrics(world: World) -> Superquadrics:
     """The surrounding objects, without the target, as a recogniser that knows the truth would report them."""
-    box, cylinder = jnp.array(superquadric.BOX_EXPONENTS), jnp.array(superquadric.CYLINDER_EXPONENTS)
-    kind = world.kind[..., :TARGET, None]
+    exponents = jnp.array([superquadric.BOX_EXPONENTS, superquadric.CYLINDER_EXPONENTS])
     return Superquadrics(
         size=world.half_size[..., :TARGET, :],
-        exponents=jnp.where(kind == CYLINDER, cylinder, box),
+        exponents=exponents[world.kind[..., :TARGET]],
         position=world.position[..., :TARGET, :],
         rotation=world.rotation[..., :TARGET, :, :],
         valid=world.valid[..., :TARGET],
