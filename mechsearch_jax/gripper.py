@@ -1,0 +1,332 @@
+"""The Panda's hand, fingers and arm as few primitives, and the point clouds that collision tests use.
+
+The boxes and capsules are fitted to the convex collision meshes of the maker's description of the robot: for the hand,
+the fingers and links 6 and 7 the real surface lies inside their union and at most 8 mm beneath it; links 1 to 5 are
+wrapped more loosely in capsules. The same primitives are the contact geometry of the simulator.
+
+Frames: as in `kinematics`. The gripper frame has its origin between the finger tips, z along the approach, y along the
+direction in which the fingers open. When joint 7 is at `q7`, links 6 and 7 are rigid with the hand.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax import kinematics
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.kinematics import Numbers
+from mechsearch_jax.shelf import Shelf
+
+FINGER_BASE = 0.0584  # z of the fingers' frames in the hand frame [m]
+FINE = 0.5  # spacing of a cloud near the front, relative to the rest
+
+
+@dataclasses.dataclass(frozen=True)
+class Gripper:
+    """The two-finger gripper and how it is used [m].
+
+    Attributes:
+      max_opening: largest distance between the fingers.
+      usable_opening: largest width of an object that may be grasped.
+      approach: length of the straight approach and retreat along the gripper's z.
+      pad_width: width of the fingers' flat inner faces along x, at the tips.
+      pad_length: length of the part of those faces with that width, along z.
+      tip: z of the finger tips' ends in the gripper frame; the pads reach from there backwards.
+      front: the clouds are dense where z in the gripper frame is above this.
+    """
+
+    max_opening: float = 0.08
+    usable_opening: float = 0.075
+    approach: float = 0.3
+    pad_width: float = 0.0175
+    pad_length: float = 0.018
+    tip: float = 0.009
+    front: float = -0.08
+
+    def __post_init__(self):
+        for field in ("max_opening", "usable_opening", "approach", "pad_width", "pad_length"):
+            if not getattr(self, field) > 0:
+                raise InputError(f"Gripper: {field} ({getattr(self, field)}) must be positive, in metres")
+        if self.usable_opening > self.max_opening:
+            raise InputError(
+                f"Gripper: usable_opening ({self.usable_opening}) must not exceed max_opening ({self.max_opening})"
+            )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Primitive:
+    """A box or a capsule in the frame of a link.
+
+    Attributes:
+      kind: "box" or "capsule".
+      size: half-extents of a box (3), or radius and half length (2) of a capsule along its own z, caps excluded [m].
+      T_frame_primitive: its pose in the link's frame, shape (4, 4), float64.
+    """
+
+    kind: Literal["box", "capsule"]
+    size: tuple[float, ...]
+    T_frame_primitive: np.ndarray
+
+
+def _box(
+    half_size: tuple[float, float, float],
+    centre: tuple[float, float, float],
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+) -> Primitive:
+    """A box from its half-extents, centre and orientation (w, x, y, z)."""
+    return Primitive("box", half_size, _pose(trimesh.transformations.quaternion_matrix(quaternion), centre))
+
+
+def _capsule(radius: float, start: tuple[float, float, float], end: tuple[float, float, float]) -> Primitive:
+    """A capsule from its radius and the ends of its axis."""
+    axis = np.subtract(end, start)
+    rotation = trimesh.geometry.align_vectors((0.0, 0.0, 1.0), axis)
+    return Primitive("capsule", (radius, float(np.linalg.norm(axis)) / 2), _pose(rotation, np.add(start, end) / 2))
+
+
+def _pose(rotation: Any, origin: Any) -> np.ndarray:
+    """A rotation, given as a 4 x 4 transform, with an origin."""
+    pose = np.array(rotation)
+    pose[:3, 3] = origin
+    return pose
+
+
+HAND = (
+    _box((0.0336, 0.0707, 0.0262), (0.0001, 0.0173, 0.0104), (1.0, 0.0025, -0.0008, -0.0031)),
+    _box((0.0207, 0.0708, 0.0493), (-0.0006, -0.0362, 0.0219), (0.9997, 0.0194, -0.0153, 0.0008)),
+    _box((0.0087, 0.0837, 0.0301), (-0.0028, -0.0196, 0.0404), (0.9876, -0.0265, -0.0526, 0.1455)),
+    _box((0.0268, 0.0922, 0.0375), (-0.0002, 0.0101, 0.0321), (1.0, -0.0054, 0.0019, -0.0024)),
+)
+
+FINGER = (
+    _box((0.0108, 0.0076, 0.0273), (0.0, 0.0073, 0.0270)),
+    _box((0.0108, 0.005, 0.0182), (0.0, 0.0152, 0.0345), (0.9886, 0.1508, 0.0, 0.0)),
+    _box((0.0108, 0.0135, 0.0102), (0.0, 0.0132, 0.01)),
+)
+
+# Links 1 to 7, each in its own frame.
+LINKS = (
+    (
+        _capsule(0.0716, (0.0, -0.0002, -0.1474), (0.0, -0.0415, -0.0028)),
+        _capsule(0.0556, (-0.001, -0.0468, -0.1061), (0.0018, -0.0832, 0.0083)),
+    ),
+    (
+        _capsule(0.0775, (-0.0006, -0.035, 0.0336), (-0.0002, -0.0024, 0.0522)),
+        _capsule(0.0732, (0.0004, -0.1468, 0.0004), (-0.0004, -0.0663, 0.041)),
+    ),
+    (
+        _capsule(0.0706, (0.0291, 0.0154, -0.0578), (0.0822, 0.0422, -0.0002)),
+        _capsule(0.0693, (0.0003, 0.0002, -0.0808), (0.0272, 0.0148, -0.0415)),
+    ),
+    (
+        _capsule(0.07, (-0.0589, 0.064, 0.0121), (-0.0003, 0.0001, 0.0422)),
+        _capsule(0.0688, (-0.0685, 0.0599, 0.0079), (-0.0824, 0.0839, 0.0001)),
+    ),
+    (
+        _capsule(0.0654, (0.0002, -0.002, -0.224), (0.0038, 0.0082, -0.167)),
+        _capsule(0.069, (-0.0017, 0.0137, -0.2194), (0.0006, 0.0639, -0.001)),
+    ),
+    (
+        _box((0.079, 0.0447, 0.0429), (0.036, 0.0231, 0.0063), (0.9727, 0.0201, 0.0587, 0.2234)),
+        _box((0.0454, 0.0675, 0.0365), (0.0887, 0.0097, -0.0019), (0.998, 0.0129, 0.0408, 0.047)),
+        _box((0.0453, 0.0352, 0.0335), (-0.0048, -0.0029, 0.0098), (0.9728, -0.0556, 0.0433, 0.2209)),
+        _box((0.0677, 0.0489, 0.0482), (0.0495, -0.0046, 0.0076), (0.9971, 0.0012, 0.0751, -0.0124)),
+    ),
+    (
+        _box((0.0371, 0.0644, 0.0197), (0.0182, 0.0182, 0.0891), (0.9166, -0.0381, 0.0188, -0.3976)),
+        _box((0.0388, 0.0431, 0.0265), (-0.0066, -0.002, 0.0763), (0.9998, -0.0041, 0.0092, -0.0188)),
+        _box((0.0445, 0.0382, 0.0283), (0.0201, 0.019, 0.0764), (0.9235, 0.0788, -0.0383, -0.3735)),
+    ),
+)
+
+
+def primitives_in_gripper(gripper: Gripper, opening: float, q7: float) -> tuple[Primitive, ...]:
+    """The primitives of the hand, both fingers, link 7 and link 6, with their poses in the gripper frame.
+
+    Args:
+      gripper: the gripper.
+      opening: distance between the fingers [m].
+      q7: angle of joint 7 [rad].
+
+    Raises:
+      InputError: the opening is negative or larger than the gripper's.
+    """
+    if not 0.0 <= opening <= gripper.max_opening:
+        raise InputError(f"Gripper: opening {opening} m must be between 0 and {gripper.max_opening}")
+    T_gripper_hand = trimesh.transformations.translation_matrix((0.0, 0.0, -kinematics.FINGER_TIPS))
+    T_gripper_left = _moved(T_gripper_hand, y=opening / 2, z=FINGER_BASE)
+    T_gripper_right = _moved(T_gripper_hand, y=-opening / 2, z=FINGER_BASE) @ _rotation(math.pi, "z")
+    T_gripper_link7 = _moved(T_gripper_hand, z=-kinematics.FLANGE) @ _rotation(-kinematics.HAND_ANGLE, "z")
+    T_link7_link6 = _moved(_rotation(-q7, "z"), x=-kinematics.JOINTS[6][0]) @ _rotation(-math.pi / 2, "x")
+    bodies = (
+        (T_gripper_hand, HAND),
+        (T_gripper_left, FINGER),
+        (T_gripper_right, FINGER),
+        (T_gripper_link7, LINKS[6]),
+        (T_gripper_link7 @ T_link7_link6, LINKS[5]),
+    )
+    return tuple(
+        dataclasses.replace(primitive, T_frame_primitive=T @ primitive.T_frame_primitive)
+        for T, primitives in bodies
+        for primitive in primitives
+    )
+
+
+def gripper_cloud(
+    gripper: Gripper, opening: float, q7: float, count: int, seed: int = 0
+) -> Float[np.ndarray, "{count} 3"]:
+    """`count` points spread over the surface of the hand, both fingers, link 7 and link 6: `swept_cloud` at rest."""
+    return swept_cloud(gripper, opening, q7, count, 0.0, seed)
+
+
+def swept_cloud(
+    gripper: Gripper, opening: float, q7: float, count: int, distance: float | None = None, seed: int = 0
+) -> Float[np.ndarray, "{count} 3"]:
+    """Points spread over the surface of all that the moving gripper passes through on a straight approach.
+
+    What a convex primitive sweeps on a line is the convex hull of its start and its end. The cloud covers the boundary
+    of the union of these hulls, twice as densely near the fingers and the front of the hand as behind.
+
+    Args:
+      gripper: the gripper.
+      opening: distance between the fingers [m].
+      q7: angle of joint 7 [rad].
+      count: number of points.
+      distance: length of the approach along z, ending in the frame [m]; the gripper's own by default.
+      seed: the same seed gives the same points.
+
+    Returns:
+      points in the gripper frame [m], float32; ordered so that any first part of them covers everything more coarsely.
+
+    Raises:
+      InputError: the opening is out of range, the distance negative, or fewer than one point asked for.
+    """
+    distance = gripper.approach if distance is None else distance
+    if distance < 0.0 or count < 1:
+        raise InputError(f"swept_cloud: distance ({distance} m) must not be negative, count ({count}) at least 1")
+    hulls = [_swept_hull(primitive, distance) for primitive in primitives_in_gripper(gripper, opening, q7)]
+    areas = np.array([hull.area for hull in hulls])
+    shares = np.ceil(20 * count * areas / areas.sum()).astype(int) + 50
+    candidates = np.concatenate(
+        [
+            _outside(trimesh.sample.sample_surface(hull, share, seed=seed + i)[0], hulls[:i] + hulls[i + 1 :])
+            for i, (hull, share) in enumerate(zip(hulls, shares, strict=True))
+        ]
+    )
+    spacing = np.where(candidates[:, 2] > gripper.front, FINE, 1.0)
+    return candidates[_spread(candidates, spacing, count)].astype(np.float32)
+
+
+def finger_box(gripper: Gripper, opening: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Half-extents and centre in the gripper frame of the smallest upright box around both fingers [m]."""
+    return _bounding_box(primitives_in_gripper(gripper, opening, 0.0)[len(HAND) : len(HAND) + 2 * len(FINGER)])
+
+
+def hand_box(gripper: Gripper, opening: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """Half-extents and centre in the gripper frame of the smallest upright box around the hand alone [m]."""
+    return _bounding_box(primitives_in_gripper(gripper, opening, 0.0)[: len(HAND)])
+
+
+def arm_points(q: Float[Numbers, "*batch 7"], count: int) -> tuple[Float[Array, "*batch n 3"], Float[Array, " n"]]:
+    """Points along the axes of the capsules of links 2 to 5, in the base frame.
+
+    Args:
+      q: joint angles [rad].
+      count: number of points on each capsule, its ends included; at least 2.
+
+    Returns:
+      points: spheres of the given radii about these points fill the capsules, up to dents between them [m].
+      radii: one for each point [m].
+    """
+    links, points, radii = [], [], []
+    for link in range(1, 5):
+        for capsule in LINKS[link]:
+            radius, half = capsule.size
+            z = np.linspace(-half, half, count)[:, None]
+            points.append(capsule.T_frame_primitive[:3, 3] + z * capsule.T_frame_primitive[:3, 2])
+            radii.append(np.full(count, radius))
+            links.append(np.full(count, link))
+    frames = kinematics.forward_kinematics(q)[..., np.concatenate(links), :, :]
+    local = jnp.asarray(np.concatenate(points), jnp.float32)
+    local = local.reshape((1,) * (frames.ndim - 3) + local.shape)
+    world = frames[..., :3, 3] + sum(frames[..., :3, i] * local[..., i, None] for i in range(3))
+    return world, jnp.asarray(np.concatenate(radii), jnp.float32)
+
+
+def arm_hits_shelf(q: Float[Numbers, "*batch 7"], shelf: Shelf, count: int = 5) -> Bool[Array, "*batch"]:
+    """Whether links 2 to 5 touch the shelf or come closer to it than the planner's margins.
+
+    All that is beyond the plane of the shelf's front and outside its free space counts as solid.
+
+    Args:
+      q: joint angles [rad].
+      shelf: the shelf.
+      count: spheres for each capsule, see `arm_points`.
+    """
+    points, radii = arm_points(q, count)
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    to_wall = jnp.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
+    to_board = jnp.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
+    beside = jnp.maximum(jnp.minimum(to_wall, to_board), 0.0)
+    before = jnp.maximum(shelf.front - x, 0.0)
+    radii = radii.reshape((1,) * (x.ndim - 1) + radii.shape)
+    return jnp.any((beside**2 + before**2 < radii**2) | (x + radii > shelf.back), axis=-1)
+
+
+def _moved(T: np.ndarray, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    """A pose moved along its own axes."""
+    return T @ trimesh.transformations.translation_matrix((x, y, z))
+
+
+def _rotation(angle: float, axis: Literal["x", "y", "z"]) -> np.ndarray:
+    return trimesh.transformations.rotation_matrix(angle, np.eye(3)["xyz".index(axis)])
+
+
+def _mesh(primitive: Primitive) -> trimesh.Trimesh:
+    """A primitive's surface; a capsule's facets lie at most half a percent of its radius beneath it."""
+    if primitive.kind == "box":
+        mesh = trimesh.creation.box(extents=2 * np.array(primitive.size))
+    else:
+        radius, half = primitive.size
+        mesh = trimesh.creation.capsule(height=2 * half, radius=radius, count=[32, 32])
+        mesh.apply_translation((0.0, 0.0, -mesh.bounds.mean(axis=0)[2]))
+    return mesh.apply_transform(primitive.T_frame_primitive)
+
+
+def _swept_hull(primitive: Primitive, distance: float) -> trimesh.Trimesh:
+    """The convex hull of a primitive and of itself `distance` back along z."""
+    mesh = _mesh(primitive)
+    return trimesh.convex.convex_hull(np.concatenate([mesh.vertices, mesh.vertices - (0.0, 0.0, distance)]))
+
+
+def _outside(points: np.ndarray, hulls: list[trimesh.Trimesh]) -> np.ndarray:
+    """The points that are not inside any of the convex hulls, to a tenth of a millimetre."""
+    for hull in hulls:
+        normals = hull.face_normals
+        offsets = np.sum(normals * hull.triangles_center, axis=-1)
+        points = points[np.max(points @ normals.T - offsets, axis=-1) > -1e-4]
+    return points
+
+
+def _spread(points: np.ndarray, spacing: np.ndarray, count: int) -> np.ndarray:
+    """Indices of `count` points, each chosen where the distance to those before, over the spacing, is largest."""
+    chosen = np.empty(count, int)
+    chosen[0] = np.argmax(points[:, 2])
+    gap = np.full(len(points), np.inf)
+    for i in range(1, count):
+        gap = np.minimum(gap, np.sum((points - points[chosen[i - 1]]) ** 2, axis=-1) / spacing**2)
+        chosen[i] = np.argmax(gap)
+    return chosen
+
+
+def _bounding_box(primitives: tuple[Primitive, ...]) -> tuple[np.ndarray, np.ndarray]:
+    bounds = np.array([_mesh(primitive).bounds for primitive in primitives])
+    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    return ((high - low) / 2).astype(np.float32), ((high + low) / 2).astype(np.float32)
