@@ -11,16 +11,17 @@ masses and inertias are set per world, on a copy of the compiled model.
 from __future__ import annotations
 
 import copy
-import dataclasses
 from collections.abc import Sequence
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs.world import BODIES
+from mechsearch_jax.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
 from mechsearch_jax.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINT_LOWER, JOINT_UPPER, JOINTS
 from mechsearch_jax.scenario import Body
 from mechsearch_jax.shelf import Shelf
@@ -59,27 +60,6 @@ LINK_INERTIAS = (
 )
 HAND_INERTIA = (0.73, (-0.01, 0.0, 0.03), (0.001, 0.0025, 0.0017, 0.0, 0.0, 0.0))
 FINGER_INERTIA = (0.015, (0.0, 0.0, 0.0), (2.375e-6, 2.375e-6, 7.5e-7, 0.0, 0.0, 0.0))
-FINGER_ROOT = 0.0584
-
-
-@dataclasses.dataclass(frozen=True)
-class _Solid:
-    kind: str
-    size: tuple[float, ...]
-    position: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-
-
-_LINK_SOLIDS = {
-    5: (_Solid("capsule", (0.06, 0.1), (0.0, 0.03, -0.15)),),
-    6: (_Solid("capsule", (0.055, 0.05), (0.04, 0.0, 0.0)),),
-    7: (_Solid("capsule", (0.05, 0.03), (0.0, 0.0, 0.06)),),
-}
-_HAND_SOLIDS = (_Solid("box", (0.0316, 0.1025, 0.033), (0.0, 0.0, 0.033)),)
-_FINGER_SOLIDS = (
-    _Solid("box", (0.00875, 0.0076, 0.00925), (0.0, 0.0076, 0.04525)),
-    _Solid("box", (0.011, 0.011, 0.018), (0.0, 0.015, 0.018)),
-)
 
 
 def _text(*numbers: float) -> str:
@@ -95,16 +75,19 @@ def _inertial(body: ElementTree.Element, inertia: tuple) -> None:
     _element(body, "inertial", mass=_text(mass), pos=_text(*centre), fullinertia=_text(*full))
 
 
-def _solids(body: ElementTree.Element, solids: Sequence[_Solid]) -> None:
+def _solids(body: ElementTree.Element, solids: Sequence[Primitive]) -> None:
     for solid in solids:
+        turn = Rotation.from_matrix(solid.T_frame_primitive[:3, :3]).as_quat(scalar_first=True)
+        # A capsule is drawn in by its radius alone; a box on every side.
+        drawn_in = (MARGIN, MARGIN, MARGIN) if solid.kind == "box" else (MARGIN, 0.0)
         _element(
             body,
             "geom",
             class_="robot",
             type=solid.kind,
-            size=_text(*(s - MARGIN for s in solid.size)),
-            pos=_text(*solid.position),
-            quat=_text(*solid.quaternion),
+            size=_text(*np.subtract(solid.size, drawn_in)),
+            pos=_text(*solid.T_frame_primitive[:3, 3]),
+            quat=_text(*turn),
         )
 
 
@@ -175,7 +158,7 @@ def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
             damping=_text(ARM_DAMPING),
             armature="0.1",
         )
-        _solids(parent, _LINK_SOLIDS.get(i + 1, ()))
+        _solids(parent, LINKS[i])
         _element(
             actuator,
             "position",
@@ -188,11 +171,11 @@ def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
     turned = (np.cos(HAND_ANGLE / 2), 0.0, 0.0, np.sin(HAND_ANGLE / 2))
     hand = _element(parent, "body", name="hand", pos=_text(0.0, 0.0, FLANGE), quat=_text(*turned), gravcomp="1")
     _inertial(hand, HAND_INERTIA)
-    _solids(hand, _HAND_SOLIDS)
+    _solids(hand, HAND)
     _element(hand, "site", name="gripper", pos=_text(0.0, 0.0, FINGER_TIPS), group="5")
     for name, quaternion in (("left", (1.0, 0.0, 0.0, 0.0)), ("right", (0.0, 0.0, 0.0, 1.0))):
         finger = _element(
-            hand, "body", name=f"{name}_finger", pos=_text(0.0, 0.0, FINGER_ROOT), quat=_text(*quaternion), gravcomp="1"
+            hand, "body", name=f"{name}_finger", pos=_text(0.0, 0.0, FINGER_BASE), quat=_text(*quaternion), gravcomp="1"
         )
         _inertial(finger, FINGER_INERTIA)
         _element(
@@ -204,7 +187,7 @@ def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
             range=_text(0.0, FINGER_TRAVEL),
             armature="0.1",
         )
-        _solids(finger, _FINGER_SOLIDS)
+        _solids(finger, FINGER)
         _element(
             actuator,
             "position",
