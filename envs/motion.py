@@ -20,6 +20,9 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.kinematics import HOME, line_poses, path_kinematics
 from mechsearch_jax.transforms import translate
 
+# Added to the turn between two waypoints, so that a stretch along which no joint turns has a length too [rad].
+LEAST_TURN = 1e-3
+
 
 @dataclasses.dataclass(frozen=True)
 class MotionConfig:
@@ -47,12 +50,12 @@ class MotionConfig:
     outside: tuple[float, ...] = (0.3, 0.34, 0.38, 0.42, 0.46)
     clearance: float = 0.002
     squeeze: float = 0.02
-    approach_steps: int = 225
-    push_steps: int = 150
+    approach_steps: int = 250
+    push_steps: int = 175
     close_steps: int = 100
-    carry_steps: int = 300
+    carry_steps: int = 325
     leave_steps: int = 150
-    transfer_steps: int = 250
+    transfer_steps: int = 275
     open_steps: int = 60
     waypoints: int = 31
 
@@ -106,12 +109,25 @@ def _ease(steps: int) -> np.ndarray:
     return (u * u * (3 - 2 * u)).astype(np.float32)
 
 
+def _travel(q: Array, stretch: _Stretch) -> Array:
+    """Joint angles on a stretch, timed so that the fastest joint speeds up and slows down once, smoothly.
+
+    Near a singularity the joints must turn far for a short way of the hand; timed by the hand's way they would have to
+    turn faster than the motors can make them.
+    """
+    if stretch.first == stretch.last:
+        return jnp.broadcast_to(q[stretch.first], (stretch.steps, q.shape[1]))
+    direction = 1 if stretch.last > stretch.first else -1
+    points = q[np.arange(stretch.first, stretch.last + direction, direction)]
+    turned = jnp.max(jnp.abs(jnp.diff(points, axis=0)), axis=1) + LEAST_TURN
+    passed = jnp.concatenate([jnp.zeros(1), jnp.cumsum(turned)])
+    now = jnp.asarray(_ease(stretch.steps)) * passed[-1]
+    return jax.vmap(lambda joint: jnp.interp(now, passed, joint), in_axes=1, out_axes=1)(points)
+
+
 def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float) -> Reference:
     """Travel along the joint angles `q` (waypoints, 7) as the stretches say."""
-    places = np.concatenate([s.first + (s.last - s.first) * _ease(s.steps) for s in stretches]).astype(np.float32)
-    before = np.clip(np.floor(places).astype(int), 0, q.shape[0] - 2)
-    share = jnp.asarray(places - before)[:, None]
-    travelled = (1 - share) * q[before] + share * q[before + 1]
+    travelled = jnp.concatenate([_travel(q, s) for s in stretches])
     fingers = jnp.concatenate(
         [s.fingers[0] + (s.fingers[1] - s.fingers[0]) * jnp.asarray(_ease(s.steps)) for s in stretches]
     )
