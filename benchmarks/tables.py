@@ -1,0 +1,92 @@
+"""Results on the screen: rates of success, timings, and the progress of many episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from mechsearch_jax.benchmarks.bench import Timing
+from mechsearch_jax.results import Row, summarise
+
+
+def rates_table(rows: Sequence[Row]) -> Table:
+    """Rates of success by method and number of objects, and mean times per action."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("method")
+    for name in ("objects", "episodes", "found", "graspable", "retrieved", "actions", "plan s", "simulate s"):
+        table.add_column(name, justify="right")
+    for rates in summarise(rows):
+        table.add_row(
+            rates.method,
+            "all" if rates.objects is None else str(rates.objects),
+            str(rates.episodes),
+            *(f"{share:.2f}" for share in (rates.found, rates.graspable, rates.retrieved)),
+            f"{rates.steps:.1f}",
+            f"{rates.planning_seconds:.2f}",
+            f"{rates.simulation_seconds:.2f}",
+            style="bold" if rates.objects is None else None,
+        )
+    return table
+
+
+def timing_table(timing: Timing) -> Table:
+    """One timing, and what it was measured on."""
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(style="cyan", justify="right")
+    table.add_column()
+    fastest, slowest = timing.spread
+    table.add_row("subject", timing.subject)
+    table.add_row("objects", str(timing.objects))
+    for name, size in timing.shapes.items():
+        table.add_row(name.replace("_", " "), str(size))
+    table.add_row("compile", f"{timing.compile_seconds:.2f} s")
+    table.add_row("median", f"{1e3 * timing.median:.1f} ms")
+    table.add_row("spread", f"{1e3 * fastest:.1f} to {1e3 * slowest:.1f} ms in {len(timing.seconds)} calls")
+    table.add_row("device", timing.versions["device"])
+    table.add_row("versions", ", ".join(f"{k} {v}" for k, v in timing.versions.items() if k != "device"))
+    return table
+
+
+class EpisodeProgress:
+    """A progress bar over episodes with the time left and the rates so far; one line per episode where no bar fits."""
+
+    def __init__(self, console: Console, total: int):
+        self._console = console
+        self._total = total
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("episodes", total=total)
+
+    def __enter__(self) -> EpisodeProgress:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *details: object) -> None:
+        self._bar.stop()
+
+    def ended(self, row: Row, rows: Sequence[Row]) -> None:
+        """Take note of one more episode; `rows` are all of them, those of earlier runs too."""
+        found, graspable, retrieved = (
+            sum(flags) / len(rows)
+            for flags in (
+                [r.found_step is not None for r in rows],
+                [r.graspable_step is not None for r in rows],
+                [r.retrieved for r in rows],
+            )
+        )
+        rates = f"found {found:.2f}  graspable {graspable:.2f}  retrieved {retrieved:.2f}"
+        self._bar.update(self._task, completed=len(rows), total=max(self._total, len(rows)), description=rates)
+        if not self._console.is_terminal:
+            outcome = "retrieved" if row.retrieved else row.failure
+            self._console.print(f"{len(rows)}/{self._total} {row.scenario}: {outcome} ({row.steps} actions)  {rates}")

@@ -1,0 +1,464 @@
+"""The command line: parse, call, print. `mechsearch --help` tells what there is.
+
+Bad input ends a command with one line on standard error and status 2, and leaves existing output as it is. What a
+command needs is imported when it runs, so that help and mistakes are answered at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import io
+import os
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.planner import PlannerConfig
+
+Method = Literal["search-for-grasp", "search-and-grasp"]
+Actions = Literal["both", "push", "pick-and-place"]
+TargetShape = Literal["cylinder", "box"]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlannerOptions:
+    """How the planner decides.
+
+    Attributes:
+      gamma: discount of later actions, above 0 and at most 1.
+      horizon: actions in a sequence.
+      sequences: sequences that are sampled for a decision.
+      actions: which actions are used.
+      criterion: what makes a target visible; "detector" counts pixels as the detector does.
+      max_steps: actions in an episode.
+      recognition: what the planner sees the objects through; "oracle" knows their true shapes and poses.
+      simulator: what executes the actions.
+    """
+
+    gamma: float = 0.9
+    horizon: int = 3
+    sequences: int = 30
+    actions: Actions = "both"
+    criterion: Literal["detector", "depth-mse", "depth-norm"] = "detector"
+    max_steps: int = 10
+    recognition: Literal["oracle"] = "oracle"
+    simulator: Literal["auto", "native"] = "auto"
+
+    def config(self, method: Method) -> PlannerConfig:
+        """The planner's configuration.
+
+        Raises:
+          InputError: an option is impossible.
+        """
+        from mechsearch_jax.planner import PlannerConfig
+
+        names = ("gamma", "horizon", "sequences", "actions", "criterion", "max_steps")
+        return PlannerConfig.paper(method=method, **{name: getattr(self, name) for name in names})
+
+
+Options = Annotated[PlannerOptions, tyro.conf.arg(name="")]
+Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER ...")]
+
+JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
+
+
+def find_scenario(name: str) -> Path:
+    """The file that a scenario's path, or the name of one that ships with the package, stands for.
+
+    Raises:
+      InputError: there is neither.
+    """
+    from mechsearch_jax.scenario import example_scenarios
+
+    shipped = example_scenarios()
+    if Path(name).is_file():
+        return Path(name)
+    if name in shipped:
+        return shipped[name]
+    raise InputError(f"{name}: there is no such file, nor a shipped scenario of that name ({', '.join(shipped)})")
+
+
+def find_scenarios(names: Sequence[str]) -> list[Path]:
+    """The files that paths, folders and names stand for.
+
+    Raises:
+      InputError: there is nothing for one of them.
+    """
+    files: list[Path] = []
+    for name in names:
+        if Path(name).is_dir():
+            inside = sorted(Path(name).glob("*.json"))
+            if not inside:
+                raise InputError(f"{name}: there are no scenario files (*.json) in this folder")
+            files += inside
+        else:
+            files.append(find_scenario(name))
+    if not files:
+        raise InputError("no scenario is given; name a file, a folder or a shipped scenario")
+    return files
+
+
+def search(
+    scenario: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")] = None,
+    /,
+    *,
+    objects: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    target: Annotated[TargetShape | None, tyro.conf.arg(metavar="{cylinder,box}")] = None,
+    method: Method = "search-for-grasp",
+    seed: int = 0,
+    out: Path,
+    options: Options = PlannerOptions(),
+) -> None:
+    """Run one episode: look, decide, act, until the target is found, graspable and taken out.
+
+    Args:
+      scenario: a scenario file, or the name of one that ships with the package.
+      objects: instead of a scenario, generate one with so many objects.
+      target: shape of a generated target; a cylinder if not given.
+      method: "search-for-grasp" minds the grasp while it searches, "search-and-grasp" only afterwards.
+      seed: of the planner, of the environment, and of a generated scenario.
+      out: folder for episode.json, filmstrip.png and the scenario.
+      options: how the planner decides.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax import planner
+    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.envs.episode import run_episode, target_of
+    from mechsearch_jax.envs.generator import generate_scenario
+    from mechsearch_jax.envs.narration import Narrator, verdict
+    from mechsearch_jax.envs.simulator import NativeSimulator
+    from mechsearch_jax.results import check_writable, save_episode
+    from mechsearch_jax.scenario import load_scenario, save_scenario
+    from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.viz.filmstrip import filmstrip
+
+    if (scenario is None) == (objects is None):
+        raise InputError("search: give either a scenario or --objects N, not both")
+    if scenario is not None and target is not None:
+        raise InputError("search: --target is for a generated scenario; a scenario file says itself what its target is")
+    config = options.config(method)
+    known = load_scenario(find_scenario(scenario)) if scenario is not None else None
+    check_writable(out)
+    keep_compilations()
+    console = Console(highlight=False)
+    with console.status("preparing") as status:
+        scene = known or generate_scenario(seed, objects or 0, target or "cylinder")
+        console.print(f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {method}")
+        problem = planner.build_problem(target=target_of(scene))
+        narrator = Narrator(console, status, problem, config)
+        episode = run_episode(seed, scene, problem, config, NativeSimulator(), watcher=narrator)
+        status.update("writing")
+        strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
+        save_figure(strip, out / "filmstrip.png")
+        save_scenario(scene, out / "scenario.json")
+        save_episode(episode, out / "episode.json")
+    narrator.ended(episode)
+    console.print(f"{out / 'episode.json'}\n{out / 'filmstrip.png'}", soft_wrap=True)
+
+
+def inspect(
+    scenarios: Scenarios,
+    /,
+    *,
+    out: Path,
+    seed: int = 0,
+    options: Options = PlannerOptions(),
+) -> None:
+    """Write maps of f and g at the start of scenarios, as NAME.npz and NAME.png.
+
+    Args:
+      scenarios: scenario files, folders of them, or names of shipped ones.
+      out: folder for the maps.
+      seed: of the recogniser.
+      options: how the planner decides.
+    """
+    from rich.progress import track
+
+    from mechsearch_jax import planner
+    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.envs.episode import target_of
+    from mechsearch_jax.envs.pictures import inspect_scenario
+    from mechsearch_jax.results import check_writable, save_maps
+    from mechsearch_jax.scenario import load_scenario
+    from mechsearch_jax.viz.drawing import save_figure
+
+    config = options.config("search-for-grasp")
+    scenes = [load_scenario(file) for file in find_scenarios(scenarios)]
+    check_writable(out)
+    keep_compilations()
+    problems = {target: planner.build_problem(target=target) for target in {target_of(scene) for scene in scenes}}
+    for scene in track(scenes, "inspecting"):
+        maps, figure = inspect_scenario(scene, problems[target_of(scene)], config, seed=seed)
+        save_maps(maps, out / f"{scene.name}.npz")
+        save_figure(figure, out / f"{scene.name}.png")
+    print(f"{len(scenes)} scenario{'s' if len(scenes) > 1 else ''} inspected: {out}")
+
+
+def evaluate(
+    scenarios: Scenarios,
+    /,
+    *,
+    out: Path,
+    method: tuple[Method, ...] = ("search-for-grasp",),
+    seed: tuple[int, ...] = (0,),
+    workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    options: Options = PlannerOptions(),
+) -> None:
+    """Run many episodes in worker processes; killed and started again, it goes on where it stopped.
+
+    Args:
+      scenarios: scenario files, folders of them, or names of shipped ones.
+      out: Parquet file with one row for each episode; rows that it already holds are not run again.
+      method: one or more.
+      seed: one or more.
+      workers: number of processes; one for each core if not given.
+      options: how the planner decides.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
+    from mechsearch_jax.benchmarks.tables import EpisodeProgress, rates_table
+
+    configs = [options.config(one) for one in method]
+    jobs = make_jobs(find_scenarios(scenarios), configs, seed)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if workers is not None and workers < 1:
+        raise InputError(f"evaluate: --workers {workers} must be at least 1")
+    console = Console(highlight=False)
+    with EpisodeProgress(console, len(jobs)) as progress:
+        rows = evaluate(jobs, out, workers or cores, progress.ended)
+    console.print(rates_table(rows))
+    console.print(str(out), soft_wrap=True)
+
+
+def report(tables: Annotated[tuple[Path, ...], tyro.conf.Positional], /) -> None:
+    """Print rates by method and number of objects from results of `evaluate`.
+
+    Args:
+      tables: Parquet files.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.tables import rates_table
+    from mechsearch_jax.results import read_rows
+
+    rows = [row for table in tables for row in read_rows(table)]
+    if not rows:
+        raise InputError("report: there are no episodes in these tables")
+    Console(highlight=False).print(rates_table(rows))
+
+
+def generate(*, objects: int, out: Path, count: int = 1, target: TargetShape = "cylinder", seed: int = 0) -> None:
+    """Generate scenarios: objects dropped on the shelf, and a target that the camera cannot see.
+
+    Args:
+      objects: surrounding objects in each.
+      out: folder for the files.
+      count: number of scenarios.
+      target: shape of the target.
+      seed: of the first scenario; the next ones follow.
+    """
+    from rich.progress import track
+
+    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.envs.generator import ScenarioGenerator
+    from mechsearch_jax.results import check_writable
+    from mechsearch_jax.scenario import save_scenario
+    from mechsearch_jax.target import Target
+
+    if count < 1:
+        raise InputError(f"scenarios generate: --count {count} must be at least 1")
+    check_writable(out)
+    keep_compilations()
+    generator = ScenarioGenerator(Target.box() if target == "box" else Target.cylinder())
+    for i in track(range(seed, seed + count), "generating"):
+        scenario = generator.generate(i, objects)
+        save_scenario(scenario, out / f"{scenario.name}.json")
+    print(f"{count} scenario{'s' if count > 1 else ''} generated: {out}")
+
+
+def check(scenarios: Scenarios, /) -> None:
+    """Check scenario files; every one that is malformed is named with its reason.
+
+    Args:
+      scenarios: scenario files, folders of them, or names of shipped ones.
+    """
+    from mechsearch_jax.scenario import load_scenario
+
+    bad = 0
+    for file in find_scenarios(scenarios):
+        try:
+            scenario = load_scenario(file)
+        except InputError as error:
+            print(error, file=sys.stderr)
+            bad += 1
+        else:
+            print(f"{file}: {len(scenario.objects)} objects, target {scenario.target.shape}")
+    if bad:
+        raise SystemExit(2)
+
+
+def _bench(
+    subject: Literal["existence", "graspability", "plan"],
+    objects: int,
+    repeats: int,
+    out: Path | None,
+    options: PlannerOptions,
+) -> None:
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.bench import bench, save_timing
+    from mechsearch_jax.benchmarks.tables import timing_table
+
+    if repeats < 1:
+        raise InputError(f"bench: --repeats {repeats} must be at least 1")
+    config = options.config("search-for-grasp")
+    # A compilation that was read from disk would not tell how long compiling takes.
+    jax.config.update("jax_enable_compilation_cache", False)
+    console = Console(highlight=False)
+    with console.status(f"timing {subject}"):
+        timing = bench(subject, objects, config, repeats=repeats)
+    console.print(timing_table(timing))
+    if out is not None:
+        save_timing(timing, out)
+
+
+def bench_existence(*, objects: int = 8, repeats: int = 20, out: JsonFile = None) -> None:
+    """Time f: compilation, median and spread.
+
+    Args:
+      objects: number of objects in a scene.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
+    _bench("existence", objects, repeats, out, PlannerOptions())
+
+
+def bench_graspability(*, objects: int = 8, repeats: int = 20, out: JsonFile = None) -> None:
+    """Time g where f = 1: compilation, median and spread.
+
+    Args:
+      objects: number of objects in a scene.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
+    _bench("graspability", objects, repeats, out, PlannerOptions())
+
+
+def bench_plan(
+    *,
+    objects: int = 8,
+    repeats: int = 10,
+    out: JsonFile = None,
+    options: Options = PlannerOptions(),
+) -> None:
+    """Time a whole decision: compilation, median and spread.
+
+    Args:
+      objects: number of objects in a scene.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+      options: how the planner decides.
+    """
+    _bench("plan", objects, repeats, out, options)
+
+
+def scenarios() -> None:
+    """Generate and check scenario files: mechsearch scenarios generate|check."""
+
+
+def bench() -> None:
+    """Time the planner's parts: mechsearch bench existence|graspability|plan."""
+
+
+Commands = dict[str, Callable[..., None]]
+
+COMMANDS: Commands = {
+    "search": search,
+    "inspect": inspect,
+    "evaluate": evaluate,
+    "report": report,
+    "scenarios": scenarios,
+    "bench": bench,
+}
+GROUPS: dict[str, Commands] = {
+    "scenarios": {"generate": generate, "check": check},
+    "bench": {"existence": bench_existence, "graspability": bench_graspability, "plan": bench_plan},
+}
+
+
+def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """A function with the same signature that only returns what is to be run."""
+
+    @functools.wraps(command)
+    def parsed(*args, **kwargs):
+        return functools.partial(command, *args, **kwargs)
+
+    return parsed
+
+
+def one_line(complaint: str) -> str:
+    """The message in the box that the parser draws around it, on one line."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", complaint)
+    rows = [row.strip("│╭╰╮╯ \t") for row in plain.splitlines()]
+    title, *rows = [row for row in rows if row] or ["the arguments are wrong"]
+    body: list[str] = []
+    for row in rows:
+        if not row.strip("─"):
+            break
+        body.append(row)
+    text = " ".join(body) if body else title.strip("─ ")
+    return re.sub(r"\s+", " ", text)
+
+
+def parse(arguments: Sequence[str]) -> Callable[[], None]:
+    """The command that arguments ask for, ready to be called.
+
+    Raises:
+      InputError: the arguments are wrong.
+      SystemExit: after help was printed.
+    """
+    group = arguments[0] if arguments and arguments[0] in GROUPS else None
+    program = f"mechsearch {group}" if group else "mechsearch"
+    commands = GROUPS[group] if group else COMMANDS
+    description = COMMANDS[group].__doc__ if group else "Find a hidden object on a cluttered shelf and take it out."
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.extras.subcommand_cli_from_dict(
+                {name: _deferred(command) for name, command in commands.items()},
+                prog=program,
+                description=description,
+                args=list(arguments[1:] if group else arguments),
+            )
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise InputError(f"{one_line(complaint.getvalue())} ({program} --help tells more)") from None
+
+
+def main() -> None:
+    """The console command `mechsearch`."""
+    try:
+        parse(sys.argv[1:])()
+    except InputError as error:
+        print(f"mechsearch: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("mechsearch: stopped", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+if __name__ == "__main__":
+    main()
