@@ -17,7 +17,7 @@ from mechsearch_jax import superquadric
 from mechsearch_jax.collision import Pair, any_inside, hits_shelf
 from mechsearch_jax.dynamics import Footprints, bounding_half_extents, footprints
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.graspability import boxes_overlap, gripper_rotation
+from mechsearch_jax.graspability import WRIST_ORIGIN, boxes_overlap, gripper_rotation
 from mechsearch_jax.gripper import Gripper, arm_hits_shelf, gripper_cloud, swept_cloud
 from mechsearch_jax.kinematics import line_kinematics, path_kinematics
 from mechsearch_jax.masked import masked_vmap
@@ -34,6 +34,9 @@ from mechsearch_jax.transforms import (
     translate,
     yaw_rotation,
 )
+
+
+PASSING_GAP = 0.003
 
 
 class ActionKind(enum.IntEnum):
@@ -85,9 +88,12 @@ class ActionConfig:
     Attributes:
       kinds: "both", "push" or "pick-and-place".
       push_distances: how far the gripper travels in a push [m].
-      push_tilt: angle by which the pushing gripper points downwards [rad]. The paper's 30 degrees bring the palm to
-        within 13 mm of an object that the fingers touch; 20 degrees leave twice that.
-      push_height: height of the finger tips above the board in a push [m].
+      push_tilt: angle by which the pushing gripper points downwards [rad].
+      push_wrists: angles of joint 7 relative to 45 degrees that pushes are tried with [rad].
+      push_heights: two limits of the height of the finger tips above the board in a push [m]: the lower keeps the hand
+        behind the object's neighbours, the higher above them.
+      push_leverage: largest height of a push in half widths of the object along it. Higher up, friction at the board
+        (0.4 to 0.6) would topple the object instead of letting it slide.
       push_gap: distance between gripper and object where a push starts [m].
       push_depths: how far the finger tips reach past the object's front, or past its centre, in a push [m].
       grasp_yaws: number of approach directions for round objects, and of places to grasp on a box.
@@ -102,8 +108,10 @@ class ActionConfig:
 
     kinds: Literal["both", "push", "pick-and-place"] = "both"
     push_distances: tuple[float, ...] = (0.05, 0.10, 0.15)
-    push_tilt: float = math.radians(20)
-    push_height: float = 0.03
+    push_tilt: float = math.radians(30)
+    push_wrists: tuple[float, ...] = (math.radians(-45), math.radians(-15), math.radians(30))
+    push_heights: tuple[float, float] = (0.06, 0.12)
+    push_leverage: float = 1.5
     push_gap: float = 0.01
     push_depths: tuple[float, float] = (0.02, 0.02)
     grasp_yaws: int = 6
@@ -127,7 +135,7 @@ class ActionTables:
     """Constants of the actions.
 
     Attributes:
-      q7: angles of joint 7, shape (W,) [rad].
+      q7: angles of joint 7 in grasps, then in pushes, shape (2, W) [rad].
       clouds: what the gripper sweeps on its way in, in its own frame, open and then closed: shape (2, W, 3, P) [m].
       low, high: boxes around them, shape (2, W, 3) [m].
       pusher: surface of the closed gripper in its own frame, by wrist, shape (W, Q, 3) [m].
@@ -140,18 +148,31 @@ class ActionTables:
     pusher: jax.Array
 
 
-def action_tables(gripper: Gripper, q7: Float[Array, " w"], config: ActionConfig) -> ActionTables:
-    """Sample the clouds of the open and the closed gripper for every wrist angle [rad]."""
-    angles = [float(a) for a in np.asarray(q7)]
+def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: ActionConfig) -> ActionTables:
+    """Sample the clouds of the open and the closed gripper for every wrist.
+
+    Args:
+      gripper: the gripper.
+      grasp_wrists: angles of joint 7 in grasps, relative to 45 degrees [rad].
+      config: has as many angles for pushes.
+
+    Raises:
+      InputError: it has not.
+    """
+    if len(grasp_wrists) != len(config.push_wrists):
+        raise InputError(
+            f"{len(grasp_wrists)} wrist angles for grasps but {len(config.push_wrists)} for pushes; give as many of each"
+        )
+    q7 = WRIST_ORIGIN + np.array([grasp_wrists, config.push_wrists])
     clouds = np.stack(
         [
-            [swept_cloud(gripper, opening, a, config.cloud_points) for a in angles]
-            for opening in (gripper.max_opening, 0.0)
+            [swept_cloud(gripper, opening, float(angle), config.cloud_points) for angle in angles]
+            for opening, angles in zip((gripper.max_opening, 0.0), q7, strict=True)
         ]
     )
-    pusher = np.stack([gripper_cloud(gripper, 0.0, a, 256) for a in angles])
+    pusher = np.stack([gripper_cloud(gripper, 0.0, float(angle), 256) for angle in q7[1]])
     return ActionTables(
-        q7=jnp.float32(angles),
+        q7=jnp.float32(q7),
         clouds=jnp.float32(np.swapaxes(clouds, -1, -2)),
         low=jnp.float32(clouds.min(axis=-2)),
         high=jnp.float32(clouds.max(axis=-2)),
@@ -164,25 +185,44 @@ class PossibleSpace:
     """Where a target that has not been ruled out would stand, as a raster at the spacing of the candidate poses.
 
     Attributes:
-      occupied: shape (rows along x, columns along y).
+      occupied: whether any of it lies in a cell, shape (rows along x, columns along y).
+      chance: share of the possible poses whose centre is in a cell, same shape; the sum is 1, or 0 if there are none.
       origin: centre of the first cell [m], shape (2,).
       cell: spacing [m], shape (2,).
       top: height up to which a target reaches [m].
     """
 
     occupied: jax.Array
+    chance: jax.Array
     origin: jax.Array
     cell: jax.Array
     top: jax.Array
 
 
+def widen(cells: Bool[Array, "r c"]) -> Bool[Array, "r c"]:
+    """A raster with the neighbours of its cells. A cell is 15 mm wide and a target's radius 20 mm: one is enough."""
+    return jax.lax.reduce_window(cells, False, jax.lax.bitwise_or, (3, 3), (1, 1), "SAME")
+
+
+def _cells(space: PossibleSpace, points):
+    """Row and column of the cells of world points (N, 3), and whether they are on the raster and not above a target."""
+    index = jnp.round((points[:, :2] - space.origin[None]) / space.cell[None]).astype(jnp.int32)
+    shape = jnp.array(space.occupied.shape)[None]
+    inside = jnp.all((index >= 0) & (index < shape), axis=-1) & (points[:, 2] < space.top)
+    return jnp.clip(index, 0, shape - 1), inside
+
+
 def _enters(space: PossibleSpace, points: Float[Array, "... 3"]) -> Bool[Array, "..."]:
     """Whether world points lie in possible space."""
-    flat = points.reshape(-1, 3)
-    index = jnp.round((flat[:, :2] - space.origin[None]) / space.cell[None]).astype(jnp.int32)
-    inside = jnp.all((index >= 0) & (index < jnp.array(space.occupied.shape)[None]), axis=-1)
-    index = jnp.clip(index, 0, jnp.array(space.occupied.shape)[None] - 1)
-    return (space.occupied[index[:, 0], index[:, 1]] & inside & (flat[:, 2] < space.top)).reshape(points.shape[:-1])
+    index, inside = _cells(space, points.reshape(-1, 3))
+    return (space.occupied[index[:, 0], index[:, 1]] & inside).reshape(points.shape[:-1])
+
+
+def _risk(space: PossibleSpace, points: Float[Array, "... 3"]) -> Float[Array, ""]:
+    """Share of the possible poses at which the target would be touched by world points."""
+    index, inside = _cells(space, points.reshape(-1, 3))
+    touched = jnp.zeros(space.occupied.shape, bool).at[index[:, 0], index[:, 1]].max(inside)
+    return jnp.sum(jnp.where(widen(touched), space.chance, 0.0))
 
 
 @flax.struct.dataclass
@@ -289,21 +329,23 @@ def object_pushes(
     """Gripper poses where pushes start: beside each object, at `push_gap` from it.
 
     For each side (pushing towards +y, then -y), for two depths (fingers just past the object's front, then past its
-    centre so that the palm pushes), for each wrist.
+    centre so that the palm pushes), for two heights, for each wrist.
     """
-    wrists = tables.q7.shape[0]
-    side, deep, wrist = (g.reshape(-1) for g in np.meshgrid([1.0, -1.0], [0, 1], np.arange(wrists), indexing="ij"))
+    wrists = tables.q7.shape[1]
+    side, deep, high, _ = _push_grid(wrists)
     rotation = gripper_rotation(jnp.float32(0.0), jnp.float32(config.push_tilt))
-    extent = bounding_half_extents(scene)[:, 0]
+    extent = bounding_half_extents(scene)
     x = jnp.where(
         jnp.asarray(deep == 0)[None],
-        (prints.position[:, 0] - extent + config.push_depths[0])[:, None],
+        (prints.position[:, 0] - extent[:, 0] + config.push_depths[0])[:, None],
         (prints.position[:, 0] + config.push_depths[1])[:, None],
     )
-    z = shelf.board + config.push_height
+    height = prints.high - shelf.board
+    limit = jnp.minimum(config.push_leverage * extent[:, 1], 0.75 * height)
+    z = shelf.board + jnp.clip(limit[:, None], 0.03, jnp.float32(config.push_heights)[high][None])
     b = len(side)
     shape = (scene.capacity, b)
-    centre = jnp.stack([x, jnp.broadcast_to(prints.position[:, 1:2], shape), jnp.full(shape, z)], axis=-1)
+    centre = jnp.stack([x, jnp.broadcast_to(prints.position[:, 1:2], shape), z], axis=-1)
     T = make(jnp.broadcast_to(rotation, (*shape, 3, 3)), centre)
 
     # The palm and the fingers decide how close the gripper can get; the wrist makes no difference to them.
@@ -315,9 +357,10 @@ def object_pushes(
         turn = yaw_rotation(-yaw)[:2, :2]
         local = rotate2(turn, world[:, :2] - position[None])
         heading = rotate2(turn, jnp.array([0.0, 1.0]) * -side)
-        grown = half + config.push_gap
+        # In front of the object the palm may pass close by; only sideways does it keep the whole gap.
+        grown = half + PASSING_GAP
         away = _exit_distance(grown[None], is_round, local, jnp.broadcast_to(heading[None], local.shape))
-        return jnp.max(jnp.where(level, away, 0.0))
+        return jnp.max(jnp.where(level, away, 0.0)) + config.push_gap - PASSING_GAP
 
     rotate2 = lambda R, v: jnp.stack([R[0, 0] * v[..., 0] + R[0, 1] * v[..., 1], R[1, 0] * v[..., 0] + R[1, 1] * v[..., 1]], -1)  # noqa: E731, E501
     each = jax.vmap(beside, in_axes=(None,) * 6 + (0, 0))
@@ -327,10 +370,15 @@ def object_pushes(
     return T.at[..., 1, 3].add(-jnp.float32(side)[None] * distance)
 
 
-def push_variants(config: ActionConfig, wrists: int) -> tuple[np.ndarray, np.ndarray]:
+def _push_grid(wrists: int):
+    """Side, depth, height and wrist of each push of an object."""
+    return [g.reshape(-1) for g in np.meshgrid([1.0, -1.0], [0, 1], [0, 1], np.arange(wrists), indexing="ij")]
+
+
+def push_variants(wrists: int) -> tuple[np.ndarray, np.ndarray]:
     """Side (+1 or -1 along y) and wrist of each push of `object_pushes`, each of shape (B,)."""
-    side, _, wrist = np.meshgrid([1.0, -1.0], [0, 1], np.arange(wrists), indexing="ij")
-    return np.float32(side.reshape(-1)), wrist.reshape(-1)
+    side, _, _, wrist = _push_grid(wrists)
+    return np.float32(side), wrist
 
 
 @dataclasses.dataclass(frozen=True)
@@ -411,7 +459,7 @@ def _approach_clear(space: ActionSpace, tables: ActionTables, opening: int, wris
     def clear(tables, row, i):
         T = row[i]
         w = jnp.asarray(wrist)[i]
-        q, reachable = line_kinematics(T, jnp.float32(space.gripper.approach), tables.q7[w], space.waypoints)
+        q, reachable = line_kinematics(T, jnp.float32(space.gripper.approach), tables.q7[opening, w], space.waypoints)
         return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf))
 
     def touches(tables, row, i):
@@ -452,7 +500,7 @@ def candidates(
       moved: which moved since; only what concerns them is computed anew.
     """
     n, config = scene.capacity, space.config
-    wrists = tables.q7.shape[0]
+    wrists = tables.q7.shape[1]
     prints = footprints(scene)
     fresh = scene.valid if moved is None else moved & scene.valid
     concerns = fresh[:, None] | fresh[None, :]
@@ -479,7 +527,7 @@ def candidates(
     grasp_enters = _enters_possible(tables, possible, 0, wrist, flat, usable).reshape(n, a)
 
     push = object_pushes(space.shelf, tables, scene, prints, config)
-    side, push_wrist = push_variants(config, wrists)
+    side, push_wrist = push_variants(wrists)
     b, d = push.shape[1], len(config.push_distances)
     flat = push.reshape(-1, 4, 4)
     owner_b = np.repeat(np.arange(n), b)
@@ -496,7 +544,7 @@ def candidates(
         w = jnp.asarray(wrist_b)[i // d]
         back = jnp.float32(space.gripper.approach)
         middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
-        q, reachable = path_kinematics(jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)]), tables.q7[w])
+        q, reachable = path_kinematics(jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)]), tables.q7[1, w])
         points = transform(end, tables.clouds[1, w].T)
         return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf)) & ~jnp.any(hits_shelf(space.shelf, points))
 
@@ -540,12 +588,12 @@ class Sample:
     Attributes:
       action: the action; of kind NONE where none is possible.
       wrist: index of its wrist angle.
-      intrudes: whether it enters possible space, because nothing else was possible.
+      risk: share of the possible poses at which it would touch the target.
     """
 
     action: Action
     wrist: jax.Array
-    intrudes: jax.Array
+    risk: jax.Array
 
 
 def _choose(key, weight):
@@ -555,13 +603,13 @@ def _choose(key, weight):
 
 
 def _weights(clean, dirty):
-    """Equal weight for every object that has an action, shared evenly among its actions; dirty ones only in need."""
-    usable = jnp.where(jnp.any(clean), clean, dirty)
+    """Equal weight for every object that has an action, shared evenly among its clean ones, or the others in need."""
+    usable = jnp.where(jnp.any(clean, axis=-1, keepdims=True), clean, dirty)
     return usable / jnp.maximum(jnp.sum(usable, axis=-1, keepdims=True), 1)
 
 
 def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
-    """A place for a picked object, and the gripper pose that puts it there: (found, T_world_place, intrudes)."""
+    """A place for a picked object, and the gripper pose that puts it there: (found, T_world_place, T_world_object)."""
     shelf, config = space.shelf, space.config
     tries, tests = config.placements
     n = scene.capacity
@@ -598,7 +646,6 @@ def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
     score = jax.random.uniform(key_order, (tries,)) - 2.0 * intrudes - 8.0 * (overlapping | ~on_board)
     _, best = jax.lax.top_k(score, tests)
     candidate = (~overlapping & on_board)[best]
-    intrudes = intrudes[best]
     # The object turns about its own centre, and the gripper with it.
     arm = T_grasp[:3, 3] - scene.position[index]
     T_place = make(
@@ -609,7 +656,7 @@ def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
 
     def clear(tables, row, i):
         T, wrist = row
-        q, reachable = line_kinematics(T[i], jnp.float32(space.gripper.approach), tables.q7[wrist], space.waypoints)
+        q, reachable = line_kinematics(T[i], jnp.float32(space.gripper.approach), tables.q7[0, wrist], space.waypoints)
         points = transform(T[i], tables.clouds[0, wrist].T)
         return reachable & ~jnp.any(arm_hits_shelf(q, shelf)) & ~jnp.any(hits_shelf(shelf, points))
 
@@ -641,7 +688,7 @@ def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
     hits |= any_inside(mask.reshape(-1), body_pair, None, row, block=32).reshape(mask.shape)
     free = clear_way & ~jnp.any(hits, axis=1)
     first = jnp.argmax(free)
-    return jnp.any(free), T_place[first], intrudes[first]
+    return jnp.any(free), T_place[first], make(rotation[best][first], position[best][first])
 
 
 def sample_action(
@@ -660,12 +707,12 @@ def sample_action(
       space: static.
       tables: constants of the problem.
       scene: the objects.
-      possible: where the target may be. Actions that enter it are drawn only if there are no others.
+      possible: where the target may be. An object's actions that enter it are drawn only if it has no others.
       options: of this scene.
       available: which objects may be moved.
     """
     config = space.config
-    wrists = tables.q7.shape[0]
+    wrists = tables.q7.shape[1]
     n, a = options.grasp_reached.shape
     b, d = options.push_reached.shape[1:]
     key_choice, key_place = jax.random.split(key)
@@ -687,26 +734,40 @@ def sample_action(
     index = row % n
 
     grasp_wrist = jnp.asarray(_grasp_variants(config, space.tilts, wrists)[2])
-    side, push_wrist = (jnp.asarray(v) for v in push_variants(config, wrists))
+    side, push_wrist = (jnp.asarray(v) for v in push_variants(wrists))
     grasp = jnp.clip(way, 0, a - 1)
     push, distance = jnp.clip(way, 0, b * d - 1) // d, jnp.clip(way, 0, b * d - 1) % d
     T_grasp, T_push = options.grasp[index, grasp], options.push[index, push]
     wrist = jnp.where(is_grasp, grasp_wrist[grasp], push_wrist[push])
     length = side[push] * jnp.float32(config.push_distances)[distance]
     displacement = jnp.stack([jnp.zeros_like(length), length, jnp.zeros_like(length)])
-    placed, T_place, place_intrudes = _placement(
+    placed, T_place, T_object_place = _placement(
         key_place, space, tables, scene, possible, index, T_grasp, grasp_wrist[grasp]
     )
     able = possible_at_all & (~is_grasp | placed)
     kind = jnp.where(is_grasp, ActionKind.PICK_AND_PLACE, ActionKind.PUSH)
+    T_world_gripper = jnp.where(is_grasp, T_grasp, T_push)
+    T_world_place = jnp.where(is_grasp, T_place, translate(T_push, displacement))
     action = Action(
         kind=jnp.where(able, kind, ActionKind.NONE).astype(jnp.int32),
         object=index.astype(jnp.int32),
-        T_world_gripper=jnp.where(is_grasp, T_grasp, T_push),
+        T_world_gripper=T_world_gripper,
         displacement=jnp.where(is_grasp, jnp.zeros(3), displacement),
-        T_world_place=jnp.where(is_grasp, T_place, translate(T_push, displacement)),
-        q7=tables.q7[wrist],
+        T_world_place=T_world_place,
+        q7=tables.q7[jnp.where(is_grasp, 0, 1), wrist],
         opening=jnp.where(is_grasp, space.gripper.max_opening, 0.0).astype(jnp.float32),
     )
-    intrudes = enters.reshape(-1)[choice] | (is_grasp & place_intrudes)
-    return Sample(action, wrist, able & intrudes)
+
+    # A push sweeps the space between its ends, at places less than two finger widths apart; a placement only its end.
+    T_object = make(scene.rotation[index], scene.position[index])
+    way = displacement[None] * jnp.linspace(0.0, 1.0, 5)[:, None]
+    ends = jnp.stack([T_grasp, T_place, T_place, T_place, T_place])
+    grippers = jnp.where(is_grasp, ends, translate(jnp.broadcast_to(T_push, (5, 4, 4)), way))
+    pushed = translate(jnp.broadcast_to(T_object, (5, 4, 4)), way)
+    bodies = jnp.where(is_grasp, jnp.broadcast_to(T_object_place, (5, 4, 4)), pushed)
+    cloud = tables.clouds[jnp.where(is_grasp, 0, 1), wrist].T
+    body = superquadric.sample_surface(scene.size[index], scene.exponents[index], config.object_points)
+    swept = jnp.concatenate(
+        [transform(grippers[:, None], cloud[None]), transform(bodies[:, None], body[None])], axis=1
+    )
+    return Sample(action, wrist, jnp.where(able, _risk(possible, swept), 0.0))

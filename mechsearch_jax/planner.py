@@ -26,6 +26,7 @@ from mechsearch_jax.actions import (
     action_tables,
     candidates,
     sample_action,
+    widen,
 )
 from mechsearch_jax.camera import Camera
 from mechsearch_jax.dynamics import PushModel, QuasiStatic, changed, pick_and_place
@@ -69,6 +70,8 @@ class PlannerConfig:
       actions: "both", "push" or "pick-and-place".
       criterion: how f decides what is visible; see `existence.ExistenceConfig`.
       push_distances: how far pushes go [m].
+      caution: what touching the target unseen would cost, in units of J: a sampled action is charged with J times the
+        share of the possible poses at which it would do so.
       max_steps: T, actions in an episode.
     """
 
@@ -79,6 +82,7 @@ class PlannerConfig:
     actions: Literal["both", "push", "pick-and-place"] = "both"
     criterion: Literal["detector", "depth-mse", "depth-norm"] = "detector"
     push_distances: tuple[float, ...] = (0.05, 0.10, 0.15)
+    caution: float = 1.0
     max_steps: int = 10
 
     def __post_init__(self):
@@ -219,11 +223,10 @@ def build_problem(
     existence_config, grasp_config = existence_config or ExistenceConfig(), grasp_config or GraspConfig()
     action_config = action_config or ActionConfig()
     grasps = grasp_tables(shelf, gripper, target, grasp_config)
-    wrists = jnp.asarray([grasps.q7[grasps.wrist == w][0] for w in range(len(grasp_config.wrists))])
     return Problem(
         existence=existence_tables(camera, shelf, target, existence_config),
         grasps=grasps,
-        actions=action_tables(gripper, wrists, action_config),
+        actions=action_tables(gripper, grasp_config.wrists, action_config),
         poses=jnp.asarray(target.candidate_poses(shelf)),
         camera=camera,
         shelf=shelf,
@@ -299,20 +302,33 @@ def _everywhere_it_can_be(belief: Belief, exists: Array) -> Bool[Array, " y"]:
 
 
 def _possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) -> PossibleSpace:
-    """Raster of the space that the target may take: the cells of its poses and those next to them.
+    """Raster of the space that an unseen target may take; empty once it is found, and an obstacle like any other."""
+    grid = jnp.sum(exists.reshape(*problem.target.grid, -1), axis=-1) * ~belief.found
+    return PossibleSpace(
+        occupied=widen(grid > 0),
+        chance=grid / jnp.maximum(jnp.sum(grid), 1),
+        origin=problem.poses[0, :2],
+        cell=jnp.float32(problem.target.cell(problem.shelf)[:2]),
+        top=jnp.float32(problem.shelf.board + 2 * problem.target.half_size[2]),
+    )
 
-    A cell is 15 mm and the target's radius 20 mm, so one cell more on every side covers it.
-    """
-    rows, columns = problem.target.grid
-    grid = jnp.any(exists.reshape(rows, columns, -1), axis=-1)
-    cell = jnp.float32(problem.target.cell(problem.shelf)[:2])
-    origin = problem.poses[0, :2]
-    row, column = jnp.round((belief.found_pose[:2] - origin) / cell).astype(jnp.int32)
-    here = (jnp.arange(rows) == row)[:, None] & (jnp.arange(columns) == column)[None]
-    grid = jnp.where(belief.found, here, grid)
-    wide = jax.lax.reduce_window(grid, False, jax.lax.bitwise_or, (3, 3), (1, 1), "SAME")
-    top = problem.shelf.board + 2 * problem.target.half_size[2]
-    return PossibleSpace(wide, origin, cell, jnp.float32(top))
+
+def _with_target(problem: Problem, belief: Belief, scene: Superquadrics) -> Superquadrics:
+    """The scene with the target in one more slot, absent until it is found."""
+    T = belief.grasps.T_world_target
+    target = Superquadrics(
+        size=jnp.float32(problem.target.half_size),
+        exponents=jnp.float32(problem.target.exponents),
+        position=T[:3, 3],
+        rotation=T[:3, :3],
+        valid=belief.found,
+    )
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), scene, target)
+
+
+def _without_target(scene: Superquadrics) -> Superquadrics:
+    """The same slots with the target's empty: it neither hides itself nor is in the way of its own grasp."""
+    return scene.replace(valid=scene.valid.at[-1].set(False))
 
 
 def _cost(problem: Problem, belief: Belief, exists: Array, hits: Array, method: str) -> Float[Array, ""]:
@@ -366,7 +382,8 @@ def _predict(problem: Problem, space: ActionSpace, push_model: PushModel, scene:
     pushed = push_model(problem.shelf, scene, pusher, action.T_world_gripper, action.displacement)
     placed = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
     is_push = action.kind == ActionKind.PUSH
-    possible = (action.kind != ActionKind.NONE) & ~(is_push & (pushed.residual > space.config.jam))
+    hits_target = jnp.any(changed(scene, pushed.scene)[-1:])
+    possible = (action.kind != ActionKind.NONE) & ~(is_push & ((pushed.residual > space.config.jam) | hits_target))
     after = jax.tree.map(lambda a, b: jnp.where(is_push, a, b), pushed.scene, placed)
     after = jax.tree.map(lambda new, old: jnp.where(possible, new, old), after, scene)
     return after, possible
@@ -376,22 +393,23 @@ def _root(problem: Problem, belief: Belief, scene: Superquadrics, space: ActionS
     settings = _existence_config(problem, config)
     nowhere = jnp.zeros_like(belief.exists)
     counts = _where_g_counts(belief, belief.exists, config.method)
-    hits = grasp_hits(problem.grasps, belief.grasps, scene, counts)
+    objects = _without_target(scene)
+    hits = grasp_hits(problem.grasps, belief.grasps, objects, counts)
     possible = _possible_space(problem, belief, belief.exists)
     return _Node(
         scene=scene,
         exists=belief.exists,
-        views=object_views(problem.existence, problem.camera, scene, nowhere, settings),
+        views=object_views(problem.existence, problem.camera, objects, nowhere, settings),
         hits=hits,
         options=candidates(space, problem.actions, scene, possible),
         moved=jnp.zeros_like(scene.valid),
-        available=scene.valid,
+        available=objects.valid,
         alive=jnp.array(True),
         cost=_cost(problem, belief, belief.exists, hits, config.method),
     )
 
 
-def _step(problem, belief, space, config, push_model, node: _Node, key) -> tuple[_Node, tuple[Action, Array]]:
+def _step(problem, belief, space, config, push_model, node: _Node, key) -> tuple[_Node, tuple[Action, Array, Array]]:
     possible = _possible_space(problem, belief, node.exists)
     options = candidates(space, problem.actions, node.scene, possible, node.options, node.moved)
     sample = sample_action(
@@ -403,14 +421,16 @@ def _step(problem, belief, space, config, push_model, node: _Node, key) -> tuple
     settings = _existence_config(problem, config)
     # What an action covers is not ruled out: a target there would be pushed along, not found to be elsewhere. So only
     # what it uncovers counts, and collisions (empty in these views) do not.
+    objects = _without_target(scene)
     views = object_views(
-        problem.existence, problem.camera, scene, jnp.zeros_like(node.exists), settings, node.views, moved
+        problem.existence, problem.camera, objects, jnp.zeros_like(node.exists), settings, node.views, moved
     )
     seen = existence(problem.existence, problem.camera, views, node.exists, settings)
     exists = jnp.where(acted, seen, node.exists)
     counts = _where_g_counts(belief, exists, config.method)
-    hits = grasp_hits(problem.grasps, belief.grasps, scene, counts, node.hits, moved)
+    hits = grasp_hits(problem.grasps, belief.grasps, objects, counts, node.hits, moved)
     action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
+    charge = config.caution * sample.risk * node.cost
     node = _Node(
         scene=scene,
         exists=exists,
@@ -422,14 +442,16 @@ def _step(problem, belief, space, config, push_model, node: _Node, key) -> tuple
         alive=acted,
         cost=_cost(problem, belief, exists, hits, config.method),
     )
-    return node, (action, node.cost)
+    return node, (action, node.cost, charge)
 
 
-def _prefix_values(cost_now: Array, cost: Float[Array, " m"], acted: Bool[Array, " m"], gamma: float):
-    """Equation 2 for every prefix of a sequence, and the best: its value and its length."""
+def _prefix_values(
+    cost_now: Array, cost: Float[Array, " m"], charge: Float[Array, " m"], acted: Bool[Array, " m"], gamma: float
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Equation 2 for every prefix of a sequence, with what its actions are charged: the best value, and its length."""
     before = jnp.concatenate([cost_now[None], cost[:-1]])
     discount = gamma ** jnp.arange(cost.shape[0], dtype=jnp.float32)
-    values = jnp.where(acted, jnp.cumsum(discount * (cost - before)), jnp.inf)
+    values = jnp.where(acted, jnp.cumsum(discount * (cost - before + charge)), jnp.inf)
     return jnp.min(values), jnp.argmin(values) + 1
 
 
@@ -457,12 +479,13 @@ def plan(
     """
     push_model = push_model or QuasiStatic()
     space = action_space(problem, config)
+    scene = _with_target(problem, belief, scene)
     root = _root(problem, belief, scene, space, config)
 
     def rollout(key):
         step = functools.partial(_step, problem, belief, space, config, push_model)
-        _, (actions, cost) = jax.lax.scan(step, root, jax.random.split(key, config.horizon))
-        value, length = _prefix_values(root.cost, cost, actions.kind != ActionKind.NONE, config.gamma)
+        _, (actions, cost, charge) = jax.lax.scan(step, root, jax.random.split(key, config.horizon))
+        value, length = _prefix_values(root.cost, cost, charge, actions.kind != ActionKind.NONE, config.gamma)
         return Sequences(actions, cost, value, length)
 
     sequences = jax.vmap(rollout)(jax.random.split(key, config.sequences))
