@@ -118,7 +118,6 @@ def _add_defaults(root: ElementTree.Element) -> None:
 def _add_shelf(world: ElementTree.Element, shelf: Shelf) -> None:
     for name, axis, value, normal in (
         ("board", 2, shelf.board, (0.0, 0.0, 1.0)),
-        ("ceiling", 2, shelf.ceiling, (0.0, 0.0, -1.0)),
         ("back", 0, shelf.back, (-1.0, 0.0, 0.0)),
         ("right", 1, shelf.right, (0.0, 1.0, 0.0)),
         ("left", 1, shelf.left, (0.0, -1.0, 0.0)),
@@ -136,7 +135,9 @@ def _add_shelf(world: ElementTree.Element, shelf: Shelf) -> None:
         )
     for name, (low, high) in shelf_boxes(shelf).items():
         centre, half = (high + low) / 2, (high - low) / 2
-        _element(world, "geom", class_="board", name=f"{name}_box", pos=_text(*centre), size=_text(*half))
+        # What is carried in front of the shelf may be higher than the upper board, which therefore is no plane.
+        meets = {"conaffinity": str(ROBOT_BIT | OBJECT_BIT)} if name == "ceiling" else {}
+        _element(world, "geom", class_="board", name=f"{name}_box", pos=_text(*centre), size=_text(*half), **meets)
 
 
 def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:

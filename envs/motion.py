@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.kinematics import HOME, line_poses, path_kinematics
+from mechsearch_jax.kinematics import line_poses, path_kinematics
 from mechsearch_jax.transforms import translate
 
 # Added to the turn between two waypoints, so that a stretch along which no joint turns has a length too [rad].
@@ -183,7 +183,7 @@ def push_reference(
 def retrieve_reference(
     T_world_gripper: Float[Array, "4 4"], q7: Float[Array, ""], opening: Float[Array, ""], config: MotionConfig
 ) -> tuple[Reference, Bool[Array, ""]]:
-    """A retrieval: approach with open fingers, close them, retreat, leave the shelf and go home; the hand stays closed.
+    """A retrieval: approach with open fingers, close them, retreat, leave the shelf; the hand stays closed.
 
     Args:
       T_world_gripper: pose of the gripper where it closes.
@@ -195,10 +195,7 @@ def retrieve_reference(
       The reference, and whether the arm reaches all of it.
     """
     q, reachable = _entries(T_world_gripper, q7, config)
-    home = q.shape[0]
-    held = (-config.squeeze, -config.squeeze)
-    stretches = (*_pick_stretches(opening, config), _Stretch(config.transfer_steps, home - 1, home, held))
-    return _schedule(jnp.concatenate([q[::-1], jnp.asarray(HOME)[None]]), stretches, config.timestep), reachable
+    return _schedule(q[::-1], _pick_stretches(opening, config), config.timestep), reachable
 
 
 def pick_and_place_reference(

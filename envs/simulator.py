@@ -184,7 +184,7 @@ class NativeSimulator:
         return self._finish(recorder, settled, None if kind is ActionKind.PUSH or held else "dropped")
 
     def retrieve(self, T_world_gripper: Array, q7: Array | float, opening: Array | float) -> Retrieval:
-        """Take the target out: approach, close the fingers, retreat, leave the shelf and go home with it.
+        """Take the target out: approach, close the fingers, retreat, and leave the shelf with it.
 
         Args:
           T_world_gripper: pose of the gripper where it closes, shape (4, 4).
