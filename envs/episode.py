@@ -233,8 +233,11 @@ def run_episode(
             graspable_step = index
 
         last = index == config.max_steps
+        trouble = _target_trouble(problem.shelf, world) if belief.found else None
+        if trouble is not None:
+            grasp = None
         decision = None
-        if grasp is None and not last:
+        if grasp is None and trouble is None and not last:
             with clock("plan"):
                 key = jax.random.fold_in(planner_key, index)
                 decision = jax.block_until_ready(planner.plan(key, problem, belief, seen.scene, config))
@@ -258,7 +261,7 @@ def run_episode(
         step = dataclasses.replace(record, failure=failure, timings=dict(clock.seconds))
         steps.append(step)
         watcher.acted(dataclasses.replace(moment, record=step, outcome=outcome))
-        failure = _end(problem, simulator, belief, step, retrieved, last)
+        failure = trouble or _end(belief, step, retrieved, last)
         if retrieved or failure is not None:
             break
         world = simulator.world or world
@@ -297,17 +300,13 @@ def _target_trouble(shelf: Shelf, world: World) -> str | None:
     return "the target fell over" if abs(rotation[2, 2]) < math.cos(MAX_TILT) else None
 
 
-def _end(problem: Problem, simulator: Simulator, belief: Belief, step: Step, retrieved: bool, last: bool) -> str | None:
+def _end(belief: Belief, step: Step, retrieved: bool, last: bool) -> str | None:
     """Why the episode ends here without a retrieval; None if it goes on, or ends with one."""
     if retrieved:
         return None
     # Trying the same grasp in the same world once more would not make it reachable.
-    if step.action is not None and step.action.kind == "retrieve" and step.failure == "retrieval: unreachable":
+    if step.failure == "retrieval: unreachable":
         return step.failure
-    if simulator.world is not None and belief.found:
-        trouble = _target_trouble(problem.shelf, simulator.world)
-        if trouble is not None:
-            return trouble
     if not last:
         return None
     return step.failure or ("found, but not graspable" if belief.found else "not found")

@@ -68,7 +68,7 @@ class Narrator:
 
     def ended(self, episode: Episode) -> None:
         """Say how it ended."""
-        self._console.print(f"\n[bold]{escape(verdict(episode))}[/bold]")
+        self._console.print(f"\n[bold]{escape(verdict(episode))}[/bold]", soft_wrap=True)
 
     def _sees(self, moment: Moment) -> None:
         shown = np.unique(np.asarray(moment.snapshot.observation.segmentation))
