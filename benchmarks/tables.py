@@ -14,10 +14,10 @@ from mechsearch_jax.results import Row, summarise
 
 def rates_table(rows: Sequence[Row]) -> Table:
     """Rates of success by method and number of objects, and mean times per action."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("method")
-    for name in ("objects", "episodes", "found", "graspable", "retrieved", "actions", "plan s", "simulate s"):
-        table.add_column(name, justify="right")
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    table.add_column("method", no_wrap=True)
+    for name in ("objects", "runs", "found", "graspable", "retrieved", "actions", "plan s", "act s"):
+        table.add_column(name, justify="right", no_wrap=True)
     for rates in summarise(rows):
         table.add_row(
             rates.method,
@@ -89,4 +89,5 @@ class EpisodeProgress:
         self._bar.update(self._task, completed=len(rows), total=max(self._total, len(rows)), description=rates)
         if not self._console.is_terminal:
             outcome = "retrieved" if row.retrieved else row.failure
-            self._console.print(f"{len(rows)}/{self._total} {row.scenario}: {outcome} ({row.steps} actions)  {rates}")
+            count = f"{len(rows)}/{self._total}"
+            self._console.print(f"{count} {row.scenario}: {outcome}, {row.steps} actions  ({rates})", soft_wrap=True)

@@ -264,7 +264,7 @@ class Row:
       target: "cylinder" or "box".
       method, recognition, gamma, horizon, sequences, actions, seed: the options it ran with.
       found_step, graspable_step, retrieved, failure: as in `Episode`.
-      steps: number of actions.
+      steps: number of actions, attempts to take the target out among them.
       planning_seconds, simulation_seconds: wall time in total [s].
     """
 
@@ -354,7 +354,7 @@ class Rates:
       objects: number of surrounding objects; None for all.
       episodes: how many episodes.
       found, graspable, retrieved: shares of them.
-      steps: mean number of actions.
+      steps: mean number of actions, attempts to take the target out among them.
       planning_seconds, simulation_seconds: mean wall time per action [s].
     """
 

@@ -153,7 +153,7 @@ def draw_map(axes: Axes, image: Float[np.ndarray, "rows columns 4"], shelf: Shel
     axes.set_aspect("equal")
 
 
-def draw_objects(axes: Axes, scene: Superquadrics, labels: bool = True) -> None:
+def draw_objects(axes: Axes, scene: Superquadrics) -> None:
     """The objects as outlines with their numbers."""
     for i, outline in enumerate(outlines(scene)):
         if outline is None:
@@ -163,9 +163,8 @@ def draw_objects(axes: Axes, scene: Superquadrics, labels: bool = True) -> None:
                 outline[:, ::-1], closed=True, facecolor=(*rgb(OBJECT), 0.22), edgecolor=OBJECT, lw=1.3, zorder=3
             )
         )
-        if labels:
-            x, y = np.asarray(scene.position)[i, :2]
-            _number(axes, (y, x), i)
+        x, y, _ = np.asarray(scene.position)[i].tolist()
+        _number(axes, (y, x), i)
 
 
 def _number(axes: Axes, place: tuple[float, float], index: int) -> None:
@@ -274,9 +273,9 @@ def view_window(camera: Camera, shelf: Shelf) -> tuple[int, int, int, int]:
         ]
     )
     pixels = _pixels(camera, corners)
-    low = np.clip(np.floor(pixels.min(axis=0)) - 10, 0, None).astype(int)
-    high = np.clip(np.ceil(pixels.max(axis=0)) + 10, None, (camera.width, camera.height)).astype(int)
-    return low[0], high[0], low[1], high[1]
+    low = np.clip(np.floor(pixels.min(axis=0)) - 10, 0, None)
+    high = np.clip(np.ceil(pixels.max(axis=0)) + 10, None, (camera.width, camera.height))
+    return int(low[0]), int(high[0]), int(low[1]), int(high[1])
 
 
 def draw_view(axes: Axes, image: UInt8[np.ndarray, "h w 3"], camera: Camera, shelf: Shelf) -> None:

@@ -1,0 +1,191 @@
+"""Pictures: what is drawn where, and that drawing leaves no trace outside the figure."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from matplotlib.patches import Circle, FancyArrowPatch, Polygon
+
+from mechsearch_jax import scenario as scenarios
+from mechsearch_jax import superquadric
+from mechsearch_jax.actions import ActionKind, no_action
+from mechsearch_jax.camera import Camera
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.results import Maps
+from mechsearch_jax.scenario import Body
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.target import Target
+from mechsearch_jax.viz import drawing
+from mechsearch_jax.viz.filmstrip import Frame, filmstrip
+from mechsearch_jax.viz.maps import maps_figure
+
+CAMERA, SHELF = Camera(), Shelf()
+TURNED = (np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8))
+ON_ITS_SIDE = (np.cos(np.pi / 4), np.sin(np.pi / 4), 0.0, 0.0)
+BODIES = (
+    Body("box", (0.05, 0.02, 0.06), (0.6, 0.1, 0.4645), TURNED),
+    Body("cylinder", (0.03, 0.03, 0.06), (0.55, -0.1, 0.4645), (1.0, 0.0, 0.0, 0.0)),
+    Body("cylinder", (0.03, 0.03, 0.1), (0.65, 0.3, 0.4345), ON_ITS_SIDE),
+)
+SCENE = scenarios.superquadrics(BODIES)
+RIGHT = np.array([[0, 0, 1, 0.55], [0, -1, 0, -0.1], [1, 0, 0, 0.46], [0, 0, 0, 1]], np.float32)
+PLACE = RIGHT + np.array([[0, 0, 0, 0.1], [0, 0, 0, 0.2], [0, 0, 0, 0], [0, 0, 0, 0]], np.float32)
+PUSH = no_action().replace(
+    kind=jnp.int32(ActionKind.PUSH),
+    object=jnp.int32(0),
+    T_world_gripper=jnp.asarray(RIGHT),
+    displacement=jnp.array([0.0, 0.1, 0.0]),
+)
+PICK = no_action().replace(
+    kind=jnp.int32(ActionKind.PICK_AND_PLACE),
+    object=jnp.int32(1),
+    T_world_gripper=jnp.asarray(RIGHT),
+    T_world_place=jnp.asarray(PLACE),
+)
+
+
+def frame(target, **changes):
+    poses = target.candidate_poses(SHELF)
+    image = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    fields = {
+        "title": "1  push",
+        "caption": "why",
+        "image": image,
+        "owner": np.full(image.shape[:2], -1, np.int8),
+        "scene": SCENE,
+        "existence": poses[:, 1] > 0.2,
+        "graspability": np.arange(len(poses)) % 12 - 10,
+        "target_pose": np.array([0.7, 0.1, 0.0], np.float32),
+        "found": False,
+        "action": PUSH,
+        "retrieval": None,
+    }
+    return Frame(**{**fields, **changes})
+
+
+def axes_of(figure):
+    return [axes for axes in figure.axes if not axes.get_images() or axes.get_images()[0].get_array().shape[-1] == 4]
+
+
+def test_outlines_are_the_bodies_seen_from_above():
+    box, round_one, lying, *absent = drawing.outlines(SCENE)
+    assert absent == [None] * (SCENE.capacity - 3)
+    for side, direction in ((0.1, (1, 1)), (0.04, (1, -1))):
+        assert np.ptp(box @ direction) / np.sqrt(2) == pytest.approx(side, abs=1e-3)
+    radius = np.linalg.norm(round_one - np.array(BODIES[1].position[:2]), axis=1)
+    np.testing.assert_allclose(radius, 0.03, atol=1e-3)
+    np.testing.assert_allclose(np.ptp(lying, axis=0), [0.06, 0.2], atol=2e-3)
+
+
+def test_a_placed_object_moves_with_the_gripper():
+    after = drawing.placed_scene(SCENE, PICK)
+    np.testing.assert_allclose(after.position[1], np.add(BODIES[1].position, (0.1, 0.2, 0.0)), atol=1e-6)
+    np.testing.assert_array_equal(after.position[0], np.asarray(SCENE.position[0], float))
+
+
+@pytest.mark.parametrize("target", [Target.cylinder(), Target.box()], ids=["cylinder", "box"])
+def test_a_map_puts_every_pose_where_it_is(target):
+    rows, columns = target.grid
+    shown = np.zeros(rows * columns * target.yaws, bool)
+    index = np.ravel_multi_index((3, 7, 0), (rows, columns, target.yaws))
+    shown[index] = True
+    image = drawing.map_image(shown, np.ones(len(shown), int), target, 8)
+    assert image.shape == (rows, columns, 4)
+    assert np.argwhere(image[..., 3] > 0).tolist() == [[3, 7]]
+    np.testing.assert_allclose(image[3, 7, :3], drawing.rgb(drawing.GRASPABLE))
+
+
+def test_a_map_shows_the_best_of_the_possible_yaw_angles():
+    target = Target.box()
+    shape = (*target.grid, target.yaws)
+    shown, g = np.zeros(shape, bool), np.full(shape, 1)
+    shown[0, 0, :2] = True
+    g[0, 0, :2] = (-1, 0)
+    image = drawing.map_image(shown.reshape(-1), g.reshape(-1), target, 8)
+    np.testing.assert_allclose(image[0, 0, :3], drawing.rgb(drawing.BLOCKED[0]))
+    assert image[0, 0, 3] < 0.9
+
+
+def test_every_value_of_g_has_one_colour():
+    bands = drawing.bands(8)
+    for g in range(-30, 2):
+        assert sum(band.low <= g <= band.high for band in bands) == 1
+    assert next(band.label for band in bands if band.low <= -8 <= band.high) == "out of reach"
+
+
+def test_the_window_holds_the_shelf():
+    left, right, top, bottom = drawing.view_window(CAMERA, SHELF)
+    assert 0 <= left < right <= CAMERA.width
+    assert 0 <= top < bottom <= CAMERA.height
+
+
+@pytest.mark.parametrize(("action", "arrows"), [(PUSH, 1), (PICK, 1), (no_action(), 0), (None, 0)])
+def test_an_action_is_drawn_into_both_pictures(action, arrows):
+    figure = filmstrip([frame(Target.cylinder(), action=action)], CAMERA, SHELF, Target.cylinder(), "one")
+    for axes in figure.axes:
+        assert sum(isinstance(p, FancyArrowPatch) for p in axes.patches) == arrows
+
+
+def test_a_push_points_where_the_gripper_goes():
+    figure = filmstrip([frame(Target.cylinder())], CAMERA, SHELF, Target.cylinder(), "one")
+    above = figure.axes[1]
+    start, end = next(p for p in above.patches if isinstance(p, FancyArrowPatch))._posA_posB
+    np.testing.assert_allclose(start, RIGHT[[1, 0], 3], atol=1e-6)
+    np.testing.assert_allclose(end, RIGHT[[1, 0], 3] + [0.1, 0.0], atol=1e-6)
+    assert above.get_xlim()[0] > above.get_xlim()[1]
+
+
+def test_objects_and_target_are_outlined():
+    hidden = filmstrip([frame(Target.cylinder())], CAMERA, SHELF, Target.cylinder(), "one").axes[1]
+    assert sum(isinstance(p, Polygon) for p in hidden.patches) == 3
+    circle = next(p for p in hidden.patches if isinstance(p, Circle))
+    assert circle.center == (pytest.approx(0.1), pytest.approx(0.7))
+    assert circle.get_facecolor()[3] == 0
+    found = filmstrip([frame(Target.cylinder(), found=True)], CAMERA, SHELF, Target.cylinder(), "one").axes[1]
+    assert next(p for p in found.patches if isinstance(p, Circle)).get_facecolor()[3] == 1
+
+
+def test_a_long_episode_is_broken_into_lines(tmp_path):
+    frames = [frame(Target.box(), retrieval=RIGHT if i == 5 else None) for i in range(6)]
+    figure = filmstrip(frames, CAMERA, SHELF, Target.box(), "six")
+    assert len(figure.axes) == 12
+    drawing.save_figure(figure, tmp_path / "strip.png", dpi=40)
+    picture = imread(tmp_path / "strip.png")
+    assert picture.shape[0] == pytest.approx(40 * figure.get_figheight(), abs=1)
+    assert picture[..., :3].std() > 0.05
+    assert [p.name for p in tmp_path.iterdir()] == ["strip.png"]
+
+
+def test_maps_become_a_picture(tmp_path):
+    one = frame(Target.cylinder())
+    maps = Maps(Target.cylinder().candidate_poses(SHELF), one.existence, one.graspability, SCENE)
+    figure = maps_figure(
+        maps, one.image, one.owner, one.target_pose, CAMERA, SHELF, Target.cylinder(), heading="two things"
+    )
+    drawing.save_figure(figure, tmp_path / "maps.png", dpi=40)
+    assert imread(tmp_path / "maps.png").shape[1] > 400
+
+
+def test_an_empty_scene_can_be_drawn(tmp_path):
+    nothing = superquadric.empty(8)
+    one = frame(Target.cylinder(), scene=nothing, action=None, existence=np.zeros(792, bool))
+    drawing.save_figure(filmstrip([one], CAMERA, SHELF, Target.cylinder(), "none"), tmp_path / "none.png", dpi=40)
+    maps = Maps(Target.cylinder().candidate_poses(SHELF), one.existence, one.graspability, nothing)
+    maps_figure(maps, one.image, one.owner, one.target_pose, CAMERA, SHELF, Target.cylinder(), heading="none")
+
+
+def test_drawing_changes_nothing_global():
+    before = dict(mpl.rcParams)
+    filmstrip([frame(Target.cylinder())], CAMERA, SHELF, Target.cylinder(), "one")
+    assert dict(mpl.rcParams) == before
+    assert dataclasses.is_dataclass(Frame)
+
+
+def test_a_picture_that_cannot_be_written_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    figure = filmstrip([frame(Target.cylinder())], CAMERA, SHELF, Target.cylinder(), "one")
+    with pytest.raises(InputError, match="cannot be written"):
+        drawing.save_figure(figure, tmp_path / "file" / "strip.png")
