@@ -62,7 +62,7 @@ HAND_INERTIA = (0.73, (-0.01, 0.0, 0.03), (0.001, 0.0025, 0.0017, 0.0, 0.0, 0.0)
 FINGER_INERTIA = (0.015, (0.0, 0.0, 0.0), (2.375e-6, 2.375e-6, 7.5e-7, 0.0, 0.0, 0.0))
 
 
-def _text(*numbers: float) -> str:
+def _text(*numbers: float | np.floating) -> str:
     return " ".join(f"{float(n):.9g}" for n in numbers)
 
 

@@ -235,8 +235,8 @@ class NativeSimulator:
 
     def _follow(self, reference: Reference, recorder: _Recorder, body: int) -> bool:
         """Run a reference; whether a body kept its place in the hand from when it closed to when it is to open."""
-        start = np.asarray(reference.start)
-        self._set_robot(start[:ARM], start[ARM])
+        start = np.asarray(reference.start, float)
+        self._set_robot(start[:ARM], float(start[ARM]))
         states = self._run(controls(reference), recorder)
         plan = self.config.motion
         if len(states) < plan.release_step:
@@ -276,10 +276,10 @@ class NativeSimulator:
         self._set_robot(HOME, 0.0)
 
     def _holds(self, body: int) -> bool:
-        """Whether both fingers touch a body."""
+        """Whether both fingers press on a body."""
         mujoco.mj_forward(self._model, self._data)
         owner = self._model.geom_bodyid
-        touching = {(owner[c.geom1], owner[c.geom2]) for c in self._data.contact if c.dist < 0}
+        touching = {(owner[c.geom1], owner[c.geom2]) for c in self._data.contact if c.efc_address >= 0}
         held = self._model.body(f"body{body}").id
         fingers = (self._model.body(f"{side}_finger").id for side in ("left", "right"))
         return all((f, held) in touching or (held, f) in touching for f in fingers)
