@@ -179,7 +179,7 @@ class ScenarioGenerator:
 
     def _target_at(self, pose: np.ndarray) -> Body:
         x, y, yaw = (float(p) for p in pose)
-        turn = (float(np.cos(yaw / 2)), 0.0, 0.0, float(np.sin(yaw / 2)))
+        turn = (round(float(np.cos(yaw / 2)), 9), 0.0, 0.0, round(float(np.sin(yaw / 2)), 9))
         height = self.target.height(self._shelf)
         return Body(self.target.shape, self.target.half_size, (round(x, 6), round(y, 6), round(height, 6)), turn)
 
