@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +37,7 @@ MAX_TILT = math.radians(15)
 BOX_YAWS = 6
 
 
+@runtime_checkable
 class Simulator(Protocol):
     """What an episode needs of a simulator; `NativeSimulator` is one."""
 
@@ -88,6 +89,7 @@ class Recognition:
     target_pose: Float[Array, " 3"]
 
 
+@runtime_checkable
 class Recogniser(Protocol):
     """Turns what the camera sees into what the planner plans with."""
 
@@ -144,6 +146,7 @@ class Moment:
     outcome: Outcome | Retrieval | None
 
 
+@runtime_checkable
 class Watcher(Protocol):
     """Looks on while an episode runs."""
 

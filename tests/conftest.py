@@ -9,9 +9,18 @@ import jaxtyping
 jaxtyping.install_import_hook("mechsearch_jax", "runtime_checks.check")
 
 import jax  # noqa: E402
+import pytest  # noqa: E402
 
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or os.path.join(tempfile.gettempdir(), "mechsearch-jax-tests")
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+@pytest.fixture(scope="session")
+def problem():
+    """The default problem: the paper's shelf, camera and gripper, and the cylinder as the target."""
+    from mechsearch_jax import planner
+
+    return planner.build_problem()

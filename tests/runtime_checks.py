@@ -1,5 +1,7 @@
 """The checker that the tests put around every annotated function of the package."""
 
+import typing
+
 from beartype import beartype
 
 
@@ -9,4 +11,10 @@ def check(function):
     Constructors stay unchecked: JAX rebuilds pytrees with whatever stands for their leaves (None, shapes, axes), and
     configurations refuse bad values themselves, with a message of their own.
     """
-    return function if function.__name__ == "__init__" else beartype(function)
+    if function.__name__ == "__init__":
+        return function
+    for hint in function.__annotations__.values():
+        for part in (hint, *typing.get_args(hint)):
+            if getattr(part, "_is_protocol", False):
+                typing.runtime_checkable(part)
+    return beartype(function)

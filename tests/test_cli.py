@@ -1,0 +1,163 @@
+"""The command line, mostly from outside the checkout: what it does, and how it refuses what is wrong."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from mechsearch_jax import cli, results
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.scenario import Body, Scenario, example_scenarios, format_scenario, load_scenario, save_scenario
+
+SCENE = Scenario(
+    name="one-box",
+    objects=(Body("box", (0.048, 0.028, 0.08), (0.5, 0.135, 0.4845), (1.0, 0.0, 0.0, 0.0)),),
+    target=Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0)),
+)
+
+
+def mechsearch(folder, *arguments):
+    """Run the program as a user would, in a folder that has nothing to do with the checkout."""
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    environment["JAX_COMPILATION_CACHE_DIR"] = str(cache())
+    program = (sys.executable, "-m", "mechsearch_jax.cli")
+    return subprocess.run(
+        [*program, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=600
+    )
+
+
+def cache():
+    import jax
+
+    return jax.config.jax_compilation_cache_dir
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with a good scenario, several bad ones, and output of an earlier run."""
+    save_scenario(SCENE, tmp_path / "good.json")
+    (tmp_path / "broken.json").write_text("{")
+    value = json.loads(format_scenario(SCENE))
+    value["objects"][0]["half_size"][1] = -0.02
+    (tmp_path / "negative.json").write_text(json.dumps(value))
+    for name in ("episode.json", "filmstrip.png", "one-box.npz", "rows.parquet"):
+        (tmp_path / "out" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "out" / name).write_text("from before")
+    (tmp_path / "empty").mkdir()
+    return tmp_path
+
+
+WRONG = {
+    "no command": ([], "Expected one of"),
+    "unknown command": (["sweep"], "sweep"),
+    "unknown option": (["search", "good.json", "--out", "out", "--speed", "3"], "--speed"),
+    "unknown choice": (["search", "good.json", "--out", "out", "--actions", "fly"], "'fly'"),
+    "no number": (["search", "good.json", "--out", "out", "--gamma", "high"], "--gamma"),
+    "impossible gamma": (["search", "good.json", "--out", "out", "--gamma", "1.5"], "gamma 1.5 is outside (0, 1]"),
+    "impossible horizon": (["inspect", "good.json", "--out", "out", "--horizon", "0"], "horizon 0 must be at least 1"),
+    "no output": (["search", "good.json"], "--out"),
+    "nothing to search": (["search", "--out", "out"], "either a scenario or --objects"),
+    "both to search": (["search", "good.json", "--objects", "3", "--out", "out"], "either a scenario or --objects"),
+    "target of a file": (["search", "good.json", "--target", "box", "--out", "out"], "--target is for a generated"),
+    "too many objects": (["search", "--objects", "9", "--out", "out"], "9 is not between 1 and 8"),
+    "negative seed": (["search", "--objects", "2", "--seed", "-1", "--out", "out"], "-1"),
+    "missing file": (["search", "none.json", "--out", "out"], "none.json: there is no such file"),
+    "malformed file": (["search", "broken.json", "--out", "out"], "broken.json: is not JSON"),
+    "bad size": (["search", "negative.json", "--out", "out"], "negative.json: objects[0].half_size"),
+    "bad among good": (["inspect", "good.json", "negative.json", "--out", "out"], "negative.json: objects[0]"),
+    "nothing to inspect": (["inspect", "--out", "out"], "no scenario is given"),
+    "empty folder": (["inspect", "empty", "--out", "out"], "empty: there are no scenario files"),
+    "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new.parquet"], "'one-box'"),
+    "no table": (["evaluate", "good.json", "--out", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
+    "no worker": (["evaluate", "good.json", "--out", "new.parquet", "--workers", "0"], "--workers 0"),
+    "no table to report": (["report", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
+    "no scenarios": (["scenarios", "generate", "--objects", "2", "--count", "0", "--out", "new"], "--count 0"),
+    "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
+    "no repeats": (["bench", "plan", "--repeats", "0"], "--repeats 0"),
+    "file for a folder": (["search", "good.json", "--out", "good.json"], "good.json: cannot be written to"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG.values(), ids=WRONG)
+def test_what_is_wrong_is_one_line_and_changes_nothing(folder, monkeypatch, capsys, arguments, message):
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["mechsearch", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    complaint = capsys.readouterr().err
+    assert end.value.code == 2
+    assert message in complaint
+    assert complaint.endswith("\n")
+    assert complaint.count("\n") == 1
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("kind", ["unknown choice", "bad size", "missing file"])
+def test_the_program_says_it_too_outside_the_checkout(folder, kind):
+    arguments, message = WRONG[kind]
+    answer = mechsearch(folder, *arguments)
+    assert answer.returncode == 2
+    assert answer.stdout == ""
+    assert message in answer.stderr
+    assert answer.stderr.count("\n") == 1
+    assert "Traceback" not in answer.stderr
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["search", "--help"], ["scenarios", "--help"], ["bench", "--help"]])
+def test_help_is_no_mistake(capsys, arguments):
+    with pytest.raises(SystemExit) as end:
+        cli.parse(arguments)
+    assert not end.value.code
+    assert "usage: mechsearch" in capsys.readouterr().out
+
+
+def test_a_scenario_is_found_by_file_by_folder_and_by_name(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    name, shipped = next(iter(example_scenarios().items()))
+    assert cli.find_scenario("good.json").name == "good.json"
+    assert cli.find_scenario(name) == shipped
+    assert [file.name for file in cli.find_scenarios([".", name])] == [
+        "broken.json", "good.json", "negative.json", shipped.name,
+    ]  # fmt: skip
+    with pytest.raises(InputError, match=name):
+        cli.find_scenario("none")
+
+
+def test_checking_names_the_bad_and_lists_the_good(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    with pytest.raises(SystemExit) as end:
+        cli.parse(["scenarios", "check", "."])()
+    assert end.value.code == 2
+    printed = capsys.readouterr()
+    assert "good.json: 1 objects, target cylinder" in printed.out
+    assert printed.err.count("\n") == 2
+
+
+def test_inspecting_writes_maps_and_a_picture(folder):
+    answer = mechsearch(folder, "inspect", "good.json", "--out", "maps")
+    assert answer.returncode == 0, answer.stderr
+    maps = results.load_maps(folder / "maps" / "one-box.npz")
+    assert maps.poses.shape == (792, 3)
+    assert 0 < maps.existence.sum() < 792
+    assert maps.graspability.max() == 1
+    nearest = np.argmin(np.linalg.norm(maps.poses[:, :2] - SCENE.target.position[:2], axis=1))
+    assert maps.existence[nearest]
+    assert (folder / "maps" / "one-box.png").stat().st_size > 10_000
+    assert sorted(path.name for path in (folder / "maps").iterdir()) == ["one-box.npz", "one-box.png"]
+
+
+def test_generated_scenarios_are_good_and_reproducible(folder):
+    for out in ("a", "b"):
+        answer = mechsearch(
+            folder, "scenarios", "generate", "--objects", "3", "--count", "2", "--seed", "5", "--out", out
+        )
+        assert answer.returncode == 0, answer.stderr
+    names = sorted(path.name for path in (folder / "a").iterdir())
+    assert len(names) == 2
+    for name in names:
+        assert len(load_scenario(folder / "a" / name).objects) == 3
+        assert (folder / "a" / name).read_bytes() == (folder / "b" / name).read_bytes()

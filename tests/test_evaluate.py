@@ -1,0 +1,130 @@
+"""Many episodes: rows as they end, none missing or double, whatever is killed; and failures that are rows."""
+
+import dataclasses
+import io
+import json
+import sys
+
+import pytest
+from rich.console import Console
+
+from mechsearch_jax import results
+from mechsearch_jax.benchmarks import tables
+from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
+from mechsearch_jax.benchmarks.worker import parse_config
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.scenario import Body, Scenario, save_scenario
+
+TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
+
+# Stands in for the real worker: says what a scenario's name asks for.
+FAKE = """
+import json, os, pathlib, sys
+for line in sys.stdin:
+    job = json.loads(line)
+    name = json.loads(pathlib.Path(job["path"]).read_text())["name"]
+    with open(os.environ["LOG"], "a") as log:
+        log.write(name + "\\n")
+    if name == "crash":
+        os._exit(3)
+    config = job["config"]
+    row = dict(scenario=name, objects=0, target="cylinder", method=config["method"], recognition="oracle",
+               gamma=config["gamma"], horizon=config["horizon"], sequences=config["sequences"],
+               actions=config["actions"], seed=job["seed"], found_step=1, graspable_step=2, retrieved=True, steps=3,
+               failure=None, planning_seconds=1.0, simulation_seconds=0.5)
+    print(json.dumps({"error": "ValueError: no"} if name == "raise" else {"row": row}), flush=True)
+"""
+
+
+@pytest.fixture
+def files(tmp_path):
+    names = ("one", "two", "crash", "raise", "three")
+    for name in names:
+        save_scenario(Scenario(name, (), TARGET), tmp_path / f"{name}.json")
+    return [tmp_path / f"{name}.json" for name in names]
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch):
+    monkeypatch.setenv("LOG", str(tmp_path / "log"))
+    return (sys.executable, "-c", FAKE)
+
+
+def ran(tmp_path):
+    return sorted((tmp_path / "log").read_text().split())
+
+
+def test_all_combinations_become_rows(tmp_path, files, command):
+    configs = [PlannerConfig(), PlannerConfig(method="search-and-grasp")]
+    jobs = make_jobs([files[0], files[1]], configs, (0, 1))
+    rows = evaluate(jobs, tmp_path / "rows.parquet", workers=2, command=command)
+    assert len(rows) == len({results.identity(row) for row in rows}) == 8
+    assert sorted(map(results.identity, results.read_rows(tmp_path / "rows.parquet"))) == sorted(
+        map(results.identity, rows)
+    )
+
+
+def test_failures_are_rows_with_their_reason_and_do_not_end_the_run(tmp_path, files, command):
+    rows = evaluate(make_jobs(files, [PlannerConfig()], (0,)), tmp_path / "rows.parquet", workers=1, command=command)
+    reasons = {row.scenario: row.failure for row in rows}
+    assert reasons == {
+        "one": None,
+        "two": None,
+        "crash": "error: the worker process ended with status 3",
+        "raise": "error: ValueError: no",
+        "three": None,
+    }
+
+
+def test_a_stopped_run_goes_on_where_it_was(tmp_path, files, command):
+    out = tmp_path / "rows.parquet"
+    jobs = make_jobs(files, [PlannerConfig()], (0,))
+
+    def stop(row, rows):
+        if len(rows) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(jobs, out, workers=1, ended=stop, command=command)
+    first = results.read_rows(out)
+    assert len(first) == 2
+    rows = evaluate(jobs, out, workers=1, command=command)
+    assert [row.scenario for row in rows] == ["one", "two", "crash", "raise", "three"]
+    assert results.read_rows(out)[:2] == first
+    (tmp_path / "log").write_text("")
+    assert evaluate(jobs, out, workers=1, command=command) == rows
+    assert ran(tmp_path) == []
+
+
+def test_rows_of_other_options_stay(tmp_path, files, command):
+    out = tmp_path / "rows.parquet"
+    for gamma in (0.9, 0.5):
+        rows = evaluate(make_jobs(files[:1], [PlannerConfig(gamma=gamma)], (0,)), out, workers=1, command=command)
+        assert [row.gamma for row in rows] == [gamma]
+    assert sorted(row.gamma for row in results.read_rows(out)) == [0.5, 0.9]
+
+
+def test_another_table_is_not_overwritten(tmp_path, files, command):
+    (tmp_path / "rows.parquet").write_text("mine")
+    with pytest.raises(InputError):
+        evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), tmp_path / "rows.parquet", 1, command=command)
+    assert (tmp_path / "rows.parquet").read_text() == "mine"
+
+
+def test_a_configuration_survives_the_way_to_the_worker():
+    config = PlannerConfig(gamma=0.7, push_distances=(0.05, 0.2))
+    assert parse_config(json.loads(json.dumps(dataclasses.asdict(config)))) == config
+
+
+def test_progress_and_rates_are_shown(tmp_path, files, command):
+    screen = io.StringIO()
+    console = Console(file=screen, width=100)
+    with tables.EpisodeProgress(console, 3) as progress:
+        jobs = make_jobs([files[0], files[1], files[3]], [PlannerConfig()], (0,))
+        rows = evaluate(jobs, tmp_path / "rows.parquet", workers=1, ended=progress.ended, command=command)
+    console.print(tables.rates_table(rows))
+    text = screen.getvalue()
+    assert "3/3 raise: error: ValueError: no" in text
+    everything = next(line for line in text.splitlines() if " all " in line)
+    assert everything.split()[:6] == ["search-for-grasp", "all", "3", "0.67", "0.67", "0.67"]
