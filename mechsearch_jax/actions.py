@@ -96,6 +96,7 @@ class ActionConfig:
         (0.4 to 0.6) would topple the object instead of letting it slide.
       push_gap: distance between gripper and object where a push starts [m].
       push_depths: how far the finger tips reach past the object's front, or past its centre, in a push [m].
+      grasp_tilts: angles by which the grasping gripper points downwards [rad].
       grasp_yaws: number of approach directions for round objects, and of places to grasp on a box.
       grasp_depth: how far the finger tips reach past the front of a deep object [m].
       placements: how many places are tried for a picked object, and how many of those are tested for collision.
@@ -114,6 +115,7 @@ class ActionConfig:
     push_leverage: float = 1.5
     push_gap: float = 0.01
     push_depths: tuple[float, float] = (0.02, 0.02)
+    grasp_tilts: tuple[float, ...] = (math.radians(20), math.radians(30))
     grasp_yaws: int = 6
     grasp_depth: float = 0.035
     placements: tuple[int, int] = (32, 4)
@@ -254,11 +256,11 @@ def _wrap(angle):
     return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
 
 
-def _grasp_variants(config: ActionConfig, tilts: tuple[float, ...], wrists: int):
+def _grasp_variants(config: ActionConfig, wrists: int):
     """Slot, tilt and wrist of each candidate grasp of an object."""
-    grid = np.meshgrid(np.arange(config.grasp_yaws), np.arange(len(tilts)), np.arange(wrists), indexing="ij")
+    grid = np.meshgrid(np.arange(config.grasp_yaws), np.arange(len(config.grasp_tilts)), np.arange(wrists), indexing="ij")
     slot, tilt, wrist = (g.reshape(-1) for g in grid)
-    return slot, np.float32(tilts)[tilt], wrist
+    return slot, np.float32(config.grasp_tilts)[tilt], wrist
 
 
 def object_grasps(
@@ -267,7 +269,6 @@ def object_grasps(
     prints: Footprints,
     config: ActionConfig,
     max_yaw: float,
-    tilts: tuple[float, ...],
     wrists: int,
 ) -> tuple[Float[Array, "n a 4 4"], Bool[Array, "n a"]]:
     """Side grasps of objects that stand or lie on the board.
@@ -278,7 +279,7 @@ def object_grasps(
     Returns:
       Gripper poses in the world, and whether the object is thin enough to be grasped so.
     """
-    slot, tilt, _ = _grasp_variants(config, tilts, wrists)
+    slot, tilt, _ = _grasp_variants(config, wrists)
     n, a = prints.yaw.shape[0], len(slot)
     count = config.grasp_yaws
     spread = np.linspace(-max_yaw, max_yaw, count) if count > 1 else np.zeros(1)
@@ -387,7 +388,7 @@ class ActionSpace:
 
     Attributes:
       shelf, gripper, config: as elsewhere.
-      max_yaw, tilts: of grasps, as in `graspability.GraspConfig`.
+      max_yaw: of grasps, as in `graspability.GraspConfig`.
       waypoints: poses at which an approach has to be reachable.
     """
 
@@ -395,7 +396,6 @@ class ActionSpace:
     gripper: Gripper
     config: ActionConfig
     max_yaw: float
-    tilts: tuple[float, ...]
     waypoints: int
 
 
@@ -507,9 +507,9 @@ def candidates(
     others = scene.valid[:, None] & scene.valid[None, :]
     clouds = _object_cloud(scene, config.object_points)
 
-    grasp, fits = object_grasps(space.shelf, space.gripper, prints, config, space.max_yaw, space.tilts, wrists)
+    grasp, fits = object_grasps(space.shelf, space.gripper, prints, config, space.max_yaw, wrists)
     a = grasp.shape[1]
-    wrist = np.tile(_grasp_variants(config, space.tilts, wrists)[2], n)
+    wrist = np.tile(_grasp_variants(config, wrists)[2], n)
     owner = np.repeat(np.arange(n), a)
     flat = grasp.reshape(-1, 4, 4)
     new = (fits & fresh[:, None]).reshape(-1) & (config.kinds != "push")
@@ -733,7 +733,7 @@ def sample_action(
     is_grasp = row < n
     index = row % n
 
-    grasp_wrist = jnp.asarray(_grasp_variants(config, space.tilts, wrists)[2])
+    grasp_wrist = jnp.asarray(_grasp_variants(config, wrists)[2])
     side, push_wrist = (jnp.asarray(v) for v in push_variants(wrists))
     grasp = jnp.clip(way, 0, a - 1)
     push, distance = jnp.clip(way, 0, b * d - 1) // d, jnp.clip(way, 0, b * d - 1) % d

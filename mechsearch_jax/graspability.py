@@ -39,8 +39,8 @@ class GraspConfig:
       yaws: number of approach directions seen from above, for round objects; boxes are grasped square to their faces.
       max_yaw: largest angle between the approach and +x, seen from above [rad].
       tilts: angles by which the gripper points downwards [rad].
-      wrists: angles of joint 7 relative to 45 degrees [rad]; each holds link 6 elsewhere beside the hand. The three
-        defaults together reach 97% of what any angle reaches.
+      wrists: angles of joint 7 relative to 45 degrees [rad]; each holds link 6 elsewhere beside the hand.
+      height: how far above the target's centre it is grasped [m]: higher grasps keep the wrist clear of the board.
       points: points on the swept gripper.
       target_points: points on the swept target.
       waypoints: poses on an approach at which inverse kinematics must succeed.
@@ -49,8 +49,9 @@ class GraspConfig:
 
     yaws: int = 7
     max_yaw: float = math.radians(45)
-    tilts: tuple[float, ...] = (math.radians(20), math.radians(30))
-    wrists: tuple[float, ...] = (math.radians(-60), math.radians(15), math.radians(60))
+    tilts: tuple[float, ...] = (math.radians(20), math.radians(25), math.radians(30))
+    wrists: tuple[float, ...] = (math.radians(-60), 0.0, math.radians(60))
+    height: float = 0.025
     points: int = 2048
     target_points: int = 512
     waypoints: int = 4
@@ -116,7 +117,8 @@ def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):
         )
     grasps = np.stack(np.meshgrid(yaws, config.tilts, np.arange(len(config.wrists)), indexing="ij"), -1).reshape(-1, 3)
     yaw, tilt, wrist = jnp.float32(grasps[:, 0]), jnp.float32(grasps[:, 1]), grasps[:, 2].astype(int)
-    T = make(gripper_rotation(yaw, tilt), jnp.zeros((len(grasps), 3)))
+    height = min(config.height, 0.6 * target.half_size[2])
+    T = make(gripper_rotation(yaw, tilt), jnp.broadcast_to(jnp.float32([0.0, 0.0, height]), (len(grasps), 3)))
     return T, yaw, wrist
 
 

@@ -370,7 +370,6 @@ def action_space(problem: Problem, config: PlannerConfig) -> ActionSpace:
         gripper=problem.gripper,
         config=dataclasses.replace(problem.action_config, **changes),
         max_yaw=problem.grasp_config.max_yaw,
-        tilts=problem.grasp_config.tilts,
         waypoints=problem.grasp_config.waypoints,
     )
 
