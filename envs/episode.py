@@ -213,11 +213,11 @@ def run_episode(
     world = simulator.reset(scenario)
     belief = planner.initial_belief(problem)
     steps: list[Step] = []
-    found_step = graspable_step = None
-    failure: str | None = None
+    found_step = graspable_step = failure = None
     retrieved = False
 
     for index in range(config.max_steps + 1):
+        last = index == config.max_steps
         clock = _Stopwatch(watcher.busy)
         snapshot = Snapshot(problem.camera, problem.shelf, world)
         with clock("recognise"):
@@ -227,44 +227,36 @@ def run_episode(
             found = jnp.asarray(seen.found)
             belief = planner.observe_belief(problem, belief, seen.scene, found, seen.target_pose, config)
             jax.block_until_ready(belief)
-        with clock("grasp"):
-            grasp = _grasp(problem, seen.scene, belief.found_pose) if belief.found else None
-        graspable = bool(belief.found) and _truly_graspable(problem, snapshot)
-        if belief.found and found_step is None:
-            found_step = index
-        if graspable and graspable_step is None:
-            graspable_step = index
 
-        last = index == config.max_steps
-        trouble = _target_trouble(problem.shelf, world) if belief.found else None
-        if trouble is not None:
-            grasp = None
-        decision = None
+        trouble = _target_trouble(snapshot) if belief.found else None
+        grasp = decision = None
+        if belief.found and trouble is None:
+            with clock("grasp"):
+                grasp = _grasp(problem, seen.scene, belief.found_pose)
         if grasp is None and trouble is None and not last:
             with clock("plan"):
                 key = jax.random.fold_in(planner_key, index)
                 decision = jax.block_until_ready(planner.plan(key, problem, belief, seen.scene, config))
-        record = _record(belief, graspable, grasp, decision, config, clock.seconds)
-        moment = Moment(index, snapshot, seen.scene, belief, decision, grasp, record, None)
+
+        graspable = bool(belief.found) and _truly_graspable(problem, snapshot)
+        found_step = index if belief.found and found_step is None else found_step
+        graspable_step = index if graspable and graspable_step is None else graspable_step
+        record = _record(belief, graspable, grasp, decision, config)
         if steps:
             steps[-1] = dataclasses.replace(steps[-1], observed_cost=record.cost)
 
-        outcome = None
-        if grasp is not None:
+        moment = Moment(index, snapshot, seen.scene, belief, decision, grasp, record, None)
+        deed = None
+        if record.action is not None:
             watcher.decided(moment)
             with clock("simulate"):
-                outcome = retrieval = simulator.retrieve(grasp.T_world_gripper, grasp.q7, grasp.opening)
-            retrieved = retrieval.retrieved
-            failure = retrieval.failure and f"retrieval: {retrieval.failure}"
-        elif decision is not None:
-            watcher.decided(moment)
-            with clock("simulate"):
-                outcome = simulator.execute(decision.action)
-            failure = "no action is possible" if decision.action.kind == ActionKind.NONE else outcome.failure
-        step = dataclasses.replace(record, failure=failure, timings=dict(clock.seconds))
+                deed = _act(simulator, grasp, decision)
+        step = dataclasses.replace(record, failure=deed and deed.failure, timings=clock.seconds)
         steps.append(step)
-        watcher.acted(dataclasses.replace(moment, record=step, outcome=outcome))
-        failure = trouble or _end(belief, step, retrieved, last)
+        watcher.acted(dataclasses.replace(moment, record=step, outcome=deed and deed.outcome))
+
+        retrieved = deed is not None and deed.retrieved
+        failure = None if retrieved else trouble or _end(belief, step, last)
         if retrieved or failure is not None:
             break
         world = simulator.world or world
@@ -290,23 +282,42 @@ def _grasp(problem: Problem, scene: Superquadrics, pose: Array) -> GraspChoice |
 def _truly_graspable(problem: Problem, snapshot: Snapshot) -> bool:
     """Whether a collision-free grasp of the target exists, whatever anybody believes."""
     return (
-        _target_trouble(problem.shelf, snapshot.world) is None
+        _target_trouble(snapshot) is None
         and _grasp(problem, objects_on_the_board(snapshot), true_target_pose(snapshot.world)) is not None
     )
 
 
-def _target_trouble(shelf: Shelf, world: World) -> str | None:
+def _target_trouble(snapshot: Snapshot) -> str | None:
     """Why the target can no longer be taken out as the planner knows it; None if it can."""
-    position, rotation = np.asarray(world.position[TARGET]), np.asarray(world.rotation[TARGET])
-    if position[0] < shelf.front or position[2] < shelf.board:
+    position = np.asarray(snapshot.world.position[TARGET])
+    rotation = np.asarray(snapshot.world.rotation[TARGET])
+    if position[0] < snapshot.shelf.front or position[2] < snapshot.shelf.board:
         return "the target fell off the board"
     return "the target fell over" if abs(rotation[2, 2]) < math.cos(MAX_TILT) else None
 
 
-def _end(belief: Belief, step: Step, retrieved: bool, last: bool) -> str | None:
-    """Why the episode ends here without a retrieval; None if it goes on, or ends with one."""
-    if retrieved:
-        return None
+@dataclasses.dataclass(frozen=True)
+class _Deed:
+    """What came of a retrieval or an action."""
+
+    outcome: Outcome | Retrieval
+    retrieved: bool
+    failure: str | None
+
+
+def _act(simulator: Simulator, grasp: GraspChoice | None, decision: Plan | None) -> _Deed:
+    """Take the target out if there is a grasp, or else execute the decision."""
+    if grasp is not None:
+        retrieval = simulator.retrieve(grasp.T_world_gripper, grasp.q7, grasp.opening)
+        return _Deed(retrieval, retrieval.retrieved, retrieval.failure and f"retrieval: {retrieval.failure}")
+    assert decision is not None
+    outcome = simulator.execute(decision.action)
+    idle = decision.action.kind == ActionKind.NONE
+    return _Deed(outcome, False, "no action is possible" if idle else outcome.failure)
+
+
+def _end(belief: Belief, step: Step, last: bool) -> str | None:
+    """Why an episode without a retrieval ends here; None if it goes on."""
     # Trying the same grasp in the same world once more would not make it reachable.
     if step.failure == "retrieval: unreachable":
         return step.failure
@@ -321,8 +332,8 @@ def _record(
     grasp: GraspChoice | None,
     decision: Plan | None,
     config: PlannerConfig,
-    timings: dict[str, float],
 ) -> Step:
+    """A step as it is decided: what comes of it is filled in later."""
     cost = predicted = None
     action, sequences = None, 0
     if grasp is not None:
@@ -343,7 +354,7 @@ def _record(
         observed_cost=None,
         sequences=sequences,
         failure=None,
-        timings=timings,
+        timings={},
     )
 
 
@@ -353,6 +364,7 @@ def describe(
     """The options of an episode, as its record keeps them."""
     return {
         **dataclasses.asdict(config),
+        "push_distances": list(config.push_distances),
         "target": problem.target.shape,
         "recognition": recognition,
         "simulator": type(simulator).__name__,
