@@ -61,13 +61,13 @@ def filmstrip(
       frames: the steps, at least one.
       camera, shelf, target: of the problem.
       heading: one line above everything.
-      columns: steps side by side, before a new line begins.
+      columns: at most so many steps side by side; lines are filled evenly.
 
     Returns:
       The figure; nothing is kept anywhere else.
     """
-    columns = min(columns, len(frames))
     lines = math.ceil(len(frames) / columns)
+    columns = math.ceil(len(frames) / lines)
     left, right, top, bottom = drawing.view_window(camera, shelf)
     view_height = _WIDTH * (bottom - top) / (right - left)
     map_height = _WIDTH * (shelf.back - shelf.front + 0.087) / (shelf.left - shelf.right + 0.024)
