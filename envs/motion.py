@@ -33,10 +33,12 @@ class MotionConfig:
       approach: length of the straight approach and retreat along the gripper's z [m].
       outside: the gripper leaves the shelf with an object until its x is at most one of these, the first that is in
         reach [m].
+      release: how far the gripper backs away from what it has pushed before it retreats, so as not to drag it along [m].
       clearance: how far above the commanded pose an object is released [m].
       squeeze: how far beyond closed the fingers are commanded when they hold something [m]; sets the grip's force.
       approach_steps: duration of an approach or a retreat with free fingers [time steps].
       push_steps: of a push.
+      release_steps: of backing away after a push.
       close_steps: of closing the fingers.
       carry_steps: of an approach or a retreat with an object in the hand.
       leave_steps: of the way between the end of the retreat and the outside.
@@ -48,10 +50,12 @@ class MotionConfig:
     timestep: float = 0.004
     approach: float = 0.3
     outside: tuple[float, ...] = (0.3, 0.34, 0.38, 0.42, 0.46)
+    release: float = 0.01
     clearance: float = 0.002
     squeeze: float = 0.02
     approach_steps: int = 250
     push_steps: int = 175
+    release_steps: int = 50
     close_steps: int = 100
     carry_steps: int = 325
     leave_steps: int = 150
@@ -155,7 +159,7 @@ def _entry(T: Array, outside: Array | float, config: MotionConfig) -> Array:
 def push_reference(
     T_world_gripper: Float[Array, "4 4"], displacement: Float[Array, " 3"], q7: Float[Array, ""], config: MotionConfig
 ) -> tuple[Reference, Bool[Array, ""]]:
-    """A push with closed fingers: approach, translate, retreat.
+    """A push with closed fingers: approach, translate, let go, retreat.
 
     Args:
       T_world_gripper: pose of the gripper where the push starts.
@@ -175,7 +179,8 @@ def push_reference(
     stretches = (
         _Stretch(config.approach_steps, 0, n - 1, closed),
         _Stretch(config.push_steps, n - 1, 2 * n - 2, closed),
-        _Stretch(config.approach_steps, 2 * n - 2, 3 * n - 3, closed),
+        _Stretch(config.release_steps, 2 * n - 2, 3 * n - 3, closed),
+        _Stretch(config.approach_steps, 3 * n - 3, 4 * n - 4, closed),
     )
     return _schedule(q, stretches, config.timestep), reachable
 
