@@ -13,6 +13,7 @@ import os
 import queue
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -148,6 +149,7 @@ class _Crew(threading.Thread):
         self._results = results
         self._command = command
         self._process: subprocess.Popen[str] | None = None
+        self._complaints = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the workers)
         self._stopped = False
 
     def run(self) -> None:
@@ -168,10 +170,7 @@ class _Crew(threading.Thread):
     def _run(self, job: Job) -> Row:
         process = self._process
         if process is None or process.poll() is not None:
-            process = self._process = subprocess.Popen(
-                self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-                env={**os.environ, **SINGLE_THREAD},
-            )  # fmt: skip
+            process = self._process = self._start()
         assert process.stdin is not None
         assert process.stdout is not None
         question = {"path": job.path, "config": dataclasses.asdict(job.config), "seed": job.seed}
@@ -182,6 +181,26 @@ class _Crew(threading.Thread):
         except BrokenPipeError:
             line = ""
         if not line:
-            return job.failed(f"the worker process ended with status {process.wait()}")
+            return job.failed(f"the worker process ended with status {process.wait()}{self._last_words()}")
         answer = json.loads(line)
         return Row(**answer["row"]) if "row" in answer else job.failed(answer["error"])
+
+    def _start(self) -> subprocess.Popen[str]:
+        self._complaints.seek(0)
+        self._complaints.truncate()
+        # In a session of its own, an interrupt from the keyboard reaches only the parent, which then ends the worker.
+        return subprocess.Popen(
+            self._command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._complaints,
+            text=True,
+            env={**os.environ, **SINGLE_THREAD},
+            start_new_session=True,
+        )
+
+    def _last_words(self) -> str:
+        """The last line that a dead worker wrote to standard error."""
+        self._complaints.seek(0)
+        lines = self._complaints.read().decode(errors="replace").split("\n")
+        return next((f": {line.strip()[:300]}" for line in reversed(lines) if line.strip()), "")

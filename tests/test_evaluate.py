@@ -27,6 +27,7 @@ for line in sys.stdin:
     with open(os.environ["LOG"], "a") as log:
         log.write(name + "\\n")
     if name == "crash":
+        print("out of luck", file=sys.stderr, flush=True)
         os._exit(3)
     config = job["config"]
     row = dict(scenario=name, objects=0, target="cylinder", method=config["method"], recognition="oracle",
@@ -71,7 +72,7 @@ def test_failures_are_rows_with_their_reason_and_do_not_end_the_run(tmp_path, fi
     assert reasons == {
         "one": None,
         "two": None,
-        "crash": "error: the worker process ended with status 3",
+        "crash": "error: the worker process ended with status 3: out of luck",
         "raise": "error: ValueError: no",
         "three": None,
     }
