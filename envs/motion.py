@@ -33,7 +33,7 @@ class MotionConfig:
       approach: length of the straight approach and retreat along the gripper's z [m].
       outside: the gripper leaves the shelf with an object until its x is at most one of these, the first that is in
         reach [m].
-      release: how far the gripper backs away from what it has pushed before it retreats, so as not to drag it along [m].
+      release: how far the gripper backs away from what it has pushed before it retreats, not to drag it along [m].
       clearance: how far above the commanded pose an object is released [m].
       squeeze: how far beyond closed the fingers are commanded when they hold something [m]; sets the grip's force.
       approach_steps: duration of an approach or a retreat with free fingers [time steps].
@@ -171,9 +171,17 @@ def push_reference(
       The reference, and whether the arm reaches all of it.
     """
     n, approach = config.waypoints, jnp.float32(config.approach)
+    length = jnp.sqrt(jnp.sum(displacement**2))
     end = translate(T_world_gripper, displacement)
-    back = line_poses(end, approach, n)[::-1]
-    path = jnp.concatenate([line_poses(T_world_gripper, approach, n), _straight(T_world_gripper, end, n)[1:], back[1:]])
+    apart = translate(end, -config.release * displacement / jnp.maximum(length, 1e-6))
+    path = jnp.concatenate(
+        [
+            line_poses(T_world_gripper, approach, n),
+            _straight(T_world_gripper, end, n)[1:],
+            _straight(end, apart, n)[1:],
+            line_poses(apart, approach, n)[::-1][1:],
+        ]
+    )
     q, reachable = path_kinematics(path, q7)
     closed = (0.0, 0.0)
     stretches = (
