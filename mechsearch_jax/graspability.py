@@ -63,6 +63,11 @@ class GraspConfig:
         if self.waypoints < 2:
             raise InputError(f"GraspConfig: {self.waypoints} waypoints make no line; use at least 2")
 
+    @classmethod
+    def dense(cls) -> GraspConfig:
+        """Several times as many grasps as the default, for the one pose at which the target has been found."""
+        return cls(yaws=13, wrists=tuple(math.radians(a) for a in (-60, -30, 0, 30, 60)))
+
 
 @flax.struct.dataclass
 class GraspTables:
@@ -161,8 +166,14 @@ def feasible_grasps(
     return (reachable & ~touching).reshape(n, g)
 
 
-def grasp_tables(shelf: Shelf, gripper: Gripper, target: Target, config: GraspConfig) -> GraspTables:
+def grasp_tables(
+    shelf: Shelf, gripper: Gripper, target: Target, config: GraspConfig, candidates: bool = True
+) -> GraspTables:
     """Precompute the target's grasps, their swept clouds and the feasible pairs of a pose and a grasp.
+
+    Args:
+      shelf, gripper, target, config: what there is to grasp, and how.
+      candidates: whether the tables are for the candidate poses, or only for a target that has been found.
 
     Raises:
       InputError: the target is too wide for the gripper.
@@ -192,6 +203,8 @@ def grasp_tables(shelf: Shelf, gripper: Gripper, target: Target, config: GraspCo
         pair_pose=jnp.zeros(0, jnp.int32),
         pair_grasp=jnp.zeros(0, jnp.int32),
     )
+    if not candidates:
+        return tables.replace(T_world_target=poses[:0])
     feasible = jax.jit(lambda tables: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))(tables)
     pose, grasp = np.nonzero(np.asarray(feasible))
     return tables.replace(pair_pose=jnp.int32(pose), pair_grasp=jnp.int32(grasp))
@@ -283,6 +296,16 @@ def graspability(tables: GraspTables, found: FoundGrasps, hits: Bool[Array, "k n
     count = jnp.where(allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), worst)
     least = jax.ops.segment_min(count, pose, num_segments=T_world_target.shape[0], indices_are_sorted=True)
     return 1 - jnp.minimum(least, worst)
+
+
+def crowding(tables: GraspTables, found: FoundGrasps, hits: Bool[Array, "k n"]) -> Float[Array, " y"]:
+    """Mean number of objects that the feasible grasps of each pose hit; 0 where none is feasible."""
+    pose, _, allowed, T_world_target = pairs(tables, found)
+    y = T_world_target.shape[0]
+    count = jnp.where(allowed, jnp.sum(hits, axis=1, dtype=jnp.float32), 0.0)
+    total = jax.ops.segment_sum(count, pose, num_segments=y, indices_are_sorted=True)
+    grasps = jax.ops.segment_sum(allowed.astype(jnp.float32), pose, num_segments=y, indices_are_sorted=True)
+    return total / jnp.maximum(grasps, 1.0)
 
 
 def find_grasps(

@@ -43,6 +43,7 @@ from mechsearch_jax.graspability import (
     FoundGrasps,
     GraspConfig,
     GraspTables,
+    crowding,
     find_grasps,
     grasp_hits,
     grasp_tables,
@@ -55,6 +56,8 @@ from mechsearch_jax.target import Target
 from mechsearch_jax.transforms import compose, upright_pose
 
 CLEARANCES = (0.0, 0.004, 0.008, 0.012, 0.02)
+# Small enough that no number of hits outweighs one pose or one object of the cost proper.
+TIE_BREAK = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,13 +112,15 @@ class Problem:
 
     Attributes:
       existence, grasps, actions: constants of f, of g and of the actions.
+      retrieval: a denser set of grasps, for the target once it is found; it has no candidate poses.
       poses: the candidate poses X as x, y [m], yaw [rad], shape (X, 3).
-      camera, shelf, gripper, target, existence_config, grasp_config, action_config: static.
+      camera, shelf, gripper, target, existence_config, grasp_config, retrieval_config, action_config: static.
     """
 
     existence: ExistenceTables
     grasps: GraspTables
     actions: ActionTables
+    retrieval: GraspTables
     poses: jax.Array
     camera: Camera = flax.struct.field(pytree_node=False)
     shelf: Shelf = flax.struct.field(pytree_node=False)
@@ -123,6 +128,7 @@ class Problem:
     target: Target = flax.struct.field(pytree_node=False)
     existence_config: ExistenceConfig = flax.struct.field(pytree_node=False)
     grasp_config: GraspConfig = flax.struct.field(pytree_node=False)
+    retrieval_config: GraspConfig = flax.struct.field(pytree_node=False)
     action_config: ActionConfig = flax.struct.field(pytree_node=False)
 
 
@@ -209,6 +215,7 @@ def build_problem(
     target: Target | None = None,
     existence_config: ExistenceConfig | None = None,
     grasp_config: GraspConfig | None = None,
+    retrieval_config: GraspConfig | None = None,
     action_config: ActionConfig | None = None,
 ) -> Problem:
     """Precompute everything about a camera, a shelf, a gripper and a target that no object changes.
@@ -221,12 +228,14 @@ def build_problem(
     camera, shelf = camera or Camera(), shelf or Shelf()
     gripper, target = gripper or Gripper(), target or Target()
     existence_config, grasp_config = existence_config or ExistenceConfig(), grasp_config or GraspConfig()
+    retrieval_config = retrieval_config or GraspConfig.dense()
     action_config = action_config or ActionConfig()
     grasps = grasp_tables(shelf, gripper, target, grasp_config)
     return Problem(
         existence=existence_tables(camera, shelf, target, existence_config),
         grasps=grasps,
         actions=action_tables(gripper, grasp_config.wrists, action_config),
+        retrieval=grasp_tables(shelf, gripper, target, retrieval_config, candidates=False),
         poses=jnp.asarray(target.candidate_poses(shelf)),
         camera=camera,
         shelf=shelf,
@@ -234,6 +243,7 @@ def build_problem(
         target=target,
         existence_config=existence_config,
         grasp_config=grasp_config,
+        retrieval_config=retrieval_config,
         action_config=action_config,
     )
 
@@ -332,13 +342,17 @@ def _without_target(scene: Superquadrics) -> Superquadrics:
 
 
 def _cost(problem: Problem, belief: Belief, exists: Array, hits: Array, method: str) -> Float[Array, ""]:
-    """J of equation 2 with g extended below zero (B.4)."""
+    """J of equation 2 with g extended below zero (B.4), and a slight preference for fewer grasps in collision.
+
+    g only sees the best grasp of a pose; while nothing changes that one, clearing the way for others is progress too.
+    """
     f = _everywhere_it_can_be(belief, exists).astype(jnp.float32)
     g = graspability(problem.grasps, belief.grasps, hits).astype(jnp.float32)
-    both = jnp.sum(f * (1.0 + (1.0 - g)))
+    crowded = TIE_BREAK * crowding(problem.grasps, belief.grasps, hits)
+    both = jnp.sum(f * (1.0 + (1.0 - g) + crowded))
     if method == "search-for-grasp":
         return both
-    return jnp.where(belief.found, 1.0 - g[-1], jnp.sum(f))
+    return jnp.where(belief.found, 1.0 - g[-1] + crowded[-1], jnp.sum(f))
 
 
 def _where_g_counts(belief: Belief, exists: Array, method: str) -> Bool[Array, " y"]:
@@ -349,7 +363,10 @@ def _where_g_counts(belief: Belief, exists: Array, method: str) -> Bool[Array, "
 
 @flax.struct.dataclass
 class _Node:
-    """A predicted state on the way through a sequence."""
+    """A predicted state on the way through a sequence, with what was computed of the one before it.
+
+    `moved` says which objects differ between the two; `alive`, whether the sequence has found something to do so far.
+    """
 
     scene: Superquadrics
     exists: jax.Array
@@ -359,7 +376,6 @@ class _Node:
     moved: jax.Array
     available: jax.Array
     alive: jax.Array
-    cost: jax.Array
 
 
 def action_space(problem: Problem, config: PlannerConfig) -> ActionSpace:
@@ -388,69 +404,70 @@ def _predict(problem: Problem, space: ActionSpace, push_model: PushModel, scene:
     return after, possible
 
 
+def _blank(function, *arguments):
+    """What a function returns, filled with zeros."""
+    return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, *arguments))
+
+
 def _root(problem: Problem, belief: Belief, scene: Superquadrics, space: ActionSpace, config: PlannerConfig) -> _Node:
+    """The present state, of which nothing is computed yet: as if every object had just moved."""
     settings = _existence_config(problem, config)
-    nowhere = jnp.zeros_like(belief.exists)
-    counts = _where_g_counts(belief, belief.exists, config.method)
-    objects = _without_target(scene)
-    hits = grasp_hits(problem.grasps, belief.grasps, objects, counts)
     possible = _possible_space(problem, belief, belief.exists)
+    counts = _everywhere_it_can_be(belief, belief.exists)
     return _Node(
         scene=scene,
         exists=belief.exists,
-        views=object_views(problem.existence, problem.camera, objects, nowhere, settings),
-        hits=hits,
-        options=candidates(space, problem.actions, scene, possible),
-        moved=jnp.zeros_like(scene.valid),
-        available=objects.valid,
+        views=_blank(lambda: object_views(problem.existence, problem.camera, scene, belief.exists, settings)),
+        hits=_blank(lambda: grasp_hits(problem.grasps, belief.grasps, scene, counts)),
+        options=_blank(lambda: candidates(space, problem.actions, scene, possible)),
+        moved=scene.valid,
+        available=_without_target(scene).valid,
         alive=jnp.array(True),
-        cost=_cost(problem, belief, belief.exists, hits, config.method),
     )
 
 
-def _step(problem, belief, space, config, push_model, node: _Node, key) -> tuple[_Node, tuple[Action, Array, Array]]:
-    possible = _possible_space(problem, belief, node.exists)
-    options = candidates(space, problem.actions, node.scene, possible, node.options, node.moved)
-    sample = sample_action(
-        key, space, problem.actions, node.scene, possible, options, node.available & node.alive
-    )
-    scene, acted = _predict(problem, space, push_model, node.scene, sample)
-    acted &= node.alive
-    moved = changed(node.scene, scene) & acted
+def _update(problem, belief, space, config, node: _Node, moved: Array, last: Array) -> _Node:
+    """Bring what is known of a state up to date after some objects moved."""
+    objects = _without_target(node.scene)
     settings = _existence_config(problem, config)
     # What an action covers is not ruled out: a target there would be pushed along, not found to be elsewhere. So only
     # what it uncovers counts, and collisions (empty in these views) do not.
-    objects = _without_target(scene)
-    views = object_views(
-        problem.existence, problem.camera, objects, jnp.zeros_like(node.exists), settings, node.views, moved
-    )
-    seen = existence(problem.existence, problem.camera, views, node.exists, settings)
-    exists = jnp.where(acted, seen, node.exists)
+    nowhere = jnp.zeros_like(node.exists)
+    views = object_views(problem.existence, problem.camera, objects, nowhere, settings, node.views, moved)
+    exists = existence(problem.existence, problem.camera, views, node.exists, settings)
     counts = _where_g_counts(belief, exists, config.method)
     hits = grasp_hits(problem.grasps, belief.grasps, objects, counts, node.hits, moved)
+    possible = _possible_space(problem, belief, exists)
+    options = candidates(space, problem.actions, node.scene, possible, node.options, moved & ~last)
+    return node.replace(exists=exists, views=views, hits=hits, options=options)
+
+
+def _act(problem, belief, space, push_model, node: _Node, key: Array, last: Array) -> tuple[_Node, Action, Array]:
+    """Sample an action and predict the scene after it; also the share of possible poses that it would touch."""
+    possible = _possible_space(problem, belief, node.exists)
+    available = node.available & node.alive & ~last
+    sample = sample_action(key, space, problem.actions, node.scene, possible, node.options, available)
+    scene, acted = _predict(problem, space, push_model, node.scene, sample)
+    acted &= node.alive
     action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
-    charge = config.caution * sample.risk * node.cost
-    node = _Node(
+    node = node.replace(
         scene=scene,
-        exists=exists,
-        views=views,
-        hits=hits,
-        options=options,
-        moved=moved,
+        moved=changed(node.scene, scene) & acted,
         available=node.available & (jnp.arange(scene.capacity) != action.object),
         alive=acted,
-        cost=_cost(problem, belief, exists, hits, config.method),
     )
-    return node, (action, node.cost, charge)
+    return node, action, sample.risk
 
 
 def _prefix_values(
-    cost_now: Array, cost: Float[Array, " m"], charge: Float[Array, " m"], acted: Bool[Array, " m"], gamma: float
+    cost: Float[Array, " n"], charge: Float[Array, " m"], acted: Bool[Array, " m"], gamma: float
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Equation 2 for every prefix of a sequence, with what its actions are charged: the best value, and its length."""
-    before = jnp.concatenate([cost_now[None], cost[:-1]])
-    discount = gamma ** jnp.arange(cost.shape[0], dtype=jnp.float32)
-    values = jnp.where(acted, jnp.cumsum(discount * (cost - before + charge)), jnp.inf)
+    """Equation 2 for every prefix of a sequence, with what its actions are charged: the best value, and its length.
+
+    `cost` is J before each action and after the last.
+    """
+    discount = gamma ** jnp.arange(charge.shape[0], dtype=jnp.float32)
+    values = jnp.where(acted, jnp.cumsum(discount * (jnp.diff(cost) + charge)), jnp.inf)
     return jnp.min(values), jnp.argmin(values) + 1
 
 
@@ -479,25 +496,44 @@ def plan(
     push_model = push_model or QuasiStatic()
     space = action_space(problem, config)
     scene = _with_target(problem, belief, scene)
-    root = _root(problem, belief, scene, space, config)
+    count, horizon = config.sequences, config.horizon
+    nodes = jax.tree.map(
+        lambda a: jnp.broadcast_to(a, (count, *a.shape)), _root(problem, belief, scene, space, config)
+    )
+    update = jax.vmap(functools.partial(_update, problem, belief, space, config), in_axes=(0, 0, None))
+    act = jax.vmap(functools.partial(_act, problem, belief, space, push_model), in_axes=(0, 0, None))
+    cost_of = jax.vmap(lambda node: _cost(problem, belief, node.exists, node.hits, config.method))
 
-    def rollout(key):
-        step = functools.partial(_step, problem, belief, space, config, push_model)
-        _, (actions, cost, charge) = jax.lax.scan(step, root, jax.random.split(key, config.horizon))
-        value, length = _prefix_values(root.cost, cost, charge, actions.kind != ActionKind.NONE, config.gamma)
-        return Sequences(actions, cost, value, length)
+    def step(nodes, keys_and_time):
+        keys, time = keys_and_time
+        # All sequences begin in the same state, so only the first computes it.
+        first, last = time == 0, time == horizon
+        computes = ~first | (jnp.arange(count) == 0)
+        nodes = update(nodes, nodes.moved & computes[:, None], last)
+        nodes = jax.tree.map(lambda a: jnp.where(first, a[:1], a), nodes)
+        cost = cost_of(nodes)
+        nodes, actions, risk = act(nodes, keys, last)
+        return nodes, (actions, cost, risk, jnp.any(nodes.views.overflow))
 
-    sequences = jax.vmap(rollout)(jax.random.split(key, config.sequences))
+    keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
+    _, (actions, cost, risk, overflow) = jax.lax.scan(step, nodes, (keys, jnp.arange(horizon + 1)))
+    actions, risk = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, risk))
+    cost, now = jnp.swapaxes(cost, 0, 1), cost[0, 0]
+    charge = config.caution * risk * cost[:, :-1]
+    value, length = jax.vmap(lambda c, h, k: _prefix_values(c, h, k != ActionKind.NONE, config.gamma))(
+        cost, charge, actions.kind
+    )
+    sequences = Sequences(actions, cost[:, 1:], value, length)
     order = jnp.argsort(sequences.value, stable=True)
     sequences = jax.tree.map(lambda a: a[order], sequences)
     first = jax.tree.map(lambda a: a[0, 0], sequences.actions)
     return Plan(
         action=first,
         value=sequences.value[0],
-        cost=root.cost,
+        cost=now,
         predicted_cost=sequences.cost[0, 0],
         sequences=sequences,
-        overflow=jnp.any(root.views.overflow),
+        overflow=overflow[0],
     )
 
 
@@ -519,13 +555,13 @@ def graspable_at(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"]
       pose: of the target as x, y [m], yaw [rad]; need not be a candidate.
     """
     T_world_target = upright_pose(pose, problem.target.height(problem.shelf))
-    found = find_grasps(problem.grasps, problem.shelf, problem.gripper, problem.grasp_config, T_world_target)
-    here = jnp.zeros(problem.poses.shape[0] + 1, bool).at[-1].set(True)
-    g = problem.grasps.q7.shape[0]
+    tables = problem.retrieval
+    found = find_grasps(tables, problem.shelf, problem.gripper, problem.retrieval_config, T_world_target)
+    here = jnp.ones(1, bool)
 
     def count(clearance):
-        hits = grasp_hits(problem.grasps, found, scene.replace(size=scene.size + clearance), here)
-        return jnp.where(found.feasible, jnp.sum(hits[-g:], axis=1), scene.capacity + 1)
+        hits = grasp_hits(tables, found, scene.replace(size=scene.size + clearance), here)
+        return jnp.where(found.feasible, jnp.sum(hits, axis=1), scene.capacity + 1)
 
     counts = jax.lax.map(count, jnp.float32(CLEARANCES))
     order = counts[0] * 1000 + jnp.sum(counts[1:], axis=0)
@@ -533,7 +569,7 @@ def graspable_at(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"]
     return GraspChoice(
         success=counts[0, best] == 0,
         hits=counts[0, best].astype(jnp.int32),
-        T_world_gripper=compose(T_world_target, problem.grasps.T_target_gripper[best]),
-        q7=problem.grasps.q7[best],
+        T_world_gripper=compose(T_world_target, tables.T_target_gripper[best]),
+        q7=tables.q7[best],
         opening=jnp.float32(problem.gripper.max_opening),
     )
