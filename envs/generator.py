@@ -105,7 +105,7 @@ class ScenarioGenerator:
         shelf: Shelf | None = None,
         camera: Camera | None = None,
         config: GeneratorConfig | None = None,
-        graspable: Callable[[Float[np.ndarray, 3]], bool] | None = None,
+        graspable: Callable[[Float[np.ndarray, " 3"]], bool] | None = None,
     ):
         """Args:
         target: what is hidden; the cylinder by default.
