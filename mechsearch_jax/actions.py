@@ -37,6 +37,11 @@ from mechsearch_jax.transforms import (
 
 
 PASSING_GAP = 0.003
+# Parts of the gripper that come this close together touch an object together [m].
+TOUCH = 0.004
+# How far the palm's flat front is behind the finger tips' centres, and how far it extends above and below them [m].
+PALM = 0.033
+HAND_LENGTH = 0.11
 
 
 class ActionKind(enum.IntEnum):
@@ -92,18 +97,19 @@ class ActionConfig:
       push_wrists: angles of joint 7 relative to 45 degrees that pushes are tried with [rad].
       push_heights: two limits of the height of the finger tips above the board in a push [m]: the lower keeps the hand
         behind the object's neighbours, the higher above them.
-      push_leverage: largest height of a push in half widths of the object along it. Higher up, friction at the board
-        (0.4 to 0.6) would topple the object instead of letting it slide.
+      push_leverage: largest height at which a push may begin to touch, in half widths of the object along it, for boxes
+        and for round objects. Higher up, friction at the board (0.4 and 0.6) topples them instead of letting them slide.
       push_gap: distance between gripper and object where a push starts [m].
       push_depths: how far the finger tips reach past the object's front, or past its centre, in a push [m].
       grasp_tilts: angles by which the grasping gripper points downwards [rad].
       grasp_yaws: number of approach directions for round objects, and of places to grasp on a box.
-      grasp_depth: how far the finger tips reach past the front of a deep object [m].
+      grasp_drops: how far below an object's top it is grasped [m]; the first two in turn for round objects.
       placements: how many places are tried for a picked object, and how many of those are tested for collision.
       place_yaw: largest angle by which a picked object is turned [rad].
       clearance: distance to keep from neighbours when placing [m].
       jam: deepest unresolved penetration of a predicted push that is still executed [m].
       cloud_points: points on the swept gripper.
+      pusher_points: points on the hand and fingers.
       object_points: points on an object.
     """
 
@@ -112,17 +118,18 @@ class ActionConfig:
     push_tilt: float = math.radians(30)
     push_wrists: tuple[float, ...] = (math.radians(-45), math.radians(-15), math.radians(30))
     push_heights: tuple[float, float] = (0.06, 0.12)
-    push_leverage: float = 1.5
+    push_leverage: tuple[float, float] = (1.8, 1.3)
     push_gap: float = 0.01
     push_depths: tuple[float, float] = (0.02, 0.02)
     grasp_tilts: tuple[float, ...] = (math.radians(20), math.radians(30))
     grasp_yaws: int = 6
-    grasp_depth: float = 0.035
+    grasp_drops: tuple[float, float, float] = (0.02, 0.03, 0.045)
     placements: tuple[int, int] = (32, 4)
     place_yaw: float = math.radians(30)
     clearance: float = 0.005
     jam: float = 0.006
     cloud_points: int = 1024
+    pusher_points: int = 384
     object_points: int = 128
 
     def __post_init__(self):
@@ -140,7 +147,7 @@ class ActionTables:
       q7: angles of joint 7 in grasps, then in pushes, shape (2, W) [rad].
       clouds: what the gripper sweeps on its way in, in its own frame, open and then closed: shape (2, W, 3, P) [m].
       low, high: boxes around them, shape (2, W, 3) [m].
-      pusher: surface of the closed gripper in its own frame, by wrist, shape (W, Q, 3) [m].
+      pusher: surface of the closed hand and fingers in the gripper's frame, shape (Q, 3) [m].
     """
 
     q7: jax.Array
@@ -172,7 +179,9 @@ def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: Act
             for opening, angles in zip((gripper.max_opening, 0.0), q7, strict=True)
         ]
     )
-    pusher = np.stack([gripper_cloud(gripper, 0.0, float(angle), 256) for angle in q7[1]])
+    # Only the hand and the fingers push; the links behind them would thin out the points that matter.
+    surface = gripper_cloud(gripper, 0.0, float(q7[1][0]), 2048)
+    pusher = surface[surface[:, 2] > -HAND_LENGTH][: config.pusher_points]
     return ActionTables(
         q7=jnp.float32(q7),
         clouds=jnp.float32(np.swapaxes(clouds, -1, -2)),
@@ -292,12 +301,16 @@ def object_grasps(
     width = jnp.where(face % 2 == 0, prints.half[:, 1], prints.half[:, 0])
     fits = (2 * width <= gripper.usable_opening)[:, None] & (jnp.abs(yaw) <= max_yaw + 1e-3)
 
-    height = (prints.high - prints.low)[:, None]
-    fraction = jnp.float32(0.5 + 0.25 * np.array([0, 1, -1])[slot % 3])[None]
-    fraction = jnp.where(prints.round[:, None], jnp.float32(0.5 + 0.2 * (slot % 2))[None], fraction)
-    z = jnp.maximum(prints.low[:, None] + fraction * height, shelf.board + 0.025)
-    reach = jnp.float32(np.where(slot < 3, config.grasp_depth, 0.6 * config.grasp_depth))[None]
-    offset = jnp.where(prints.round[:, None], 0.0, jnp.maximum(depth[:, None] - reach, 0.0))
+    drop = jnp.float32(config.grasp_drops)
+    drop = jnp.where(prints.round[:, None], drop[slot % 2][None], drop[slot % 3][None])
+    z = jnp.maximum(prints.high[:, None] - drop, shelf.board + 0.025)
+    # The palm must not run into what stands up before it: the object's front, or its top if the palm reaches that high.
+    c, t = np.cos(tilt), np.tan(tilt)
+    above = jnp.clip(prints.high[:, None] - z, 0.0, jnp.float32(PALM * np.sin(tilt) + PALM * c)[None])
+    reach = jnp.float32(PALM / c)[None] - above * jnp.float32(t)[None] - PASSING_GAP
+    reach = reach * jnp.float32(np.where(slot < 3, 1.0, 0.7))[None]
+    reach = jnp.where(prints.round[:, None], jnp.maximum(reach, 0.0), reach)
+    offset = jnp.maximum(depth[:, None] - reach, 0.0)
     centre = jnp.stack(
         [
             prints.position[:, None, 0] - offset * jnp.cos(yaw),
@@ -326,8 +339,8 @@ def _exit_distance(half, is_round, points, direction):
 
 def object_pushes(
     shelf: Shelf, tables: ActionTables, scene: Superquadrics, prints: Footprints, config: ActionConfig
-) -> Float[Array, "n b 4 4"]:
-    """Gripper poses where pushes start: beside each object, at `push_gap` from it.
+) -> tuple[Float[Array, "n b 4 4"], Bool[Array, "n b"]]:
+    """Gripper poses where pushes start, beside each object at `push_gap` from it, and whether it would stay upright.
 
     For each side (pushing towards +y, then -y), for two depths (fingers just past the object's front, then past its
     centre so that the palm pushes), for two heights, for each wrist.
@@ -342,15 +355,15 @@ def object_pushes(
         (prints.position[:, 0] + config.push_depths[1])[:, None],
     )
     height = prints.high - shelf.board
-    limit = jnp.minimum(config.push_leverage * extent[:, 1], 0.75 * height)
+    leverage = jnp.where(prints.round, config.push_leverage[1], config.push_leverage[0]) * extent[:, 1]
+    limit = jnp.minimum(leverage, 0.75 * height)
     z = shelf.board + jnp.clip(limit[:, None], 0.03, jnp.float32(config.push_heights)[high][None])
     b = len(side)
     shape = (scene.capacity, b)
     centre = jnp.stack([x, jnp.broadcast_to(prints.position[:, 1:2], shape), z], axis=-1)
     T = make(jnp.broadcast_to(rotation, (*shape, 3, 3)), centre)
 
-    # The palm and the fingers decide how close the gripper can get; the wrist makes no difference to them.
-    points = rotate(rotation, tables.pusher[0])
+    points = rotate(rotation, tables.pusher)
 
     def beside(half, is_round, position, yaw, low, high, centre, side):
         world = points + centre[None]
@@ -361,14 +374,19 @@ def object_pushes(
         # In front of the object the palm may pass close by; only sideways does it keep the whole gap.
         grown = half + PASSING_GAP
         away = _exit_distance(grown[None], is_round, local, jnp.broadcast_to(heading[None], local.shape))
-        return jnp.max(jnp.where(level, away, 0.0)) + config.push_gap - PASSING_GAP
+        away = jnp.where(level, away, 0.0)
+        farthest = jnp.max(away)
+        touching = level & (away > farthest - TOUCH)
+        lowest = jnp.min(jnp.where(touching, world[:, 2], jnp.inf))
+        return farthest + config.push_gap - PASSING_GAP, lowest - shelf.board
 
     rotate2 = lambda R, v: jnp.stack([R[0, 0] * v[..., 0] + R[0, 1] * v[..., 1], R[1, 0] * v[..., 0] + R[1, 1] * v[..., 1]], -1)  # noqa: E731, E501
     each = jax.vmap(beside, in_axes=(None,) * 6 + (0, 0))
-    distance = jax.vmap(each, in_axes=(0,) * 7 + (None,))(
+    distance, contact = jax.vmap(each, in_axes=(0,) * 7 + (None,))(
         prints.half, prints.round, prints.position, prints.yaw, prints.low, prints.high, centre, jnp.float32(side)
     )
-    return T.at[..., 1, 3].add(-jnp.float32(side)[None] * distance)
+    stable = contact <= jnp.maximum(leverage, 0.03)[:, None]
+    return T.at[..., 1, 3].add(-jnp.float32(side)[None] * distance), stable
 
 
 def _push_grid(wrists: int):
@@ -526,13 +544,13 @@ def candidates(
     usable = reached & ~jnp.any(hits, axis=-1).reshape(-1)
     grasp_enters = _enters_possible(tables, possible, 0, wrist, flat, usable).reshape(n, a)
 
-    push = object_pushes(space.shelf, tables, scene, prints, config)
+    push, stable = object_pushes(space.shelf, tables, scene, prints, config)
     side, push_wrist = push_variants(wrists)
     b, d = push.shape[1], len(config.push_distances)
     flat = push.reshape(-1, 4, 4)
     owner_b = np.repeat(np.arange(n), b)
     wrist_b = np.tile(push_wrist, n)
-    new = jnp.broadcast_to(fresh[:, None], (n, b)).reshape(-1) & (config.kinds != "pick-and-place")
+    new = (stable & fresh[:, None]).reshape(-1) & (config.kinds != "pick-and-place")
     starts = _approach_clear(space, tables, 1, wrist_b, flat, new)
     displacement = jnp.asarray(np.tile(side, n))[:, None] * jnp.float32(config.push_distances)[None]
     shift = jnp.stack([jnp.zeros_like(displacement), displacement, jnp.zeros_like(displacement)], axis=-1)

@@ -116,20 +116,31 @@ def _deepest(depth, normal, point):
     return jnp.max(depth, axis=-1), pick(normal), pick(point)
 
 
-def _yield_to(prints, depth, direction, arm):
-    """Move footprints by `depth` at a contact, as a quasi-static slider under an ellipsoidal limit surface does.
+def _yield_to(prints, depth, normal, arm, heading, friction):
+    """Move footprints out of contacts, as quasi-static sliders under an ellipsoidal limit surface move.
 
-    `direction` is the unit vector along which the contact point at `arm` from the centre has to give way. The ratio of
-    torque to force is that of a uniform pressure distribution, 0.6 of the footprint's half diagonal.
+    A force f at `arm` from the centre moves the slider by f and turns it by (arm x f) / c^2, with c, the ratio of torque
+    to force, that of a uniform pressure distribution: 0.6 of the footprint's half diagonal. The contact sticks, and the
+    point at `arm` follows `heading` until it has given way by `depth` along `normal`, if the force for that is inside
+    the friction cone; otherwise it slides, with the force on the cone's edge (Lynch and Mason's pushing with one contact).
     """
-    lever = arm[..., 0] * direction[..., 1] - arm[..., 1] * direction[..., 0]
     c2 = 0.36 * jnp.sum(prints.half**2, axis=-1)
-    share = jnp.maximum(depth, 0.0) / (1.0 + lever**2 / c2)
-    # A disc pushed by a point does not turn in a way that matters: its footprint stays the same.
-    turn = jnp.where(prints.round, 0.0, share * lever / c2)
-    return prints.replace(
-        position=prints.position + share[..., None] * direction, yaw=prints.yaw + jnp.clip(turn, -0.2, 0.2)
-    )
+    side = jnp.stack([-arm[..., 1], arm[..., 0]], axis=-1)
+    dot = lambda a, b: jnp.sum(a * b, axis=-1)  # noqa: E731
+    advance = dot(heading, normal)
+    follows = advance > 0.2
+    target = jnp.where(follows[..., None], heading / jnp.where(follows, advance, 1.0)[..., None], normal)
+    force = target - side * (dot(side, target) / (c2 + dot(side, side)))[..., None]
+    tangent = jnp.stack([-normal[..., 1], normal[..., 0]], axis=-1)
+    along, across = dot(force, normal), dot(force, tangent)
+    sticks = jnp.abs(across) <= friction * along
+    edge = normal + friction * jnp.where(across < 0, -1.0, 1.0)[..., None] * tangent
+    given = dot(normal, edge) + dot(normal, side) * dot(side, edge) / c2
+    edge = edge / jnp.maximum(given, 0.1)[..., None]
+    force = jnp.where(sticks[..., None], force, edge) * jnp.maximum(depth, 0.0)[..., None]
+    # A disc may spin as it likes: its footprint stays the same.
+    turn = jnp.where(prints.round, 0.0, dot(side, force) / c2)
+    return prints.replace(position=prints.position + force, yaw=prints.yaw + jnp.clip(turn, -0.2, 0.2))
 
 
 def _outline(prints):
@@ -140,14 +151,15 @@ def _outline(prints):
     return _turn(prints.yaw[:, None], unit * prints.half[:, None, :]) + prints.position[:, None, :]
 
 
-def _resolve_pusher(prints, points):
+def _resolve_pusher(prints, points, heading, friction):
     local = _turn(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
     depth, normal = _contact(prints.half[:, None, :], prints.round[:, None], local)
     level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
     depth = jnp.where(level & prints.valid[:, None], depth, -1.0)
     depth, normal, point = _deepest(depth, normal, local)
     away = -_turn(prints.yaw, normal)
-    return _yield_to(prints, depth, away, _turn(prints.yaw, point)), jnp.max(depth)
+    heading = jnp.broadcast_to(heading, away.shape)
+    return _yield_to(prints, depth, away, _turn(prints.yaw, point), heading, friction), jnp.max(depth)
 
 
 def _pair_contacts(prints):
@@ -168,14 +180,14 @@ def _pair_contacts(prints):
     return jnp.where(both, jnp.maximum(depth, depth.T), -1.0), *deeper
 
 
-def _resolve_neighbours(prints, heading):
+def _resolve_neighbours(prints, heading, friction):
     """Objects further along the push give way to those behind them."""
     depth, direction, arm = _pair_contacts(prints)
     along = jnp.sum((prints.position[None] - prints.position[:, None]) * heading[None, None], axis=-1)
     depth = jnp.where(along > 0, depth, -1.0)
     i = jnp.argmax(depth, axis=0)
     j = jnp.arange(prints.valid.size)
-    return _yield_to(prints, depth[i, j], direction[i, j], arm[i, j])
+    return _yield_to(prints, depth[i, j], direction[i, j], arm[i, j], direction[i, j], friction)
 
 
 def _wall_depth(shelf, prints):
@@ -190,7 +202,8 @@ def _resolve_walls(shelf, prints):
     for wall in range(3):
         deepest, _, point = _deepest(depth[..., wall], outline, outline)
         direction = jnp.broadcast_to(inward[wall], point.shape)
-        prints = _yield_to(prints, jnp.where(prints.valid, deepest, -1.0), direction, point - prints.position)
+        depth_in = jnp.where(prints.valid, deepest, -1.0)
+        prints = _yield_to(prints, depth_in, direction, point - prints.position, direction, 0.0)
     return prints
 
 
@@ -198,16 +211,19 @@ def _resolve_walls(shelf, prints):
 class QuasiStatic:
     """An analytic `PushModel`: the gripper moves in small steps, and what it runs into gives way.
 
-    Objects are planar footprints that slide under an ellipsoidal limit surface without inertia; toppling, friction at
-    the contacts and objects pushed back by others are neglected.
+    Objects are planar footprints that slide under an ellipsoidal limit surface without inertia; toppling and
+    objects pushed back by others are neglected.
 
     Attributes:
       steps: number of steps of the gripper.
       sweeps: how often contacts are resolved in each.
+      gripper_friction, object_friction: coefficients at contacts with the gripper and between objects.
     """
 
     steps: int = 16
     sweeps: int = 2
+    gripper_friction: float = 0.8
+    object_friction: float = 0.4
 
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array
@@ -219,8 +235,8 @@ class QuasiStatic:
 
         def sweep(_, carry):
             prints, points = carry
-            prints, _ = _resolve_pusher(prints, points)
-            return _resolve_walls(shelf, _resolve_neighbours(prints, heading)), points
+            prints, _ = _resolve_pusher(prints, points, heading, self.gripper_friction)
+            return _resolve_walls(shelf, _resolve_neighbours(prints, heading, self.object_friction)), points
 
         def step(prints, fraction):
             points = start + fraction * displacement[None]
@@ -229,7 +245,7 @@ class QuasiStatic:
 
         before = footprints(scene)
         after, _ = jax.lax.scan(step, before, (jnp.arange(self.steps) + 1.0) / self.steps)
-        _, held = _resolve_pusher(after, start + displacement[None])
+        _, held = _resolve_pusher(after, start + displacement[None], heading, self.gripper_friction)
         jammed = jnp.max(_pair_contacts(after)[0]) - jnp.maximum(jnp.max(_pair_contacts(before)[0]), 0.0)
         wall = jnp.max(jnp.where(after.valid[:, None], jnp.max(_wall_depth(shelf, after)[0], axis=1), -1.0))
         turn = after.yaw - before.yaw

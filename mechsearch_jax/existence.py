@@ -107,12 +107,16 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     offsets = np.array([(a * cell[0] / 2, b * cell[1] / 2) for a, b in config.spread], np.float32)
     places = np.repeat(poses[:, None, :], len(offsets), axis=1)
     places[..., :2] += offsets[None]
-    T = upright_pose(jnp.asarray(places), target.height(shelf))
+    T = jax.jit(upright_pose)(jnp.asarray(places), target.height(shelf))
     coarse = camera.scaled(config.downscale)
     half = np.array(target.half_size, np.float32)
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
-    pixels, _ = project(coarse, transform(T[:, :, None], jnp.asarray(corners)))
-    extent = np.asarray(jnp.max(jnp.max(pixels, axis=2) - jnp.min(pixels, axis=2), axis=(0, 1)))
+
+    def image_size(T):
+        pixels, _ = project(coarse, transform(T[:, :, None], jnp.asarray(corners)))
+        return jnp.max(jnp.max(pixels, axis=2) - jnp.min(pixels, axis=2), axis=(0, 1))
+
+    extent = np.asarray(jax.jit(image_size)(T))
     window = (int(np.ceil(extent[0])) + 2, int(np.ceil(extent[1])) + 2)
 
     def view(pose):
@@ -127,7 +131,8 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
 
     depth, corner = jax.jit(jax.vmap(jax.vmap(view)))(T)
     eroded = jnp.asarray(half - config.erosion)
-    cloud = superquadric.sample_surface(eroded, jnp.array(target.exponents), config.points)
+    sample = jax.jit(superquadric.sample_surface, static_argnames="count")
+    cloud = sample(eroded, jnp.array(target.exponents), count=config.points)
     return ExistenceTables(T, depth, corner, cloud.T, jnp.float32(np.linalg.norm(half)))
 
 

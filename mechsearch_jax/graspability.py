@@ -123,7 +123,8 @@ def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):
     grasps = np.stack(np.meshgrid(yaws, config.tilts, np.arange(len(config.wrists)), indexing="ij"), -1).reshape(-1, 3)
     yaw, tilt, wrist = jnp.float32(grasps[:, 0]), jnp.float32(grasps[:, 1]), grasps[:, 2].astype(int)
     height = min(config.height, 0.6 * target.half_size[2])
-    T = make(gripper_rotation(yaw, tilt), jnp.broadcast_to(jnp.float32([0.0, 0.0, height]), (len(grasps), 3)))
+    above = np.broadcast_to(np.float32([0.0, 0.0, height]), (len(grasps), 3))
+    T = jax.jit(lambda yaw, tilt, above: make(gripper_rotation(yaw, tilt), above))(yaw, tilt, above)
     return T, yaw, wrist
 
 
@@ -190,7 +191,7 @@ def grasp_tables(
         clouds.append(np.concatenate([swept[w] @ T[:3, :3].T + T[:3, 3], own]).T)
         low.append(both.min(axis=0))
         high.append(both.max(axis=0))
-    poses = upright_pose(jnp.asarray(target.candidate_poses(shelf)), target.height(shelf))
+    poses = jax.jit(upright_pose)(target.candidate_poses(shelf), target.height(shelf))
     tables = GraspTables(
         T_target_gripper=T_target_gripper,
         q7=jnp.float32(angles)[wrist],

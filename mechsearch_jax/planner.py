@@ -393,8 +393,7 @@ def action_space(problem: Problem, config: PlannerConfig) -> ActionSpace:
 def _predict(problem: Problem, space: ActionSpace, push_model: PushModel, scene: Superquadrics, sample):
     """S of equation 4, and whether the action can be executed as predicted."""
     action = sample.action
-    pusher = problem.actions.pusher[sample.wrist]
-    pushed = push_model(problem.shelf, scene, pusher, action.T_world_gripper, action.displacement)
+    pushed = push_model(problem.shelf, scene, problem.actions.pusher, action.T_world_gripper, action.displacement)
     placed = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
     is_push = action.kind == ActionKind.PUSH
     hits_target = jnp.any(changed(scene, pushed.scene)[-1:])
