@@ -322,7 +322,9 @@ def _outside(points: np.ndarray, hulls: list[trimesh.Trimesh]) -> np.ndarray:
     for hull in hulls:
         normals = hull.face_normals
         offsets = np.sum(normals * hull.triangles_center, axis=-1)
-        points = points[np.max(points @ normals.T - offsets, axis=-1) > -1e-4]
+        inside = np.all((points > hull.bounds[0]) & (points < hull.bounds[1]), axis=-1)
+        inside[inside] = np.max(points[inside] @ normals.T - offsets, axis=-1, initial=-np.inf) <= -1e-4
+        points = points[~inside]
     return points
 
 
