@@ -80,8 +80,7 @@ class MotionConfig:
         return self.grasp_step + 2 * (self.carry_steps + self.leave_steps) + self.transfer_steps
 
 
-@flax.struct.dataclass
-class Reference:
+class Reference(flax.struct.PyTreeNode):
     """What the controller follows; one row for each time step.
 
     Attributes:

@@ -44,8 +44,7 @@ LIGHT = (-0.62, 0.25, 0.74)
 AMBIENT = 0.55
 
 
-@flax.struct.dataclass
-class Observation:
+class Observation(flax.struct.PyTreeNode):
     """An image of the shelf.
 
     Attributes:

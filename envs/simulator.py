@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -132,9 +133,9 @@ class NativeSimulator:
         self.config = config or SimulatorConfig()
         plan = self.config.motion
         self._blank = models.compile_model(self.shelf, self.camera, plan.timestep)
-        self._push = jax.jit(lambda *a: motion.push_reference(*a, plan))
-        self._pick = jax.jit(lambda *a: motion.pick_and_place_reference(*a, plan))
-        self._retrieve = jax.jit(lambda *a: motion.retrieve_reference(*a, plan))
+        self._push = functools.partial(jax.jit(motion.push_reference, static_argnames="config"), config=plan)
+        self._pick = functools.partial(jax.jit(motion.pick_and_place_reference, static_argnames="config"), config=plan)
+        self._retrieve = functools.partial(jax.jit(motion.retrieve_reference, static_argnames="config"), config=plan)
         self._data = mujoco.MjData(self._blank)
         self._model = self._blank
         self._bodies: list[Body | None] = [None] * BODIES

@@ -17,8 +17,7 @@ TARGET = MAX_OBJECTS
 BODIES = MAX_OBJECTS + 1
 
 
-@flax.struct.dataclass
-class World:
+class World(flax.struct.PyTreeNode):
     """All bodies on the shelf. Every field has the leading axes (..., 9): eight slots for objects, then the target.
 
     Attributes:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax import superquadric
 from mechsearch_jax.collision import Pair, any_inside, hits_shelf
-from mechsearch_jax.dynamics import Footprints, bounding_half_extents, footprints
+from mechsearch_jax.dynamics import Footprints, bounding_half_extents, footprints, turned
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.graspability import WRIST_ORIGIN, boxes_overlap, gripper_rotation
 from mechsearch_jax.gripper import Gripper, arm_hits_shelf, gripper_cloud, swept_cloud
@@ -35,7 +35,6 @@ from mechsearch_jax.transforms import (
     yaw_rotation,
 )
 
-
 PASSING_GAP = 0.003
 # Parts of the gripper that come this close together touch an object together [m].
 TOUCH = 0.004
@@ -50,15 +49,15 @@ class ActionKind(enum.IntEnum):
     PICK_AND_PLACE = 2
 
 
-@flax.struct.dataclass
-class Action:
+class Action(flax.struct.PyTreeNode):
     """One action of the robot; every field may carry leading batch axes.
 
     Attributes:
       kind: an `ActionKind`, int32.
       object: index of the object that is pushed or picked, int32.
       T_world_gripper: gripper pose where the push starts, or where the object is grasped, shape (..., 4, 4).
-      displacement: translation of the gripper while it pushes, in the world [m], shape (..., 3); zero for a pick-and-place.
+      displacement: translation of the gripper while it pushes, in the world [m], shape (..., 3); zero for a
+        pick-and-place.
       T_world_place: gripper pose where the object is released, shape (..., 4, 4); for a push, the pose where it ends.
       q7: angle of joint 7 during the whole motion [rad].
       opening: distance between the fingers while the gripper approaches [m]; 0 is closed.
@@ -98,7 +97,8 @@ class ActionConfig:
       push_heights: two limits of the height of the finger tips above the board in a push [m]: the lower keeps the hand
         behind the object's neighbours, the higher above them.
       push_leverage: largest height at which a push may begin to touch, in half widths of the object along it, for boxes
-        and for round objects. Higher up, friction at the board (0.4 and 0.6) topples them instead of letting them slide.
+        and for round objects. Higher up, friction at the board (0.4 and 0.6) topples them instead of letting them
+        slide.
       push_gap: distance between gripper and object where a push starts [m].
       push_depths: how far the finger tips reach past the object's front, or past its centre, in a push [m].
       grasp_tilts: angles by which the grasping gripper points downwards [rad].
@@ -139,8 +139,7 @@ class ActionConfig:
             raise InputError(f"push_distances {self.push_distances} must be one or more positive lengths in metres")
 
 
-@flax.struct.dataclass
-class ActionTables:
+class ActionTables(flax.struct.PyTreeNode):
     """Constants of the actions.
 
     Attributes:
@@ -170,7 +169,7 @@ def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: Act
     """
     if len(grasp_wrists) != len(config.push_wrists):
         raise InputError(
-            f"{len(grasp_wrists)} wrist angles for grasps but {len(config.push_wrists)} for pushes; give as many of each"
+            f"{len(grasp_wrists)} wrist angles for grasps but {len(config.push_wrists)} for pushes; give as many each"
         )
     q7 = WRIST_ORIGIN + np.array([grasp_wrists, config.push_wrists])
     clouds = np.stack(
@@ -191,8 +190,7 @@ def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: Act
     )
 
 
-@flax.struct.dataclass
-class PossibleSpace:
+class PossibleSpace(flax.struct.PyTreeNode):
     """Where a target that has not been ruled out would stand, as a raster at the spacing of the candidate poses.
 
     Attributes:
@@ -236,8 +234,7 @@ def _risk(space: PossibleSpace, points: Float[Array, "... 3"]) -> Float[Array, "
     return jnp.sum(jnp.where(widen(touched), space.chance, 0.0))
 
 
-@flax.struct.dataclass
-class Candidates:
+class Candidates(flax.struct.PyTreeNode):
     """The pushes and grasps of every object in a scene, and what stands in their way.
 
     Attributes:
@@ -267,9 +264,11 @@ def _wrap(angle):
 
 def _grasp_variants(config: ActionConfig, wrists: int):
     """Slot, tilt and wrist of each candidate grasp of an object."""
-    grid = np.meshgrid(np.arange(config.grasp_yaws), np.arange(len(config.grasp_tilts)), np.arange(wrists), indexing="ij")
+    grid = np.meshgrid(
+        np.arange(config.grasp_yaws), np.arange(len(config.grasp_tilts)), np.arange(wrists), indexing="ij"
+    )
     slot, tilt, wrist = (g.reshape(-1) for g in grid)
-    return slot, np.float32(config.grasp_tilts)[tilt], wrist
+    return slot, np.asarray(config.grasp_tilts, np.float32)[tilt], wrist
 
 
 def object_grasps(
@@ -368,9 +367,8 @@ def object_pushes(
     def beside(half, is_round, position, yaw, low, high, centre, side):
         world = points + centre[None]
         level = (world[:, 2] > low - config.push_gap) & (world[:, 2] < high + config.push_gap)
-        turn = yaw_rotation(-yaw)[:2, :2]
-        local = rotate2(turn, world[:, :2] - position[None])
-        heading = rotate2(turn, jnp.array([0.0, 1.0]) * -side)
+        local = turned(-yaw, world[:, :2] - position[None])
+        heading = turned(-yaw, jnp.array([0.0, 1.0]) * -side)
         # In front of the object the palm may pass close by; only sideways does it keep the whole gap.
         grown = half + PASSING_GAP
         away = _exit_distance(grown[None], is_round, local, jnp.broadcast_to(heading[None], local.shape))
@@ -380,7 +378,6 @@ def object_pushes(
         lowest = jnp.min(jnp.where(touching, world[:, 2], jnp.inf))
         return farthest + config.push_gap - PASSING_GAP, lowest - shelf.board
 
-    rotate2 = lambda R, v: jnp.stack([R[0, 0] * v[..., 0] + R[0, 1] * v[..., 1], R[1, 0] * v[..., 0] + R[1, 1] * v[..., 1]], -1)  # noqa: E731, E501
     each = jax.vmap(beside, in_axes=(None,) * 6 + (0, 0))
     distance, contact = jax.vmap(each, in_axes=(0,) * 7 + (None,))(
         prints.half, prints.round, prints.position, prints.yaw, prints.low, prints.high, centre, jnp.float32(side)
@@ -397,7 +394,7 @@ def _push_grid(wrists: int):
 def push_variants(wrists: int) -> tuple[np.ndarray, np.ndarray]:
     """Side (+1 or -1 along y) and wrist of each push of `object_pushes`, each of shape (B,)."""
     side, _, _, wrist = _push_grid(wrists)
-    return np.float32(side), wrist
+    return np.asarray(side, np.float32), wrist
 
 
 @dataclasses.dataclass(frozen=True)
@@ -562,7 +559,9 @@ def candidates(
         w = jnp.asarray(wrist_b)[i // d]
         back = jnp.float32(space.gripper.approach)
         middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
-        q, reachable = path_kinematics(jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)]), tables.q7[1, w])
+        q, reachable = path_kinematics(
+            jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)]), tables.q7[1, w]
+        )
         points = transform(end, tables.clouds[1, w].T)
         return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf)) & ~jnp.any(hits_shelf(space.shelf, points))
 
@@ -599,8 +598,7 @@ def candidates(
     )
 
 
-@flax.struct.dataclass
-class Sample:
+class Sample(flax.struct.PyTreeNode):
     """A sampled action.
 
     Attributes:
@@ -785,7 +783,5 @@ def sample_action(
     bodies = jnp.where(is_grasp, jnp.broadcast_to(T_object_place, (5, 4, 4)), pushed)
     cloud = tables.clouds[jnp.where(is_grasp, 0, 1), wrist].T
     body = superquadric.sample_surface(scene.size[index], scene.exponents[index], config.object_points)
-    swept = jnp.concatenate(
-        [transform(grippers[:, None], cloud[None]), transform(bodies[:, None], body[None])], axis=1
-    )
+    swept = jnp.concatenate([transform(grippers[:, None], cloud[None]), transform(bodies[:, None], body[None])], axis=1)
     return Sample(action, wrist, jnp.where(able, _risk(possible, swept), 0.0))

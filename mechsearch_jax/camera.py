@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.transforms import rotate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +56,9 @@ class Camera:
         )
 
 
-def pixel_rays(camera: Camera, rows: Float[Array, "*batch"], columns: Float[Array, "*batch"]) -> Float[Array, "*batch 3"]:
+def pixel_rays(
+    camera: Camera, rows: Float[Array, "*batch"], columns: Float[Array, "*batch"]
+) -> Float[Array, "*batch 3"]:
     """Directions in the world of the rays through pixel centres, scaled to unit depth along the optical axis.
 
     Args:
@@ -78,14 +81,16 @@ def rays(camera: Camera) -> Float[Array, "h w 3"]:
     return pixel_rays(camera, rows, columns)
 
 
-def project(camera: Camera, points: Float[Array, "*batch 3"]) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
+def project(
+    camera: Camera, points: Float[Array, "*batch 3"]
+) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
     """World points as (row, column) pixel coordinates and depth [m]; the inverse of `pixel_rays`.
 
     Points at or behind the camera's plane have no image: theirs is computed at a depth of 1 micrometre.
     """
-    x, y, z = (
-        sum((points[..., i] - camera.position[i]) * camera.rotation[i][k] for i in range(3)) for k in range(3)
-    )
+    inverse = jnp.array(camera.rotation).T
+    origin = jnp.array(camera.position).reshape([1] * (points.ndim - 1) + [3])
+    x, y, z = jnp.moveaxis(rotate(inverse, points - origin), -1, 0)
     safe = jnp.maximum(z, 1e-6)
     row = camera.fy * y / safe + camera.cy - 0.5
     column = camera.fx * x / safe + camera.cx - 0.5

@@ -31,7 +31,8 @@ def _bounds(cloud, T_object_cloud, size, exponents):
     most, two = jnp.maximum(x, y), jnp.sqrt(x * x + y * y)
     below = jnp.where(p > 2.0, most, two)
     above = jnp.where(p >= 2.0, jnp.minimum(two, 2.0 ** (1.0 / p) * most), x + y)
-    # The axis and the plane are joined by an r-norm with r >= 1: at least the larger of the two, at most 2^(1/r) times it.
+    # The axis and the plane are joined by an r-norm with r >= 1: at least the larger of the two, at most 2^(1/r)
+    # times it.
     return jnp.min(jnp.maximum(below, z)), jnp.min(jnp.maximum(above, z)) * 2.0 ** (1.0 / r)
 
 
@@ -79,7 +80,8 @@ def any_inside(
 def points_inside(scene: Superquadrics, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch n"]:
     """Whether world points lie inside each of the scene's objects; never inside an absent one."""
     local = superquadric.to_object_frame(scene, points)
-    return (superquadric.gauge(scene.size, scene.exponents, local) < 1.0) & scene.valid
+    inside = superquadric.gauge(scene.size, scene.exponents, local) < 1.0
+    return inside & jnp.broadcast_to(scene.valid, inside.shape)
 
 
 def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"], radius: float | Array = 0.0) -> Bool[Array, "*batch"]:

@@ -19,8 +19,7 @@ ROUND_EXPONENT = 0.6
 BOUNDARY_POINTS = 24
 
 
-@flax.struct.dataclass
-class PushOutcome:
+class PushOutcome(flax.struct.PyTreeNode):
     """What a push is predicted to do.
 
     Attributes:
@@ -50,8 +49,7 @@ class PushModel(Protocol):
         ...
 
 
-@flax.struct.dataclass
-class Footprints:
+class Footprints(flax.struct.PyTreeNode):
     """Objects seen from above: a rectangle or an ellipse and a range of heights, every field with leading axis N."""
 
     half: jax.Array
@@ -88,7 +86,8 @@ def footprints(scene: Superquadrics) -> Footprints:
     return Footprints(half, is_round, scene.position[:, :2], yaw, z - height, z + height, scene.valid)
 
 
-def _turn(yaw, v):
+def turned(yaw: Float[Array, "..."], v: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+    """Planar vectors turned by angles that belong to their first axes [rad]."""
     c, s = (a.reshape(a.shape + (1,) * (v.ndim - 1 - a.ndim)) for a in (jnp.cos(yaw), jnp.sin(yaw)))
     return jnp.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], axis=-1)
 
@@ -119,10 +118,10 @@ def _deepest(depth, normal, point):
 def _yield_to(prints, depth, normal, arm, heading, friction):
     """Move footprints out of contacts, as quasi-static sliders under an ellipsoidal limit surface move.
 
-    A force f at `arm` from the centre moves the slider by f and turns it by (arm x f) / c^2, with c, the ratio of torque
-    to force, that of a uniform pressure distribution: 0.6 of the footprint's half diagonal. The contact sticks, and the
-    point at `arm` follows `heading` until it has given way by `depth` along `normal`, if the force for that is inside
-    the friction cone; otherwise it slides, with the force on the cone's edge (Lynch and Mason's pushing with one contact).
+    A force f at `arm` from the centre moves the slider by f and turns it by (arm x f) / c^2, with c, the ratio of
+    torque to force, that of a uniform pressure distribution: 0.6 of the footprint's half diagonal. The contact sticks,
+    and the point at `arm` follows `heading` until it has given way by `depth` along `normal`, if the force for that is
+    inside the friction cone; otherwise it slides, with the force on the cone's edge (Lynch and Mason, one contact).
     """
     c2 = 0.36 * jnp.sum(prints.half**2, axis=-1)
     side = jnp.stack([-arm[..., 1], arm[..., 0]], axis=-1)
@@ -148,33 +147,33 @@ def _outline(prints):
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     square = circle / np.abs(circle).max(axis=-1, keepdims=True)
     unit = jnp.where(prints.round[:, None, None], jnp.float32(circle)[None], jnp.float32(square)[None])
-    return _turn(prints.yaw[:, None], unit * prints.half[:, None, :]) + prints.position[:, None, :]
+    return turned(prints.yaw[:, None], unit * prints.half[:, None, :]) + prints.position[:, None, :]
 
 
 def _resolve_pusher(prints, points, heading, friction):
-    local = _turn(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
+    local = turned(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
     depth, normal = _contact(prints.half[:, None, :], prints.round[:, None], local)
     level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
     depth = jnp.where(level & prints.valid[:, None], depth, -1.0)
     depth, normal, point = _deepest(depth, normal, local)
-    away = -_turn(prints.yaw, normal)
+    away = -turned(prints.yaw, normal)
     heading = jnp.broadcast_to(heading, away.shape)
-    return _yield_to(prints, depth, away, _turn(prints.yaw, point), heading, friction), jnp.max(depth)
+    return _yield_to(prints, depth, away, turned(prints.yaw, point), heading, friction), jnp.max(depth)
 
 
 def _pair_contacts(prints):
     """For every ordered pair (i, j): the deepest contact, and the direction in which j has to give way."""
     outline = _outline(prints)
-    into_j = _turn(-prints.yaw[None, :, None], outline[:, None] - prints.position[None, :, None, :])
+    into_j = turned(-prints.yaw[None, :, None], outline[:, None] - prints.position[None, :, None, :])
     depth, normal = _contact(prints.half[None, :, None, :], prints.round[None, :, None], into_j)
     depth, normal, point = _deepest(depth, normal, into_j)
     yaw = jnp.broadcast_to(prints.yaw[None, :], depth.shape)
-    direction, arm = -_turn(yaw, normal), _turn(yaw, point)
+    direction, arm = -turned(yaw, normal), turned(yaw, point)
     # The same the other way round: a corner of j inside a face of i, where j gives way along i's normal.
     other_direction = -jnp.swapaxes(direction, 0, 1)
     world = arm + prints.position[None, :, :]
     other_arm = jnp.swapaxes(world, 0, 1) - prints.position[None, :, :]
-    swap = depth.T > depth
+    swap = depth < depth.T
     deeper = jnp.where(swap[..., None], other_direction, direction), jnp.where(swap[..., None], other_arm, arm)
     both = prints.valid[:, None] & prints.valid[None, :] & ~jnp.eye(prints.valid.size, dtype=bool)
     return jnp.where(both, jnp.maximum(depth, depth.T), -1.0), *deeper
@@ -260,7 +259,7 @@ def rigid_motion(
     scene: Superquadrics, before: Float[Array, "n 2"], after: Float[Array, "n 2"], turn: Float[Array, " n"]
 ) -> Superquadrics:
     """Objects moved in the plane from `before` to `after` [m] and turned about the vertical through `before` [rad]."""
-    arm = _turn(turn, scene.position[:, :2] - before) + after
+    arm = turned(turn, scene.position[:, :2] - before) + after
     return scene.replace(
         position=jnp.concatenate([arm, scene.position[:, 2:]], axis=-1),
         rotation=matmul(yaw_rotation(turn), scene.rotation),
@@ -281,10 +280,11 @@ def pick_and_place(
 
 def changed(before: Superquadrics, after: Superquadrics) -> Bool[Array, " n"]:
     """Which objects differ in pose between two scenes."""
-    return jnp.any(before.position != after.position, axis=-1) | jnp.any(before.rotation != after.rotation, axis=(-1, -2))
+    return jnp.any(before.position != after.position, axis=-1) | jnp.any(
+        before.rotation != after.rotation, axis=(-1, -2)
+    )
 
 
 def bounding_half_extents(scene: Superquadrics) -> Float[Array, "n 3"]:
     """Half-extents of the objects' bounding boxes along the world's axes [m]."""
     return jnp.sum(jnp.abs(scene.rotation) * scene.size[:, None, :], axis=-1)
-

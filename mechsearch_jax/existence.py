@@ -15,7 +15,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from mechsearch_jax import render, superquadric
 from mechsearch_jax.camera import Camera, project
@@ -36,7 +36,8 @@ class ExistenceConfig:
 
     Attributes:
       criterion: what makes the target visible: "detector" counts the pixels it would show at full resolution;
-        "depth-mse" is the paper's mean squared difference of the two depth images; "depth-norm" their Euclidean distance.
+        "depth-mse" is the paper's mean squared difference of the two depth images; "depth-norm" their Euclidean
+        distance.
       found_pixels: more pixels than this at full resolution and the detector finds the target.
       depth_threshold: threshold of "depth-mse" [m^2] and "depth-norm" [m].
       downscale: how much coarser than the camera f is rendered.
@@ -64,8 +65,7 @@ class ExistenceConfig:
             raise InputError("ExistenceConfig: downscale must be at least 1 and spread hold at least one place")
 
 
-@flax.struct.dataclass
-class ExistenceTables:
+class ExistenceTables(flax.struct.PyTreeNode):
     """What f needs of the candidate poses, the camera and the target: constants of a `Problem`.
 
     Attributes:
@@ -83,8 +83,7 @@ class ExistenceTables:
     radius: jax.Array
 
 
-@flax.struct.dataclass
-class ObjectViews:
+class ObjectViews(flax.struct.PyTreeNode):
     """Per object, what f needs of it; only what moved has to be computed anew.
 
     Attributes:

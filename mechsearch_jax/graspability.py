@@ -2,8 +2,8 @@
 
 Everything that a grasp sweeps (hand, fingers, links 7 and 6 on their straight way in, and the target on its way out) is
 a constant point cloud in the target's frame. Which grasps the arm can make at a candidate pose, and which the shelf
-leaves room for, does not depend on the objects, so the pairs of a pose and a grasp that are feasible are listed once, and
-a scene only adds the table H[pair, object] of who is hit. Moving one object recomputes its column.
+leaves room for, does not depend on the objects, so the pairs of a pose and a grasp that are feasible are listed once,
+and a scene only adds the table H[pair, object] of who is hit. Moving one object recomputes its column.
 """
 
 from __future__ import annotations
@@ -69,8 +69,7 @@ class GraspConfig:
         return cls(yaws=13, wrists=tuple(math.radians(a) for a in (-60, -30, 0, 30, 60)))
 
 
-@flax.struct.dataclass
-class GraspTables:
+class GraspTables(flax.struct.PyTreeNode):
     """The target's grasps: constants of a `Problem`.
 
     Attributes:
@@ -118,7 +117,7 @@ def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):
     yaws = yaws[widths <= gripper.usable_opening]
     if len(yaws) == 0:
         raise InputError(
-            f"Target: {min(widths):.3f} m wide, but the gripper opens only {gripper.usable_opening} m; use a thinner target"
+            f"Target: {min(widths):.3f} m wide, but the gripper takes {gripper.usable_opening} m; use a thinner target"
         )
     grasps = np.stack(np.meshgrid(yaws, config.tilts, np.arange(len(config.wrists)), indexing="ij"), -1).reshape(-1, 3)
     yaw, tilt, wrist = jnp.float32(grasps[:, 0]), jnp.float32(grasps[:, 1]), grasps[:, 2].astype(int)
@@ -136,7 +135,7 @@ def swept_target(target: Target, direction: np.ndarray, distance: float, count: 
     else:
         mesh = trimesh.creation.box(extents=(2 * a, 2 * b, 2 * c))
     both = np.concatenate([mesh.vertices, mesh.vertices + distance * np.asarray(direction)])
-    points, _ = trimesh.sample.sample_surface(trimesh.convex.convex_hull(both), count, seed=0)
+    points = trimesh.sample.sample_surface(trimesh.convex.convex_hull(both), count, seed=0)[0]
     return np.asarray(points, np.float32)
 
 
@@ -194,7 +193,7 @@ def grasp_tables(
     poses = jax.jit(upright_pose)(target.candidate_poses(shelf), target.height(shelf))
     tables = GraspTables(
         T_target_gripper=T_target_gripper,
-        q7=jnp.float32(angles)[wrist],
+        q7=jnp.asarray(angles, jnp.float32)[wrist],
         wrist=jnp.int32(wrist),
         clouds=jnp.float32(np.stack(clouds)),
         low=jnp.float32(np.stack(low)),
@@ -212,7 +211,10 @@ def grasp_tables(
 
 
 def boxes_overlap(
-    low: Float[Array, "... 3"], high: Float[Array, "... 3"], T_box_object: Float[Array, "... 4 4"], size: Float[Array, "... 3"]
+    low: Float[Array, "... 3"],
+    high: Float[Array, "... 3"],
+    T_box_object: Float[Array, "... 4 4"],
+    size: Float[Array, "... 3"],
 ) -> Bool[Array, "..."]:
     """Whether a box and the bounding box of an object may overlap: not separated along any of the box's own axes."""
     reach = jnp.sum(jnp.abs(T_box_object[..., :3, :3]) * size[..., None, :], axis=-1)
@@ -220,8 +222,7 @@ def boxes_overlap(
     return jnp.all((centre - reach < high) & (centre + reach > low), axis=-1)
 
 
-@flax.struct.dataclass
-class FoundGrasps:
+class FoundGrasps(flax.struct.PyTreeNode):
     """The grasps of a target that has been found, whose pose need not be a candidate.
 
     Attributes:
@@ -314,4 +315,3 @@ def find_grasps(
 ) -> FoundGrasps:
     """The feasible grasps of a target at any pose."""
     return FoundGrasps(T_world_target, feasible_grasps(tables, shelf, gripper, config, T_world_target[None])[0])
-

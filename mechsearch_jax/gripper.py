@@ -11,6 +11,7 @@ direction in which the fingers open. When joint 7 is at `q7`, links 6 and 7 are 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import Any, Literal
 
@@ -222,9 +223,17 @@ def swept_cloud(
     distance = gripper.approach if distance is None else distance
     if distance < 0.0 or count < 1:
         raise InputError(f"swept_cloud: distance ({distance} m) must not be negative, count ({count}) at least 1")
+    return _sampled(gripper, float(opening), float(q7), int(count), float(distance), int(seed)).copy()
+
+
+@functools.cache
+def _sampled(
+    gripper: Gripper, opening: float, q7: float, count: int, distance: float, seed: int
+) -> Float[np.ndarray, "{count} 3"]:
+    """`swept_cloud` of checked arguments; kept, because several tables of a problem are made of the same clouds."""
     hulls = [_swept_hull(primitive, distance) for primitive in primitives_in_gripper(gripper, opening, q7)]
     areas = np.array([hull.area for hull in hulls])
-    shares = np.ceil(20 * count * areas / areas.sum()).astype(int) + 50
+    shares = np.ceil(8 * count * areas / areas.sum()).astype(int) + 50
     candidates = np.concatenate(
         [
             _outside(trimesh.sample.sample_surface(hull, share, seed=seed + i)[0], hulls[:i] + hulls[i + 1 :])

@@ -106,8 +106,7 @@ class PlannerConfig:
         return cls(**changes)
 
 
-@flax.struct.dataclass
-class Problem:
+class Problem(flax.struct.PyTreeNode):
     """What does not change in an episode: the world around the objects, and all that follows from it.
 
     Attributes:
@@ -132,8 +131,7 @@ class Problem:
     action_config: ActionConfig = flax.struct.field(pytree_node=False)
 
 
-@flax.struct.dataclass
-class Belief:
+class Belief(flax.struct.PyTreeNode):
     """What is known of the target.
 
     Attributes:
@@ -151,8 +149,7 @@ class Belief:
     restarts: jax.Array
 
 
-@flax.struct.dataclass
-class Sequences:
+class Sequences(flax.struct.PyTreeNode):
     """Sampled sequences of actions, best first; leading axis S, and M within.
 
     Attributes:
@@ -168,8 +165,7 @@ class Sequences:
     length: jax.Array
 
 
-@flax.struct.dataclass
-class Plan:
+class Plan(flax.struct.PyTreeNode):
     """A decision.
 
     Attributes:
@@ -189,8 +185,7 @@ class Plan:
     overflow: jax.Array
 
 
-@flax.struct.dataclass
-class GraspChoice:
+class GraspChoice(flax.struct.PyTreeNode):
     """How to take out a found target.
 
     Attributes:
@@ -273,10 +268,11 @@ def observe_belief(
     found_pose: Float[Array, "3"],
     config: PlannerConfig,
 ) -> Belief:
-    """Fold an observation into the belief: `f_t = f_{t-1} * f_hat(s_t)` (equation 4), or the target's pose once it is seen.
+    """Fold an observation into the belief: `f_t = f_{t-1} * f_hat(s_t)` (equation 4), or the target's pose once it is
+    seen.
 
-    A target that was pushed without having been seen may leave f empty, which is a contradiction; f then starts anew from
-    what the objects allow now, and `restarts` counts it.
+    A target that was pushed without having been seen may leave f empty, which is a contradiction; f then starts anew
+    from what the objects allow now, and `restarts` counts it.
 
     Args:
       problem: what does not change.
@@ -361,8 +357,7 @@ def _where_g_counts(belief: Belief, exists: Array, method: str) -> Bool[Array, "
     return f if method == "search-for-grasp" else f.at[:-1].set(False)
 
 
-@flax.struct.dataclass
-class _Node:
+class _Node(flax.struct.PyTreeNode):
     """A predicted state on the way through a sequence, with what was computed of the one before it.
 
     `moved` says which objects differ between the two; `alive`, whether the sequence has found something to do so far.
@@ -496,9 +491,7 @@ def plan(
     space = action_space(problem, config)
     scene = _with_target(problem, belief, scene)
     count, horizon = config.sequences, config.horizon
-    nodes = jax.tree.map(
-        lambda a: jnp.broadcast_to(a, (count, *a.shape)), _root(problem, belief, scene, space, config)
-    )
+    nodes = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *a.shape)), _root(problem, belief, scene, space, config))
     update = jax.vmap(functools.partial(_update, problem, belief, space, config), in_axes=(0, 0, None))
     act = jax.vmap(functools.partial(_act, problem, belief, space, push_model), in_axes=(0, 0, None))
     cost_of = jax.vmap(lambda node: _cost(problem, belief, node.exists, node.hits, config.method))

@@ -61,10 +61,11 @@ def cast(
 def integrate(
     size: Float[Array, "3"], exponents: Float[Array, "2"], origin: Float[Array, "3"], direction: Float[Array, "3"]
 ) -> Float[Array, ""]:
-    """The volumetric depth of equations 10 to 12 of one superquadric, in its own frame and in units of the ray parameter.
+    """The volumetric depth of equations 10 to 12 of one superquadric, in its own frame and in units of the ray
+    parameter.
 
-    Integrated over the chord through the ellipsoid of equation 13. The finite `TAU` lets a ray sink in by 1 / TAU = 10 mm
-    in the mean, which is this method's bias.
+    Integrated over the chord through the ellipsoid of equation 13. The finite `TAU` lets a ray sink in by 1 / TAU =
+    10 mm in the mean, which is this method's bias.
     """
     scaled_o, scaled_d = origin / (3.0**0.5 * size), direction / (3.0**0.5 * size)
     a, b = jnp.sum(scaled_d**2), jnp.sum(scaled_o * scaled_d)
@@ -92,7 +93,7 @@ def object_depth(
     directions: Float[Array, "*batch 3"],
     method: Literal["root", "volumetric"] = "root",
 ) -> Float[Array, "*batch"]:
-    """Depth of one object (a `Superquadrics` without its object axis) along world rays; infinite where there is none."""
+    """Depth of one object (a `Superquadrics` without its object axis) along world rays; infinite where it is not."""
     inverse = scene_object.rotation.T
     local_origin = rotate(inverse, origin - scene_object.position)
     local = rotate(inverse, directions)
@@ -153,7 +154,7 @@ def merge_windows(
     camera: Camera, windows: Float[Array, "n h w"], corners: Int[Array, "n 2"]
 ) -> Float[Array, "height width"]:
     """The depth image of a scene from its objects' windows."""
-    n, h, w = windows.shape
+    _, h, w = windows.shape
     rows = corners[:, 0, None, None] + jnp.arange(h)[None, :, None]
     columns = corners[:, 1, None, None] + jnp.arange(w)[None, None, :]
     # Negative indices would wrap around to the far side of the image instead of being dropped.

@@ -14,7 +14,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.transforms import align, inverse, make, transform
@@ -23,8 +23,7 @@ BOX_EXPONENTS = (0.2, 0.2)
 CYLINDER_EXPONENTS = (0.2, 1.0)
 
 
-@flax.struct.dataclass
-class Superquadrics:
+class Superquadrics(flax.struct.PyTreeNode):
     """A fixed number of superquadrics, some of which may be absent; every field has the leading axes `(..., N)`.
 
     Attributes:

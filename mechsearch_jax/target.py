@@ -37,7 +37,9 @@ class Target:
         if len(self.half_size) != 3 or not all(s > 0 for s in self.half_size):
             raise InputError(f"Target: half_size {self.half_size} must be three positive lengths in metres")
         if min(self.grid) < 2 or self.yaws < 1:
-            raise InputError(f"Target: grid {self.grid} needs at least 2 positions an axis and yaws {self.yaws} at least 1")
+            raise InputError(
+                f"Target: grid {self.grid} needs at least 2 positions an axis and yaws {self.yaws} at least 1"
+            )
 
     @classmethod
     def cylinder(cls) -> Target:

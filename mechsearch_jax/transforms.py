@@ -6,6 +6,9 @@ what surrounds them, and no GPU rounds their factors to TF32, which would move p
 
 from __future__ import annotations
 
+import functools
+import operator
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -19,7 +22,8 @@ def align(*arrays_and_ranks: tuple[Array, int]) -> list[Array]:
 def rotate(rotation: Float[Array, "... 3 3"], vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     """`rotation @ vector`."""
     rotation, vectors = align((rotation, 2), (vectors, 1))
-    return sum(rotation[..., :, k] * vectors[..., None, k] for k in range(3))
+    terms = (rotation[..., :, k] * vectors[..., None, k] for k in range(3))
+    return functools.reduce(operator.add, terms)
 
 
 def transform(T_a_b: Float[Array, "... 4 4"], points: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
@@ -36,7 +40,8 @@ def compose(T_a_b: Float[Array, "... 4 4"], T_b_c: Float[Array, "... 4 4"]) -> F
 def matmul(a: Float[Array, "... i j"], b: Float[Array, "... j k"]) -> Float[Array, "... i k"]:
     """Product of small matrices, as explicit sums: a batched 3 x 3 product is slower than the arithmetic around it."""
     a, b = align((a, 2), (b, 2))
-    return sum(a[..., :, k, None] * b[..., None, k, :] for k in range(a.shape[-1]))
+    terms = (a[..., :, k, None] * b[..., None, k, :] for k in range(a.shape[-1]))
+    return functools.reduce(operator.add, terms)
 
 
 def make(rotation: Float[Array, "*batch 3 3"], position: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4 4"]:
@@ -69,7 +74,7 @@ def yaw_rotation(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def upright_pose(pose: Float[Array, "*batch 3"], z: float) -> Float[Array, "*batch 4 4"]:
-    """`T_world_target` of a target that stands upright at `pose` = x, y [m], yaw [rad], its centre at height `z` [m]."""
+def upright_pose(pose: Float[Array, "*batch 3"], z: float | Array) -> Float[Array, "*batch 4 4"]:
+    """`T_world_target` of a target upright at `pose` = x, y [m], yaw [rad], with its centre at height `z` [m]."""
     height = jnp.full(pose.shape[:-1], z, pose.dtype)
     return make(yaw_rotation(pose[..., 2]), jnp.stack([pose[..., 0], pose[..., 1], height], axis=-1))

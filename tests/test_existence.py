@@ -1,0 +1,181 @@
+"""f against a brute-force reference in float64, and its promises on shipped and published scenes."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from published import published_scenarios
+from test_camera_render import reference_superquadric_depth
+
+from mechsearch_jax import existence, planner, scenario, superquadric
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.existence import ExistenceConfig
+from mechsearch_jax.planner import PlannerConfig
+
+CONFIG = PlannerConfig.paper()
+UNSEEN, NOWHERE = jnp.array(False), jnp.zeros(3)
+
+
+def look(problem, objects, belief=None, config=CONFIG):
+    return planner.observe_belief(problem, belief or planner.initial_belief(problem), objects, UNSEEN, NOWHERE, config)
+
+
+def every_scenario():
+    paths = [*scenario.example_scenarios().values(), *published_scenarios()]
+    loaded = [scenario.load_scenario(path) for path in paths]
+    return [s for s in loaded if s.target.shape == "cylinder"]
+
+
+def reference_existence(problem, objects, poses, config):
+    """Try the target at every place of every cell: count the pixels it shows, and look for points inside objects."""
+    cam, target, shelf = problem.camera.scaled(config.downscale), problem.target, problem.shelf
+    scene_depth = reference_superquadric_depth(cam, objects)
+    cell = target.cell(shelf)
+    half = np.array(target.half_size)
+    cloud = np.asarray(
+        superquadric.sample_surface(jnp.float32(half - config.erosion), jnp.float32(target.exponents), config.points),
+        np.float64,
+    )
+    result = []
+    for pose in poses:
+        possible = False
+        for a, b in config.spread:
+            position = np.array([pose[0] + a * cell[0] / 2, pose[1] + b * cell[1] / 2, target.height(shelf)])
+            one = superquadric.Superquadrics(
+                size=jnp.float32(half)[None],
+                exponents=jnp.float32(target.exponents)[None],
+                position=jnp.float32(position)[None],
+                rotation=jnp.eye(3)[None],
+                valid=jnp.ones(1, bool),
+            )
+            visible = reference_superquadric_depth(cam, one) + config.depth_margin < scene_depth
+            hidden = visible.sum() * config.downscale**2 <= config.found_pixels
+            points = cloud + position
+            free = True
+            for k in range(objects.capacity):
+                if not objects.valid[k]:
+                    continue
+                local = (points - np.asarray(objects.position[k], np.float64)) @ np.asarray(
+                    objects.rotation[k], np.float64
+                )
+                x, y, z = np.abs(local / np.asarray(objects.size[k], np.float64)).T
+                e1, e2 = np.asarray(objects.exponents[k], np.float64)
+                free &= bool(np.min((x ** (2 / e2) + y ** (2 / e2)) ** (e2 / e1) + z ** (2 / e1)) > 1)
+            possible |= bool(hidden and free)
+        result.append(possible)
+    return np.array(result)
+
+
+def test_f_is_that_of_a_brute_force_reference(problem):
+    loaded = scenario.load_scenario(scenario.example_scenarios()["first-light"])
+    objects = scenario.superquadrics(loaded.objects)
+    exists = np.asarray(look(problem, objects).exists)
+    rng = np.random.default_rng(0)
+    chosen = np.concatenate(
+        [rng.choice(np.flatnonzero(exists), 12, False), rng.choice(np.flatnonzero(~exists), 12, False)]
+    )
+    expected = reference_existence(problem, objects, np.asarray(problem.poses)[chosen], problem.existence_config)
+    # A ray that grazes a silhouette may count in one and not in the other.
+    assert np.mean(exists[chosen] == expected) >= 0.95
+
+
+def test_f_never_loses_the_true_pose_at_the_start(problem):
+    poses = np.asarray(problem.poses)
+    for one in every_scenario():
+        exists = np.asarray(look(problem, scenario.superquadrics(one.objects)).exists)
+        nearest = np.argmin(np.hypot(*(poses[:, :2] - np.array(one.target.position[:2])).T))
+        assert exists[nearest], one.name
+
+
+def test_f_grows_the_possible_set_by_no_more_than_a_third(problem):
+    """Against one place a cell, without margins, at a third of the camera's resolution instead of a seventh."""
+    exact = ExistenceConfig(spread=((0.0, 0.0),), erosion=0.0, depth_margin=0.0, downscale=3, window=(110, 110))
+    tables = existence.existence_tables(problem.camera, problem.shelf, problem.target, exact)
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+
+    @jax.jit
+    def exactly(objects):
+        views = existence.object_views(tables, problem.camera, objects, everywhere, exact)
+        return existence.existence(tables, problem.camera, views, everywhere, exact)
+
+    ours = theirs = 0
+    for one in every_scenario()[::4]:
+        objects = scenario.superquadrics(one.objects)
+        ours += int(jnp.sum(look(problem, objects).exists))
+        theirs += int(jnp.sum(exactly(objects)))
+    assert theirs > 100
+    assert ours <= 1.35 * theirs
+
+
+def test_f_never_grows(problem):
+    rng = np.random.default_rng(0)
+    one = scenario.load_scenario(scenario.example_scenarios()["first-light"])
+    objects = scenario.superquadrics(one.objects)
+    belief = look(problem, objects)
+    for _ in range(5):
+        shift = np.zeros((objects.capacity, 3), np.float32)
+        shift[:, :2] = rng.normal(size=(objects.capacity, 2)) * 0.03
+        objects = objects.replace(position=objects.position + shift)
+        after = look(problem, objects, belief)
+        assert after.restarts > belief.restarts or not np.any(after.exists & ~belief.exists)
+        belief = after
+
+
+def test_a_belief_that_contradicts_itself_starts_anew_and_says_so(problem):
+    one = scenario.load_scenario(scenario.example_scenarios()["first-light"])
+    objects = scenario.superquadrics(one.objects)
+    fresh = look(problem, objects)
+    wrong = fresh.replace(exists=~fresh.exists)
+    again = look(problem, objects, wrong)
+    assert int(again.restarts) == 1
+    np.testing.assert_array_equal(again.exists, fresh.exists)
+
+
+def test_an_empty_shelf_hides_nothing(problem):
+    belief = look(problem, superquadric.empty(8))
+    # There is nothing that it could believe instead.
+    assert int(belief.restarts) == 1
+
+
+def test_looking_again_at_moved_objects_alone_gives_the_same_views(problem):
+    one = scenario.load_scenario(scenario.example_scenarios()["first-light"])
+    objects = scenario.superquadrics(one.objects)
+    config, tables, everywhere = problem.existence_config, problem.existence, jnp.ones(problem.poses.shape[0], bool)
+    before = existence.object_views(tables, problem.camera, objects, everywhere, config)
+    moved = objects.replace(position=objects.position.at[1].add(jnp.float32([0.0, 0.04, 0.0])))
+    which = jnp.arange(objects.capacity) == 1
+    update = existence.object_views(tables, problem.camera, moved, everywhere, config, before, which)
+    whole = existence.object_views(tables, problem.camera, moved, everywhere, config)
+    np.testing.assert_array_equal(update.collides, whole.collides)
+    np.testing.assert_allclose(update.depth, whole.depth, rtol=1e-5)
+
+
+@pytest.mark.parametrize("criterion", ["depth-mse", "depth-norm"])
+def test_other_criteria_are_selectable(problem, criterion):
+    one = scenario.load_scenario(scenario.example_scenarios()["first-light"])
+    objects = scenario.superquadrics(one.objects)
+    ours = look(problem, objects).exists
+    other = look(problem, objects, config=dataclasses.replace(CONFIG, criterion=criterion)).exists
+    # A mean over the whole image lets visible targets pass, a norm almost none.
+    assert (jnp.sum(other) > jnp.sum(ours)) == (criterion == "depth-mse")
+
+
+def test_bad_settings_are_refused_with_what_would_do():
+    with pytest.raises(InputError, match='use "detector", "depth-mse" or "depth-norm"'):
+        ExistenceConfig(criterion="guess")
+    with pytest.raises(InputError, match="downscale"):
+        ExistenceConfig(downscale=0)
+
+
+def test_the_candidate_poses_cover_the_board(problem):
+    poses = np.asarray(problem.poses)
+    assert poses.shape == (792, 3)
+    shelf, target = problem.shelf, problem.target
+    np.testing.assert_allclose(poses[:, 0].min(), shelf.front + target.inset, rtol=1e-5)
+    np.testing.assert_allclose(poses[:, 1].max(), shelf.left - target.inset, rtol=1e-5)
+    cell = target.cell(shelf)
+    assert all(0.0145 < c < 0.0165 for c in cell[:2])
+    assert len(set(itertools.chain(map(tuple, poses.round(5).tolist())))) == 792
