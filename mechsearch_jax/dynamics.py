@@ -240,11 +240,12 @@ class QuasiStatic:
         def step(prints, fraction):
             points = start + fraction * displacement[None]
             prints, _ = jax.lax.fori_loop(0, self.sweeps, sweep, (prints, points))
-            return prints, None
+            return prints, _resolve_pusher(prints, points, heading, self.gripper_friction)[1]
 
         before = footprints(scene)
-        after, _ = jax.lax.scan(step, before, (jnp.arange(self.steps) + 1.0) / self.steps)
-        _, held = _resolve_pusher(after, start + displacement[None], heading, self.gripper_friction)
+        # A gripper that cannot move what is jammed would pass through it, so the worst moment counts, not the last.
+        after, held = jax.lax.scan(step, before, (jnp.arange(self.steps) + 1.0) / self.steps)
+        held = jnp.max(held)
         jammed = jnp.max(_pair_contacts(after)[0]) - jnp.maximum(jnp.max(_pair_contacts(before)[0]), 0.0)
         wall = jnp.max(jnp.where(after.valid[:, None], jnp.max(_wall_depth(shelf, after)[0], axis=1), -1.0))
         turn = after.yaw - before.yaw

@@ -122,7 +122,7 @@ def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):
     grasps = np.stack(np.meshgrid(yaws, config.tilts, np.arange(len(config.wrists)), indexing="ij"), -1).reshape(-1, 3)
     yaw, tilt, wrist = jnp.float32(grasps[:, 0]), jnp.float32(grasps[:, 1]), grasps[:, 2].astype(int)
     height = min(config.height, 0.6 * target.half_size[2])
-    above = np.broadcast_to(np.float32([0.0, 0.0, height]), (len(grasps), 3))
+    above = np.broadcast_to(np.array([0.0, 0.0, height], np.float32), (len(grasps), 3))
     T = jax.jit(lambda yaw, tilt, above: make(gripper_rotation(yaw, tilt), above))(yaw, tilt, above)
     return T, yaw, wrist
 

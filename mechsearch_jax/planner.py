@@ -50,6 +50,7 @@ from mechsearch_jax.graspability import (
     graspability,
 )
 from mechsearch_jax.gripper import Gripper
+from mechsearch_jax.kinematics import line_poses, path_kinematics
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.target import Target
@@ -58,6 +59,8 @@ from mechsearch_jax.transforms import compose, upright_pose
 CLEARANCES = (0.0, 0.004, 0.008, 0.012, 0.02)
 # Small enough that no number of hits outweighs one pose or one object of the cost proper.
 TIE_BREAK = 0.02
+# How far in front of the shelf the gripper has to get with the target [m].
+OUTSIDE = 0.04
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,7 +194,8 @@ class GraspChoice(flax.struct.PyTreeNode):
     Attributes:
       success: whether there is a grasp that hits nothing.
       hits: number of objects that the best grasp hits; one more than there can be if no grasp is feasible.
-      T_world_gripper: the best grasp, of those that hit fewest the one that keeps furthest from the objects.
+      T_world_gripper: the best grasp: of those that hit fewest one with which the arm can leave the shelf, and of
+        those the one that keeps furthest from the objects.
       q7: angle of joint 7 [rad].
       opening: distance between the fingers on the way in [m].
     """
@@ -537,6 +541,19 @@ def graspability_map(problem: Problem, belief: Belief, scene: Superquadrics, con
     return graspability(problem.grasps, belief.grasps, hits)[:-1]
 
 
+def _leaves_shelf(
+    problem: Problem, T_world_gripper: Float[Array, "g 4 4"], q7: Float[Array, " g"]
+) -> Bool[Array, " g"]:
+    """Whether the arm can go on from the end of a retreat, along -x, until what it holds is outside the shelf."""
+    back = line_poses(T_world_gripper, jnp.full(q7.shape, problem.gripper.approach), problem.grasp_config.waypoints)
+    start = back[:, 0]
+    step = jnp.minimum(problem.shelf.front - OUTSIDE - start[:, 0, 3], 0.0)
+    out = start.at[:, 0, 3].add(step)
+    middle = start.at[:, 0, 3].add(0.5 * step)
+    path = jnp.concatenate([out[:, None], middle[:, None], back], axis=1)
+    return path_kinematics(path, q7)[1]
+
+
 @jax.jit
 def graspable_at(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"]) -> GraspChoice:
     """Whether and how a target at a pose can be grasped without hitting anything.
@@ -556,12 +573,14 @@ def graspable_at(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"]
         return jnp.where(found.feasible, jnp.sum(hits, axis=1), scene.capacity + 1)
 
     counts = jax.lax.map(count, jnp.float32(CLEARANCES))
-    order = counts[0] * 1000 + jnp.sum(counts[1:], axis=0)
+    T = compose(T_world_target[None], tables.T_target_gripper)
+    leaves = _leaves_shelf(problem, T, tables.q7)
+    order = counts[0] * 1000 + ~leaves * 500 + jnp.sum(counts[1:], axis=0)
     best = jnp.argmin(order)
     return GraspChoice(
         success=counts[0, best] == 0,
         hits=counts[0, best].astype(jnp.int32),
-        T_world_gripper=compose(T_world_target, tables.T_target_gripper[best]),
+        T_world_gripper=T[best],
         q7=tables.q7[best],
         opening=jnp.float32(problem.gripper.max_opening),
     )

@@ -48,7 +48,7 @@ class Superquadrics(flax.struct.PyTreeNode):
 def empty(capacity: int) -> Superquadrics:
     """`capacity` absent superquadrics: millimetre spheres at the origin, masked out."""
     return Superquadrics(
-        size=jnp.full((capacity, 3), 1e-3),
+        size=jnp.full((capacity, 3), 1e-3, jnp.float32),
         exponents=jnp.ones((capacity, 2)),
         position=jnp.zeros((capacity, 3)),
         rotation=jnp.broadcast_to(jnp.eye(3), (capacity, 3, 3)),

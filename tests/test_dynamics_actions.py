@@ -1,0 +1,199 @@
+"""What actions do to objects as predicted, and which actions are offered."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mechsearch_jax import actions, dynamics, planner, scenario, superquadric, transforms
+from mechsearch_jax.actions import ActionConfig, ActionKind
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.shelf import Shelf
+
+SHELF = Shelf()
+PUSH = jax.jit(dynamics.QuasiStatic(), static_argnums=0)
+
+
+def on_board(*bodies):
+    """Objects that stand on the board from (half size, exponents, x, y, yaw), in eight slots."""
+    size, exponents, x, y, yaw = zip(*bodies, strict=True)
+    size = np.float32(size)
+    position = np.stack([np.float32(x), np.float32(y), SHELF.board + size[:, 2]], axis=-1)
+    return superquadric.pad(
+        superquadric.Superquadrics(
+            size=jnp.asarray(size),
+            exponents=jnp.asarray(np.float32(exponents)),
+            position=jnp.asarray(position),
+            rotation=transforms.yaw_rotation(jnp.asarray(np.float32(yaw))),
+            valid=jnp.ones(len(bodies), bool),
+        ),
+        8,
+    )
+
+
+def finger_at(x, y):
+    """A finger-sized pusher and its pose."""
+    grid = np.stack(np.meshgrid([-0.01, 0, 0.01], np.linspace(-0.01, 0.01, 5), np.linspace(-0.02, 0.02, 5)), -1)
+    return jnp.float32(grid.reshape(-1, 3)), transforms.upright_pose(jnp.float32([x, y, 0.0]), SHELF.board + 0.03)
+
+
+BOX = ((0.03, 0.03, 0.06), superquadric.BOX_EXPONENTS)
+ROUND = ((0.03, 0.03, 0.06), superquadric.CYLINDER_EXPONENTS)
+
+
+def yaw_of(rotation):
+    return np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0])
+
+
+@pytest.mark.parametrize("shape", [BOX, ROUND])
+def test_a_push_through_the_centre_moves_by_the_distance_less_the_gap(shape):
+    scene = on_board((*shape, 0.6, 0.1, 0.0))
+    pusher, T = finger_at(0.6, 0.1 - 0.03 - 0.01 - 0.01)
+    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]))
+    np.testing.assert_allclose(after.scene.position[0, :2], [0.6, 0.1 + 0.09], atol=2e-3)
+    np.testing.assert_allclose(yaw_of(np.asarray(after.scene.rotation[0])), 0.0, atol=0.04)
+    assert float(after.residual) < 1e-3
+
+
+def test_a_push_off_the_centre_turns_a_box_the_right_way():
+    scene = on_board((*BOX, 0.6, 0.1, 0.0))
+    pusher, T = finger_at(0.58, 0.05)
+    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.08, 0.0]))
+    assert yaw_of(np.asarray(after.scene.rotation[0])) < -0.05
+    assert 0.01 < float(after.scene.position[0, 1]) - 0.1 < 0.07
+
+
+def test_pushing_mirrored_scenes_gives_mirrored_results():
+    middle = (SHELF.left + SHELF.right) / 2
+    left = on_board((*BOX, 0.6, middle + 0.08, 0.3), (*ROUND, 0.62, middle + 0.16, 0.0))
+    right = on_board((*BOX, 0.6, middle - 0.08, -0.3), (*ROUND, 0.62, middle - 0.16, 0.0))
+    results = []
+    for scene, side in ((left, 1.0), (right, -1.0)):
+        pusher, T = finger_at(0.59, middle + side * 0.01)
+        results.append(PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, side * 0.1, 0.0])).scene)
+    np.testing.assert_allclose(results[0].position[:2, 0], results[1].position[:2, 0], atol=2e-4)
+    np.testing.assert_allclose(results[0].position[:2, 1] - middle, middle - results[1].position[:2, 1], atol=2e-4)
+
+
+def test_a_pushed_object_pushes_its_neighbour_and_nothing_else_moves():
+    scene = on_board((*BOX, 0.6, 0.1, 0.0), (*BOX, 0.6, 0.18, 0.0), (*BOX, 0.72, -0.2, 0.0))
+    pusher, T = finger_at(0.6, 0.05)
+    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0])).scene
+    moved = np.asarray(dynamics.changed(scene, after))
+    assert moved.tolist() == [True, True] + [False] * 6
+    assert float(after.position[1, 1] - after.position[0, 1]) >= 0.06 - 2e-3
+
+
+def test_an_object_against_the_wall_is_jammed():
+    scene = on_board((*BOX, 0.6, SHELF.left - 0.03, 0.0))
+    pusher, T = finger_at(0.6, SHELF.left - 0.08)
+    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]))
+    assert float(after.residual) > ActionConfig().jam
+
+
+def test_a_push_that_misses_moves_nothing():
+    scene = on_board((*BOX, 0.6, 0.1, 0.0))
+    pusher, T = finger_at(0.5, 0.05)
+    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0])).scene
+    assert not np.any(dynamics.changed(scene, after))
+
+
+def test_pick_and_place_is_a_rigid_motion():
+    scene = on_board((*BOX, 0.6, 0.1, 0.2), (*ROUND, 0.55, -0.1, 0.0))
+    grasp = transforms.upright_pose(jnp.float32([0.6, 0.1, 0.0]), 0.45)
+    place = transforms.upright_pose(jnp.float32([0.7, -0.05, 0.5]), 0.45)
+    after = jax.jit(dynamics.pick_and_place)(scene, jnp.int32(0), grasp, place)
+    np.testing.assert_allclose(after.position[0], [0.7, -0.05, scene.position[0, 2]], atol=1e-6)
+    np.testing.assert_allclose(yaw_of(np.asarray(after.rotation[0])), 0.7, atol=1e-5)
+    np.testing.assert_array_equal(after.position[1:], scene.position[1:])
+
+
+def test_footprints_of_objects_on_their_side():
+    scene = on_board((*ROUND, 0.6, 0.1, 0.0))
+    lying = scene.replace(rotation=scene.rotation.at[0].set(jnp.float32([[1, 0, 0], [0, 0, -1], [0, 1, 0]])))
+    prints = dynamics.footprints(lying)
+    assert not bool(prints.round[0])
+    np.testing.assert_allclose(np.sort(prints.half[0]), [0.03, 0.06], rtol=1e-5)
+    np.testing.assert_allclose(prints.high[0] - prints.low[0], 0.06, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def sampled(problem):
+    """Many actions sampled in a shipped scene, whose target is still hidden."""
+    loaded = scenario.load_scenario(scenario.example_scenarios()["first-light"])
+    objects = scenario.superquadrics(loaded.objects)
+    config = PlannerConfig.paper()
+    belief = planner.observe_belief(
+        problem, planner.initial_belief(problem), objects, jnp.array(False), jnp.zeros(3), config
+    )
+    space = planner.action_space(problem, config)
+
+    @jax.jit
+    def draw(problem, belief, objects, keys):
+        possible = planner._possible_space(problem, belief, belief.exists)
+        options = actions.candidates(space, problem.actions, objects, possible)
+        sample = lambda key: actions.sample_action(  # noqa: E731
+            key, space, problem.actions, objects, possible, options, objects.valid
+        )
+        return options, jax.vmap(sample)(keys)
+
+    options, samples = draw(problem, belief, objects, jax.random.split(jax.random.key(0), 200))
+    return objects, options, jax.tree.map(np.asarray, samples)
+
+
+def test_both_kinds_of_action_are_offered(sampled):
+    kinds = sampled[2].action.kind
+    assert np.mean(kinds == ActionKind.PUSH) > 0.05
+    assert np.mean(kinds == ActionKind.PICK_AND_PLACE) > 0.05
+
+
+def test_only_present_objects_are_moved(sampled):
+    objects, _, samples = sampled
+    moved = samples.action.object[samples.action.kind != ActionKind.NONE]
+    assert np.all(np.asarray(objects.valid)[moved])
+
+
+def test_pushes_go_left_and_right_by_the_given_distances(sampled):
+    action = sampled[2].action
+    d = action.displacement[action.kind == ActionKind.PUSH]
+    np.testing.assert_array_equal(d[:, [0, 2]], 0.0)
+    assert set(np.rint(np.abs(d[:, 1]) * 1000)) <= {50, 100, 150}
+    assert {-1, 1} <= set(np.sign(d[:, 1]))
+
+
+def test_placed_objects_stand_clear_of_each_other_on_the_board(sampled, problem):
+    objects, _, samples = sampled
+    action = samples.action
+    for i in np.flatnonzero(action.kind == ActionKind.PICK_AND_PLACE)[:25]:
+        k = int(action.object[i])
+        after = dynamics.pick_and_place(
+            objects, jnp.int32(k), jnp.asarray(action.T_world_gripper[i]), jnp.asarray(action.T_world_place[i])
+        )
+        np.testing.assert_allclose(after.position[k, 2], objects.position[k, 2], atol=1e-5)
+        cloud = superquadric.sample_surface(after.size[k], after.exponents[k], 400)
+        world = transforms.transform(transforms.make(after.rotation[k], after.position[k]), cloud)
+        others = after.replace(valid=after.valid.at[k].set(False))
+        local = superquadric.to_object_frame(others, world)
+        gauge = superquadric.gauge(others.size, others.exponents, local)
+        assert float(jnp.min(jnp.where(others.valid[None], gauge, jnp.inf))) > 1.0
+        assert float(jnp.min(world[:, 0])) > problem.shelf.front
+
+
+def test_grasped_objects_fit_between_the_fingers(sampled, problem):
+    objects, options, _ = sampled
+    prints = dynamics.footprints(objects)
+    narrow = 2 * np.min(np.asarray(prints.half), axis=1)
+    graspable = np.asarray(options.grasp_reached).any(axis=1)
+    assert np.all(narrow[graspable] <= problem.gripper.usable_opening + 1e-5)
+
+
+def test_settings_that_make_no_sense_are_refused():
+    with pytest.raises(InputError, match='use "both", "push" or "pick-and-place"'):
+        ActionConfig(kinds="throw")
+    with pytest.raises(InputError, match="push_distances"):
+        ActionConfig(push_distances=())
+    with pytest.raises(InputError, match="give as many each"):
+        actions.action_tables(planner.Gripper(), (0.0,), dataclasses.replace(ActionConfig()))

@@ -1,0 +1,134 @@
+"""g against a brute-force reference in float64, and the grasps that it is made of."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mechsearch_jax import graspability, kinematics, planner, scenario, superquadric, transforms
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.graspability import GraspConfig
+from mechsearch_jax.gripper import Gripper
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.target import Target
+
+
+@pytest.fixture(scope="module")
+def objects():
+    return scenario.superquadrics(scenario.load_scenario(scenario.example_scenarios()["first-light"]).objects)
+
+
+@pytest.fixture(scope="module")
+def nothing_found(problem):
+    return planner.initial_belief(problem).grasps
+
+
+@pytest.fixture(scope="module")
+def hits(problem, objects, nothing_found):
+    everywhere = jnp.ones(problem.poses.shape[0] + 1, bool)
+    return np.asarray(graspability.grasp_hits(problem.grasps, nothing_found, objects, everywhere))
+
+
+def least_implicit(objects, k, points):
+    local = (points - np.asarray(objects.position[k], np.float64)) @ np.asarray(objects.rotation[k], np.float64)
+    x, y, z = np.abs(local / np.asarray(objects.size[k], np.float64)).T
+    e1, e2 = np.asarray(objects.exponents[k], np.float64)
+    return np.min((x ** (2 / e2) + y ** (2 / e2)) ** (e2 / e1) + z ** (2 / e1))
+
+
+def test_h_is_that_of_a_brute_force_reference(problem, objects, nothing_found, hits):
+    tables = problem.grasps
+    pose, grasp, allowed, T = (np.asarray(a) for a in graspability.pairs(tables, nothing_found))
+    rng = np.random.default_rng(0)
+    chosen = rng.choice(np.flatnonzero(allowed), 150, replace=False)
+    for pair in chosen:
+        cloud = np.asarray(tables.clouds[grasp[pair]], np.float64).T
+        world = cloud @ T[pose[pair], :3, :3].T.astype(np.float64) + T[pose[pair], :3, 3]
+        for k in np.flatnonzero(objects.valid):
+            least = least_implicit(objects, k, world)
+            if abs(least - 1) > 1e-3:
+                assert hits[pair, k] == (least < 1)
+
+
+def test_g_is_one_minus_the_least_number_of_hits(problem, objects, nothing_found, hits):
+    g = np.asarray(graspability.graspability(problem.grasps, nothing_found, jnp.asarray(hits)))
+    pose, _, allowed, _ = (np.asarray(a) for a in graspability.pairs(problem.grasps, nothing_found))
+    for x in range(0, problem.poses.shape[0], 37):
+        counts = hits[(pose == x) & allowed].sum(axis=1)
+        assert g[x] == 1 - (counts.min() if len(counts) else objects.capacity + 1)
+    assert set(np.unique(g)) <= set(range(-objects.capacity, 2))
+
+
+def test_moving_one_object_recomputes_its_column_alone(problem, objects, nothing_found, hits):
+    everywhere = jnp.ones(problem.poses.shape[0] + 1, bool)
+    moved = objects.replace(position=objects.position.at[2].add(jnp.float32([0.0, 0.05, 0.0])))
+    which = jnp.arange(objects.capacity) == 2
+    update = graspability.grasp_hits(problem.grasps, nothing_found, moved, everywhere, jnp.asarray(hits), which)
+    whole = graspability.grasp_hits(problem.grasps, nothing_found, moved, everywhere)
+    np.testing.assert_array_equal(update, whole)
+    np.testing.assert_array_equal(np.delete(np.asarray(update), 2, axis=1), np.delete(hits, 2, axis=1))
+
+
+def test_nothing_is_in_the_way_on_an_empty_shelf(problem, nothing_found):
+    belief = planner.initial_belief(problem)
+    g = np.asarray(planner.graspability_map(problem, belief, superquadric.empty(8), planner.PlannerConfig.paper()))
+    feasible = np.isin(np.arange(len(g)), np.asarray(problem.grasps.pair_pose))
+    assert np.all(g[feasible] == 1)
+    assert np.all(g[~feasible] == 1 - 9)
+    assert feasible.mean() > 0.9
+
+
+def test_the_arm_reaches_every_feasible_grasp_and_its_pregrasp(problem):
+    tables = problem.grasps
+    chosen = np.random.default_rng(0).choice(len(tables.pair_pose), 200, replace=False)
+    pose, grasp = np.asarray(tables.pair_pose)[chosen], np.asarray(tables.pair_grasp)[chosen]
+    T = transforms.compose(tables.T_world_target[pose], tables.T_target_gripper[grasp])
+    for distance in (0.0, problem.gripper.approach):
+        back = transforms.back_off(T, jnp.full(len(chosen), distance))
+        _, valid = kinematics.inverse_kinematics(back, tables.q7[grasp])
+        assert np.all(np.any(np.asarray(valid), axis=-1))
+
+
+def test_grasps_point_into_the_shelf_and_down(problem):
+    approach = np.asarray(problem.grasps.T_target_gripper)[:, :3, 2]
+    assert np.all(approach[:, 0] >= np.cos(problem.grasp_config.max_yaw) * np.hypot(*approach[:, :2].T) - 1e-5)
+    tilt = np.degrees(np.arcsin(-approach[:, 2]))
+    assert tilt.min() >= 19.9
+    assert tilt.max() <= 30.1
+    np.testing.assert_allclose(np.asarray(problem.grasps.T_target_gripper)[:, 2, 1], 0.0, atol=1e-6)
+
+
+def test_a_wide_target_is_refused_with_what_would_do():
+    with pytest.raises(InputError, match="use a thinner target"):
+        graspability.grasp_tables(Shelf(), Gripper(), Target(half_size=(0.05, 0.05, 0.05)), GraspConfig())
+    with pytest.raises(InputError, match="waypoints"):
+        GraspConfig(waypoints=1)
+
+
+def test_what_the_target_sweeps_is_the_target_and_its_way():
+    target, direction = Target(), np.array([-0.9, 0.0, 0.43588989])
+    points = graspability.swept_target(target, direction, 0.3, 4000, 0.0)
+    t = np.clip(points @ direction, 0, 0.3)
+    radius = np.hypot(*(points - t[:, None] * direction)[:, :2].T)
+    assert points.shape == (4000, 3)
+    assert points[:, 0].min() < -0.26
+    assert points[:, 0].max() <= 0.0201
+    assert np.abs(points[:, 1]).max() <= 0.0201
+    assert radius.min() < 0.021
+
+
+def test_a_found_target_in_the_open_is_grasped_and_one_behind_a_wall_of_boxes_is_not(problem):
+    pose = jnp.float32([0.6, 0.1, 0.0])
+    free = planner.graspable_at(problem, superquadric.empty(8), pose)
+    assert bool(free.success)
+    np.testing.assert_allclose(free.T_world_gripper[:2, 3], pose[:2], atol=1e-5)
+    wall = superquadric.empty(8)
+    for i, y in enumerate(np.linspace(-0.1, 0.3, 5)):
+        wall = wall.replace(
+            size=wall.size.at[i].set(jnp.float32([0.02, 0.06, 0.15])),
+            exponents=wall.exponents.at[i].set(jnp.float32(superquadric.BOX_EXPONENTS)),
+            position=wall.position.at[i].set(jnp.float32([0.5, y, problem.shelf.board + 0.15])),
+            valid=wall.valid.at[i].set(True),
+        )
+    blocked = planner.graspable_at(problem, wall, pose)
+    assert not bool(blocked.success)
+    assert int(blocked.hits) >= 1

@@ -1,0 +1,143 @@
+"""The planner: equation 2, decisions that repeat, no retracing, and the rules of the two methods."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mechsearch_jax import planner, scenario, superquadric
+from mechsearch_jax.actions import ActionKind
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import PlannerConfig
+
+CONFIG = PlannerConfig.paper(sequences=6, horizon=2)
+
+
+def load(name):
+    loaded = scenario.load_scenario(scenario.example_scenarios()[name])
+    return loaded, scenario.superquadrics(loaded.objects)
+
+
+def look(problem, objects, found=False, pose=(0.0, 0.0, 0.0)):
+    start = planner.initial_belief(problem)
+    return planner.observe_belief(problem, start, objects, jnp.array(found), jnp.float32(pose), CONFIG)
+
+
+@pytest.fixture(scope="module")
+def decision(problem):
+    _, objects = load("first-light")
+    belief = look(problem, objects)
+    return objects, belief, planner.plan(jax.random.key(0), problem, belief, objects, CONFIG)
+
+
+def test_the_papers_settings():
+    config = PlannerConfig.paper()
+    assert (config.gamma, config.horizon, config.sequences, config.max_steps) == (0.9, 3, 30, 10)
+    assert config.push_distances == (0.05, 0.10, 0.15)
+    assert config.method == "search-for-grasp"
+
+
+def test_prefix_values_are_equation_2():
+    gamma, cost = 0.9, np.array([20.0, 15.0, 18.0, 3.0])
+    # The right-hand side of equation 2, for every T.
+    expected = [
+        gamma**T * cost[T] + (1 - gamma) / gamma * sum(gamma**t * cost[t] for t in range(1, T + 1)) - cost[0]
+        for T in (1, 2, 3)
+    ]
+    for acted, best in (([True] * 3, np.argmin(expected)), ([True, False, False], 0)):
+        value, length = planner._prefix_values(jnp.float32(cost), jnp.zeros(3), jnp.array(acted), gamma)
+        np.testing.assert_allclose(value, expected[best], rtol=1e-5)
+        assert int(length) == best + 1
+    nothing, _ = planner._prefix_values(jnp.float32(cost), jnp.zeros(3), jnp.zeros(3, bool), gamma)
+    assert np.isinf(nothing)
+
+
+def test_a_decision_is_the_first_action_of_the_best_sequence(decision):
+    _, belief, plan = decision
+    values = np.asarray(plan.sequences.value)
+    assert np.all(values[:-1] <= values[1:])
+    assert float(plan.value) == values[0]
+    assert int(plan.action.kind) == int(plan.sequences.actions.kind[0, 0]) != ActionKind.NONE
+    assert float(plan.cost) >= float(jnp.sum(belief.exists))
+    assert not bool(plan.overflow)
+
+
+def test_an_object_moves_at_most_once_in_a_sequence(decision):
+    actions = decision[2].sequences.actions
+    for kinds, objects in zip(np.asarray(actions.kind), np.asarray(actions.object), strict=True):
+        moved = objects[kinds != ActionKind.NONE]
+        assert len(set(moved.tolist())) == len(moved)
+
+
+def test_the_same_key_and_state_give_the_same_decision(decision, problem):
+    objects, belief, plan = decision
+    again = planner.plan(jax.random.key(0), problem, belief, objects, CONFIG)
+    jax.tree.map(np.testing.assert_array_equal, plan, again)
+
+
+def test_nothing_is_compiled_anew_when_objects_come_go_or_move(decision, problem):
+    objects = decision[0]
+    counts = [f._cache_size() for f in (planner.plan, planner.observe_belief, planner.graspable_at)]
+    fewer = objects.replace(valid=objects.valid.at[0].set(False))
+    moved = objects.replace(position=objects.position.at[1].add(jnp.float32([0.01, 0.02, 0.0])))
+    _, other = load("crowded-shelf")
+    for scene in (fewer, moved, other):
+        seen = look(problem, scene)
+        planner.plan(jax.random.key(1), problem, seen, scene, CONFIG)
+    found = look(problem, objects, True, (0.7, 0.2, 0.0))
+    plan = planner.plan(jax.random.key(1), problem, found, objects, CONFIG)
+    assert float(plan.cost) < superquadric.empty(8).capacity + 3
+    planner.graspable_at(problem, objects, jnp.float32([0.7, 0.2, 0.0]))
+    planner.graspable_at(problem, fewer, jnp.float32([0.6, 0.0, 0.0]))
+    after = [f._cache_size() for f in (planner.plan, planner.observe_belief, planner.graspable_at)]
+    assert after[:2] == counts[:2]
+    assert after[2] <= counts[2] + 1
+
+
+def test_a_found_target_is_one_pose_and_stays_found(problem):
+    _, objects = load("first-light")
+    belief = look(problem, objects, True, (0.7, 0.2, 0.0))
+    assert bool(belief.found)
+    hidden_again = planner.observe_belief(problem, belief, objects, jnp.array(False), jnp.zeros(3), CONFIG)
+    assert bool(hidden_again.found)
+    np.testing.assert_allclose(hidden_again.found_pose, [0.7, 0.2, 0.0])
+
+
+def test_an_empty_shelf_leaves_nothing_to_do(problem):
+    empty = superquadric.empty(8)
+    plan = planner.plan(jax.random.key(0), problem, look(problem, empty), empty, CONFIG)
+    assert int(plan.action.kind) == ActionKind.NONE
+    assert np.all(np.isinf(plan.sequences.value))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"gamma": 0.0}, r"gamma 0.0 is outside \(0, 1\]"),
+        ({"gamma": 1.5}, "gamma 1.5"),
+        ({"horizon": 0}, "horizon 0 must be at least 1"),
+        ({"sequences": 0}, "sequences 0"),
+        ({"method": "guess"}, 'use "search-for-grasp" or "search-and-grasp"'),
+        ({"actions": "throw"}, 'use "both", "push" or "pick-and-place"'),
+        ({"criterion": "guess"}, 'criterion "guess" is unknown'),
+    ],
+)
+def test_impossible_options_are_refused_with_what_would_do(changes, message):
+    with pytest.raises(InputError, match=message):
+        PlannerConfig.paper(**changes)
+
+
+@pytest.mark.slow
+def test_decisions_in_a_batch_are_those_made_alone(problem):
+    _, first = load("first-light")
+    _, second = load("crowded-shelf")
+    scenes = jax.tree.map(lambda *a: jnp.stack(a), first, second)
+    beliefs = jax.tree.map(lambda *a: jnp.stack(a), look(problem, first), look(problem, second))
+    keys = jnp.stack([jax.random.key(3), jax.random.key(4)])
+    batch = jax.vmap(lambda k, b, s: planner.plan(k, problem, b, s, CONFIG))
+    together = jax.jit(batch)(keys, beliefs, scenes)
+    for i, scene in enumerate((first, second)):
+        alone = planner.plan(keys[i], problem, look(problem, scene), scene, CONFIG)
+        assert int(together.action.kind[i]) == int(alone.action.kind)
+        assert int(together.action.object[i]) == int(alone.action.object)
+        np.testing.assert_allclose(together.action.T_world_gripper[i], alone.action.T_world_gripper, atol=1e-4)
