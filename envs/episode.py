@@ -318,8 +318,8 @@ def _act(simulator: Simulator, grasp: GraspChoice | None, decision: Plan | None)
 
 def _end(belief: Belief, step: Step, last: bool) -> str | None:
     """Why an episode without a retrieval ends here; None if it goes on."""
-    # Trying the same grasp in the same world once more would not make it reachable.
-    if step.failure == "retrieval: unreachable":
+    # Trying once more would neither make the same grasp reachable nor put a fallen object back on the board.
+    if step.failure in ("retrieval: unreachable", "retrieval: fallen"):
         return step.failure
     if not last:
         return None

@@ -94,8 +94,8 @@ class ActionConfig:
       push_distances: how far the gripper travels in a push [m].
       push_tilt: angle by which the pushing gripper points downwards [rad].
       push_wrists: angles of joint 7 relative to 45 degrees that pushes are tried with [rad].
-      push_heights: two limits of the height of the finger tips above the board in a push [m]: the lower keeps the hand
-        behind the object's neighbours, the higher above them.
+      push_yaws: angles between the gripper's approach and +x in a push, seen from above [rad].
+      push_height: largest height of the finger tips above the board in a push [m].
       push_leverage: largest height at which a push may begin to touch, in half widths of the object along it, for boxes
         and for round objects. Higher up, friction at the board (0.4 and 0.6) topples them instead of letting them
         slide.
@@ -117,7 +117,8 @@ class ActionConfig:
     push_distances: tuple[float, ...] = (0.05, 0.10, 0.15)
     push_tilt: float = math.radians(30)
     push_wrists: tuple[float, ...] = (math.radians(-45), math.radians(-15), math.radians(30))
-    push_heights: tuple[float, float] = (0.06, 0.12)
+    push_yaws: tuple[float, ...] = (math.radians(-25), 0.0, math.radians(25))
+    push_height: float = 0.08
     push_leverage: tuple[float, float] = (1.8, 1.3)
     push_gap: float = 0.01
     push_depths: tuple[float, float] = (0.02, 0.02)
@@ -342,11 +343,11 @@ def object_pushes(
     """Gripper poses where pushes start, beside each object at `push_gap` from it, and whether it would stay upright.
 
     For each side (pushing towards +y, then -y), for two depths (fingers just past the object's front, then past its
-    centre so that the palm pushes), for two heights, for each wrist.
+    centre so that the palm pushes), for each yaw of the gripper, for each wrist.
     """
     wrists = tables.q7.shape[1]
-    side, deep, high, _ = _push_grid(wrists)
-    rotation = gripper_rotation(jnp.float32(0.0), jnp.float32(config.push_tilt))
+    side, deep, yaw, _ = _push_grid(config, wrists)
+    rotation = gripper_rotation(jnp.float32(yaw), jnp.full(len(yaw), config.push_tilt, jnp.float32))
     extent = bounding_half_extents(scene)
     x = jnp.where(
         jnp.asarray(deep == 0)[None],
@@ -356,16 +357,13 @@ def object_pushes(
     height = prints.high - shelf.board
     leverage = jnp.where(prints.round, config.push_leverage[1], config.push_leverage[0]) * extent[:, 1]
     limit = jnp.minimum(leverage, 0.75 * height)
-    z = shelf.board + jnp.clip(limit[:, None], 0.03, jnp.float32(config.push_heights)[high][None])
-    b = len(side)
-    shape = (scene.capacity, b)
+    shape = (scene.capacity, len(side))
+    z = jnp.broadcast_to(shelf.board + jnp.clip(limit, 0.03, config.push_height)[:, None], shape)
     centre = jnp.stack([x, jnp.broadcast_to(prints.position[:, 1:2], shape), z], axis=-1)
-    T = make(jnp.broadcast_to(rotation, (*shape, 3, 3)), centre)
+    T = make(jnp.broadcast_to(rotation[None], (*shape, 3, 3)), centre)
 
-    points = rotate(rotation, tables.pusher)
-
-    def beside(half, is_round, position, yaw, low, high, centre, side):
-        world = points + centre[None]
+    def beside(half, is_round, position, yaw, low, high, T, side):
+        world = transform(T, tables.pusher)
         level = (world[:, 2] > low - config.push_gap) & (world[:, 2] < high + config.push_gap)
         local = turned(-yaw, world[:, :2] - position[None])
         heading = turned(-yaw, jnp.array([0.0, 1.0]) * -side)
@@ -380,20 +378,21 @@ def object_pushes(
 
     each = jax.vmap(beside, in_axes=(None,) * 6 + (0, 0))
     distance, contact = jax.vmap(each, in_axes=(0,) * 7 + (None,))(
-        prints.half, prints.round, prints.position, prints.yaw, prints.low, prints.high, centre, jnp.float32(side)
+        prints.half, prints.round, prints.position, prints.yaw, prints.low, prints.high, T, jnp.float32(side)
     )
     stable = contact <= jnp.maximum(leverage, 0.03)[:, None]
     return T.at[..., 1, 3].add(-jnp.float32(side)[None] * distance), stable
 
 
-def _push_grid(wrists: int):
-    """Side, depth, height and wrist of each push of an object."""
-    return [g.reshape(-1) for g in np.meshgrid([1.0, -1.0], [0, 1], [0, 1], np.arange(wrists), indexing="ij")]
+def _push_grid(config: ActionConfig, wrists: int):
+    """Side, depth, yaw and wrist of each push of an object."""
+    grid = np.meshgrid([1.0, -1.0], [0, 1], np.asarray(config.push_yaws), np.arange(wrists), indexing="ij")
+    return [g.reshape(-1) for g in grid]
 
 
-def push_variants(wrists: int) -> tuple[np.ndarray, np.ndarray]:
+def push_variants(config: ActionConfig, wrists: int) -> tuple[np.ndarray, np.ndarray]:
     """Side (+1 or -1 along y) and wrist of each push of `object_pushes`, each of shape (B,)."""
-    side, _, _, wrist = _push_grid(wrists)
+    side, _, _, wrist = _push_grid(config, wrists)
     return np.asarray(side, np.float32), wrist
 
 
@@ -542,7 +541,7 @@ def candidates(
     grasp_enters = _enters_possible(tables, possible, 0, wrist, flat, usable).reshape(n, a)
 
     push, stable = object_pushes(space.shelf, tables, scene, prints, config)
-    side, push_wrist = push_variants(wrists)
+    side, push_wrist = push_variants(config, wrists)
     b, d = push.shape[1], len(config.push_distances)
     flat = push.reshape(-1, 4, 4)
     owner_b = np.repeat(np.arange(n), b)
@@ -750,7 +749,7 @@ def sample_action(
     index = row % n
 
     grasp_wrist = jnp.asarray(_grasp_variants(config, wrists)[2])
-    side, push_wrist = (jnp.asarray(v) for v in push_variants(wrists))
+    side, push_wrist = (jnp.asarray(v) for v in push_variants(config, wrists))
     grasp = jnp.clip(way, 0, a - 1)
     push, distance = jnp.clip(way, 0, b * d - 1) // d, jnp.clip(way, 0, b * d - 1) % d
     T_grasp, T_push = options.grasp[index, grasp], options.push[index, push]

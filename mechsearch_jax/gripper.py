@@ -233,7 +233,7 @@ def _sampled(
     """`swept_cloud` of checked arguments; kept, because several tables of a problem are made of the same clouds."""
     hulls = [_swept_hull(primitive, distance) for primitive in primitives_in_gripper(gripper, opening, q7)]
     areas = np.array([hull.area for hull in hulls])
-    shares = np.ceil(8 * count * areas / areas.sum()).astype(int) + 50
+    shares = np.ceil(12 * count * areas / areas.sum()).astype(int) + 50
     candidates = np.concatenate(
         [
             _outside(trimesh.sample.sample_surface(hull, share, seed=seed + i)[0], hulls[:i] + hulls[i + 1 :])

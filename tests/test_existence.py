@@ -102,11 +102,12 @@ def test_f_grows_the_possible_set_by_no_more_than_a_third(problem):
         return existence.existence(tables, problem.camera, views, everywhere, exact)
 
     ours = theirs = 0
-    for one in every_scenario()[::4]:
+    scenes = every_scenario()
+    for one in scenes[:: 4 if len(scenes) > 10 else 1]:
         objects = scenario.superquadrics(one.objects)
         ours += int(jnp.sum(look(problem, objects).exists))
         theirs += int(jnp.sum(exactly(objects)))
-    assert theirs > 100
+    assert theirs > 50
     assert ours <= 1.35 * theirs
 
 
