@@ -3,6 +3,10 @@
 A candidate pose stands for its whole grid cell, so the target is tried at several places of the cell. At each it must
 be hidden (it would show no more pixels than the detector needs) and free of collision (with the target drawn in by a
 margin for what lies between those places and for the uncertainty of the shapes). f is 1 if any of the places passes.
+
+An approximation: the places reach half way to the cell's edges. Measured on published scenes, that loses 2% of hidden
+positions that are anywhere in a cell, and makes the possible set a third larger than one exact place a cell does; places
+at the corners would lose 0.3% and make it 60% larger.
 """
 
 from __future__ import annotations
