@@ -11,15 +11,23 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax import superquadric
 from mechsearch_jax.collision import Pair, any_inside, hits_shelf
-from mechsearch_jax.dynamics import Footprints, bounding_half_extents, footprints, turned
+from mechsearch_jax.dynamics import (
+    LEVERAGE,
+    LOW_CONTACT,
+    TOUCH,
+    Footprints,
+    bounding_half_extents,
+    footprints,
+    turned,
+)
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.graspability import WRIST_ORIGIN, boxes_overlap, gripper_rotation
 from mechsearch_jax.gripper import Gripper, arm_hits_shelf, gripper_cloud, swept_cloud
-from mechsearch_jax.kinematics import line_kinematics, path_kinematics
+from mechsearch_jax.kinematics import line_kinematics, line_poses, path_kinematics
 from mechsearch_jax.masked import masked_vmap
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
@@ -35,9 +43,12 @@ from mechsearch_jax.transforms import (
     yaw_rotation,
 )
 
+# How close to an object's front the palm may pass [m].
 PASSING_GAP = 0.003
-# Parts of the gripper that come this close together touch an object together [m].
-TOUCH = 0.004
+# Number of poses on each stretch of a motion where it is followed closely, and of places on the way of a push that
+# are tested for collision.
+CLOSE_WAYPOINTS = 12
+PUSH_PLACES = 3
 # How far the palm's flat front is behind the finger tips' centres, and how far it extends above and below them [m].
 PALM = 0.033
 HAND_LENGTH = 0.11
@@ -96,9 +107,8 @@ class ActionConfig:
       push_wrists: angles of joint 7 relative to 45 degrees that pushes are tried with [rad].
       push_yaws: angles between the gripper's approach and +x in a push, seen from above [rad].
       push_height: largest height of the finger tips above the board in a push [m].
-      push_leverage: largest height at which a push may begin to touch, in half widths of the object along it, for boxes
-        and for round objects. Higher up, friction at the board (0.4 and 0.6) topples them instead of letting them
-        slide.
+      push_leverage: largest height at which a push may begin to touch; see `dynamics.LEVERAGE`.
+      topple: a push is not executed if an object is predicted to fall over with a probability above this.
       push_gap: distance between gripper and object where a push starts [m].
       push_depths: how far the finger tips reach past the object's front, or past its centre, in a push [m].
       grasp_tilts: angles by which the grasping gripper points downwards [rad].
@@ -119,7 +129,8 @@ class ActionConfig:
     push_wrists: tuple[float, ...] = (math.radians(-45), math.radians(-15), math.radians(30))
     push_yaws: tuple[float, ...] = (math.radians(-25), 0.0, math.radians(25))
     push_height: float = 0.08
-    push_leverage: tuple[float, float] = (1.8, 1.3)
+    push_leverage: tuple[float, float] = LEVERAGE
+    topple: float = 0.5
     push_gap: float = 0.01
     push_depths: tuple[float, float] = (0.02, 0.02)
     grasp_tilts: tuple[float, ...] = (math.radians(20), math.radians(30))
@@ -358,7 +369,7 @@ def object_pushes(
     leverage = jnp.where(prints.round, config.push_leverage[1], config.push_leverage[0]) * extent[:, 1]
     limit = jnp.minimum(leverage, 0.75 * height)
     shape = (scene.capacity, len(side))
-    z = jnp.broadcast_to(shelf.board + jnp.clip(limit, 0.03, config.push_height)[:, None], shape)
+    z = jnp.broadcast_to(shelf.board + jnp.clip(limit, LOW_CONTACT, config.push_height)[:, None], shape)
     centre = jnp.stack([x, jnp.broadcast_to(prints.position[:, 1:2], shape), z], axis=-1)
     T = make(jnp.broadcast_to(rotation[None], (*shape, 3, 3)), centre)
 
@@ -380,7 +391,7 @@ def object_pushes(
     distance, contact = jax.vmap(each, in_axes=(0,) * 7 + (None,))(
         prints.half, prints.round, prints.position, prints.yaw, prints.low, prints.high, T, jnp.float32(side)
     )
-    stable = contact <= jnp.maximum(leverage, 0.03)[:, None]
+    stable = contact <= jnp.maximum(leverage, LOW_CONTACT)[:, None]
     return T.at[..., 1, 3].add(-jnp.float32(side)[None] * distance), stable
 
 
@@ -426,18 +437,19 @@ def _swept_object(cloud, R_object_gripper, distance, steps=7):
 def _gripper_hits(tables, opening, wrist, T, scene, mask):
     """Which objects the swept gripper hits: poses (C, 4, 4) against objects (N), where the mask (C, N) is true."""
     c, n = mask.shape
+    wrist = jnp.asarray(wrist)
 
     def pair(tables, row, i):
-        T, scene = row
+        T, wrist, scene = row
         k, j = i // n, i % n
-        cloud = tables.clouds[opening, jnp.asarray(wrist)[k]]
+        cloud = tables.clouds[opening, wrist[k]]
         T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
         return Pair(cloud, compose(T_object_world, T[k]), scene.size[j], scene.exponents[j])
 
     T_gripper_object = compose(inverse(T)[:, None], make(scene.rotation, scene.position)[None])
-    low, high = tables.low[opening][jnp.asarray(wrist)], tables.high[opening][jnp.asarray(wrist)]
+    low, high = tables.low[opening][wrist], tables.high[opening][wrist]
     near = boxes_overlap(low[:, None], high[:, None], T_gripper_object, scene.size[None])
-    return any_inside((mask & near).reshape(-1), pair, tables, (T, scene)).reshape(c, n)
+    return any_inside((mask & near).reshape(-1), pair, tables, (T, wrist, scene)).reshape(c, n)
 
 
 def _object_hits(T, owner, scene, clouds, distance, mask, grow=0.0):
@@ -597,6 +609,49 @@ def candidates(
     )
 
 
+def followable(space: ActionSpace, action: Action) -> Bool[Array, ""]:
+    """Whether the arm can follow an action closely, in one configuration and without passing a singularity.
+
+    `candidates` looks at few poses on a motion, which is enough to rule out most; this is for the few that are drawn.
+    """
+    n, back = CLOSE_WAYPOINTS, jnp.float32(space.gripper.approach)
+    is_push = action.kind == ActionKind.PUSH
+    start, end = action.T_world_gripper, action.T_world_place
+    way = translate(jnp.broadcast_to(start, (n, 4, 4)), jnp.linspace(0.0, 1.0, n)[:, None] * (end - start)[None, :3, 3])
+    into, out = line_poses(start, back, n), line_poses(end, back, n)[::-1]
+    # Between picking and placing the arm is outside the shelf, where it may turn as it likes.
+    pushing = path_kinematics(jnp.concatenate([into, way[1:], out[1:]]), action.q7)[1]
+    picking = jnp.all(path_kinematics(jnp.stack([into, out]), jnp.broadcast_to(action.q7, 2))[1])
+    return jnp.where(is_push, pushing, picking)
+
+
+def push_hits_others(
+    space: ActionSpace,
+    tables: ActionTables,
+    scene: Superquadrics,
+    action: Action,
+    wrist: Int[Array, ""],
+    still: Bool[Array, " n"],
+) -> Bool[Array, ""]:
+    """Whether a pushing gripper, on its way or on its retreat, hits an object that the push should leave in place.
+
+    A `PushModel` knows the hand and the fingers; links 6 and 7 and the retreat are tested here.
+
+    Args:
+      space: static.
+      tables: constants of the problem.
+      scene: the objects, before or after the push.
+      action: the push.
+      wrist: index of its wrist angle.
+      still: which objects it leaves in place.
+    """
+    share = (jnp.arange(PUSH_PLACES) + 1.0) / PUSH_PLACES
+    T = jnp.broadcast_to(action.T_world_gripper, (PUSH_PLACES, 4, 4))
+    T = translate(T, share[:, None] * action.displacement[None])
+    mask = jnp.broadcast_to(still & scene.valid, (PUSH_PLACES, scene.capacity))
+    return jnp.any(_gripper_hits(tables, 1, jnp.broadcast_to(wrist, PUSH_PLACES), T, scene, mask))
+
+
 class Sample(flax.struct.PyTreeNode):
     """A sampled action.
 
@@ -667,7 +722,6 @@ def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
         matmul(yaw_rotation(turn[best]), T_grasp[:3, :3]),
         rotate(yaw_rotation(turn[best]), arm) + position[best],
     )
-    wrist_b = jnp.full(tests, wrist)
 
     def clear(tables, row, i):
         T, wrist = row
@@ -677,18 +731,8 @@ def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
 
     clear_way = masked_vmap(clear, candidate, tables, (T_place, wrist))
 
-    def gripper_pair(tables, row, i):
-        T, wrist, other = row
-        k, j = i // n, i % n
-        T_object_world = inverse(make(other.rotation[j], other.position[j]))
-        return Pair(tables.clouds[0, wrist], compose(T_object_world, T[k]), other.size[j], other.exponents[j])
-
-    T_gripper_object = compose(inverse(T_place)[:, None], make(scene.rotation, scene.position)[None])
-    low = jnp.broadcast_to(tables.low[0][wrist_b][:, None], (tests, 1, 3))
-    high = jnp.broadcast_to(tables.high[0][wrist_b][:, None], (tests, 1, 3))
-    near = boxes_overlap(low, high, T_gripper_object, scene.size[None])
-    mask = near & clear_way[:, None] & other.valid[None]
-    hits = any_inside(mask.reshape(-1), gripper_pair, tables, (T_place, wrist, other)).reshape(mask.shape)
+    mask = clear_way[:, None] & other.valid[None]
+    hits = _gripper_hits(tables, 0, jnp.full(tests, wrist), T_place, other, mask)
 
     def body_pair(_, row, i):
         T, position, rotation, cloud, scene = row

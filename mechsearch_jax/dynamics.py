@@ -17,6 +17,13 @@ from mechsearch_jax.transforms import compose, inverse, matmul, transform, yaw_r
 
 ROUND_EXPONENT = 0.6
 BOUNDARY_POINTS = 24
+# Largest height at which a push may begin to touch, in half widths of the object along it, for boxes and for round
+# objects. Higher up, friction at the board (0.4 and 0.6) topples them instead of letting them slide; but a push at the
+# very bottom never does.
+LEVERAGE = (1.8, 1.3)
+LOW_CONTACT = 0.03
+# Parts of the gripper that come this close together touch an object together [m].
+TOUCH = 0.004
 
 
 class PushOutcome(flax.struct.PyTreeNode):
@@ -25,10 +32,12 @@ class PushOutcome(flax.struct.PyTreeNode):
     Attributes:
       scene: the objects afterwards.
       residual: deepest penetration that the model could not resolve [m]: objects jammed against a wall or one another.
+      topples: probability that an object falls over, shape (N,).
     """
 
     scene: Superquadrics
     residual: jax.Array
+    topples: jax.Array
 
 
 class PushModel(Protocol):
@@ -161,6 +170,20 @@ def _resolve_pusher(prints, points, heading, friction):
     return _yield_to(prints, depth, away, turned(prints.yaw, point), heading, friction), jnp.max(depth)
 
 
+def _touched_high(scene, prints, points, heading, leverage):
+    """Which objects points touch so high above the board that a push along `heading` tips them."""
+    local = turned(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
+    depth, _ = _contact(prints.half[:, None, :], prints.round[:, None], local)
+    level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
+    touching = level & (depth > -TOUCH) & prints.valid[:, None]
+    lowest = jnp.min(jnp.where(touching, points[None, :, 2], jnp.inf), axis=1) - prints.low
+    along = jnp.sum(scene.rotation[:, :2, :] * heading[None, :, None], axis=1)
+    half = jnp.sum(jnp.abs(along) * scene.size, axis=-1)
+    limit = jnp.where(prints.round, leverage[1], leverage[0]) * half
+    # Half a centimetre more than a planned push is given, since this only sees where the push ends.
+    return jnp.any(touching, axis=1) & (lowest > jnp.maximum(limit, LOW_CONTACT) + 0.005)
+
+
 def _pair_contacts(prints):
     """For every ordered pair (i, j): the deepest contact, and the direction in which j has to give way."""
     outline = _outline(prints)
@@ -210,19 +233,21 @@ def _resolve_walls(shelf, prints):
 class QuasiStatic:
     """An analytic `PushModel`: the gripper moves in small steps, and what it runs into gives way.
 
-    Objects are planar footprints that slide under an ellipsoidal limit surface without inertia; toppling and
-    objects pushed back by others are neglected.
+    Objects are planar footprints that slide under an ellipsoidal limit surface without inertia; objects pushed back by
+    others are neglected, and only what the gripper itself touches too high is taken to topple.
 
     Attributes:
       steps: number of steps of the gripper.
       sweeps: how often contacts are resolved in each.
       gripper_friction, object_friction: coefficients at contacts with the gripper and between objects.
+      leverage: how high the gripper may touch an object without tipping it; see `LEVERAGE`.
     """
 
     steps: int = 16
     sweeps: int = 2
     gripper_friction: float = 0.8
     object_friction: float = 0.4
+    leverage: tuple[float, float] = LEVERAGE
 
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array
@@ -253,7 +278,9 @@ class QuasiStatic:
         moved_scene = rigid_motion(scene, before.position, after.position, turn)
         pick = lambda new, old: jnp.where(moved.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
         residual = jnp.maximum(jnp.maximum(held, jammed), wall)
-        return PushOutcome(jax.tree.map(pick, moved_scene, scene), jnp.maximum(residual, 0.0))
+        scene = jax.tree.map(pick, moved_scene, scene)
+        high = _touched_high(scene, after, start + displacement[None], heading, self.leverage)
+        return PushOutcome(scene, jnp.maximum(residual, 0.0), jnp.where(high, 1.0, 0.0))
 
 
 def rigid_motion(

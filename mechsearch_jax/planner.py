@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import (
+    CLOSE_WAYPOINTS,
     Action,
     ActionConfig,
     ActionKind,
@@ -23,8 +24,11 @@ from mechsearch_jax.actions import (
     ActionTables,
     Candidates,
     PossibleSpace,
+    Sample,
     action_tables,
     candidates,
+    followable,
+    push_hits_others,
     sample_action,
     widen,
 )
@@ -49,16 +53,18 @@ from mechsearch_jax.graspability import (
     grasp_tables,
     graspability,
 )
-from mechsearch_jax.gripper import Gripper
-from mechsearch_jax.kinematics import line_poses, path_kinematics
+from mechsearch_jax.gripper import Gripper, arm_points
+from mechsearch_jax.kinematics import line_kinematics, line_poses, path_kinematics
 from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.superquadric import Superquadrics, gauge, to_object_frame
 from mechsearch_jax.target import Target
 from mechsearch_jax.transforms import compose, upright_pose
 
 CLEARANCES = (0.0, 0.004, 0.008, 0.012, 0.02)
 # Small enough that no number of hits outweighs one pose or one object of the cost proper.
 TIE_BREAK = 0.02
+# On the approach to a found target: poses of the arm, and points on each of its capsules, that are tested.
+ARM_WAYPOINTS, ARM_POINTS = 6, 7
 # How far in front of the shelf the gripper has to get with the target [m].
 OUTSIDE = 0.04
 
@@ -194,8 +200,8 @@ class GraspChoice(flax.struct.PyTreeNode):
     Attributes:
       success: whether there is a grasp that hits nothing.
       hits: number of objects that the best grasp hits; one more than there can be if no grasp is feasible.
-      T_world_gripper: the best grasp: of those that hit fewest one with which the arm can leave the shelf, and of
-        those the one that keeps furthest from the objects.
+      T_world_gripper: the best grasp: of those that hit fewest one with which the arm can leave the shelf, of those
+        one with which links 2 to 5 touch fewest objects, and of those the one that keeps furthest from the objects.
       q7: angle of joint 7 [rad].
       opening: distance between the fingers on the way in [m].
     """
@@ -389,14 +395,17 @@ def action_space(problem: Problem, config: PlannerConfig) -> ActionSpace:
     )
 
 
-def _predict(problem: Problem, space: ActionSpace, push_model: PushModel, scene: Superquadrics, sample):
+def _predict(problem: Problem, space: ActionSpace, push_model: PushModel, scene: Superquadrics, sample: Sample):
     """S of equation 4, and whether the action can be executed as predicted."""
     action = sample.action
     pushed = push_model(problem.shelf, scene, problem.actions.pusher, action.T_world_gripper, action.displacement)
     placed = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
     is_push = action.kind == ActionKind.PUSH
-    hits_target = jnp.any(changed(scene, pushed.scene)[-1:])
-    possible = (action.kind != ActionKind.NONE) & ~(is_push & ((pushed.residual > space.config.jam) | hits_target))
+    moved = changed(scene, pushed.scene)
+    still = scene.valid & ~moved & is_push
+    spoiled = (pushed.residual > space.config.jam) | jnp.any(pushed.topples > space.config.topple) | moved[-1]
+    spoiled |= push_hits_others(space, problem.actions, scene, action, sample.wrist, still)
+    possible = (action.kind != ActionKind.NONE) & ~(is_push & spoiled) & followable(space, action)
     after = jax.tree.map(lambda a, b: jnp.where(is_push, a, b), pushed.scene, placed)
     after = jax.tree.map(lambda new, old: jnp.where(possible, new, old), after, scene)
     return after, possible
@@ -545,13 +554,25 @@ def _leaves_shelf(
     problem: Problem, T_world_gripper: Float[Array, "g 4 4"], q7: Float[Array, " g"]
 ) -> Bool[Array, " g"]:
     """Whether the arm can go on from the end of a retreat, along -x, until what it holds is outside the shelf."""
-    back = line_poses(T_world_gripper, jnp.full(q7.shape, problem.gripper.approach), problem.grasp_config.waypoints)
-    start = back[:, 0]
-    step = jnp.minimum(problem.shelf.front - OUTSIDE - start[:, 0, 3], 0.0)
-    out = start.at[:, 0, 3].add(step)
-    middle = start.at[:, 0, 3].add(0.5 * step)
-    path = jnp.concatenate([out[:, None], middle[:, None], back], axis=1)
-    return path_kinematics(path, q7)[1]
+    n = CLOSE_WAYPOINTS
+    back = line_poses(T_world_gripper, jnp.full(q7.shape, problem.gripper.approach), n)
+    step = jnp.minimum(problem.shelf.front - OUTSIDE - back[:, 0, 0, 3], 0.0)
+    out = jnp.broadcast_to(back[:, :1], (q7.shape[0], n - 1, 4, 4))
+    out = out.at[..., 0, 3].add(step[:, None] * jnp.linspace(1.0, 0.0, n)[None, :-1])
+    return path_kinematics(jnp.concatenate([out, back], axis=1), q7)[1]
+
+
+def _arm_touches(
+    problem: Problem, scene: Superquadrics, T_world_gripper: Float[Array, "g 4 4"], q7: Float[Array, " g"]
+) -> Int[Array, " g"]:
+    """How many objects links 2 to 5 run into on the approach to each grasp."""
+    approach = jnp.full(q7.shape, problem.gripper.approach)
+    q, _ = line_kinematics(T_world_gripper, approach, q7, ARM_WAYPOINTS)
+    points, radius = arm_points(q, ARM_POINTS)
+    size = scene.size[None] + radius[:, None, None]
+    # A superquadric that is larger by the radius on every side holds all that is nearer than that to the object.
+    near = gauge(size, scene.exponents[None], to_object_frame(scene, points)) < 1.0
+    return jnp.sum(jnp.any(near, axis=(1, 2)) & scene.valid[None], axis=1)
 
 
 @jax.jit
@@ -575,7 +596,8 @@ def graspable_at(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"]
     counts = jax.lax.map(count, jnp.float32(CLEARANCES))
     T = compose(T_world_target[None], tables.T_target_gripper)
     leaves = _leaves_shelf(problem, T, tables.q7)
-    order = counts[0] * 1000 + ~leaves * 500 + jnp.sum(counts[1:], axis=0)
+    touches = _arm_touches(problem, scene, T, tables.q7)
+    order = ((counts[0] * 2 + ~leaves) * 10 + touches) * 100 + jnp.sum(counts[1:], axis=0)
     best = jnp.argmin(order)
     return GraspChoice(
         success=counts[0, best] == 0,
