@@ -609,6 +609,22 @@ def candidates(
     )
 
 
+def free_ways(options: Candidates) -> tuple[Bool[Array, "n a"], Bool[Array, "n b d"]]:
+    """Which grasps and which pushes of each object nothing stands in the way of."""
+    grasps = options.grasp_reached & ~jnp.any(options.grasp_hits, axis=-1)
+    pushes = options.push_reached & ~jnp.any(options.push_hits, axis=-1)[..., None]
+    return grasps, pushes
+
+
+def obstruction(options: Candidates) -> Float[Array, "n n"]:
+    """How much each object (second axis) is in the way of moving each other: the share of its ways that it blocks."""
+    pushes = jnp.any(options.push_reached, axis=-1)
+    blocked = jnp.sum(options.grasp_hits & options.grasp_reached[..., None], axis=1)
+    blocked += jnp.sum(options.push_hits & pushes[..., None], axis=1)
+    ways = jnp.sum(options.grasp_reached, axis=1) + jnp.sum(pushes, axis=1)
+    return blocked / jnp.maximum(ways, 1)[:, None]
+
+
 def followable(space: ActionSpace, action: Action) -> Bool[Array, ""]:
     """Whether the arm can follow an action closely, in one configuration and without passing a singularity.
 
@@ -758,8 +774,9 @@ def sample_action(
     possible: PossibleSpace,
     options: Candidates,
     available: Bool[Array, " n"],
+    preference: Float[Array, " n"],
 ) -> Sample:
-    """Draw an action: an object and a kind with equal weight (the multi-set of B.5), then one of its ways at random.
+    """Draw an action: an object and a kind (the multi-set of B.5), then one of its ways at random.
 
     Args:
       key: PRNG key.
@@ -769,14 +786,15 @@ def sample_action(
       possible: where the target may be. An object's actions that enter it are drawn only if it has no others.
       options: of this scene.
       available: which objects may be moved.
+      preference: how likely each object is drawn, relative to the others; positive.
     """
     config = space.config
     wrists = tables.q7.shape[1]
     n, a = options.grasp_reached.shape
     b, d = options.push_reached.shape[1:]
     key_choice, key_place = jax.random.split(key)
-    grasps = options.grasp_reached & ~jnp.any(options.grasp_hits, axis=-1) & available[:, None]
-    pushes = options.push_reached & ~jnp.any(options.push_hits, axis=-1)[..., None] & available[:, None, None]
+    grasps, pushes = free_ways(options)
+    grasps, pushes = grasps & available[:, None], pushes & available[:, None, None]
     ways = jnp.concatenate([jnp.pad(grasps, ((0, 0), (0, b * d - a))), pushes.reshape(n, -1)]) if b * d >= a else None
     if ways is None:
         ways = jnp.concatenate([grasps, jnp.pad(pushes.reshape(n, -1), ((0, 0), (0, a - b * d)))])
@@ -787,7 +805,8 @@ def sample_action(
             jnp.pad(options.push_enters.reshape(n, -1), ((0, 0), (0, width - b * d))),
         ]
     )
-    choice, possible_at_all = _choose(key_choice, _weights(ways & ~enters, ways).reshape(-1))
+    weights = _weights(ways & ~enters, ways) * jnp.tile(preference, 2)[:, None]
+    choice, possible_at_all = _choose(key_choice, weights.reshape(-1))
     row, way = choice // width, choice % width
     is_grasp = row < n
     index = row % n
