@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -24,6 +25,7 @@ def _transform_cloud(T, cloud):
     return [sum(T[i, k] * cloud[k] for k in range(3)) + T[i, 3] for i in range(3)]
 
 
+@jax.jit
 def _bounds(cloud, T_object_cloud, size, exponents):
     """Bounds on the least gauge of a cloud's points, with no power evaluated per point."""
     p, r = 2.0 / exponents[1], 2.0 / exponents[0]
@@ -36,6 +38,7 @@ def _bounds(cloud, T_object_cloud, size, exponents):
     return jnp.min(jnp.maximum(below, z)), jnp.min(jnp.maximum(above, z)) * 2.0 ** (1.0 / r)
 
 
+@jax.jit
 def _least_gauge(cloud, T_object_cloud, size, exponents):
     points = jnp.stack(_transform_cloud(T_object_cloud, cloud), axis=-1)
     return jnp.min(superquadric.gauge(size[None], exponents[None], points))

@@ -15,6 +15,7 @@ import functools
 import math
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
@@ -280,6 +281,7 @@ def arm_points(q: Float[Numbers, "*batch 7"], count: int) -> tuple[Float[Array, 
     return world, jnp.asarray(np.concatenate(radii), jnp.float32)
 
 
+@functools.partial(jax.jit, static_argnames=("shelf", "count"))
 def arm_hits_shelf(q: Float[Numbers, "*batch 7"], shelf: Shelf, count: int = 5) -> Bool[Array, "*batch"]:
     """Whether links 2 to 5 touch the shelf or come closer to it than the planner's margins.
 
