@@ -131,8 +131,7 @@ def search(
     """
     from rich.console import Console
 
-    from mechsearch_jax import planner
-    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.cache import keep_compilations, kept_problem
     from mechsearch_jax.envs.episode import run_episode, target_of
     from mechsearch_jax.envs.generator import generate_scenario
     from mechsearch_jax.envs.narration import Narrator, verdict
@@ -154,7 +153,7 @@ def search(
     with console.status("preparing") as status:
         scene = known or generate_scenario(seed, objects or 0, target or "cylinder")
         console.print(f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {method}")
-        problem = planner.build_problem(target=target_of(scene))
+        problem = kept_problem(target_of(scene))
         narrator = Narrator(console, status, problem, config)
         episode = run_episode(seed, scene, problem, config, NativeSimulator(), watcher=narrator)
         status.update("writing")
@@ -184,8 +183,7 @@ def inspect(
     """
     from rich.progress import track
 
-    from mechsearch_jax import planner
-    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.cache import keep_compilations, kept_problem
     from mechsearch_jax.envs.episode import target_of
     from mechsearch_jax.envs.pictures import inspect_scenario
     from mechsearch_jax.results import check_writable, save_maps
@@ -196,7 +194,7 @@ def inspect(
     scenes = [load_scenario(file) for file in find_scenarios(scenarios)]
     check_writable(out)
     keep_compilations()
-    problems = {target: planner.build_problem(target=target) for target in {target_of(scene) for scene in scenes}}
+    problems = {target: kept_problem(target) for target in {target_of(scene) for scene in scenes}}
     for scene in track(scenes, "inspecting"):
         maps, figure = inspect_scenario(scene, problems[target_of(scene)], config, seed=seed)
         save_maps(maps, out / f"{scene.name}.npz")

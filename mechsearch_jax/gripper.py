@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -232,12 +232,15 @@ def _sampled(
     gripper: Gripper, opening: float, q7: float, count: int, distance: float, seed: int
 ) -> Float[np.ndarray, "{count} 3"]:
     """`swept_cloud` of checked arguments; kept, because several tables of a problem are made of the same clouds."""
-    hulls = [_swept_hull(primitive, distance) for primitive in primitives_in_gripper(gripper, opening, q7)]
-    areas = np.array([hull.area for hull in hulls])
+    hulls = [
+        _swept_hull(primitive.kind, primitive.size, primitive.T_frame_primitive.tobytes(), distance)
+        for primitive in primitives_in_gripper(gripper, opening, q7)
+    ]
+    areas = np.array([hull.mesh.area for hull in hulls])
     shares = np.ceil(12 * count * areas / areas.sum()).astype(int) + 50
     candidates = np.concatenate(
         [
-            _outside(trimesh.sample.sample_surface(hull, share, seed=seed + i)[0], hulls[:i] + hulls[i + 1 :])
+            _outside(trimesh.sample.sample_surface(hull.mesh, share, seed=seed + i)[0], hulls[:i] + hulls[i + 1 :])
             for i, (hull, share) in enumerate(zip(hulls, shares, strict=True))
         ]
     )
@@ -322,19 +325,34 @@ def _mesh(primitive: Primitive) -> trimesh.Trimesh:
     return mesh.apply_transform(primitive.T_frame_primitive)
 
 
-def _swept_hull(primitive: Primitive, distance: float) -> trimesh.Trimesh:
-    """The convex hull of a primitive and of itself `distance` back along z."""
-    mesh = _mesh(primitive)
-    return trimesh.convex.convex_hull(np.concatenate([mesh.vertices, mesh.vertices - (0.0, 0.0, distance)]))
+class _Hull(NamedTuple):
+    """A convex mesh, and its faces and bounds as plain arrays: trimesh checks its own for changes at every access."""
+
+    mesh: trimesh.Trimesh
+    normals: np.ndarray
+    offsets: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
 
 
-def _outside(points: np.ndarray, hulls: list[trimesh.Trimesh]) -> np.ndarray:
+@functools.cache
+def _swept_hull(kind: Literal["box", "capsule"], size: tuple[float, ...], pose: bytes, distance: float) -> _Hull:
+    """The convex hull of a primitive and of itself `distance` back along z; the fields of the primitive are hashable.
+
+    Kept, because only link 6 differs between the angles of joint 7.
+    """
+    mesh = _mesh(Primitive(kind, size, np.frombuffer(pose).reshape(4, 4)))
+    hull = trimesh.convex.convex_hull(np.concatenate([mesh.vertices, mesh.vertices - (0.0, 0.0, distance)]))
+    normals, centres, bounds = (np.array(a) for a in (hull.face_normals, hull.triangles_center, hull.bounds))
+    return _Hull(hull, normals, np.sum(normals * centres, axis=-1), bounds[0], bounds[1])
+
+
+def _outside(points: np.ndarray, hulls: list[_Hull]) -> np.ndarray:
     """The points that are not inside any of the convex hulls, to a tenth of a millimetre."""
+    points = np.array(points)
     for hull in hulls:
-        normals = hull.face_normals
-        offsets = np.sum(normals * hull.triangles_center, axis=-1)
-        inside = np.all((points > hull.bounds[0]) & (points < hull.bounds[1]), axis=-1)
-        inside[inside] = np.max(points[inside] @ normals.T - offsets, axis=-1, initial=-np.inf) <= -1e-4
+        inside = np.all((points > hull.low) & (points < hull.high), axis=-1)
+        inside[inside] = np.max(points[inside] @ hull.normals.T - hull.offsets, axis=-1, initial=-np.inf) <= -1e-4
         points = points[~inside]
     return points
 
@@ -344,8 +362,20 @@ def _spread(points: np.ndarray, spacing: np.ndarray, count: int) -> np.ndarray:
     chosen = np.empty(count, int)
     chosen[0] = np.argmax(points[:, 2])
     gap = np.full(len(points), np.inf)
+    x, y, z = np.array(points.T, order="C")
+    scale = spacing**2
+    distance, square = np.empty_like(gap), np.empty_like(gap)
+    # Column by column and in place: this loop is most of the time that a cloud takes.
     for i in range(1, count):
-        gap = np.minimum(gap, np.sum((points - points[chosen[i - 1]]) ** 2, axis=-1) / spacing**2)
+        last = chosen[i - 1]
+        np.subtract(x, x[last], out=distance)
+        np.multiply(distance, distance, out=distance)
+        for axis in (y, z):
+            np.subtract(axis, axis[last], out=square)
+            np.multiply(square, square, out=square)
+            np.add(distance, square, out=distance)
+        np.divide(distance, scale, out=distance)
+        np.minimum(gap, distance, out=gap)
         chosen[i] = np.argmax(gap)
     return chosen
 
