@@ -19,8 +19,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.results import PathLike, Row, configuration, identity, read_rows, write_rows
+from mechsearch_jax.results import Row, configuration, identity, read_rows, write_rows
 from mechsearch_jax.scenario import Scenario, load_scenario
 
 SINGLE_THREAD = {

@@ -20,10 +20,10 @@ from mechsearch_jax.actions import ActionConfig, ActionTables
 from mechsearch_jax.camera import Camera
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig, ExistenceTables
+from mechsearch_jax.files import replacing
 from mechsearch_jax.graspability import GraspConfig, GraspTables
 from mechsearch_jax.gripper import Gripper
 from mechsearch_jax.planner import Problem
-from mechsearch_jax.results import replacing
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.target import Target
 

@@ -5,19 +5,16 @@ Every file is written beside its place and then moved there, so that a file is e
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib.metadata
 import json
 import math
-import os
 import platform
 import tempfile
-import uuid
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -27,33 +24,10 @@ from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.superquadric import Superquadrics
 
-PathLike = str | os.PathLike[str]
-
 ACTION_NAMES = {ActionKind.NONE: "none", ActionKind.PUSH: "push", ActionKind.PICK_AND_PLACE: "pick-and-place"}
-
-
-@contextlib.contextmanager
-def replacing(path: PathLike) -> Iterator[IO[bytes]]:
-    """A binary file to write to; it takes the place of `path` at the end, unless an exception leaves the block.
-
-    Raises:
-      InputError: the file cannot be written.
-    """
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-        try:
-            with open(temporary, "xb") as file:
-                yield file
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def check_writable(folder: PathLike) -> None:
