@@ -22,6 +22,7 @@ import trimesh
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax import kinematics
+from mechsearch_jax.collision import spheres_hit_shelf
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.kinematics import Numbers
 from mechsearch_jax.shelf import Shelf
@@ -295,14 +296,7 @@ def arm_hits_shelf(q: Float[Numbers, "*batch 7"], shelf: Shelf, count: int = 5) 
       shelf: the shelf.
       count: spheres for each capsule, see `arm_points`.
     """
-    points, radii = arm_points(q, count)
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    to_wall = jnp.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
-    to_board = jnp.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
-    beside = jnp.maximum(jnp.minimum(to_wall, to_board), 0.0)
-    before = jnp.maximum(shelf.front - x, 0.0)
-    radii = radii.reshape((1,) * (x.ndim - 1) + radii.shape)
-    return jnp.any((beside**2 + before**2 < radii**2) | (x + radii > shelf.back), axis=-1)
+    return jnp.any(spheres_hit_shelf(shelf, *arm_points(q, count)), axis=-1)
 
 
 def _moved(T: np.ndarray, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
