@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
@@ -187,7 +188,7 @@ def success_figure(rows: Sequence[Row]) -> Figure:
             axes.grid(color=MUTED, alpha=0.2)
             axes.spines[["top", "right"]].set_visible(False)
             axes.tick_params(colors=INK, labelsize=8)
-            axes.xaxis.get_major_locator().set_params(integer=True)
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
             if i == 0:
                 axes.set_title(f"{count} object{'' if count == 1 else 's'}", fontsize=10, color=INK)
             if i == len(GOALS) - 1:
