@@ -18,9 +18,10 @@ from mechsearch_jax.envs.episode import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.existence import existence, object_views
+from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.graspability import grasp_hits, graspability
 from mechsearch_jax.planner import Belief, PlannerConfig, Problem
-from mechsearch_jax.results import PathLike, replacing, versions
+from mechsearch_jax.results import versions
 from mechsearch_jax.superquadric import Superquadrics
 
 

@@ -19,8 +19,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.results import PathLike, Row, identity, read_rows, write_rows
+from mechsearch_jax.results import Row, configuration, identity, read_rows, write_rows
 from mechsearch_jax.scenario import Scenario, load_scenario
 
 SINGLE_THREAD = {
@@ -29,6 +30,7 @@ SINGLE_THREAD = {
     "OPENBLAS_NUM_THREADS": "1",
 }
 RECOGNITION = "oracle"
+SIMULATOR = "NativeSimulator"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +69,14 @@ class Job:
             failure=f"error: {reason}",
             planning_seconds=0.0,
             simulation_seconds=0.0,
+            configuration=self.configuration,
         )
+
+    @property
+    def configuration(self) -> str:
+        """As in the row of the episode."""
+        options = {**dataclasses.asdict(self.config), "recognition": RECOGNITION, "simulator": SIMULATOR}
+        return configuration(options)
 
 
 def make_jobs(files: Sequence[PathLike], configs: Sequence[PlannerConfig], seeds: Sequence[int]) -> list[Job]:
@@ -101,7 +110,8 @@ def evaluate(
 
     Args:
       jobs: what is wanted.
-      out: the Parquet file; rows that it holds already are kept.
+      out: the Parquet file; rows that it holds already are kept, and stand for a job only if every option was the
+        same. (Files of version 0.1.0 do not hold every option: their rows are kept, but run again.)
       workers: number of processes.
       ended: called after every episode with its row and with all rows.
       command: starts a worker; only tests have another one.
@@ -183,7 +193,12 @@ class _Crew(threading.Thread):
         if not line:
             return job.failed(f"the worker process ended with status {process.wait()}{self._last_words()}")
         answer = json.loads(line)
-        return Row(**answer["row"]) if "row" in answer else job.failed(answer["error"])
+        if "row" not in answer:
+            return job.failed(answer["error"])
+        row = Row(**answer["row"])
+        if identity(row) != identity(job.failed("")):
+            return job.failed("the worker ran the episode with other options than those asked for")
+        return row
 
     def _start(self) -> subprocess.Popen[str]:
         self._complaints.seek(0)

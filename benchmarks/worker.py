@@ -11,8 +11,7 @@ import os
 import sys
 from typing import Any, TextIO
 
-from mechsearch_jax import planner
-from mechsearch_jax.cache import keep_compilations
+from mechsearch_jax.cache import keep_compilations, kept_problem
 from mechsearch_jax.envs.episode import row, run_episode, target_of
 from mechsearch_jax.envs.simulator import NativeSimulator
 from mechsearch_jax.planner import PlannerConfig, Problem
@@ -33,7 +32,7 @@ class Worker:
         scenario = load_scenario(path)
         target = target_of(scenario)
         if target not in self._problems:
-            self._problems[target] = planner.build_problem(target=target)
+            self._problems[target] = kept_problem(target)
         return row(run_episode(seed, scenario, self._problems[target], config, self._simulator))
 
 

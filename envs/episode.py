@@ -395,4 +395,5 @@ def row(episode: Episode) -> results.Row:
         failure=episode.failure,
         planning_seconds=sum(seconds[name] for name in planning),
         simulation_seconds=seconds["simulate"],
+        configuration=results.configuration(config),
     )

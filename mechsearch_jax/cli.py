@@ -31,38 +31,46 @@ TargetShape = Literal["cylinder", "box"]
 
 @dataclasses.dataclass(frozen=True)
 class PlannerOptions:
-    """How the planner decides.
+    """How the planner decides. What is not given is the preset's.
 
     Attributes:
-      gamma: discount of later actions, above 0 and at most 1.
-      horizon: actions in a sequence.
-      sequences: sequences that are sampled for a decision.
-      actions: which actions are used.
-      criterion: what makes a target visible; "detector" counts pixels as the detector does.
-      max_steps: actions in an episode.
+      preset: where settings come from that are not given; "best" stands for the best known ones, which so far are
+        those of the paper: nothing that was measured beats them.
+      gamma: discount of later actions, above 0 and at most 1; the paper's is 0.9.
+      horizon: actions in a sequence; the paper's is 3.
+      sequences: sequences that are sampled for a decision; 30 by default.
+      actions: which actions are used; both by default.
+      criterion: what makes a target visible; "detector", the default, counts pixels as the detector does.
+      max_steps: actions in an episode; 10 by default.
       recognition: what the planner sees the objects through; "oracle" knows their true shapes and poses.
       simulator: what executes the actions.
     """
 
-    gamma: float = 0.9
-    horizon: int = 3
-    sequences: int = 30
-    actions: Actions = "both"
-    criterion: Literal["detector", "depth-mse", "depth-norm"] = "detector"
-    max_steps: int = 10
+    preset: Literal["paper", "best"] = "paper"
+    gamma: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    horizon: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    sequences: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    actions: Annotated[Actions | None, tyro.conf.arg(metavar="{both,push,pick-and-place}")] = None
+    criterion: Annotated[
+        Literal["detector", "depth-mse", "depth-norm"] | None,
+        tyro.conf.arg(metavar="{detector,depth-mse,depth-norm}"),
+    ] = None
+    max_steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     recognition: Literal["oracle"] = "oracle"
     simulator: Literal["auto", "native"] = "auto"
 
     def config(self, method: Method) -> PlannerConfig:
-        """The planner's configuration.
+        """The planner's configuration: the preset's, with what is given in its place.
 
         Raises:
           InputError: an option is impossible.
         """
         from mechsearch_jax.planner import PlannerConfig
 
+        presets = {"paper": PlannerConfig.paper, "best": PlannerConfig.paper}
         names = ("gamma", "horizon", "sequences", "actions", "criterion", "max_steps")
-        return PlannerConfig.paper(method=method, **{name: getattr(self, name) for name in names})
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return presets[self.preset](method=method, **given)
 
 
 Options = Annotated[PlannerOptions, tyro.conf.arg(name="")]
@@ -90,13 +98,22 @@ def find_scenario(name: str) -> Path:
 def find_scenarios(names: Sequence[str]) -> list[Path]:
     """The files that paths, folders and names stand for.
 
+    In a folder, JSON files that are plainly something else, as the episode.json that `search` writes beside its
+    scenario, are left out; each is named on standard error.
+
     Raises:
       InputError: there is nothing for one of them.
     """
+    from mechsearch_jax.scenario import is_another_format
+
     files: list[Path] = []
     for name in names:
         if Path(name).is_dir():
             inside = sorted(Path(name).glob("*.json"))
+            others = [file for file in inside if is_another_format(file)]
+            for file in others:
+                print(f"{file}: is not a scenario file and is left out", file=sys.stderr)
+            inside = [file for file in inside if file not in others]
             if not inside:
                 raise InputError(f"{name}: there are no scenario files (*.json) in this folder")
             files += inside
@@ -131,8 +148,7 @@ def search(
     """
     from rich.console import Console
 
-    from mechsearch_jax import planner
-    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.cache import keep_compilations, kept_problem
     from mechsearch_jax.envs.episode import run_episode, target_of
     from mechsearch_jax.envs.generator import generate_scenario
     from mechsearch_jax.envs.narration import Narrator, verdict
@@ -154,7 +170,7 @@ def search(
     with console.status("preparing") as status:
         scene = known or generate_scenario(seed, objects or 0, target or "cylinder")
         console.print(f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {method}")
-        problem = planner.build_problem(target=target_of(scene))
+        problem = kept_problem(target_of(scene))
         narrator = Narrator(console, status, problem, config)
         episode = run_episode(seed, scene, problem, config, NativeSimulator(), watcher=narrator)
         status.update("writing")
@@ -184,8 +200,7 @@ def inspect(
     """
     from rich.progress import track
 
-    from mechsearch_jax import planner
-    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.cache import keep_compilations, kept_problem
     from mechsearch_jax.envs.episode import target_of
     from mechsearch_jax.envs.pictures import inspect_scenario
     from mechsearch_jax.results import check_writable, save_maps
@@ -196,7 +211,7 @@ def inspect(
     scenes = [load_scenario(file) for file in find_scenarios(scenarios)]
     check_writable(out)
     keep_compilations()
-    problems = {target: planner.build_problem(target=target) for target in {target_of(scene) for scene in scenes}}
+    problems = {target: kept_problem(target) for target in {target_of(scene) for scene in scenes}}
     for scene in track(scenes, "inspecting"):
         maps, figure = inspect_scenario(scene, problems[target_of(scene)], config, seed=seed)
         save_maps(maps, out / f"{scene.name}.npz")
@@ -241,21 +256,30 @@ def evaluate(
     console.print(str(out), soft_wrap=True)
 
 
-def report(tables: Annotated[tuple[Path, ...], tyro.conf.Positional], /) -> None:
-    """Print rates by method and number of objects from results of `evaluate`.
+def report(
+    tables: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE ...")],
+    /,
+    *,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None,
+) -> None:
+    """Print rates by method and number of objects from results of `evaluate`, and write them with plots.
 
     Args:
       tables: Parquet files.
+      out: folder for report.md, rates.csv, rates.json, failures.csv and success.png; only prints if not given.
     """
     from rich.console import Console
 
+    from mechsearch_jax.benchmarks.report import read_tables, write_report
     from mechsearch_jax.benchmarks.tables import rates_table
-    from mechsearch_jax.results import read_rows
 
-    rows = [row for table in tables for row in read_rows(table)]
-    if not rows:
-        raise InputError("report: there are no episodes in these tables")
-    Console(highlight=False).print(rates_table(rows))
+    rows = read_tables(tables)
+    if out is not None:
+        write_report(rows, out)
+    console = Console(highlight=False)
+    console.print(rates_table(rows))
+    if out is not None:
+        console.print(str(out / "report.md"), soft_wrap=True)
 
 
 def generate(*, objects: int, out: Path, count: int = 1, target: TargetShape = "cylinder", seed: int = 0) -> None:
@@ -308,13 +332,24 @@ def check(scenarios: Scenarios, /) -> None:
         raise SystemExit(2)
 
 
-def _bench(
-    subject: Literal["existence", "graspability", "plan"],
-    objects: int,
-    repeats: int,
-    out: Path | None,
-    options: PlannerOptions,
+def bench(
+    subject: Annotated[Literal["existence", "graspability", "plan"], tyro.conf.Positional],
+    /,
+    *,
+    objects: int = 8,
+    repeats: int = 10,
+    out: JsonFile = None,
+    options: Options = PlannerOptions(),
 ) -> None:
+    """Time f, g where f = 1, or a whole decision: compilation, median and spread.
+
+    Args:
+      subject: what is timed.
+      objects: number of objects in a scene.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+      options: how the planner decides.
+    """
     import jax
     from rich.console import Console
 
@@ -334,52 +369,8 @@ def _bench(
         save_timing(timing, out)
 
 
-def bench_existence(*, objects: int = 8, repeats: int = 20, out: JsonFile = None) -> None:
-    """Time f: compilation, median and spread.
-
-    Args:
-      objects: number of objects in a scene.
-      repeats: number of timed calls.
-      out: JSON file for the result.
-    """
-    _bench("existence", objects, repeats, out, PlannerOptions())
-
-
-def bench_graspability(*, objects: int = 8, repeats: int = 20, out: JsonFile = None) -> None:
-    """Time g where f = 1: compilation, median and spread.
-
-    Args:
-      objects: number of objects in a scene.
-      repeats: number of timed calls.
-      out: JSON file for the result.
-    """
-    _bench("graspability", objects, repeats, out, PlannerOptions())
-
-
-def bench_plan(
-    *,
-    objects: int = 8,
-    repeats: int = 10,
-    out: JsonFile = None,
-    options: Options = PlannerOptions(),
-) -> None:
-    """Time a whole decision: compilation, median and spread.
-
-    Args:
-      objects: number of objects in a scene.
-      repeats: number of timed calls.
-      out: JSON file for the result.
-      options: how the planner decides.
-    """
-    _bench("plan", objects, repeats, out, options)
-
-
 def scenarios() -> None:
     """Generate and check scenario files: mechsearch scenarios generate|check."""
-
-
-def bench() -> None:
-    """Time the planner's parts: mechsearch bench existence|graspability|plan."""
 
 
 Commands = dict[str, Callable[..., None]]
@@ -394,7 +385,6 @@ COMMANDS: Commands = {
 }
 GROUPS: dict[str, Commands] = {
     "scenarios": {"generate": generate, "check": check},
-    "bench": {"existence": bench_existence, "graspability": bench_graspability, "plan": bench_plan},
 }
 
 

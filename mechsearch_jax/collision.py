@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -24,6 +25,7 @@ def _transform_cloud(T, cloud):
     return [sum(T[i, k] * cloud[k] for k in range(3)) + T[i, 3] for i in range(3)]
 
 
+@jax.jit
 def _bounds(cloud, T_object_cloud, size, exponents):
     """Bounds on the least gauge of a cloud's points, with no power evaluated per point."""
     p, r = 2.0 / exponents[1], 2.0 / exponents[0]
@@ -36,6 +38,7 @@ def _bounds(cloud, T_object_cloud, size, exponents):
     return jnp.min(jnp.maximum(below, z)), jnp.min(jnp.maximum(above, z)) * 2.0 ** (1.0 / r)
 
 
+@jax.jit
 def _least_gauge(cloud, T_object_cloud, size, exponents):
     points = jnp.stack(_transform_cloud(T_object_cloud, cloud), axis=-1)
     return jnp.min(superquadric.gauge(size[None], exponents[None], points))
@@ -84,18 +87,36 @@ def points_inside(scene: Superquadrics, points: Float[Array, "*batch 3"]) -> Boo
     return inside & jnp.broadcast_to(scene.valid, inside.shape)
 
 
-def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"], radius: float | Array = 0.0) -> Bool[Array, "*batch"]:
-    """Whether spheres about world points touch the shelf, whose sides and ceiling are taken closer by their margins.
+def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
+    """Whether world points are in the shelf, whose sides and ceiling are taken closer by their margins.
 
-    Everything beyond the front edge has to be inside the free box. That is exact except below the board and behind the
-    walls, where nothing can be without having passed through them.
+    Everything beyond the front edge has to be inside the free box, or counts as in the shelf.
     """
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     inside = (
-        (x + radius <= shelf.back)
-        & (y - radius >= shelf.right + shelf.side_margin)
-        & (y + radius <= shelf.left - shelf.side_margin)
-        & (z - radius >= shelf.board)
-        & (z + radius <= shelf.ceiling - shelf.ceiling_margin)
+        (x <= shelf.back)
+        & (y >= shelf.right + shelf.side_margin)
+        & (y <= shelf.left - shelf.side_margin)
+        & (z >= shelf.board)
+        & (z <= shelf.ceiling - shelf.ceiling_margin)
     )
-    return (x + radius > shelf.front) & ~inside
+    return (x > shelf.front) & ~inside
+
+
+def spheres_hit_shelf(
+    shelf: Shelf, centres: Float[Array, "*batch n 3"], radii: Float[Array, " n"]
+) -> Bool[Array, "*batch n"]:
+    """Whether spheres touch what `hits_shelf` is true for; one in front of the shelf may bulge past its front edges.
+
+    Args:
+      shelf: the shelf.
+      centres: in the world [m].
+      radii: above 0 [m].
+    """
+    x, y, z = centres[..., 0], centres[..., 1], centres[..., 2]
+    to_wall = jnp.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
+    to_board = jnp.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
+    beside = jnp.maximum(jnp.minimum(to_wall, to_board), 0.0)
+    before = jnp.maximum(shelf.front - x, 0.0)
+    radii = radii.reshape((1,) * (x.ndim - 1) + radii.shape)
+    return (beside**2 + before**2 < radii**2) | (x + radii > shelf.back)

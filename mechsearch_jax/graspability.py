@@ -183,8 +183,14 @@ def grasp_tables(
     swept = [swept_cloud(gripper, gripper.max_opening, a, config.points) for a in angles]
     outward = -np.asarray(T_target_gripper)[:, :3, 2]
     clouds, low, high = [], [], []
+    # Grasps that differ in their wrists only take the target out the same way.
+    ways = {d.tobytes(): d for d in outward}
+    swept_targets = {
+        key: swept_target(target, direction, gripper.approach, config.target_points, config.erosion)
+        for key, direction in ways.items()
+    }
     for T, w, direction in zip(np.asarray(T_target_gripper), wrist, outward, strict=True):
-        own = swept_target(target, direction, gripper.approach, config.target_points, config.erosion)
+        own = swept_targets[direction.tobytes()]
         inside = (own - T[:3, 3]) @ T[:3, :3]
         both = np.concatenate([swept[w], inside])
         clouds.append(np.concatenate([swept[w] @ T[:3, :3].T + T[:3, 3], own]).T)

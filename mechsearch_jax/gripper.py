@@ -13,14 +13,16 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax import kinematics
+from mechsearch_jax.collision import spheres_hit_shelf
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.kinematics import Numbers
 from mechsearch_jax.shelf import Shelf
@@ -231,12 +233,15 @@ def _sampled(
     gripper: Gripper, opening: float, q7: float, count: int, distance: float, seed: int
 ) -> Float[np.ndarray, "{count} 3"]:
     """`swept_cloud` of checked arguments; kept, because several tables of a problem are made of the same clouds."""
-    hulls = [_swept_hull(primitive, distance) for primitive in primitives_in_gripper(gripper, opening, q7)]
-    areas = np.array([hull.area for hull in hulls])
+    hulls = [
+        _swept_hull(primitive.kind, primitive.size, primitive.T_frame_primitive.tobytes(), distance)
+        for primitive in primitives_in_gripper(gripper, opening, q7)
+    ]
+    areas = np.array([hull.mesh.area for hull in hulls])
     shares = np.ceil(12 * count * areas / areas.sum()).astype(int) + 50
     candidates = np.concatenate(
         [
-            _outside(trimesh.sample.sample_surface(hull, share, seed=seed + i)[0], hulls[:i] + hulls[i + 1 :])
+            _outside(trimesh.sample.sample_surface(hull.mesh, share, seed=seed + i)[0], hulls[:i] + hulls[i + 1 :])
             for i, (hull, share) in enumerate(zip(hulls, shares, strict=True))
         ]
     )
@@ -280,6 +285,7 @@ def arm_points(q: Float[Numbers, "*batch 7"], count: int) -> tuple[Float[Array, 
     return world, jnp.asarray(np.concatenate(radii), jnp.float32)
 
 
+@functools.partial(jax.jit, static_argnames=("shelf", "count"))
 def arm_hits_shelf(q: Float[Numbers, "*batch 7"], shelf: Shelf, count: int = 5) -> Bool[Array, "*batch"]:
     """Whether links 2 to 5 touch the shelf or come closer to it than the planner's margins.
 
@@ -290,14 +296,7 @@ def arm_hits_shelf(q: Float[Numbers, "*batch 7"], shelf: Shelf, count: int = 5) 
       shelf: the shelf.
       count: spheres for each capsule, see `arm_points`.
     """
-    points, radii = arm_points(q, count)
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    to_wall = jnp.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
-    to_board = jnp.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
-    beside = jnp.maximum(jnp.minimum(to_wall, to_board), 0.0)
-    before = jnp.maximum(shelf.front - x, 0.0)
-    radii = radii.reshape((1,) * (x.ndim - 1) + radii.shape)
-    return jnp.any((beside**2 + before**2 < radii**2) | (x + radii > shelf.back), axis=-1)
+    return jnp.any(spheres_hit_shelf(shelf, *arm_points(q, count)), axis=-1)
 
 
 def _moved(T: np.ndarray, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
@@ -320,19 +319,34 @@ def _mesh(primitive: Primitive) -> trimesh.Trimesh:
     return mesh.apply_transform(primitive.T_frame_primitive)
 
 
-def _swept_hull(primitive: Primitive, distance: float) -> trimesh.Trimesh:
-    """The convex hull of a primitive and of itself `distance` back along z."""
-    mesh = _mesh(primitive)
-    return trimesh.convex.convex_hull(np.concatenate([mesh.vertices, mesh.vertices - (0.0, 0.0, distance)]))
+class _Hull(NamedTuple):
+    """A convex mesh, and its faces and bounds as plain arrays: trimesh checks its own for changes at every access."""
+
+    mesh: trimesh.Trimesh
+    normals: np.ndarray
+    offsets: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
 
 
-def _outside(points: np.ndarray, hulls: list[trimesh.Trimesh]) -> np.ndarray:
+@functools.cache
+def _swept_hull(kind: Literal["box", "capsule"], size: tuple[float, ...], pose: bytes, distance: float) -> _Hull:
+    """The convex hull of a primitive and of itself `distance` back along z; the fields of the primitive are hashable.
+
+    Kept, because only link 6 differs between the angles of joint 7.
+    """
+    mesh = _mesh(Primitive(kind, size, np.frombuffer(pose).reshape(4, 4)))
+    hull = trimesh.convex.convex_hull(np.concatenate([mesh.vertices, mesh.vertices - (0.0, 0.0, distance)]))
+    normals, centres, bounds = (np.array(a) for a in (hull.face_normals, hull.triangles_center, hull.bounds))
+    return _Hull(hull, normals, np.sum(normals * centres, axis=-1), bounds[0], bounds[1])
+
+
+def _outside(points: np.ndarray, hulls: list[_Hull]) -> np.ndarray:
     """The points that are not inside any of the convex hulls, to a tenth of a millimetre."""
+    points = np.array(points)
     for hull in hulls:
-        normals = hull.face_normals
-        offsets = np.sum(normals * hull.triangles_center, axis=-1)
-        inside = np.all((points > hull.bounds[0]) & (points < hull.bounds[1]), axis=-1)
-        inside[inside] = np.max(points[inside] @ normals.T - offsets, axis=-1, initial=-np.inf) <= -1e-4
+        inside = np.all((points > hull.low) & (points < hull.high), axis=-1)
+        inside[inside] = np.max(points[inside] @ hull.normals.T - hull.offsets, axis=-1, initial=-np.inf) <= -1e-4
         points = points[~inside]
     return points
 
@@ -342,8 +356,20 @@ def _spread(points: np.ndarray, spacing: np.ndarray, count: int) -> np.ndarray:
     chosen = np.empty(count, int)
     chosen[0] = np.argmax(points[:, 2])
     gap = np.full(len(points), np.inf)
+    x, y, z = np.array(points.T, order="C")
+    scale = spacing**2
+    distance, square = np.empty_like(gap), np.empty_like(gap)
+    # Column by column and in place: this loop is most of the time that a cloud takes.
     for i in range(1, count):
-        gap = np.minimum(gap, np.sum((points - points[chosen[i - 1]]) ** 2, axis=-1) / spacing**2)
+        last = chosen[i - 1]
+        np.subtract(x, x[last], out=distance)
+        np.multiply(distance, distance, out=distance)
+        for axis in (y, z):
+            np.subtract(axis, axis[last], out=square)
+            np.multiply(square, square, out=square)
+            np.add(distance, square, out=distance)
+        np.divide(distance, scale, out=distance)
+        np.minimum(gap, distance, out=gap)
         chosen[i] = np.argmax(gap)
     return chosen
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -53,6 +54,7 @@ _UPPER, _FORE, _OFFSET, _WRIST = JOINTS[2][2], JOINTS[4][2], JOINTS[3][0], JOINT
 _UPPER_SIDE, _FORE_SIDE = math.hypot(_UPPER, _OFFSET), math.hypot(_FORE, _OFFSET)
 
 
+@jax.jit
 def forward_kinematics(q: Float[Numbers, "*batch 7"]) -> Float[Array, "*batch 8 4 4"]:
     """Poses in the base frame of links 1 to 7 and of the hand, for joint angles `q` [rad].
 
@@ -80,6 +82,7 @@ def gripper_pose(q: Float[Numbers, "*batch 7"]) -> Float[Array, "*batch 4 4"]:
     return hand.at[..., :3, 3].add(FINGER_TIPS * hand[..., :3, 2])
 
 
+@jax.jit
 def inverse_kinematics(
     T_base_gripper: Float[Numbers, "*batch 4 4"], q7: Float[Numbers, "*#batch"]
 ) -> tuple[Float[Array, "*batch 4 7"], Bool[Array, "*batch 4"]]:
@@ -152,6 +155,7 @@ def inverse_kinematics(
     return q, within & (moved < POSITION_TOLERANCE) & (turned < ROTATION_TOLERANCE)
 
 
+@jax.jit
 def path_kinematics(
     T_base_gripper: Float[Numbers, "*batch waypoints 4 4"], q7: Float[Numbers, "*#batch"]
 ) -> tuple[Float[Array, "*batch waypoints 7"], Bool[Array, "*batch"]]:

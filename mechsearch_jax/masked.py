@@ -34,10 +34,12 @@ def masked_vmap(
       The function's results with a leading axis `n`.
     """
     rows = jax.tree.map(lambda a: a[None], row)
-    return jax.tree.map(lambda a: a[0], _masked(function, block)(mask[None], shared, rows))
+    # Jitted, it is traced once for all the places below that use it; most of the time of tracing a plan went there.
+    evaluate = jax.jit(jax.vmap(function, in_axes=(None, 0, 0)))
+    return jax.tree.map(lambda a: a[0], _masked(evaluate, block)(mask[None], shared, rows))
 
 
-def _masked(function, block):
+def _masked(evaluate, block):
     @custom_vmap
     def apply(mask, shared, rows):
         shape, total = mask.shape, mask.size
@@ -45,16 +47,16 @@ def _masked(function, block):
         slots = math.ceil(total / size) * size
         order = jnp.nonzero(mask.reshape(-1), size=slots, fill_value=total)[0].astype(jnp.int32)
 
-        def entry(index):
+        def block_of(index):
             row = jax.tree.map(lambda a: a.at[index // shape[1]].get(mode="clip"), rows)
-            return function(shared, row, index % shape[1])
+            return evaluate(shared, row, index % shape[1])
 
-        result = jax.eval_shape(entry, jax.ShapeDtypeStruct((), jnp.int32))
-        result = jax.tree.map(lambda s: jnp.zeros((total, *s.shape), s.dtype), result)
+        result = jax.eval_shape(block_of, jax.ShapeDtypeStruct((size,), jnp.int32))
+        result = jax.tree.map(lambda s: jnp.zeros((total, *s.shape[1:]), s.dtype), result)
 
         def body(i, result):
             index = jax.lax.dynamic_slice(order, (i * size,), (size,))
-            return jax.tree.map(lambda r, v: r.at[index].set(v, mode="drop"), result, jax.vmap(entry)(index))
+            return jax.tree.map(lambda r, v: r.at[index].set(v, mode="drop"), result, block_of(index))
 
         blocks = (jnp.sum(mask, dtype=jnp.int32) + (size - 1)) // size
         result = jax.lax.fori_loop(0, blocks, body, result)

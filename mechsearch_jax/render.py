@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
 import jax
@@ -140,6 +141,7 @@ def window_corner(
     return corner.astype(jnp.int32), jnp.maximum(jnp.ceil(high - low) + 1.0 - extent, 0.0)
 
 
+@functools.partial(jax.jit, static_argnames=("camera", "window"))
 def object_window(
     camera: Camera, scene_object: Superquadrics, window: tuple[int, int]
 ) -> tuple[Float[Array, "h w"], Int[Array, "2"]]:

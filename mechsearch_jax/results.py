@@ -5,18 +5,16 @@ Every file is written beside its place and then moved there, so that a file is e
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib.metadata
 import json
-import os
+import math
 import platform
 import tempfile
-import uuid
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -26,33 +24,10 @@ from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.superquadric import Superquadrics
 
-PathLike = str | os.PathLike[str]
-
 ACTION_NAMES = {ActionKind.NONE: "none", ActionKind.PUSH: "push", ActionKind.PICK_AND_PLACE: "pick-and-place"}
-
-
-@contextlib.contextmanager
-def replacing(path: PathLike) -> Iterator[IO[bytes]]:
-    """A binary file to write to; it takes the place of `path` at the end, unless an exception leaves the block.
-
-    Raises:
-      InputError: the file cannot be written.
-    """
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-        try:
-            with open(temporary, "xb") as file:
-                yield file
-            os.replace(temporary, path)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
 def check_writable(folder: PathLike) -> None:
@@ -266,6 +241,8 @@ class Row:
       found_step, graspable_step, retrieved, failure: as in `Episode`.
       steps: number of actions, attempts to take the target out among them.
       planning_seconds, simulation_seconds: wall time in total [s].
+      configuration: everything that decides about the episode beside its scenario and its seed, as `configuration`
+        writes it; None in files of version 0.1.0, which do not say.
     """
 
     scenario: str
@@ -285,6 +262,7 @@ class Row:
     failure: str | None
     planning_seconds: float
     simulation_seconds: float
+    configuration: str | None = None
 
 
 SCHEMA = pyarrow.schema(
@@ -306,15 +284,50 @@ SCHEMA = pyarrow.schema(
         ("failure", pyarrow.string()),
         ("planning_seconds", pyarrow.float64()),
         ("simulation_seconds", pyarrow.float64()),
+        ("configuration", pyarrow.string()),
     ]
 )
 
-IDENTITY = ("scenario", "target", "method", "recognition", "gamma", "horizon", "sequences", "actions", "seed")
+OPTIONS = ("target", "method", "recognition", "gamma", "horizon", "sequences", "actions")
+# What version 0.1.0 wrote.
+_FIRST_COLUMNS = SCHEMA.names[:-1]
+
+
+def configuration(options: Mapping[str, Any]) -> str:
+    """An episode's options, as `Episode.config` holds them, in one text that is the same for the same options.
+
+    The target and the seed have columns of their own and are left out.
+    """
+    kept = {name: value for name, value in options.items() if name not in ("target", "seed")}
+    return json.dumps(kept, sort_keys=True, allow_nan=False)
 
 
 def identity(row: Row) -> tuple[Any, ...]:
-    """What tells the rows of a table apart: the scenario and the options."""
-    return tuple(getattr(row, name) for name in IDENTITY)
+    """What tells the rows of a table apart: the scenario, every option and the seed."""
+    return row.scenario, *(getattr(row, name) for name in OPTIONS), row.seed, row.configuration
+
+
+def _options(row: Row) -> dict[str, Any]:
+    """Every option of a row that is known."""
+    known = {name: getattr(row, name) for name in OPTIONS}
+    return known if row.configuration is None else {**json.loads(row.configuration), **known}
+
+
+def label_variants(rows: Sequence[Row]) -> list[str]:
+    """For each row the method and those options that are not the same in all rows: "search-for-grasp, gamma 0.5".
+
+    Rows that ran under different options never share a label.
+    """
+    each = [_options(row) for row in rows]
+    names = sorted({name for options in each for name in options} - {"method"})
+    differing = [name for name in names if len({json.dumps(options.get(name)) for options in each}) > 1]
+
+    def said(options: dict[str, Any], name: str) -> str:
+        value = options.get(name, "unknown")
+        shown = "/".join(f"{v:g}" for v in value) if isinstance(value, list) else value
+        return f"{name.replace('_', ' ')} {shown}"
+
+    return [", ".join([str(o["method"]), *(said(o, name) for name in differing)]) for o in each]
 
 
 def read_rows(path: PathLike) -> list[Row]:
@@ -329,9 +342,21 @@ def read_rows(path: PathLike) -> list[Row]:
         raise InputError(f"{path}: cannot be read ({error.strerror or ' '.join(str(error).split())})") from error
     except pyarrow.ArrowException as error:
         raise InputError(f"{path}: is not a Parquet file ({' '.join(str(error).split())})") from error
-    if table.schema.names != SCHEMA.names:
+    if table.schema.names not in (SCHEMA.names, _FIRST_COLUMNS):
         raise InputError(f"{path}: is a table of something else, not of episodes; use another file")
-    return [Row(**row) for row in table.to_pylist()]
+    rows = [Row(**row) for row in table.to_pylist()]
+    for row in rows:
+        _check_configuration(row, path)
+    return rows
+
+
+def _check_configuration(row: Row, path: PathLike) -> None:
+    try:
+        value = {} if row.configuration is None else json.loads(row.configuration)
+    except ValueError:
+        value = None
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: the configuration of {row.scenario!r} is not a JSON object; use another file")
 
 
 def write_rows(rows: Sequence[Row], path: PathLike) -> None:
@@ -350,10 +375,12 @@ class Rates:
     """Shares of episodes, among those with a number of objects.
 
     Attributes:
-      method: the planner's method.
+      method: the planner's method, with the options that tell it from the others: see `label_variants`.
       objects: number of surrounding objects; None for all.
       episodes: how many episodes.
+      errors: how many of them could not be run to their end; they count as failures.
       found, graspable, retrieved: shares of them.
+      found_interval, graspable_interval, retrieved_interval: what the true shares may be: see `wilson`.
       steps: mean number of actions, attempts to take the target out among them.
       planning_seconds, simulation_seconds: mean wall time per action [s].
     """
@@ -361,30 +388,61 @@ class Rates:
     method: str
     objects: int | None
     episodes: int
+    errors: int
     found: float
     graspable: float
     retrieved: float
+    found_interval: tuple[float, float]
+    graspable_interval: tuple[float, float]
+    retrieved_interval: tuple[float, float]
     steps: float
     planning_seconds: float
     simulation_seconds: float
 
 
+Z = 1.959964
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """Wilson's 95% confidence interval of a share: low and high; (0, 1) if nothing was counted."""
+    if count == 0:
+        return 0.0, 1.0
+    share = successes / count
+    middle = (share + Z**2 / (2 * count)) / (1 + Z**2 / count)
+    half = Z / (1 + Z**2 / count) * math.sqrt(share * (1 - share) / count + Z**2 / (4 * count**2))
+    low = 0.0 if successes == 0 else middle - half
+    return low, 1.0 if successes == count else middle + half
+
+
+def is_error(row: Row) -> bool:
+    """Whether an episode ended because the program failed, not the robot."""
+    return row.failure is not None and row.failure.startswith("error: ")
+
+
 def summarise(rows: Sequence[Row]) -> list[Rates]:
-    """Rates by method and number of objects, and for each method over all of them."""
+    """Rates by method (and what else differs) and number of objects, and for each method over all of them."""
     summary = []
-    for method in sorted({row.method for row in rows}):
-        of_method = [row for row in rows if row.method == method]
+    labels = label_variants(rows)
+    for method in sorted(set(labels)):
+        of_method = [row for row, label in zip(rows, labels, strict=True) if label == method]
         for objects in [*sorted({row.objects for row in of_method}), None]:
             group = [row for row in of_method if objects is None or row.objects == objects]
             actions = max(sum(row.steps for row in group), 1)
+            found = sum(row.found_step is not None for row in group)
+            graspable = sum(row.graspable_step is not None for row in group)
+            retrieved = sum(row.retrieved for row in group)
             summary.append(
                 Rates(
                     method=method,
                     objects=objects,
                     episodes=len(group),
-                    found=sum(row.found_step is not None for row in group) / len(group),
-                    graspable=sum(row.graspable_step is not None for row in group) / len(group),
-                    retrieved=sum(row.retrieved for row in group) / len(group),
+                    errors=sum(is_error(row) for row in group),
+                    found=found / len(group),
+                    graspable=graspable / len(group),
+                    retrieved=retrieved / len(group),
+                    found_interval=wilson(found, len(group)),
+                    graspable_interval=wilson(graspable, len(group)),
+                    retrieved_interval=wilson(retrieved, len(group)),
                     steps=sum(row.steps for row in group) / len(group),
                     planning_seconds=sum(row.planning_seconds for row in group) / actions,
                     simulation_seconds=sum(row.simulation_seconds for row in group) / actions,

@@ -7,7 +7,6 @@ import importlib.resources
 import json
 import math
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +17,7 @@ from jaxtyping import Float
 
 from mechsearch_jax import superquadric
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import replacing
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 
@@ -165,6 +165,18 @@ def load_scenario(path: str | os.PathLike[str], shelf: Shelf | None = None) -> S
     return parse_scenario(value, str(path), shelf)
 
 
+def is_another_format(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a JSON object that does not even look like a scenario: it has neither `format` nor `target`.
+
+    What cannot be read or parsed may be a broken scenario, and is left to `load_scenario` to complain about.
+    """
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(value, dict) and not {"format", "target"} & set(value)
+
+
 def format_scenario(scenario: Scenario) -> str:
     """The text of a scenario's file."""
     value = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(scenario)}
@@ -177,20 +189,9 @@ def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
     Raises:
       InputError: the file cannot be written.
     """
-    path = Path(path)
     text = format_scenario(scenario)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            os.replace(temporary, path)
-        except BaseException:
-            os.unlink(temporary)
-            raise
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    with replacing(path) as file:
+        file.write(text.encode())
 
 
 def superquadrics(bodies: Sequence[Body], capacity: int = MAX_OBJECTS) -> Superquadrics:

@@ -9,13 +9,20 @@ import numpy as np
 import pytest
 
 from mechsearch_jax import cli, results
+from mechsearch_jax.benchmarks.report import FILES
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import PlannerConfig
 from mechsearch_jax.scenario import Body, Scenario, example_scenarios, format_scenario, load_scenario, save_scenario
 
 SCENE = Scenario(
     name="one-box",
     objects=(Body("box", (0.048, 0.028, 0.08), (0.5, 0.135, 0.4845), (1.0, 0.0, 0.0, 0.0)),),
     target=Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0)),
+)
+
+
+ROW = results.Row(
+    "one-box", 1, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.5
 )
 
 
@@ -47,6 +54,7 @@ def folder(tmp_path):
         (tmp_path / "out" / name).parent.mkdir(exist_ok=True)
         (tmp_path / "out" / name).write_text("from before")
     (tmp_path / "empty").mkdir()
+    results.write_rows([ROW], tmp_path / "table.parquet")
     return tmp_path
 
 
@@ -73,6 +81,10 @@ WRONG = {
     "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new.parquet"], "'one-box'"),
     "no table": (["evaluate", "good.json", "--out", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
     "no worker": (["evaluate", "good.json", "--out", "new.parquet", "--workers", "0"], "--workers 0"),
+    "nowhere to report to": (["report", "table.parquet", "--out", "good.json"], "good.json: cannot be written to"),
+    "the same table twice": (["report", "table.parquet", "table.parquet"], "report them one by one"),
+    "unknown preset": (["search", "good.json", "--out", "out", "--preset", "worst"], "'worst'"),
+    "unknown subject": (["bench", "speed"], "'speed'"),
     "no table to report": (["report", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
     "no scenarios": (["scenarios", "generate", "--objects", "2", "--count", "0", "--out", "new"], "--count 0"),
     "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
@@ -135,6 +147,36 @@ def test_checking_names_the_bad_and_lists_the_good(folder, monkeypatch, capsys):
     printed = capsys.readouterr()
     assert "good.json: 1 objects, target cylinder" in printed.out
     assert printed.err.count("\n") == 2
+
+
+def test_a_folder_that_search_wrote_is_good(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save_scenario(SCENE, "out/scenario.json")
+    results.save_episode(results.Episode("one-box", 1, {}, {}, (), None, None, False, "not found"), "out/episode.json")
+    cli.parse(["scenarios", "check", "out"])()
+    printed = capsys.readouterr()
+    assert printed.out == "out/scenario.json: 1 objects, target cylinder\n"
+    assert printed.err == "out/episode.json: is not a scenario file and is left out\n"
+    # Named by itself, it is a mistake.
+    with pytest.raises(SystemExit):
+        cli.parse(["scenarios", "check", "out/episode.json"])()
+
+
+@pytest.mark.parametrize("preset", ["paper", "best"])
+def test_what_is_given_goes_before_the_preset(preset):
+    options = cli.PlannerOptions(preset=preset)
+    assert options.config("search-and-grasp") == PlannerConfig.paper(method="search-and-grasp")
+    options = cli.PlannerOptions(preset=preset, gamma=0.5, actions="push")
+    assert options.config("search-for-grasp") == PlannerConfig.paper(gamma=0.5, actions="push")
+
+
+def test_a_report_is_printed_and_written(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    cli.parse(["report", "table.parquet"])()
+    assert "search-for-grasp" in capsys.readouterr().out
+    cli.parse(["report", "table.parquet", "--out", "report"])()
+    assert {path.name for path in (folder / "report").iterdir()} == set(FILES)
+    assert "report/report.md" in capsys.readouterr().out
 
 
 def test_inspecting_writes_maps_and_a_picture(folder):

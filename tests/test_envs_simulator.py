@@ -2,13 +2,13 @@
 
 import dataclasses
 import math
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from published import published_scenarios
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
 from mechsearch_jax.camera import Camera
@@ -24,7 +24,6 @@ from mechsearch_jax.scenario import Body, Scenario, load_scenario
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.transforms import make
 
-PUBLISHED = Path(__file__).parents[2] / "shared" / "scenarios" / "published"
 BOARD = Shelf().board
 WRISTS = tuple(math.pi / 4 + math.radians(a) for a in (15, -60, 60, -15, -45, 30, -30, 0, 45))
 TARGET_BODY = Body("cylinder", (0.02, 0.02, 0.05), (0.72, -0.2, BOARD + 0.05), (1.0, 0.0, 0.0, 0.0))
@@ -354,9 +353,9 @@ def test_home_is_clear_of_the_shelf():
     assert gripper_pose(q)[0, 3] < Shelf().front - 0.1
 
 
-@pytest.mark.skipif(not PUBLISHED.is_dir(), reason="the published scenes are not next to this checkout")
+@pytest.mark.skipif(not published_scenarios(), reason="the published scenes are not next to this checkout")
 def test_published_scenes_rest(sim):
-    for path in sorted(PUBLISHED.glob("*.json"))[::10]:
+    for path in published_scenarios()[::10]:
         before = sim.reset(load_scenario(path))
         outcome = sim.settle()
         assert outcome.settled, path.name

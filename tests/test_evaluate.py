@@ -5,12 +5,13 @@ import io
 import json
 import sys
 
+import pyarrow.parquet
 import pytest
 from rich.console import Console
 
 from mechsearch_jax import results
 from mechsearch_jax.benchmarks import tables
-from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
+from mechsearch_jax.benchmarks.evaluate import Job, evaluate, make_jobs
 from mechsearch_jax.benchmarks.worker import parse_config
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PlannerConfig
@@ -33,7 +34,12 @@ for line in sys.stdin:
     row = dict(scenario=name, objects=0, target="cylinder", method=config["method"], recognition="oracle",
                gamma=config["gamma"], horizon=config["horizon"], sequences=config["sequences"],
                actions=config["actions"], seed=job["seed"], found_step=1, graspable_step=2, retrieved=True, steps=3,
-               failure=None, planning_seconds=1.0, simulation_seconds=0.5)
+               failure=None, planning_seconds=1.0, simulation_seconds=0.5,
+               configuration=None)
+    options = dict(config, recognition="oracle", simulator="NativeSimulator")
+    row["configuration"] = json.dumps(options, sort_keys=True)
+    if name == "confused":
+        row["gamma"] = 0.123
     print(json.dumps({"error": "ValueError: no"} if name == "raise" else {"row": row}), flush=True)
 """
 
@@ -104,6 +110,50 @@ def test_rows_of_other_options_stay(tmp_path, files, command):
         rows = evaluate(make_jobs(files[:1], [PlannerConfig(gamma=gamma)], (0,)), out, workers=1, command=command)
         assert [row.gamma for row in rows] == [gamma]
     assert sorted(row.gamma for row in results.read_rows(out)) == [0.5, 0.9]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"criterion": "depth-mse"}, {"max_steps": 5}, {"caution": 0.5}, {"push_distances": (0.1,)}],
+    ids=lambda other: next(iter(other)),
+)
+def test_every_option_tells_rows_apart(tmp_path, files, command, other):
+    out = tmp_path / "rows.parquet"
+    for config in (PlannerConfig(), PlannerConfig(**other), PlannerConfig()):
+        rows = evaluate(make_jobs(files[:1], [config], (0,)), out, workers=1, command=command)
+        assert len(rows) == 1
+    assert ran(tmp_path) == ["one", "one"]
+    both = results.read_rows(out)
+    assert len(both) == 2
+    assert len({results.identity(row) for row in both}) == 2
+    assert [rates.episodes for rates in results.summarise(both)] == [1] * 4
+
+
+def test_rows_that_do_not_say_how_they_ran_are_kept_but_not_believed(tmp_path, files, command):
+    out = tmp_path / "rows.parquet"
+    jobs = make_jobs(files[:1], [PlannerConfig()], (0,))
+    (row,) = evaluate(jobs, out, workers=1, command=command)
+    table = pyarrow.parquet.read_table(out)
+    pyarrow.parquet.write_table(table.drop_columns(["configuration"]), out)
+    evaluate(jobs, out, workers=1, command=command)
+    assert ran(tmp_path) == ["one", "one"]
+    assert results.read_rows(out) == [dataclasses.replace(row, configuration=None), row]
+
+
+def test_a_worker_that_ran_something_else_is_not_believed(tmp_path, command):
+    save_scenario(Scenario("confused", (), TARGET), tmp_path / "confused.json")
+    jobs = make_jobs([tmp_path / "confused.json"], [PlannerConfig()], (0,))
+    (row,) = evaluate(jobs, tmp_path / "rows.parquet", workers=1, command=command)
+    assert row.failure == "error: the worker ran the episode with other options than those asked for"
+
+
+def test_the_row_of_a_job_is_that_of_its_episode(problem):
+    from mechsearch_jax.envs.episode import describe
+    from mechsearch_jax.envs.simulator import NativeSimulator
+
+    config = PlannerConfig(push_distances=(0.05, 0.2))
+    job = Job("", Scenario("one", (), TARGET), config, 3)
+    assert job.configuration == results.configuration(describe(3, problem, config, "oracle", NativeSimulator()))
 
 
 def test_another_table_is_not_overwritten(tmp_path, files, command):

@@ -138,7 +138,8 @@ def test_one_angle_serves_a_batch():
     T = forward(q)
     solutions, valid = kinematics.inverse_kinematics(T, jnp.float32(0.7))
     repeated, same = kinematics.inverse_kinematics(T, jnp.full(5, 0.7))
-    np.testing.assert_array_equal(solutions, repeated)
+    # A scalar and a batch of angles are compiled apart, and may round differently.
+    np.testing.assert_allclose(solutions, repeated, atol=1e-6)
     np.testing.assert_array_equal(valid, same)
 
 

@@ -118,8 +118,17 @@ def test_the_shelf_is_what_surrounds_its_free_box(point, hit):
 
 def test_a_sphere_touches_the_board_a_radius_above_it():
     shelf = Shelf()
-    assert bool(collision.hits_shelf(shelf, jnp.float32([0.6, 0.1, shelf.board + 0.04]), 0.05))
-    assert not bool(collision.hits_shelf(shelf, jnp.float32([0.6, 0.1, shelf.board + 0.06]), 0.05))
+    radius = jnp.array([0.05])
+
+    def hits(x, y, z):
+        return bool(collision.spheres_hit_shelf(shelf, jnp.float32([[x, y, z]]), radius)[0])
+
+    assert hits(0.6, 0.1, shelf.board + 0.04)
+    assert not hits(0.6, 0.1, shelf.board + 0.06)
+    # In front of the board's edge, and diagonally in front of and above it.
+    assert hits(shelf.front - 0.04, 0.1, shelf.board - 0.1)
+    assert not hits(shelf.front - 0.06, 0.1, shelf.board - 0.1)
+    assert not hits(shelf.front - 0.04, 0.1, shelf.board + 0.04)
 
 
 def test_moving_pair_and_world_together_changes_nothing():

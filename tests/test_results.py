@@ -143,6 +143,42 @@ def test_rows_are_read_back(tmp_path):
     assert pyarrow.parquet.read_schema(tmp_path / "new" / "rows.parquet").equals(results.SCHEMA)
 
 
+def test_rows_of_the_first_version_are_read(tmp_path):
+    results.write_rows([ROW], tmp_path / "rows.parquet")
+    table = pyarrow.parquet.read_table(tmp_path / "rows.parquet")
+    pyarrow.parquet.write_table(table.drop_columns(["configuration"]), tmp_path / "rows.parquet")
+    assert results.read_rows(tmp_path / "rows.parquet") == [ROW]
+
+
+@pytest.mark.parametrize("text", ["{", "3"])
+def test_a_configuration_that_is_none_is_one_line(tmp_path, text):
+    results.write_rows([dataclasses.replace(ROW, configuration=text)], tmp_path / "rows.parquet")
+    with pytest.raises(InputError, match=r"rows\.parquet: the configuration of 'two-things'"):
+        results.read_rows(tmp_path / "rows.parquet")
+
+
+def test_options_that_differ_tell_rows_apart():
+    full = results.configuration({"gamma": 0.9, "push_distances": [0.05, 0.1], "seed": 3, "target": "box"})
+    assert json.loads(full) == {"gamma": 0.9, "push_distances": [0.05, 0.1]}
+    rows = [dataclasses.replace(ROW, configuration=full), ROW, dataclasses.replace(ROW, gamma=0.5)]
+    assert results.label_variants(rows) == [
+        "search-for-grasp, gamma 0.9, push distances 0.05/0.1",
+        "search-for-grasp, gamma 0.9, push distances unknown",
+        "search-for-grasp, gamma 0.5, push distances unknown",
+    ]
+    assert results.label_variants(rows[1:2]) == ["search-for-grasp"]
+    assert [rates.episodes for rates in results.summarise(rows)] == [1] * 6
+
+
+def test_confidence_intervals_are_wilsons():
+    # Newcombe 1998, table I: 81 of 263, 15 of 148, 0 of 20, 29 of 29.
+    for counts, interval in {
+        (81, 263): (0.2553, 0.3662), (15, 148): (0.0624, 0.1605), (0, 20): (0.0, 0.1611), (29, 29): (0.8830, 1.0),
+    }.items():  # fmt: skip
+        assert results.wilson(*counts) == pytest.approx(interval, abs=5e-5)
+    assert results.wilson(0, 0) == (0.0, 1.0)
+
+
 def test_the_schema_is_the_row():
     assert results.SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
 

@@ -3,16 +3,15 @@
 import copy
 import dataclasses
 import json
-from pathlib import Path
+import stat
 
 import numpy as np
 import pytest
+from published import published_scenarios
 
 from mechsearch_jax import scenario as scenarios
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.scenario import Body, Scenario
-
-PUBLISHED = Path(__file__).parents[2] / "shared" / "scenarios" / "published"
 
 SCENE = Scenario(
     name="two-things",
@@ -194,8 +193,16 @@ def test_shipped_scenarios_are_well_formed():
         assert path.read_text() == scenarios.format_scenario(scene)
 
 
-@pytest.mark.skipif(not PUBLISHED.is_dir(), reason="the published scenes are not next to this checkout")
+def test_a_file_gets_ordinary_permissions(tmp_path):
+    (tmp_path / "plain").write_text("")
+    scenarios.save_scenario(SCENE, tmp_path / "new" / "scene.json")
+    modes = {stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("plain", "new/scene.json")}
+    assert len(modes) == 1
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["scene.json"]
+
+
+@pytest.mark.skipif(not published_scenarios(), reason="the published scenes are not next to this checkout")
 def test_published_scenes_are_read():
-    files = sorted(PUBLISHED.glob("*.json"))
+    files = published_scenarios()
     assert len(files) == 100
     assert sorted({len(scenarios.load_scenario(f).objects) for f in files}) == [2, 4, 6, 8]

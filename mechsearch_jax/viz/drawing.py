@@ -19,7 +19,7 @@ from scipy.spatial import ConvexHull
 
 from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.camera import Camera, project
-from mechsearch_jax.results import PathLike, replacing
+from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.target import Target

@@ -1,0 +1,228 @@
+"""What results say: tables with confidence intervals, failure reasons, and success over the number of actions."""
+
+from __future__ import annotations
+
+import collections
+import csv
+import dataclasses
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.results import (
+    Rates,
+    Row,
+    check_writable,
+    identity,
+    label_variants,
+    read_rows,
+    summarise,
+    wilson,
+)
+from mechsearch_jax.viz.drawing import INK, MUTED, save_figure
+
+FILES = ("report.md", "rates.csv", "rates.json", "failures.csv", "success.png")
+GOALS = {"found": "found", "graspable": "found and graspable", "retrieved": "retrieved"}
+# Told apart without colour vision too (Okabe and Ito).
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+
+
+def read_tables(files: Sequence[PathLike]) -> list[Row]:
+    """The rows of several tables of `evaluate`.
+
+    Raises:
+      InputError: a file is no such table, an episode is in two of them, or there is none at all.
+    """
+    rows: list[Row] = []
+    origin: dict[tuple, PathLike] = {}
+    for file in files:
+        for row in read_rows(file):
+            if identity(row) in origin:
+                raise InputError(
+                    f"{file}: holds scenario {row.scenario!r}, seed {row.seed}, with the same options as "
+                    f"{origin[identity(row)]}; report them one by one"
+                )
+            origin[identity(row)] = file
+            rows.append(row)
+    if not rows:
+        raise InputError("report: there are no episodes in these tables")
+    return rows
+
+
+def step_of(row: Row, goal: str) -> int | None:
+    """Number of actions after which an episode reached "found", "graspable" or "retrieved"; None if it never did."""
+    if goal == "retrieved":
+        return row.steps if row.retrieved else None
+    return row.found_step if goal == "found" else row.graspable_step
+
+
+def reached(rows: Sequence[Row], goal: str, actions: int) -> list[int]:
+    """How many episodes had reached a goal after 0, 1, ..., `actions` actions."""
+    steps = [step_of(row, goal) for row in rows]
+    return [sum(step is not None and step <= k for step in steps) for k in range(actions + 1)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Failures:
+    """How often episodes ended for a reason.
+
+    Attributes:
+      method: with the options that differ, as in `Rates`.
+      reason: why there was no retrieval.
+      episodes: how many ended so.
+      share: of the method's episodes.
+    """
+
+    method: str
+    reason: str
+    episodes: int
+    share: float
+
+
+def failures(rows: Sequence[Row]) -> list[Failures]:
+    """Why episodes ended without a retrieval, the most frequent reason first."""
+    labels = label_variants(rows)
+    result = []
+    for method in sorted(set(labels)):
+        group = [row for row, label in zip(rows, labels, strict=True) if label == method]
+        reasons = collections.Counter(row.failure or "unknown" for row in group if not row.retrieved)
+        result += [Failures(method, reason, n, n / len(group)) for reason, n in reasons.most_common()]
+    return result
+
+
+def _share(value: float, interval: tuple[float, float]) -> str:
+    return f"{value:.2f} ({interval[0]:.2f} to {interval[1]:.2f})"
+
+
+def _objects(rates: Rates) -> str:
+    return "all" if rates.objects is None else str(rates.objects)
+
+
+def _row(cells: Sequence[str]) -> str:
+    # A bar would end the cell.
+    return "| " + " | ".join(" ".join(cell.replace("|", "\\|").split()) for cell in cells) + " |"
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """The report as text."""
+    summary, reasons = summarise(rows), failures(rows)
+    names = ("method", "objects", "episodes", "errors", *GOALS, "actions", "planning [s]", "simulation [s]")
+    lines = [
+        "# Results",
+        "",
+        f"{len(rows)} episodes. Shares with Wilson's 95% confidence interval; actions are the mean number per episode, "
+        "attempts to take the target out among them; times are means per action. An episode that ended in an error of "
+        "the program counts as a failure.",
+        "",
+        _row(names),
+        _row(["---"] * len(names)),
+    ]
+    for rates in summary:
+        cells = [rates.method, _objects(rates), str(rates.episodes), str(rates.errors)]
+        cells += [_share(getattr(rates, goal), getattr(rates, f"{goal}_interval")) for goal in GOALS]
+        cells += [f"{v:.2f}" for v in (rates.steps, rates.planning_seconds, rates.simulation_seconds)]
+        lines.append(_row(cells))
+    lines += ["", "## Why episodes failed", ""]
+    if reasons:
+        lines += [_row(("method", "reason", "episodes", "share")), _row(["---"] * 4)]
+        lines += [_row((f.method, f.reason, str(f.episodes), f"{f.share:.2f}")) for f in reasons]
+    else:
+        lines.append("None did.")
+    lines += ["", "## Success over the number of actions", "", "![Success over the number of actions](success.png)", ""]
+    return "\n".join(lines)
+
+
+def _flat(rates: Rates) -> dict[str, object]:
+    """Rates with one value a column."""
+    flat: dict[str, object] = {}
+    for name, value in dataclasses.asdict(rates).items():
+        if isinstance(value, tuple):
+            goal = name.removesuffix("_interval")
+            flat |= {f"{goal}_low": value[0], f"{goal}_high": value[1]}
+        else:
+            flat[name] = "all" if name == "objects" and value is None else value
+    return flat
+
+
+def _csv(lines: Sequence[dict[str, object]], names: Sequence[str]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return text.getvalue()
+
+
+def _curve(axes: Axes, rows: Sequence[Row], goal: str, actions: int, colour: str, label: str) -> None:
+    counts = reached(rows, goal, actions)
+    x = np.arange(actions + 1)
+    low, high = np.array([wilson(n, len(rows)) for n in counts]).T
+    axes.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
+    axes.plot(x, np.array(counts) / len(rows), color=colour, marker="o", markersize=3, label=label)
+
+
+def success_figure(rows: Sequence[Row]) -> Figure:
+    """Share of episodes that reached each goal over the number of actions: a column for each number of objects."""
+    labels = label_variants(rows)
+    variants, objects = sorted(set(labels)), sorted({row.objects for row in rows})
+    actions = max(max(row.steps for row in rows), 1)
+    size = (2.6 * len(objects) + 1.2, 2.2 * len(GOALS) + 0.9 + 0.2 * len(variants))
+    figure = Figure(figsize=(max(size[0], 5.0), size[1]), layout="constrained")
+    grid = figure.subplots(len(GOALS), len(objects), sharex=True, sharey=True, squeeze=False)
+    for i, (goal, title) in enumerate(GOALS.items()):
+        for j, count in enumerate(objects):
+            axes: Axes = grid[i][j]
+            for k, variant in enumerate(variants):
+                chosen = zip(rows, labels, strict=True)
+                group = [row for row, label in chosen if label == variant and row.objects == count]
+                if group:
+                    _curve(axes, group, goal, actions, COLOURS[k % len(COLOURS)], variant)
+            axes.set_ylim(-0.03, 1.03)
+            axes.grid(color=MUTED, alpha=0.2)
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.tick_params(colors=INK, labelsize=8)
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+            if i == 0:
+                axes.set_title(f"{count} object{'' if count == 1 else 's'}", fontsize=10, color=INK)
+            if i == len(GOALS) - 1:
+                axes.set_xlabel("actions", fontsize=9, color=INK)
+            if j == 0:
+                axes.set_ylabel(f"share {title}", fontsize=9, color=INK)
+    handles = {line.get_label(): line for axes in grid.flat for line in axes.get_lines()}
+    shown = [handles[variant] for variant in variants]
+    figure.legend(shown, variants, loc="outside lower center", ncols=1, frameon=False, fontsize=8)
+    return figure
+
+
+def write_report(rows: Sequence[Row], out: PathLike) -> None:
+    """Write `report.md`, `rates.csv`, `rates.json`, `failures.csv` and `success.png` into a folder.
+
+    Args:
+      rows: at least one.
+      out: the folder; files of these names are replaced.
+
+    Raises:
+      InputError: the folder cannot be written to.
+    """
+    check_writable(out)
+    folder = Path(out)
+    figure = success_figure(rows)
+    flat = [_flat(rates) for rates in summarise(rows)]
+    reasons = [dataclasses.asdict(f) for f in failures(rows)]
+    texts = {
+        "report.md": markdown(rows),
+        "rates.csv": _csv(flat, list(flat[0])),
+        "rates.json": json.dumps({"rates": flat, "failures": reasons}, indent=1, allow_nan=False) + "\n",
+        "failures.csv": _csv(reasons, [field.name for field in dataclasses.fields(Failures)]),
+    }
+    for name, text in texts.items():
+        with replacing(folder / name) as file:
+            file.write(text.encode())
+    save_figure(figure, folder / "success.png")
