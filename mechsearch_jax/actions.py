@@ -502,7 +502,7 @@ def _enters_possible(tables: ActionTables, space: PossibleSpace, opening: int, w
     def enters(tables, row, i):
         T, space = row
         points = transform(T[i], tables.clouds[opening, jnp.asarray(wrist)[i]].T)
-        return jnp.any(_enters(space, points))
+        return jnp.any(_enters(jax.tree.map(lambda a: a[...], space), points))
 
     return masked_vmap(enters, mask, tables, (T, space))
 
@@ -566,7 +566,7 @@ def candidates(
 
     def push_path(tables, row, i):
         starts, ends = row
-        T, end = starts[i // d], ends.reshape(-1, 4, 4)[i]
+        T, end = starts[i // d], ends[i // d, i % d]
         w = jnp.asarray(wrist_b)[i // d]
         back = jnp.float32(space.gripper.approach)
         middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
@@ -594,7 +594,7 @@ def candidates(
         gripper = transform(flat[k], tables.clouds[1, w].T)
         body = transform(make(scene.rotation[o], scene.position[o]), clouds[o].T)
         both = jnp.concatenate([gripper[None] + way[:, None], body[None] + way[:, None]], axis=1)
-        return jnp.any(_enters(space, both))
+        return jnp.any(_enters(jax.tree.map(lambda a: a[...], space), both))
 
     entering = masked_vmap(push_enters, usable.reshape(-1), tables, (flat, shift, possible, scene, clouds), block=64)
     return Candidates(
@@ -722,7 +722,8 @@ def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
         position, rotation, cloud, other = row
         k, j = i // n, i % n
         T_object_world = inverse(make(other.rotation[j], other.position[j]))
-        return Pair(cloud.T, compose(T_object_world, make(rotation[k], position[k])), other.size[j], other.exponents[j])
+        T = compose(T_object_world, make(rotation[k], position[k]))
+        return Pair(cloud[...].T, T, other.size[j], other.exponents[j])
 
     row = (position, rotation, cloud, other)
     overlapping = jnp.any(any_inside(near.reshape(-1), overlap, None, row).reshape(near.shape), axis=1)
@@ -740,7 +741,7 @@ def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
     )
 
     def clear(tables, row, i):
-        T, wrist = row
+        T, wrist = row[0], row[1][...]
         q, reachable = line_kinematics(T[i], jnp.float32(space.gripper.approach), tables.q7[0, wrist], space.waypoints)
         points = transform(T[i], tables.clouds[0, wrist].T)
         return reachable & ~jnp.any(arm_hits_shelf(q, shelf)) & ~jnp.any(hits_shelf(shelf, points))
@@ -753,7 +754,7 @@ def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
     def body_pair(_, row, i):
         T, position, rotation, cloud, scene = row
         k, j = i // n, i % n
-        swept = _swept_object(cloud.T, matmul(rotation[k].T, T[k][:3, :3]), space.gripper.approach)
+        swept = _swept_object(cloud[...].T, matmul(rotation[k].T, T[k][:3, :3]), space.gripper.approach)
         T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
         T_object_body = compose(T_object_world, make(rotation[k], position[k]))
         return Pair(swept, T_object_body, scene.size[j], scene.exponents[j])

@@ -14,7 +14,7 @@ from mechsearch_jax.shelf import Shelf
 
 
 def function(shared, row, i):
-    return shared * row["a"][i], {"b": row["b"] + i}
+    return shared * row["a"][i], {"b": row["b"][...] + i}
 
 
 @pytest.mark.parametrize("block", [1, 4, 64])
@@ -48,6 +48,17 @@ def test_batches_nest_and_shared_values_may_be_batched_too():
     run = lambda s, m, r: masked_vmap(function, m, s, r)[0]  # noqa: E731
     got = jax.vmap(jax.vmap(run, in_axes=(None, 0, 0)))(scale, masks, rows)
     np.testing.assert_allclose(got, jnp.where(masks, rows["a"] * scale[:, None, None], 0.0))
+
+
+def test_rows_may_vary_along_some_axes_of_a_batch_only():
+    masks = jnp.ones((2, 3, 10), bool)
+    outer, inner = jax.random.normal(jax.random.key(0), (2, 10)), jnp.arange(3)
+    run = lambda m, a, b: masked_vmap(function, m, jnp.float32(1.0), {"a": a, "b": b})  # noqa: E731
+    got = jax.jit(jax.vmap(jax.vmap(run, in_axes=(0, None, 0)), in_axes=(0, 0, None)))(masks, outer, inner)
+    np.testing.assert_array_equal(got[0], jnp.broadcast_to(outer[:, None], (2, 3, 10)))
+    np.testing.assert_array_equal(
+        got[1]["b"], jnp.broadcast_to(inner[None, :, None] + jnp.arange(10)[None, None], (2, 3, 10))
+    )
 
 
 def test_nothing_is_evaluated_for_an_empty_mask():
@@ -140,6 +151,8 @@ def test_moving_pair_and_world_together_changes_nothing():
 
     def hit(T_world_object, T_world_cloud):
         relative = transforms.compose(transforms.inverse(T_world_object), T_world_cloud)
-        return bool(collision.any_inside(jnp.ones(1, bool), lambda c, r, i: Pair(c, r, size, e), cloud.T, relative)[0])
+        return bool(
+            collision.any_inside(jnp.ones(1, bool), lambda c, r, i: Pair(c, r[...], size, e), cloud.T, relative)[0]
+        )
 
     assert hit(jnp.eye(4), T) == hit(world, transforms.compose(world, T))
