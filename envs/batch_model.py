@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -41,7 +42,7 @@ def body_fields(
     half_size: Float[np.ndarray, "worlds 9 3"],
     valid: Bool[np.ndarray, "worlds 9"],
 ) -> BodyFields:
-    """The fields of a model whose slots hold the bodies of each world, float32, on the host.
+    """The fields of a model whose slots hold the bodies of each world, float32.
 
     Args:
       blank: the compiled model with empty slots.
@@ -86,4 +87,4 @@ def body_fields(
         fields["geom_rbound"][:, geom] = radius
         fields["geom_aabb"][:, geom] = np.concatenate([np.zeros_like(half), half], axis=-1)
     fields["geom_aabb"] = fields["geom_aabb"].reshape(worlds, -1, 2, 3)
-    return BodyFields(**fields)
+    return BodyFields(**{name: jnp.asarray(value) for name, value in fields.items()})

@@ -374,15 +374,22 @@ class MjxSimulator:
         """
         return self.execute(retrievals(T_world_gripper, q7, opening), active)
 
-    def follow(self, controls: Float[Array, "steps worlds 9"]) -> Outcomes:
+    def follow(
+        self, controls: Float[Array, "steps worlds 9"], start: Float[Array, "worlds 9"] | None = None
+    ) -> Outcomes:
         """Step all worlds with these controls, without any verdict: for measurements, and for motions of one's own.
 
         Args:
           controls: joint angles [rad] and distances of the two fingers from the middle [m] that the position actuators
-            are told. The robot begins wherever it is.
+            are told.
+          start: where the robot is put first, at rest; by default it begins where it is.
         """
         self._count()
         data, self._data = self._data, None
+        if start is not None:
+            data = data.replace(
+                qpos=data.qpos.at[:, :ROBOT].set(start), qvel=data.qvel.at[:, :ROBOT].set(jnp.zeros_like(start))
+            )
         self._data, self.world, outcomes = self._rollout(self._fields, data, self.world, controls)
         return outcomes
 
@@ -505,7 +512,7 @@ class MjxSimulator:
 
         def one(carry, i):
             row = jax.lax.dynamic_index_in_dim(task.controls, jnp.minimum(i, last), keepdims=False)
-            return self._advance(fields, task, *carry, i, row), None
+            return self._advance(fields, task, carry[0], carry[1], i, row), None
 
         def some(carry):
             i, state = carry
@@ -564,7 +571,7 @@ class MjxSimulator:
         task = _Task(controls, jnp.full(worlds, steps + 1, jnp.int32), none, data.qpos)
 
         def one(carry, step):
-            return self._advance(fields, task, *carry, *step), None
+            return self._advance(fields, task, carry[0], carry[1], *step), None
 
         state = (data, self._begin(data, none, none))
         (data, progress), _ = jax.lax.scan(one, state, (jnp.arange(steps), controls))

@@ -293,7 +293,7 @@ def masses_and_inertias(
     box = (square.sum(axis=-1, keepdims=True) - square) / 3
     across = square[..., 0] / 4 + square[..., 2] / 3
     rod = np.stack([across, across, square[..., 0] / 2], axis=-1)
-    return mass, mass[..., None] * np.where(cylinder[..., None], rod, box)
+    return np.asarray(mass), mass[..., None] * np.where(cylinder[..., None], rod, box)
 
 
 def mass_and_inertia(body: Body) -> tuple[float, Float[np.ndarray, " 3"]]:
