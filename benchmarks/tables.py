@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from mechsearch_jax.benchmarks.agreement import Agreement
 from mechsearch_jax.benchmarks.bench import Timing
 from mechsearch_jax.results import Row, summarise
 
@@ -45,8 +46,30 @@ def timing_table(timing: Timing) -> Table:
     table.add_row("compile", f"{timing.compile_seconds:.2f} s")
     table.add_row("median", f"{1e3 * timing.median:.1f} ms")
     table.add_row("spread", f"{1e3 * fastest:.1f} to {1e3 * slowest:.1f} ms in {len(timing.seconds)} calls")
+    if timing.rate is not None:
+        table.add_row("rate", f"{timing.rate:,.0f} steps/s")
     table.add_row("device", timing.versions["device"])
     table.add_row("versions", ", ".join(f"{k} {v}" for k, v in timing.versions.items() if k != "device"))
+    return table
+
+
+def agreement_table(agreement: Agreement) -> Table:
+    """How well two simulators agree, by kind of action."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    table.add_column("action", no_wrap=True)
+    for name in ("number", "agree", "failure", "differ mm", "p90", "native mm", "p90", "batch mm", "p90", "KS p"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, row in agreement.summary().items():
+        lengths = ("position_difference", "native_moved", "batch_moved")
+        table.add_row(
+            name,
+            f"{row['actions']:.0f}",
+            f"{row['agreeing']:.3f}",
+            f"{row['same_failure']:.3f}",
+            *(f"{1e3 * row[f'{length}_{what}']:.2f}" for length in lengths for what in ("median", "p90")),
+            f"{row['displacement_p_value']:.2f}",
+            style="bold" if name == "all" else None,
+        )
     return table
 
 

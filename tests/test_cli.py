@@ -77,6 +77,8 @@ WRONG = {
     "no scenarios": (["scenarios", "generate", "--objects", "2", "--count", "0", "--out", "new"], "--count 0"),
     "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
     "no repeats": (["bench", "plan", "--repeats", "0"], "--repeats 0"),
+    "no worlds": (["bench", "simulate", "--worlds", "0"], "worlds 0 must be at least 1"),
+    "nothing to agree on": (["bench", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
     "file for a folder": (["search", "good.json", "--out", "good.json"], "good.json: cannot be written to"),
 }
 

@@ -205,10 +205,10 @@ def test_a_world_that_diverges_touches_no_other(sim):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("config", "flag"), [(MjxConfig(rows=12), Overflow.ROWS), (MjxConfig(contacts=2), Overflow.CONTACTS)]
+    ("config", "flag"), [(MjxConfig(rows=30), Overflow.ROWS), (MjxConfig(contacts=2), Overflow.CONTACTS)]
 )
 def test_what_overflows_is_reported(config, flag):
-    """An empty shelf has nothing to overflow: of its own rows it has enough, but the contacts are everybody's."""
+    """The target alone has rows enough, which are its own; the contacts are everybody's."""
     small = MjxSimulator(config=config)
     small.reset([scene(BOX, BOTTLE, target=GOAL), scene()])
     hold = jnp.broadcast_to(small._data.ctrl, (5, *small._data.ctrl.shape))

@@ -1,0 +1,287 @@
+"""How well the batch simulator agrees with the native one: random actions executed by both, all in one batch.
+
+Agreement is meant of every action by itself (where do all bodies end up?) and of the whole (how far do things move?).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.stats import ks_2samp
+
+from mechsearch_jax import planner
+from mechsearch_jax.actions import Action, ActionKind, PossibleSpace, candidates, sample_action
+from mechsearch_jax.envs.generator import ScenarioGenerator
+from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
+from mechsearch_jax.envs.simulator import NativeSimulator
+from mechsearch_jax.envs.world import CYLINDER, World, from_scenario, true_superquadrics
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import PlannerConfig, Problem
+from mechsearch_jax.results import ACTION_NAMES, PathLike, replacing, versions
+from mechsearch_jax.scenario import MAX_OBJECTS, Scenario
+
+# What counts as the same final pose [m, degrees].
+NEAR, ALIGNED = 5e-3, 3.0
+KINDS = (ActionKind.PUSH, ActionKind.PICK_AND_PLACE)
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """One action in one scene, as both simulators executed it.
+
+    Attributes:
+      scenario, objects: name of the scene, and number of objects in it.
+      kind: "push" or "pick-and-place".
+      object: index of the object that it is about.
+      native_failure, batch_failure: why it was not executed as commanded, or None.
+      native_moved, batch_moved: how far the object was displaced [m].
+      native_steps, batch_steps: simulated time steps.
+      position_difference: between the final positions of a body, the largest of all bodies [m].
+      rotation_difference: between the final rotations, likewise [degrees]; a cylinder's spin about its axis is nothing.
+      spin_difference: the same with the spin.
+      overflow: flags of `mjx_simulator.Overflow`.
+    """
+
+    scenario: str
+    objects: int
+    kind: str
+    object: int
+    native_failure: str | None
+    batch_failure: str | None
+    native_moved: float
+    batch_moved: float
+    native_steps: int
+    batch_steps: int
+    position_difference: float
+    rotation_difference: float
+    spin_difference: float
+    overflow: int
+
+    @property
+    def agrees(self) -> bool:
+        """Whether all final poses are the same within 5 mm and 3 degrees."""
+        return self.position_difference <= NEAR and self.rotation_difference <= ALIGNED
+
+
+@dataclasses.dataclass(frozen=True)
+class Agreement:
+    """What came of all actions.
+
+    Attributes:
+      cases: one for each action.
+      native_seconds: of all actions, one after the other [s].
+      batch_seconds: of the first batch, with compilation, and of the same again [s].
+      versions: as `results.versions` returns them, with those of MJX and Warp.
+    """
+
+    cases: tuple[Case, ...]
+    native_seconds: float
+    batch_seconds: tuple[float, float]
+    versions: dict[str, str]
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """By kind of action and for all: shares, quantiles of the differences [m, degrees] and displacements [m]."""
+        rows = {ACTION_NAMES[kind]: [c for c in self.cases if c.kind == ACTION_NAMES[kind]] for kind in KINDS}
+        return {name: _summary(cases) for name, cases in {**rows, "all": list(self.cases)}.items() if cases}
+
+
+def _summary(cases: Sequence[Case]) -> dict[str, float]:
+    position, rotation, spin, native, batch = np.array(
+        [
+            (c.position_difference, c.rotation_difference, c.spin_difference, c.native_moved, c.batch_moved)
+            for c in cases
+        ]
+    ).T
+    value: dict[str, float] = {
+        "actions": len(cases),
+        "agreeing": float(np.mean([c.agrees for c in cases])),
+        "agreeing_with_spin": float(np.mean((position <= NEAR) & (spin <= ALIGNED))),
+        "same_failure": float(np.mean([c.native_failure == c.batch_failure for c in cases])),
+        "overflowed": sum(c.overflow != 0 for c in cases),
+    }
+    for name, sample in (
+        ("position_difference", position),
+        ("rotation_difference", rotation),
+        ("native_moved", native),
+        ("batch_moved", batch),
+    ):
+        value |= {f"{name}_median": float(np.median(sample)), f"{name}_p90": float(np.quantile(sample, 0.9))}
+    # Probability of displacements that differ as much, if both come from one distribution.
+    test: Any = ks_2samp(native, batch)
+    return value | {"displacement_ks": float(test.statistic), "displacement_p_value": float(test.pvalue)}
+
+
+def save_agreement(agreement: Agreement, path: PathLike) -> None:
+    """Write an agreement as JSON, with its summary.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    value = {"summary": agreement.summary(), **dataclasses.asdict(agreement)}
+    with replacing(path) as file:
+        file.write((json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+
+
+def generated_scenes(count: int, seed: int = 0) -> list[Scenario]:
+    """Generated scenes with 1 to 8 objects in turn."""
+    generator = ScenarioGenerator()
+    return [generator.generate(seed + i // MAX_OBJECTS, 1 + i % MAX_OBJECTS) for i in range(count)]
+
+
+def _sampler(problem: Problem, config: PlannerConfig) -> Callable[[Array, World], Action]:
+    """A compiled function that draws one valid action for every key, wherever the target may be."""
+    space = planner.action_space(problem, config)
+    grid = problem.target.grid[:2]
+    nowhere = PossibleSpace(
+        occupied=jnp.zeros(grid, bool),
+        chance=jnp.zeros(grid),
+        origin=problem.poses[0, :2],
+        cell=jnp.float32(problem.target.cell(problem.shelf)[:2]),
+        top=jnp.float32(problem.shelf.board),
+    )
+
+    def draw(keys: Array, world: World, problem: Problem) -> Action:
+        scene = true_superquadrics(world)
+        options = candidates(space, problem.actions, scene, nowhere)
+
+        def one(key: Array) -> Action:
+            return sample_action(key, space, problem.actions, scene, nowhere, options, scene.valid).action
+
+        return jax.vmap(one)(keys)
+
+    compiled = jax.jit(draw)
+    return lambda keys, world: compiled(keys, world, problem)
+
+
+def draw_actions(
+    scenes: Sequence[Scenario], count: int, seed: int = 0, tries: int = 16
+) -> list[tuple[Scenario, Action]]:
+    """Random valid actions in scenes: the scenes in turn, and pushes and pick-and-places in turn where there are both.
+
+    Args:
+      scenes: where.
+      count: how many actions.
+      seed: of the random numbers.
+      tries: actions drawn in a scene, from which it contributes.
+
+    Raises:
+      InputError: the scenes do not have so many.
+    """
+    sample = _sampler(planner.build_problem(), PlannerConfig.paper())
+    drawn: list[dict[ActionKind, list[Action]]] = []
+    for i, scene in enumerate(scenes):
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), i), tries)
+        actions = jax.device_get(sample(keys, from_scenario(scene)))
+        split = [jax.tree.map(lambda leaf, j=j: leaf[j], actions) for j in range(tries)]
+        drawn.append({kind: [action for action in split if action.kind == kind] for kind in KINDS})
+    cases: list[tuple[Scenario, Action]] = []
+    for round_ in range(2 * tries):
+        for i, (scene, found) in enumerate(zip(scenes, drawn, strict=True)):
+            wanted = KINDS[(round_ + i) % 2]
+            other = KINDS[(round_ + i + 1) % 2]
+            usable = found[wanted] or found[other]
+            if usable and len(cases) < count:
+                cases.append((scene, usable.pop(0)))
+    if len(cases) < count:
+        raise InputError(f"agreement: {len(scenes)} scenes have only {len(cases)} of {count} actions; take more scenes")
+    return cases
+
+
+def _angle(cosine: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def pose_differences(a: World, b: World) -> tuple[Float[np.ndarray, " worlds"], ...]:
+    """How far apart the bodies of two states are: the largest distance [m] and angle [degrees] in every world.
+
+    Args:
+      a, b: the same bodies; fields with a leading axis for the worlds.
+
+    Returns:
+      Distances; angles, of cylinders between their axes; angles between rotations.
+    """
+    a, b = jax.tree.map(np.asarray, (a, b))
+    distance = np.linalg.norm(a.position - b.position, axis=-1)
+    turn = _angle((np.einsum("wnij,wnij->wn", a.rotation, b.rotation) - 1) / 2)
+    tilt = _angle(np.einsum("wni,wni->wn", a.rotation[..., 2], b.rotation[..., 2]))
+    valid = a.valid
+    angle = np.where(a.kind == CYLINDER, tilt, turn)
+    return tuple(np.where(valid, value, 0.0).max(axis=1) for value in (distance, angle, turn))
+
+
+def _displacement(before: World, after: World, objects: np.ndarray) -> np.ndarray:
+    moved = np.linalg.norm(np.asarray(after.position) - np.asarray(before.position), axis=-1)
+    return moved[np.arange(len(objects)), objects]
+
+
+def _stack(trees: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
+
+
+def agreement(cases: Sequence[tuple[Scenario, Action]], config: MjxConfig | None = None) -> Agreement:
+    """Execute actions with both simulators; the batch simulator executes them all at once.
+
+    Args:
+      cases: scenes, and what to do in them.
+      config: of the batch simulator; the native one takes its `simulator`.
+
+    Raises:
+      InputError: Warp is missing.
+    """
+    config = config or MjxConfig()
+    simulator = MjxSimulator(config=config)
+    scenes = [scene for scene, _ in cases]
+    actions = jax.tree.map(jnp.asarray, _stack([action for _, action in cases]))
+    seconds: list[float] = []
+    # The second time tells how long it takes when everything is compiled; on a GPU its results differ a little.
+    for _ in range(2):
+        before = jax.device_get(simulator.reset(scenes))
+        start = time.perf_counter()
+        outcomes = simulator.execute(actions)
+        outcomes, after = jax.device_get((outcomes, simulator.world))
+        seconds.append(time.perf_counter() - start)
+
+    native = NativeSimulator(config=config.simulator)
+    worlds, records = [], []
+    start = time.perf_counter()
+    for scene, action in cases:
+        native.reset(scene)
+        records.append(native.execute(action))
+        worlds.append(native.world)
+    native_seconds = time.perf_counter() - start
+
+    expected: World = _stack(worlds)
+    objects = np.asarray(actions.object)
+    distance, angle, spin = pose_differences(expected, after)
+    native_moved = _displacement(before, expected, objects)
+    batch_moved = _displacement(before, after, objects)
+    results = tuple(
+        Case(
+            scenario=scene.name,
+            objects=len(scene.objects),
+            kind=ACTION_NAMES[ActionKind(int(action.kind))],
+            object=int(action.object),
+            native_failure=records[i].failure,
+            batch_failure=outcomes.reason(i),
+            native_moved=float(native_moved[i]),
+            batch_moved=float(batch_moved[i]),
+            native_steps=records[i].steps,
+            batch_steps=int(outcomes.steps[i]),
+            position_difference=float(distance[i]),
+            rotation_difference=float(angle[i]),
+            spin_difference=float(spin[i]),
+            overflow=int(outcomes.overflow[i]),
+        )
+        for i, (scene, action) in enumerate(cases)
+    )
+    engines = {name: importlib.metadata.version(name) for name in ("mujoco-mjx", "warp-lang")}
+    return Agreement(results, native_seconds, (seconds[0], seconds[1]), {**versions(), **engines})
