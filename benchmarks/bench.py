@@ -185,12 +185,12 @@ def plough(worlds: int, steps: int) -> tuple[Float[Array, "steps worlds 9"], Flo
       The controls, and where the robot begins.
     """
     u = jnp.asarray((np.arange(worlds) % 16) / 16.0 + 1 / 32, jnp.float32)
-    position = jnp.stack([0.54 + 0.08 * u, -0.05 + 0.2 * ((5 * u) % 1), jnp.full(worlds, 0.48)], axis=-1)
+    position = jnp.stack([0.53 + 0.07 * u, -0.08 + 0.3 * ((5 * u) % 1), jnp.full(worlds, 0.48)], axis=-1)
     tilt = jnp.full(worlds, np.radians(30), jnp.float32)
     T = make(gripper_rotation(jnp.zeros(worlds), tilt), position.astype(jnp.float32))
     shift = jnp.tile(jnp.float32([[0.0, 0.15, 0.0]]), (worlds, 1))
     build = jax.vmap(lambda T, shift, q7: motion.push_reference(T, shift, q7, motion.MotionConfig()))
-    reference, reachable = build(T, shift, jnp.full(worlds, WRIST_ORIGIN - np.radians(15), jnp.float32))
+    reference, reachable = build(T, shift, jnp.full(worlds, WRIST_ORIGIN + np.radians(30), jnp.float32))
     if not reachable.all():
         raise InputError("bench simulate: the arm cannot make its sweep")
     told = jnp.swapaxes(commands(reference), 0, 1)
