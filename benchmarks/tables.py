@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -54,22 +54,31 @@ def timing_table(timing: Timing) -> Table:
 
 
 def agreement_table(agreement: Agreement) -> Table:
-    """How well two simulators agree, by kind of action."""
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    table.add_column("action", no_wrap=True)
-    for name in ("number", "agree", "failure", "differ mm", "p90", "native mm", "p90", "batch mm", "p90", "KS p"):
+    """How well two simulators agree: a column for each kind of action."""
+    summary = agreement.summary()
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("", style="cyan", justify="right", no_wrap=True)
+    for name in summary:
         table.add_column(name, justify="right", no_wrap=True)
-    for name, row in agreement.summary().items():
-        lengths = ("position_difference", "native_moved", "batch_moved")
-        table.add_row(
-            name,
-            f"{row['actions']:.0f}",
-            f"{row['agreeing']:.3f}",
-            f"{row['same_failure']:.3f}",
-            *(f"{1e3 * row[f'{length}_{what}']:.2f}" for length in lengths for what in ("median", "p90")),
-            f"{row['displacement_p_value']:.2f}",
-            style="bold" if name == "all" else None,
-        )
+
+    def add(title: str, text: Callable[[dict[str, float]], str]) -> None:
+        table.add_row(title, *(text(row) for row in summary.values()))
+
+    def length(name: str, scale: float = 1e3) -> Callable[[dict[str, float]], str]:
+        return lambda row: f"{scale * row[f'{name}_median']:.2f}, {scale * row[f'{name}_p90']:.2f}"
+
+    add("actions", lambda row: f"{row['actions']:.0f}")
+    add("same final poses", lambda row: f"{row['agreeing']:.3f}")
+    add("same failure", lambda row: f"{row['same_failure']:.3f}")
+    add("worlds with overflow", lambda row: f"{row['overflowed']:.0f}")
+    add("difference [mm]: median, 90%", length("position_difference"))
+    add("difference [degrees]", length("rotation_difference", 1.0))
+    add("displacement, native [mm]", length("native_moved"))
+    add("displacement, batch [mm]", length("batch_moved"))
+    add("same distribution: p", lambda row: f"{row['displacement_p_value']:.2f}")
+    first, again = agreement.batch_seconds
+    seconds = f"native {agreement.native_seconds:.1f} s; batch {again:.1f} s, {first:.1f} s with compilation"
+    table.caption = f"{seconds}; {agreement.versions['device']}"
     return table
 
 

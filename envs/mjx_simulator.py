@@ -410,7 +410,7 @@ class MjxSimulator:
     def _make_data(self, worlds: int) -> Any:
         capacity = self.config.contacts * worlds
         one = self._mjx.make_data(self._blank, impl="warp", naconmax=capacity, njmax=self.config.rows)
-        return jax.jit(lambda: jax.vmap(lambda _: one)(jnp.arange(worlds)))()
+        return jax.jit(jax.vmap(lambda _, data: data, in_axes=(0, None)))(jnp.arange(worlds), one)
 
     def _step(self, fields: BodyFields, data: Any) -> Any:
         model = self._model.replace(**{name: getattr(fields, name) for name in BodyFields.__dataclass_fields__})
