@@ -33,6 +33,8 @@ from mechsearch_jax.scenario import MAX_OBJECTS, Scenario
 NEAR, ALIGNED = 5e-3, 3.0
 KINDS = (ActionKind.PUSH, ActionKind.PICK_AND_PLACE)
 
+Measures = dict[str, int | float]
+
 
 @dataclasses.dataclass(frozen=True)
 class Case:
@@ -88,20 +90,20 @@ class Agreement:
     batch_seconds: tuple[float, float]
     versions: dict[str, str]
 
-    def summary(self) -> dict[str, dict[str, float]]:
+    def summary(self) -> dict[str, Measures]:
         """By kind of action and for all: shares, quantiles of the differences [m, degrees] and displacements [m]."""
         rows = {ACTION_NAMES[kind]: [c for c in self.cases if c.kind == ACTION_NAMES[kind]] for kind in KINDS}
         return {name: _summary(cases) for name, cases in {**rows, "all": list(self.cases)}.items() if cases}
 
 
-def _summary(cases: Sequence[Case]) -> dict[str, float]:
+def _summary(cases: Sequence[Case]) -> Measures:
     position, rotation, spin, native, batch = np.array(
         [
             (c.position_difference, c.rotation_difference, c.spin_difference, c.native_moved, c.batch_moved)
             for c in cases
         ]
     ).T
-    value: dict[str, float] = {
+    value: Measures = {
         "actions": len(cases),
         "agreeing": float(np.mean([c.agrees for c in cases])),
         "agreeing_with_spin": float(np.mean((position <= NEAR) & (spin <= ALIGNED))),

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from mechsearch_jax.benchmarks.agreement import Agreement
+from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
 from mechsearch_jax.results import Row, summarise
 
@@ -61,10 +61,10 @@ def agreement_table(agreement: Agreement) -> Table:
     for name in summary:
         table.add_column(name, justify="right", no_wrap=True)
 
-    def add(title: str, text: Callable[[dict[str, float]], str]) -> None:
+    def add(title: str, text: Callable[[Measures], str]) -> None:
         table.add_row(title, *(text(row) for row in summary.values()))
 
-    def length(name: str, scale: float = 1e3) -> Callable[[dict[str, float]], str]:
+    def length(name: str, scale: float = 1e3) -> Callable[[Measures], str]:
         return lambda row: f"{scale * row[f'{name}_median']:.2f}, {scale * row[f'{name}_p90']:.2f}"
 
     add("actions", lambda row: f"{row['actions']:.0f}")
