@@ -71,13 +71,12 @@ def agreement_table(agreement: Agreement) -> Table:
     add("same final poses", lambda row: f"{row['agreeing']:.3f}")
     add("same failure", lambda row: f"{row['same_failure']:.3f}")
     add("worlds with overflow", lambda row: f"{row['overflowed']:.0f}")
-    add("difference [mm]: median, 90%", length("position_difference"))
-    add("difference [degrees]", length("rotation_difference", 1.0))
-    add("displacement, native [mm]", length("native_moved"))
-    add("displacement, batch [mm]", length("batch_moved"))
-    add("same distribution: p", lambda row: f"{row['displacement_p_value']:.2f}")
-    first, again = agreement.batch_seconds
-    seconds = f"native {agreement.native_seconds:.1f} s; batch {again:.1f} s, {first:.1f} s with compilation"
+    add("difference in mm: median, 90%", length("position_difference"))
+    add("difference in degrees", length("rotation_difference", 1.0))
+    add("native displacement in mm", length("native_moved"))
+    add("batch displacement in mm", length("batch_moved"))
+    add("same distribution, p", lambda row: f"{row['displacement_p_value']:.2f}")
+    seconds = f"native {agreement.native_seconds:.1f} s, batch {agreement.batch_seconds:.1f} s with compilation"
     table.caption = f"{seconds}; {agreement.versions['device']}"
     return table
 

@@ -224,7 +224,10 @@ def import_mjx() -> Any:
       InputError: Warp cannot be imported.
     """
     try:
-        import warp  # noqa: F401  # pyright: ignore[reportMissingImports]
+        import warp  # pyright: ignore[reportMissingImports]
+
+        # It would announce itself, and every kernel that it loads, on standard output.
+        warp.config.quiet = True
         from mujoco import mjx
     except (ImportError, RuntimeError) as error:
         reason = " ".join(str(error).split())

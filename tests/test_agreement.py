@@ -49,7 +49,7 @@ def test_the_summary_counts_what_agrees(tmp_path):
     far = dataclasses.replace(
         CASE, kind="pick-and-place", position_difference=0.02, batch_failure="dropped", overflow=2
     )
-    found = Agreement((CASE, CASE, far), 1.0, (3.0, 2.0), VERSIONS)
+    found = Agreement((CASE, CASE, far), 1.0, 3.0, VERSIONS)
     summary = found.summary()
     assert list(summary) == ["push", "pick-and-place", "all"]
     assert summary["push"]["agreeing"] == 1.0
