@@ -226,8 +226,9 @@ def import_mjx() -> Any:
     try:
         import warp  # pyright: ignore[reportMissingImports]
 
-        # It would announce itself, and every kernel that it loads, on standard output.
-        warp.config.quiet = True
+        # By default it announces itself, and every kernel that it loads, on standard output.
+        if warp.config.log_level == warp.LOG_INFO:
+            warp.config.log_level = warp.LOG_WARNING
         from mujoco import mjx
     except (ImportError, RuntimeError) as error:
         reason = " ".join(str(error).split())
@@ -419,8 +420,11 @@ class MjxSimulator:
         model = self._model.replace(**{name: getattr(fields, name) for name in BodyFields.__dataclass_fields__})
         return jax.vmap(self._mjx.step, in_axes=(self._axes, 0))(model, data)
 
-    def _task(self, data: Any, actions: Action) -> tuple[_Task, Array, Array]:
-        """What the actions ask of the actuators, where the robot begins, and whether the arm reaches all of it."""
+    def _task(self, data: Any, actions: Action, kind: Array) -> tuple[_Task, Array, Array]:
+        """What the actions ask of the actuators, where the robot begins, and in which worlds there is anything to do.
+
+        Where the arm does not reach all of a motion, there is not: the robot is told what it was told before.
+        """
         plan = self.config.simulator.motion
 
         def references(action: Action) -> tuple[tuple[motion.Reference, Array], ...]:
@@ -432,19 +436,17 @@ class MjxSimulator:
             )
 
         found = jax.vmap(references)(actions)
-        kind = actions.kind
-        waits = kind == WAIT
         home = (kind == ActionKind.PUSH) | (kind == ActionKind.PICK_AND_PLACE)
         lengths = [reference.fingers.shape[1] for reference, _ in found]
         # One row more than the longest: the robot at home, or the last command of a retrieval, held from then on.
         steps = max(lengths) + 1
         controls = jnp.broadcast_to(data.ctrl, (steps, *data.ctrl.shape))
-        start, length, reachable = data.qpos[:, :ROBOT], jnp.zeros_like(kind), waits
+        start, length, moves = data.qpos[:, :ROBOT], jnp.zeros_like(kind), kind == WAIT
         rest = jnp.asarray(self._home(), jnp.float32)
         for code, (reference, reached) in zip(
             (ActionKind.PUSH, ActionKind.PICK_AND_PLACE, RETRIEVE), found, strict=True
         ):
-            this = kind == code
+            this = (kind == code) & reached
             told = jnp.moveaxis(commands(reference), 1, 0)
             after = told[-1] if code == RETRIEVE else jnp.broadcast_to(rest, told[-1].shape)
             padded = jnp.concatenate([told, jnp.broadcast_to(after, (steps - len(told), *after.shape))])
@@ -452,8 +454,8 @@ class MjxSimulator:
             finger = jnp.maximum(reference.start[:, ARM:], 0.0)
             start = _where(this, jnp.concatenate([reference.start[:, :ARM], finger, finger], axis=1), start)
             length = jnp.where(this, len(told), length)
-            reachable = jnp.where(this, reached, reachable)
-        return _Task(controls, length, home, data.qpos), start, reachable
+            moves |= this
+        return _Task(controls, length, home, data.qpos), start, moves
 
     def _advance(self, fields: BodyFields, task: _Task, data: Any, progress: _Progress, i: Array, row: Array):
         """One time step, the `i`-th, of all worlds that are not done."""
@@ -502,9 +504,8 @@ class MjxSimulator:
     def _simulate(self, fields: BodyFields, data: Any, world: World, actions: Action, active: Array):
         """`execute`, compiled: the state, the world and what came of the actions."""
         chunk = self.config.chunk
-        task, start, reachable = self._task(data, actions)
         kind = jnp.where(active, actions.kind, ActionKind.NONE)
-        moves = (kind != ActionKind.NONE) & reachable
+        task, start, moves = self._task(data, actions, kind)
         idle = data.ctrl
         data = data.replace(
             qpos=data.qpos.at[:, :ROBOT].set(_where(moves, start, data.qpos[:, :ROBOT])),
@@ -524,8 +525,8 @@ class MjxSimulator:
         begun = (jnp.int32(0), (data, self._begin(data, ~moves, ~moves)))
         _, (data, progress) = jax.lax.while_loop(lambda carry: ~jnp.all(carry[1][1].done), some, begun)
 
-        # What moved is stopped. Worlds in which nothing was done, or undone, also keep what the robot was told.
-        controlled = _where(moves & ~progress.diverged, task.controls[last], idle)
+        # What moved is stopped. Where all was undone, the robot is again told what it was told before.
+        controlled = _where(progress.diverged, idle, task.controls[last])
         resting = data.replace(qvel=_where(moves, jnp.zeros_like(data.qvel), data.qvel))
         touch = self._step(fields, resting)
         in_hand = self._touches(touch._impl, "left") & self._touches(touch._impl, "right")
@@ -539,7 +540,7 @@ class MjxSimulator:
             position=jnp.where(changed[..., None], poses[..., :3], world.position),
             rotation=jnp.where(changed[..., None, None], _matrices(poses[..., 3:]), world.rotation),
         )
-        retrieves = (kind == RETRIEVE) & reachable & ~progress.diverged
+        retrieves = (kind == RETRIEVE) & moves & ~progress.diverged
         held = retrieves & in_hand
         outside = retrieves & (poses[:, TARGET, 0] < self.shelf.front)
         fallen = fallen & ~(held[:, None] & (jnp.arange(BODIES) == TARGET)[None])
@@ -552,9 +553,9 @@ class MjxSimulator:
             (Failure.MISSED, retrieves & ~held),
             (Failure.DROPPED, dropped),
             (Failure.UNSTABLE, progress.diverged),
-            (Failure.UNREACHABLE, ~reachable),
+            (Failure.UNREACHABLE, (kind != ActionKind.NONE) & ~moves),
         ):
-            failure = jnp.where(applies & (kind != ActionKind.NONE), int(code), failure)
+            failure = jnp.where(applies, int(code), failure)
         outcomes = Outcomes(
             failure=failure,
             steps=progress.steps,
