@@ -23,7 +23,7 @@ from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.scenario import Body, Scenario, example_scenarios, load_scenario
 
-CASE = Case("scene", 2, "push", 0, None, None, 0.1, 0.11, 775, 775, 0.004, 1.0, 50.0, 0)
+CASE = Case("scene", 2, "push", 0, None, None, 0.1, 0.11, 775, 775, 0.004, 1.0, 50.0, 0, 0.002, 4.0)
 VERSIONS = {"device": "cpu: cpu"}
 
 
@@ -54,11 +54,12 @@ def test_the_summary_counts_what_agrees(tmp_path):
     assert list(summary) == ["push", "pick-and-place", "all"]
     assert summary["push"]["agreeing"] == 1.0
     assert summary["push"]["agreeing_with_spin"] == 0.0
+    assert summary["push"]["native_agreeing_with_itself"] == 0.0
     assert summary["all"]["agreeing"] == pytest.approx(2 / 3)
     assert summary["all"]["same_failure"] == pytest.approx(2 / 3)
     assert summary["all"]["overflowed"] == 1
     assert summary["all"]["native_moved_median"] == pytest.approx(0.1)
-    assert agreement_table(found).row_count == 9
+    assert agreement_table(found).row_count == 11
     save_agreement(found, tmp_path / "found.json")
     written = json.loads((tmp_path / "found.json").read_text())
     assert len(written["cases"]) == 3
