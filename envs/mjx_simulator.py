@@ -414,6 +414,8 @@ class MjxSimulator:
     def _make_data(self, worlds: int) -> Any:
         capacity = self.config.contacts * worlds
         one = self._mjx.make_data(self._blank, impl="warp", naconmax=capacity, njmax=self.config.rows)
+        # MJX ties it to a device, and with it all results; what was compiled for free arrays would not serve for those.
+        one = jax.device_get(one)
         return jax.jit(jax.vmap(lambda _, data: data, in_axes=(0, None)))(jnp.arange(worlds), one)
 
     def _step(self, fields: BodyFields, data: Any) -> Any:
