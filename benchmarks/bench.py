@@ -1,28 +1,38 @@
-"""How long f, g and a decision take: compilation apart from steady state, on scenes that the generator made."""
+"""How long f, g, a decision and simulation take, on scenes that the generator made.
+
+Compilation is timed apart from the steady state.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax import planner
+from mechsearch_jax.envs import motion
 from mechsearch_jax.envs.episode import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.generator import ScenarioGenerator
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator, commands
+from mechsearch_jax.envs.world import World, from_scenario
+from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.files import PathLike, replacing
-from mechsearch_jax.graspability import grasp_hits, graspability
+from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation
 from mechsearch_jax.planner import Belief, PlannerConfig, Problem
 from mechsearch_jax.results import versions
+from mechsearch_jax.scenario import MAX_OBJECTS
 from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.transforms import make
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,9 +40,9 @@ class Timing:
     """How long one function takes.
 
     Attributes:
-      subject: "existence", "graspability" or "plan".
+      subject: "existence", "graspability", "plan" or "simulate".
       objects: number of objects in the scenes.
-      shapes: sizes that the time depends on.
+      shapes: sizes that the time depends on; for "simulate" also what was seen of overflows and divergence.
       compile_seconds: of tracing and compiling [s]; honest only if compilations are not kept on disk.
       seconds: of every call afterwards, results awaited [s].
       versions: as `results.versions` returns them.
@@ -54,6 +64,11 @@ class Timing:
         """The fastest and the slowest call [s]."""
         return min(self.seconds), max(self.seconds)
 
+    @property
+    def rate(self) -> float | None:
+        """Simulated time steps per second, of all worlds together; None where nothing was simulated."""
+        return self.shapes["worlds"] * self.shapes["steps"] / self.median if self.subject == "simulate" else None
+
 
 def save_timing(timing: Timing, path: PathLike) -> None:
     """Write a timing as JSON, with its median.
@@ -62,6 +77,8 @@ def save_timing(timing: Timing, path: PathLike) -> None:
       InputError: the file cannot be written.
     """
     value = {**dataclasses.asdict(timing), "median_seconds": timing.median}
+    if timing.rate is not None:
+        value["steps_per_second"] = timing.rate
     with replacing(path) as file:
         file.write((json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
@@ -99,14 +116,22 @@ def g_of(problem: Problem, belief: Belief, scene: Superquadrics) -> Int[Array, "
     return graspability(problem.grasps, belief.grasps, hits)[:-1]
 
 
-def bench(subject: str, objects: int, config: PlannerConfig, scenes: int = 5, repeats: int = 20) -> Timing:
+def bench(
+    subject: Literal["existence", "graspability", "plan"],
+    objects: int,
+    config: PlannerConfig,
+    batch: int = 1,
+    scenes: int = 5,
+    repeats: int = 20,
+) -> Timing:
     """Time f, g or a decision on generated scenes.
 
     Args:
-      subject: "existence", "graspability" or "plan".
+      subject: what is timed.
       objects: number of objects in a scene.
       config: the planner's options.
-      scenes: number of scenes, taken in turn.
+      batch: number of scenes in one call; 1 times the function itself, without a batch axis.
+      scenes: number of different scenes, taken in turn.
       repeats: number of timed calls.
 
     Raises:
@@ -114,27 +139,115 @@ def bench(subject: str, objects: int, config: PlannerConfig, scenes: int = 5, re
     """
     generator = ScenarioGenerator()
     problem = planner.build_problem(target=generator.target)
+    observe = jax.jit(functools.partial(planner.observe_belief, config=config))
     states = []
     for seed in range(scenes):
         world = from_scenario(generator.generate(seed, objects))
         scene = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-        belief = planner.initial_belief(problem)
-        belief = planner.observe_belief(problem, belief, scene, jnp.array(False), jnp.zeros(3), config)
-        states.append((belief, scene))
-    poses = [int(belief.exists.sum()) for belief, _ in states]
-    shapes = {"poses": problem.poses.shape[0], "capacity": states[0][1].capacity, "scenes": scenes}
-    if subject == "existence":
-        timed = measure(f_of, [(problem, scene) for _, scene in states], repeats)
-    elif subject == "graspability":
-        timed = measure(g_of, [(problem, *state) for state in states], repeats)
+        belief = observe(problem, planner.initial_belief(problem), scene, jnp.array(False), jnp.zeros(3))
+        states.append((jax.random.key(seed), belief, scene))
+    poses = [int(belief.exists.sum()) for _, belief, _ in states]
+    shapes = {"poses": problem.poses.shape[0], "capacity": states[0][2].capacity, "scenes": scenes, "batch": batch}
+    functions: dict[str, Callable[..., Any]] = {
+        "existence": lambda problem, key, belief, scene: f_of(problem, scene),
+        "graspability": lambda problem, key, belief, scene: g_of(problem, belief, scene),
+        "plan": lambda problem, key, belief, scene: planner.plan(key, problem, belief, scene, config),
+    }
+    if subject == "graspability":
         shapes["median_possible_poses"] = int(statistics.median(poses))
-    else:
-
-        def decide(key: Array, problem: Problem, belief: Belief, scene: Superquadrics) -> planner.Plan:
-            return planner.plan(key, problem, belief, scene, config)
-
-        keys = jax.random.split(jax.random.key(0), scenes)
-        timed = measure(decide, [(key, problem, *state) for key, state in zip(keys, states, strict=True)], repeats)
+    elif subject == "plan":
         shapes |= {"sequences": config.sequences, "horizon": config.horizon}
-    compile_seconds, seconds = timed
+    function, calls = functions[subject], [(problem, *state) for state in states]
+    if batch > 1:
+        function = jax.vmap(function, in_axes=(None, 0, 0, 0))
+        several = jax.tree.map(lambda *leaves: jnp.stack([leaves[i % scenes] for i in range(batch)]), *states)
+        calls = [(problem, *several)]
+    compile_seconds, seconds = measure(function, calls, repeats)
     return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions())
+
+
+def crowded_worlds(worlds: int, scenes: int = 8, seed: int = 0) -> World:
+    """Many worlds with 8 objects each: generated scenes in turn, in every world with other sizes.
+
+    Args:
+      worlds: how many.
+      scenes: number of generated scenes.
+      seed: of the scenes and of the sizes.
+    """
+    generator = ScenarioGenerator()
+    made = [from_scenario(generator.generate(seed + i, MAX_OBJECTS)) for i in range(min(scenes, worlds))]
+    several: World = jax.tree.map(lambda *leaves: np.stack(leaves)[np.arange(worlds) % len(leaves)], *made)
+    scale = np.random.default_rng(seed).uniform(0.96, 1.0, (worlds, several.kind.shape[1], 1)).astype(np.float32)
+    half = np.asarray(several.half_size)
+    # A smaller body stands lower, if it stands.
+    lower = (1 - scale[..., 0]) * half[..., 2]
+    position = np.asarray(several.position) - lower[..., None] * np.array([0.0, 0.0, 1.0], np.float32)
+    return several.replace(half_size=half * scale, position=position)
+
+
+def plough(worlds: int, steps: int) -> tuple[Float[Array, "steps worlds 9"], Float[Array, "worlds 9"]]:
+    """Controls with which the arm reaches in, sweeps 0.15 m through the objects, and goes out again, to and fro.
+
+    Args:
+      worlds: each sweeps at a depth and a side of its own.
+      steps: number of time steps.
+
+    Returns:
+      The controls, and where the robot begins.
+    """
+    u = jnp.asarray((np.arange(worlds) % 16) / 16.0 + 1 / 32, jnp.float32)
+    position = jnp.stack([0.53 + 0.07 * u, -0.08 + 0.3 * ((5 * u) % 1), jnp.full(worlds, 0.48)], axis=-1)
+    tilt = jnp.full(worlds, np.radians(30), jnp.float32)
+    T = make(gripper_rotation(jnp.zeros(worlds), tilt), position.astype(jnp.float32))
+    shift = jnp.tile(jnp.float32([[0.0, 0.15, 0.0]]), (worlds, 1))
+    build = jax.vmap(lambda T, shift, q7: motion.push_reference(T, shift, q7, motion.MotionConfig()))
+    reference, reachable = build(T, shift, jnp.full(worlds, WRIST_ORIGIN + np.radians(30), jnp.float32))
+    if not reachable.all():
+        raise InputError("bench simulate: the arm cannot make its sweep")
+    told = jnp.swapaxes(commands(reference), 0, 1)
+    # Back along the same way at its end, where the next sweep would begin elsewhere.
+    last = len(told) - 1
+    index = np.arange(steps) % (2 * last)
+    row = np.minimum(index, 2 * last - index)
+    start = jnp.concatenate([reference.start, reference.start[:, -1:]], axis=1)
+    return told[row], start
+
+
+def bench_simulate(
+    worlds: int, steps: int, repeats: int = 5, scenes: int = 8, config: MjxConfig | None = None
+) -> Timing:
+    """Time the batch simulator: 8 objects of other sizes in every world, the arm sweeping through them.
+
+    Args:
+      worlds: how many at once.
+      steps: time steps of a timed call; `Timing.rate` is worlds times steps by the median of the calls.
+      repeats: number of timed calls; each begins with the scenes as generated.
+      scenes: number of generated scenes, which the worlds take in turn.
+      config: of the simulator.
+
+    Raises:
+      InputError: a number is not positive, or Warp is missing.
+    """
+    for name, value in {"worlds": worlds, "steps": steps, "repeats": repeats, "scenes": scenes}.items():
+        if value < 1:
+            raise InputError(f"bench simulate: {name} {value} must be at least 1")
+    simulator = MjxSimulator(config=config)
+    start = crowded_worlds(worlds, scenes)
+    controls, begin = plough(worlds, steps)
+    seconds = []
+    for _ in range(repeats + 1):
+        jax.block_until_ready((simulator.load(start), controls))
+        before = time.perf_counter()
+        outcomes = jax.block_until_ready(simulator.follow(controls, begin))
+        seconds.append(time.perf_counter() - before)
+    first, *rest = seconds
+    shapes = {
+        "worlds": worlds,
+        "steps": steps,
+        "scenes": scenes,
+        "overflowed_worlds": int((outcomes.overflow != 0).sum()),
+        "diverged_worlds": int((outcomes.failure != 0).sum()),
+    }
+    # Warp compiles when its kernels are first launched, so that only the first call's excess tells how long that takes.
+    compile_seconds = max(first - statistics.median(rest), 0.0)
+    return Timing("simulate", MAX_OBJECTS, shapes, compile_seconds, tuple(rest), versions())

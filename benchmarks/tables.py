@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
+from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
 from mechsearch_jax.results import Row, summarise
 
@@ -45,8 +46,40 @@ def timing_table(timing: Timing) -> Table:
     table.add_row("compile", f"{timing.compile_seconds:.2f} s")
     table.add_row("median", f"{1e3 * timing.median:.1f} ms")
     table.add_row("spread", f"{1e3 * fastest:.1f} to {1e3 * slowest:.1f} ms in {len(timing.seconds)} calls")
+    if timing.rate is not None:
+        table.add_row("rate", f"{timing.rate:,.0f} steps/s")
     table.add_row("device", timing.versions["device"])
     table.add_row("versions", ", ".join(f"{k} {v}" for k, v in timing.versions.items() if k != "device"))
+    return table
+
+
+def agreement_table(agreement: Agreement) -> Table:
+    """How well two simulators agree: a column for each kind of action."""
+    summary = agreement.summary()
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("", style="cyan", justify="right", no_wrap=True)
+    for name in summary:
+        table.add_column(name, justify="right", no_wrap=True)
+
+    def add(title: str, text: Callable[[Measures], str]) -> None:
+        table.add_row(title, *(text(row) for row in summary.values()))
+
+    def length(name: str, scale: float = 1e3) -> Callable[[Measures], str]:
+        return lambda row: f"{scale * row[f'{name}_median']:.2f}, {scale * row[f'{name}_p90']:.2f}"
+
+    add("actions", lambda row: f"{row['actions']:.0f}")
+    add("same final poses", lambda row: f"{row['agreeing']:.3f}")
+    add("native with itself, nudged", lambda row: f"{row['native_agreeing_with_itself']:.3f}")
+    add("same failure", lambda row: f"{row['same_failure']:.3f}")
+    add("worlds with overflow", lambda row: f"{row['overflowed']:.0f}")
+    add("difference in mm: median, 90%", length("position_difference"))
+    add("difference in degrees", length("rotation_difference", 1.0))
+    add("native with itself in mm", length("nudged_position_difference"))
+    add("native displacement in mm", length("native_moved"))
+    add("batch displacement in mm", length("batch_moved"))
+    add("same distribution, p", lambda row: f"{row['displacement_p_value']:.2f}")
+    seconds = f"native {agreement.native_seconds:.1f} s, batch {agreement.batch_seconds:.1f} s"
+    table.caption = f"{seconds}; {agreement.versions['device']}"
     return table
 
 

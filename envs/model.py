@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.camera import Camera
@@ -44,6 +44,8 @@ MARGIN = 5e-4
 # Keeps tall cylinders from rolling on their rim for ever [N m s, N s/m]; too little to be noticed otherwise.
 BODY_DAMPING = 2e-3
 TINY = 1e-3
+# What an empty slot weighs [kg], and its moments of inertia [kg m2].
+EMPTY_MASS, EMPTY_INERTIA = 1e-3, 1e-6
 OBJECT_BIT, ROBOT_BIT = 1, 2
 
 # Mass [kg], centre of mass [m], and inertia about it (xx, yy, zz, xy, xz, yz) [kg m2] of links 1 to 7: C. Gaz et al.,
@@ -206,7 +208,7 @@ def _add_bodies(world: ElementTree.Element) -> None:
     for i in range(BODIES):
         body = _element(world, "body", name=f"body{i}", pos=_text(*parking_place(i)), gravcomp="1")
         _element(body, "joint", name=f"body{i}", type="free", damping=_text(BODY_DAMPING))
-        _element(body, "inertial", mass="0.001", pos="0 0 0", diaginertia="1e-6 1e-6 1e-6")
+        _element(body, "inertial", mass=_text(EMPTY_MASS), pos="0 0 0", diaginertia=_text(*[EMPTY_INERTIA] * 3))
         _element(body, "geom", class_="object", name=f"box{i}", type="box", friction=_text(BOX_FRICTION))
         _element(body, "geom", class_="object", name=f"cylinder{i}", type="cylinder", friction=_text(CYLINDER_FRICTION))
 
@@ -276,15 +278,28 @@ def compile_model(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> mujo
     return mujoco.MjModel.from_xml_string(panda_shelf_mjcf(shelf, camera, timestep))
 
 
+def masses_and_inertias(
+    cylinder: Bool[np.ndarray, "*batch"], half_size: Float[np.ndarray, "*batch 3"]
+) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
+    """Masses [kg] and principal moments of inertia [kg m2] of solid bodies, along their own axes.
+
+    Args:
+      cylinder: which are cylinders; the others are boxes.
+      half_size: half-extents [m].
+    """
+    square = half_size**2
+    volume = 8 * np.prod(half_size, axis=-1) * np.where(cylinder, np.pi / 4, 1.0)
+    mass = volume * np.where(cylinder, CYLINDER_DENSITY, BOX_DENSITY)
+    box = (square.sum(axis=-1, keepdims=True) - square) / 3
+    across = square[..., 0] / 4 + square[..., 2] / 3
+    rod = np.stack([across, across, square[..., 0] / 2], axis=-1)
+    return np.asarray(mass), mass[..., None] * np.where(cylinder[..., None], rod, box)
+
+
 def mass_and_inertia(body: Body) -> tuple[float, Float[np.ndarray, " 3"]]:
     """Mass [kg] and principal moments of inertia [kg m2] of a solid body, along its own axes."""
-    a, b, c = body.half_size
-    if body.shape == "box":
-        mass = BOX_DENSITY * 8 * a * b * c
-        return mass, mass / 3 * np.array([b * b + c * c, a * a + c * c, a * a + b * b])
-    mass = CYLINDER_DENSITY * np.pi * a * a * 2 * c
-    across = mass * (a * a / 4 + c * c / 3)
-    return mass, np.array([across, across, mass * a * a / 2])
+    mass, inertia = masses_and_inertias(np.array(body.shape == "cylinder"), np.array(body.half_size, float))
+    return float(mass), inertia
 
 
 def with_bodies(model: mujoco.MjModel, bodies: Sequence[Body | None], skin: float = MARGIN) -> mujoco.MjModel:
@@ -298,7 +313,7 @@ def with_bodies(model: mujoco.MjModel, bodies: Sequence[Body | None], skin: floa
     model = copy.copy(model)
     for i, body in enumerate(bodies):
         index = model.body(f"body{i}").id
-        mass, inertia = mass_and_inertia(body) if body else (1e-3, np.full(3, 1e-6))
+        mass, inertia = mass_and_inertia(body) if body else (EMPTY_MASS, np.full(3, EMPTY_INERTIA))
         model.body_mass[index], model.body_inertia[index] = mass, inertia
         model.body_gravcomp[index] = 0.0 if body else 1.0
         for shape in ("box", "cylinder"):

@@ -45,6 +45,8 @@ from mechsearch_jax.transforms import (
 
 # How close to an object's front the palm may pass [m].
 PASSING_GAP = 0.003
+# Longer pushes would leave the shelf [m].
+LONGEST_PUSH = 0.5
 # Number of poses on each stretch of a motion where it is followed closely, and of places on the way of a push that
 # are tested for collision.
 CLOSE_WAYPOINTS = 12
@@ -147,8 +149,10 @@ class ActionConfig:
     def __post_init__(self):
         if self.kinds not in ("both", "push", "pick-and-place"):
             raise InputError(f'actions "{self.kinds}" are unknown; use "both", "push" or "pick-and-place"')
-        if not self.push_distances or min(self.push_distances) <= 0:
-            raise InputError(f"push_distances {self.push_distances} must be one or more positive lengths in metres")
+        if not self.push_distances or not all(0.0 < d <= LONGEST_PUSH for d in self.push_distances):
+            raise InputError(
+                f"push_distances {self.push_distances} must be one or more lengths above 0 and at most {LONGEST_PUSH} m"
+            )
 
 
 class ActionTables(flax.struct.PyTreeNode):

@@ -332,45 +332,123 @@ def check(scenarios: Scenarios, /) -> None:
         raise SystemExit(2)
 
 
-def bench(
-    subject: Annotated[Literal["existence", "graspability", "plan"], tyro.conf.Positional],
-    /,
-    *,
-    objects: int = 8,
-    repeats: int = 10,
-    out: JsonFile = None,
-    options: Options = PlannerOptions(),
-) -> None:
-    """Time f, g where f = 1, or a whole decision: compilation, median and spread.
+def _timing_of(subject: Literal["existence", "graspability", "plan"], what: str) -> Callable[..., None]:
+    """The command that times one part of the planner."""
+
+    def command(
+        *,
+        objects: int = 8,
+        batch: int = 1,
+        repeats: int = 10,
+        out: JsonFile = None,
+        options: Options = PlannerOptions(),
+    ) -> None:
+        import jax
+        from rich.console import Console
+
+        from mechsearch_jax.benchmarks.bench import bench, save_timing
+        from mechsearch_jax.benchmarks.tables import timing_table
+
+        for name, value in {"repeats": repeats, "batch": batch}.items():
+            if value < 1:
+                raise InputError(f"bench: --{name} {value} must be at least 1")
+        config = options.config("search-for-grasp")
+        # A compilation that was read from disk would not tell how long compiling takes.
+        jax.config.update("jax_enable_compilation_cache", False)
+        console = Console(highlight=False)
+        with console.status(f"timing {subject}"):
+            timing = bench(subject, objects, config, batch=batch, repeats=repeats)
+        console.print(timing_table(timing))
+        if out is not None:
+            save_timing(timing, out)
+
+    command.__name__ = subject
+    command.__doc__ = f"""Time {what}: compilation, median and spread.
 
     Args:
-      subject: what is timed.
       objects: number of objects in a scene.
+      batch: how many scenes at once.
       repeats: number of timed calls.
       out: JSON file for the result.
       options: how the planner decides.
     """
+    return command
+
+
+def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, out: JsonFile = None) -> None:
+    """Time the batch simulator with 8 objects, the arm sweeping through them: steps per second of all worlds together.
+
+    Args:
+      worlds: simulated at once.
+      steps: time steps in a timed call.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
     import jax
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.bench import bench, save_timing
+    from mechsearch_jax.benchmarks import bench as benches
     from mechsearch_jax.benchmarks.tables import timing_table
 
-    if repeats < 1:
-        raise InputError(f"bench: --repeats {repeats} must be at least 1")
-    config = options.config("search-for-grasp")
-    # A compilation that was read from disk would not tell how long compiling takes.
     jax.config.update("jax_enable_compilation_cache", False)
     console = Console(highlight=False)
-    with console.status(f"timing {subject}"):
-        timing = bench(subject, objects, config, repeats=repeats)
+    with console.status("timing simulate"):
+        timing = benches.bench_simulate(worlds, steps, repeats)
     console.print(timing_table(timing))
     if out is not None:
-        save_timing(timing, out)
+        benches.save_timing(timing, out)
+
+
+def bench_agreement(
+    scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")] = (),
+    /,
+    *,
+    actions: int = 200,
+    scenes: int = 40,
+    seed: int = 0,
+    out: JsonFile = None,
+) -> None:
+    """Compare the batch simulator with the native one: random pushes and pick-and-places, executed by both.
+
+    Args:
+      scenarios: scenario files, folders of them, or names of shipped ones; scenes are generated if there are none.
+      actions: how many; they are as many worlds of one batch.
+      scenes: how many are generated, with 1 to 8 objects in turn.
+      seed: of the scenes and of the actions.
+      out: JSON file for the result.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.agreement import agreement, draw_actions, generated_scenes, save_agreement
+    from mechsearch_jax.benchmarks.tables import agreement_table
+    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.envs.mjx_simulator import import_mjx
+    from mechsearch_jax.scenario import load_scenario
+
+    for name, value in {"actions": actions, "scenes": scenes}.items():
+        if value < 1:
+            raise InputError(f"bench agreement: --{name} {value} must be at least 1")
+    files = find_scenarios(scenarios) if scenarios else []
+    import_mjx()
+    keep_compilations()
+    console = Console(highlight=False)
+    with console.status("making scenes") as status:
+        where = [load_scenario(file) for file in files] or generated_scenes(scenes, seed)
+        status.update("drawing actions")
+        cases = draw_actions(where, actions, seed)
+        status.update("executing actions")
+        found = agreement(cases)
+    console.print(agreement_table(found))
+    if out is not None:
+        save_agreement(found, out)
 
 
 def scenarios() -> None:
     """Generate and check scenario files: mechsearch scenarios generate|check."""
+
+
+def bench() -> None:
+    """Measure the parts: mechsearch bench existence|graspability|plan|simulate|agreement."""
 
 
 Commands = dict[str, Callable[..., None]]
@@ -385,6 +463,13 @@ COMMANDS: Commands = {
 }
 GROUPS: dict[str, Commands] = {
     "scenarios": {"generate": generate, "check": check},
+    "bench": {
+        "existence": _timing_of("existence", "f"),
+        "graspability": _timing_of("graspability", "g where f = 1"),
+        "plan": _timing_of("plan", "a whole decision"),
+        "simulate": bench_simulate,
+        "agreement": bench_agreement,
+    },
 }
 
 

@@ -20,7 +20,7 @@ BOUNDARY_POINTS = 24
 # Largest height at which a push may begin to touch, in half widths of the object along it, for boxes and for round
 # objects. Higher up, friction at the board (0.4 and 0.6) topples them instead of letting them slide; but a push at the
 # very bottom never does.
-LEVERAGE = (1.8, 1.3)
+LEVERAGE = (1.8, 1.5)
 LOW_CONTACT = 0.03
 # Parts of the gripper that come this close together touch an object together [m].
 TOUCH = 0.004
@@ -83,13 +83,13 @@ def footprints(scene: Superquadrics) -> Footprints:
     along = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
     across = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)], axis=-1)
     upright = jnp.abs(scene.rotation[rows, 2, vertical]) > 0.98
-    projected = [
-        jnp.sum(jnp.abs(jnp.sum(scene.rotation[:, :2, :] * u[:, :, None], axis=1)) * scene.size, axis=-1)
-        for u in (along, across)
-    ]
+    # Each object has directions of its own here.
+    one_by_one = jax.vmap(lambda one, u: extents(jax.tree.map(lambda a: a[None], one), u)[0])
+    level = jnp.stack([along, across], axis=-1)
+    projected = one_by_one(scene, jnp.concatenate([level, jnp.zeros_like(level[:, :1])], axis=1))
     own = [scene.size[rows, first], scene.size[rows, second]]
-    half = jnp.stack([jnp.where(upright, o, p) for o, p in zip(own, projected, strict=True)], axis=-1)
-    height = jnp.sum(jnp.abs(scene.rotation[:, 2, :]) * scene.size, axis=-1)
+    half = jnp.where(upright[:, None], jnp.stack(own, axis=-1), projected)
+    height = bounding_half_extents(scene)[:, 2]
     z = scene.position[:, 2]
     is_round = upright & (vertical == 2) & (scene.exponents[:, 1] > ROUND_EXPONENT)
     return Footprints(half, is_round, scene.position[:, :2], yaw, z - height, z + height, scene.valid)
@@ -177,8 +177,7 @@ def _touched_high(scene, prints, points, heading, leverage):
     level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
     touching = level & (depth > -TOUCH) & prints.valid[:, None]
     lowest = jnp.min(jnp.where(touching, points[None, :, 2], jnp.inf), axis=1) - prints.low
-    along = jnp.sum(scene.rotation[:, :2, :] * heading[None, :, None], axis=1)
-    half = jnp.sum(jnp.abs(along) * scene.size, axis=-1)
+    half = extents(scene, jnp.append(heading, 0.0)[:, None])[:, 0]
     limit = jnp.where(prints.round, leverage[1], leverage[0]) * half
     # Half a centimetre more than a planned push is given, since this only sees where the push ends.
     return jnp.any(touching, axis=1) & (lowest > jnp.maximum(limit, LOW_CONTACT) + 0.005)
@@ -313,6 +312,23 @@ def changed(before: Superquadrics, after: Superquadrics) -> Bool[Array, " n"]:
     )
 
 
+def extents(scene: Superquadrics, directions: Float[Array, "3 d"]) -> Float[Array, "n d"]:
+    """How far objects reach from their centres along directions [m].
+
+    An approximation: the objects are taken as elliptic cylinders if their exponent e2 is above 0.6, else as boxes; both
+    hold the superquadric, however it is turned.
+
+    Args:
+      scene: the objects, fields (N, ...).
+      directions: unit vectors in the world, as columns.
+    """
+    local = jnp.sum(scene.rotation[:, :, :, None] * directions[None, :, None, :], axis=1)
+    x, y, z = (jnp.abs(local[:, i]) * scene.size[:, i, None] for i in range(3))
+    square = x**2 + y**2
+    plane = jnp.sqrt(jnp.where(square > 0, square, 1.0)) * (square > 0)
+    return jnp.where((scene.exponents[:, 1] > ROUND_EXPONENT)[:, None], plane, x + y) + z
+
+
 def bounding_half_extents(scene: Superquadrics) -> Float[Array, "n 3"]:
-    """Half-extents of the objects' bounding boxes along the world's axes [m]."""
-    return jnp.sum(jnp.abs(scene.rotation) * scene.size[:, None, :], axis=-1)
+    """Half-extents of the objects' bounding boxes along the world's axes [m]; see `extents`."""
+    return extents(scene, jnp.eye(3))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import Literal
 
 import flax.struct
@@ -62,10 +63,12 @@ from mechsearch_jax.target import Target
 from mechsearch_jax.transforms import compose, upright_pose
 
 CLEARANCES = (0.0, 0.004, 0.008, 0.012, 0.02)
-# Small enough that no number of hits outweighs one pose or one object of the cost proper.
+# Small enough that, at a pose, no number of hits outweighs one object of the cost proper.
 TIE_BREAK = 0.02
 # On the approach to a found target: poses of the arm, and points on each of its capsules, that are tested.
 ARM_WAYPOINTS, ARM_POINTS = 6, 7
+# An object is not to be pushed to where its centre is nearer than this to the front edge [m].
+EDGE = 0.01
 # How far in front of the shelf the gripper has to get with the target [m].
 OUTSIDE = 0.04
 
@@ -106,6 +109,8 @@ class PlannerConfig:
             raise InputError(f'method "{self.method}" is unknown; use "search-for-grasp" or "search-and-grasp"')
         if not 0.0 < self.gamma <= 1.0:
             raise InputError(f"gamma {self.gamma} is outside (0, 1]; the paper uses 0.9")
+        if not 0.0 <= self.caution < math.inf:
+            raise InputError(f"caution {self.caution} must be a number that is not negative; the default is 1")
         if not 0.0 <= self.guidance < 1.0:
             raise InputError(f"guidance {self.guidance} is outside [0, 1); 0 draws all objects alike")
         for name in ("horizon", "sequences", "max_steps"):
@@ -410,6 +415,7 @@ def _predict(problem: Problem, space: ActionSpace, push_model: PushModel, scene:
     moved = changed(scene, pushed.scene)
     still = scene.valid & ~moved & is_push
     spoiled = (pushed.residual > space.config.jam) | jnp.any(pushed.topples > space.config.topple) | moved[-1]
+    spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < problem.shelf.front + EDGE))
     spoiled |= push_hits_others(space, problem.actions, scene, action, sample.wrist, still)
     possible = (action.kind != ActionKind.NONE) & ~(is_push & spoiled) & followable(space, action)
     after = jax.tree.map(lambda a, b: jnp.where(is_push, a, b), pushed.scene, placed)

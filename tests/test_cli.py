@@ -84,11 +84,13 @@ WRONG = {
     "nowhere to report to": (["report", "table.parquet", "--out", "good.json"], "good.json: cannot be written to"),
     "the same table twice": (["report", "table.parquet", "table.parquet"], "report them one by one"),
     "unknown preset": (["search", "good.json", "--out", "out", "--preset", "worst"], "'worst'"),
-    "unknown subject": (["bench", "speed"], "'speed'"),
+    "unknown subject": (["bench", "speed"], "speed"),
     "no table to report": (["report", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
     "no scenarios": (["scenarios", "generate", "--objects", "2", "--count", "0", "--out", "new"], "--count 0"),
     "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
     "no repeats": (["bench", "plan", "--repeats", "0"], "--repeats 0"),
+    "no worlds": (["bench", "simulate", "--worlds", "0"], "worlds 0 must be at least 1"),
+    "nothing to agree on": (["bench", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
     "file for a folder": (["search", "good.json", "--out", "good.json"], "good.json: cannot be written to"),
 }
 

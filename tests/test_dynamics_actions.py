@@ -156,12 +156,19 @@ def test_only_present_objects_are_moved(sampled):
     assert np.all(np.asarray(objects.valid)[moved])
 
 
-def test_pushes_go_left_and_right_by_the_given_distances(sampled):
-    action = sampled[2].action
+def test_pushes_go_left_and_right_by_the_given_distances(sampled, problem):
+    objects, options, samples = sampled
+    action = samples.action
     d = action.displacement[action.kind == ActionKind.PUSH]
     np.testing.assert_array_equal(d[:, [0, 2]], 0.0)
     assert set(np.rint(np.abs(d[:, 1]) * 1000)) <= {50, 100, 150}
-    assert {-1, 1} <= set(np.sign(d[:, 1]))
+    # They start on the other side of the object.
+    side, _ = actions.push_variants(problem.action_config, problem.actions.q7.shape[1])
+    assert set(side) == {-1.0, 1.0}
+    from_object = np.asarray(options.push[..., 1, 3] - objects.position[:, None, 1])
+    assert np.all((from_object * side < 0)[np.asarray(objects.valid)])
+    y = action.T_world_gripper[:, 1, 3] - np.asarray(objects.position)[action.object, 1]
+    assert np.all((y * action.displacement[:, 1])[action.kind == ActionKind.PUSH] < 0)
 
 
 def test_placed_objects_stand_clear_of_each_other_on_the_board(sampled, problem):

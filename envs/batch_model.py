@@ -1,0 +1,90 @@
+"""The model of many worlds at once: one compiled MJCF, and the few of its fields that differ from world to world.
+
+`body_fields` gives for thousands of worlds, in closed form, what `model.with_bodies` has MuJoCo compute for one.
+"""
+
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mechsearch_jax.envs import model as models
+from mechsearch_jax.envs.world import BODIES, CYLINDER
+
+
+class BodyFields(flax.struct.PyTreeNode):
+    """Fields of the model that depend on the bodies' shapes; every one has a leading axis for the worlds.
+
+    Names, units and the axes that follow (bodies, geoms, degrees of freedom) are those of MJX's model.
+    """
+
+    geom_size: jax.Array
+    geom_rbound: jax.Array
+    geom_aabb: jax.Array
+    body_mass: jax.Array
+    body_inertia: jax.Array
+    body_subtreemass: jax.Array
+    body_invweight0: jax.Array
+    dof_invweight0: jax.Array
+    body_gravcomp: jax.Array
+
+
+def body_fields(
+    blank: mujoco.MjModel,
+    kind: Int[np.ndarray, "worlds 9"],
+    half_size: Float[np.ndarray, "worlds 9 3"],
+    valid: Bool[np.ndarray, "worlds 9"],
+) -> BodyFields:
+    """The fields of a model whose slots hold the bodies of each world, float32.
+
+    Args:
+      blank: the compiled model with empty slots.
+      kind, half_size, valid: of the bodies, as in a `World`.
+    """
+    worlds = len(kind)
+    half_size = np.asarray(half_size, float)
+    cylinder = kind == CYLINDER
+    mass, inertia = models.masses_and_inertias(cylinder, half_size)
+    mass = np.where(valid, mass, models.EMPTY_MASS)
+    inertia = np.where(valid[..., None], inertia, models.EMPTY_INERTIA)
+
+    fields = {
+        name: np.broadcast_to(getattr(blank, name), (worlds, *getattr(blank, name).shape)).astype(np.float32)
+        for name in BodyFields.__dataclass_fields__
+    }
+    body = np.array([blank.body(f"body{i}").id for i in range(BODIES)])
+    fields["body_mass"][:, body] = mass
+    fields["body_inertia"][:, body] = inertia
+    fields["body_gravcomp"][:, body] = ~valid
+    # A free body is all of its subtree; the world's subtree is everything.
+    fields["body_subtreemass"][:, body] = mass
+    robot = blank.body_mass.sum() - blank.body_mass[body].sum()
+    fields["body_subtreemass"][:, 0] = robot + mass.sum(axis=1)
+
+    # The inverse of a free body's mass matrix is diagonal; its turns share the mean, as in mj_setConst.
+    inverse = np.stack([1 / mass, (1 / inertia).mean(axis=-1)], axis=-1)
+    fields["body_invweight0"][:, body] = inverse
+    dof = np.concatenate([np.arange(6) + blank.joint(f"body{i}").dofadr[0] for i in range(BODIES)])
+    fields["dof_invweight0"][:, dof] = np.repeat(inverse, 3, axis=-1).reshape(worlds, -1)
+
+    for shape in ("box", "cylinder"):
+        geom = np.array([blank.geom(f"{shape}{i}").id for i in range(BODIES)])
+        used = valid & (cylinder == (shape == "cylinder"))
+        half = np.where(used[..., None], half_size - models.MARGIN, models.TINY)
+        if shape == "box":
+            size, radius = half, np.linalg.norm(half, axis=-1)
+        else:
+            size = np.stack([half[..., 0], half[..., 2], np.zeros_like(half[..., 0])], axis=-1)
+            radius = np.hypot(half[..., 0], half[..., 2])
+        fields["geom_size"][:, geom] = size
+        fields["geom_rbound"][:, geom] = radius
+        fields["geom_aabb"][:, geom] = np.concatenate([np.zeros_like(half), half], axis=-1)
+    fields["geom_aabb"] = fields["geom_aabb"].reshape(worlds, -1, 2, 3)
+    return BodyFields(**{name: jnp.asarray(value) for name, value in fields.items()})

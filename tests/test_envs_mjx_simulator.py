@@ -1,0 +1,232 @@
+"""The batch simulator: what it makes of every kind of action, next to what the native simulator makes of it.
+
+The first call compiles for about a minute, of which Warp's part is kept on disk (`WARP_CACHE_PATH`).
+"""
+
+import dataclasses
+import math
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_envs_simulator import BOARD, pick_and_place, pose, push, scene, standing, wrist_for
+
+from mechsearch_jax.actions import ActionKind, no_action
+from mechsearch_jax.camera import Camera
+from mechsearch_jax.envs import mjx_simulator, model, simulator
+from mechsearch_jax.envs.batch_model import BodyFields, body_fields
+from mechsearch_jax.envs.mjx_simulator import Failure, MjxConfig, MjxSimulator, Overflow, choose, retrievals
+from mechsearch_jax.envs.motion import MotionConfig, Reference
+from mechsearch_jax.envs.simulator import NativeSimulator, SimulatorConfig
+from mechsearch_jax.envs.world import TARGET, from_scenario, slots
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.shelf import Shelf
+
+BOX = standing("box", (0.054, 0.025, 0.054), 0.55, 0.1)
+BOTTLE = standing("cylinder", (0.032, 0.032, 0.067), 0.6, 0.1)
+GOAL = standing("cylinder", (0.02, 0.02, 0.05), 0.65, 0.25)
+
+
+def stack(*trees):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def angle(a, b):
+    """Angle between rotations [degrees]."""
+    cosine = (np.einsum("...ij,...ij->...", np.asarray(a), np.asarray(b)) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def sideways(distance=0.15):
+    """A push of `BOX` to the left."""
+    return push(pose(0.595, 0.1 - 0.025 - 0.1125, 0.04, tilt=math.radians(30)), (0.0, distance, 0.0))
+
+
+def out_of_reach():
+    return dataclasses.replace(no_action(), kind=jnp.int32(ActionKind.PUSH), T_world_gripper=pose(1.3, 0.1, 0.1))
+
+
+def take_out(T):
+    one = retrievals(T[None], wrist_for(T)[None], jnp.float32([0.08]))
+    return jax.tree.map(lambda leaf: leaf[0], one)
+
+
+def native_of(start, action):
+    """The native simulator's outcome and world."""
+    single = NativeSimulator()
+    single.reset(start)
+    if int(action.kind) == mjx_simulator.RETRIEVE:
+        return single.retrieve(action.T_world_gripper, action.q7, action.opening), single.world
+    return single.execute(action), single.world
+
+
+def test_the_fields_of_every_world_are_those_that_mujoco_computes():
+    blank = model.compile_model(Shelf(), Camera())
+    scenes = [scene(BOX, BOTTLE), scene(), scene(*[BOTTLE] * 8, target=standing("box", (0.015, 0.02, 0.05), 0.6, 0.1))]
+    worlds = jax.tree.map(lambda *leaves: np.stack(leaves), *[from_scenario(s) for s in scenes])
+    found = body_fields(blank, worlds.kind, worlds.half_size, worlds.valid)
+    for i, start in enumerate(scenes):
+        compiled = model.with_bodies(blank, slots(start))
+        for name in BodyFields.__dataclass_fields__:
+            value = np.asarray(getattr(found, name)[i])
+            np.testing.assert_allclose(value, getattr(compiled, name).reshape(value.shape), 2e-6, err_msg=name)
+
+
+def test_commands_are_those_of_the_native_simulator():
+    draw = np.random.default_rng(0).normal
+    shapes = {"q": (20, 7), "velocity": (20, 7), "fingers": (20,), "start": (8,)}
+    reference = Reference(**{name: jnp.asarray(draw(size=shape), jnp.float32) for name, shape in shapes.items()})
+    batch = mjx_simulator.commands(jax.tree.map(lambda leaf: leaf[None], reference))
+    np.testing.assert_allclose(batch[0], simulator.controls(reference), atol=1e-6)
+
+
+def test_actions_of_two_kinds_are_mixed_by_world():
+    taken = retrievals(jnp.stack([pose(0.6, 0.1, 0.06)] * 3), jnp.zeros(3), jnp.full(3, 0.08))
+    idle = stack(*[no_action()] * 3)
+    mixed = choose(jnp.array([True, False, True]), taken, idle)
+    assert mixed.kind.tolist() == [mjx_simulator.RETRIEVE, ActionKind.NONE, mjx_simulator.RETRIEVE]
+    np.testing.assert_array_equal(mixed.T_world_gripper[1], np.eye(4))
+    np.testing.assert_array_equal(mixed.T_world_gripper[2], taken.T_world_gripper[2])
+
+
+def test_without_warp_one_line_tells_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "warp", None)
+    with pytest.raises(InputError, match=r"pip install 'mechsearch-jax\[gpu\]'") as complaint:
+        MjxSimulator()
+    assert "\n" not in str(complaint.value)
+
+
+def test_a_capacity_of_nothing_is_refused():
+    with pytest.raises(InputError, match="rows 0 must be at least 1"):
+        MjxConfig(rows=0)
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return MjxSimulator()
+
+
+def test_what_it_is_given_has_to_fit(sim):
+    with pytest.raises(InputError, match="reset it"):
+        MjxSimulator.settle(sim)
+    with pytest.raises(InputError, match="no scenarios"):
+        sim.reset([])
+    with pytest.raises(InputError, match="some of 1 worlds"):
+        sim.load(stack(from_scenario(scene(BOX))), np.array([True]))
+    sim.reset([scene(BOX)] * 2)
+    with pytest.raises(InputError, match="for 2 worlds"):
+        sim.execute(stack(no_action()))
+
+
+def test_a_push_ends_where_the_native_simulator_has_it_and_other_worlds_stay(sim):
+    """One batch: a push, a push out of reach, and one that is not to be executed."""
+    starts = [scene(BOX), scene(BOX), scene(BOTTLE)]
+    before = sim.reset(starts)
+    np.testing.assert_array_equal(before.position[2], from_scenario(starts[2]).position)
+    actions = stack(sideways(), out_of_reach(), sideways())
+    outcomes = sim.execute(actions, jnp.array([True, True, False]))
+    assert [outcomes.reason(i) for i in range(3)] == [None, "unreachable", None]
+    assert outcomes.settled.all()
+    assert not outcomes.overflow.any()
+    assert not outcomes.fallen.any()
+    outcome, world = native_of(starts[0], sideways())
+    assert outcomes.steps.tolist() == [outcome.steps, 0, 0]
+    assert np.abs(np.asarray(sim.world.position[0] - world.position)).max() < 2e-3
+    assert angle(sim.world.rotation[0], world.rotation).max() < 1.5
+    assert float(sim.world.position[0, 0, 1]) > 0.2
+    for i in (1, 2):
+        np.testing.assert_array_equal(sim.world.position[i], before.position[i])
+        np.testing.assert_array_equal(sim.world.rotation[i], before.rotation[i])
+
+
+@pytest.mark.slow
+def test_all_kinds_at_once_agree_with_the_native_simulator(sim):
+    picked = pick_and_place(pose(0.59, 0.1, 0.1), pose(0.5, 0.22, 0.1))
+    off_the_board = pick_and_place(pose(0.596, 0.1, 0.1), pose(0.39, 0.1, 0.1))
+    taken = take_out(pose(0.65, 0.25, 0.06, tilt=math.radians(30)))
+    cases = [
+        (scene(BOX), sideways()),
+        (scene(BOTTLE), picked),
+        (scene(BOX, target=GOAL), taken),
+        (scene(BOTTLE), pick_and_place(pose(0.5, 0.3, 0.1), pose(0.55, 0.2, 0.1))),
+        (scene(BOX, target=GOAL), take_out(pose(0.55, 0.3, 0.06))),
+        (scene(BOTTLE, target=GOAL), off_the_board),
+        (scene(BOTTLE), no_action()),
+    ]
+    sim.reset([start for start, _ in cases])
+    outcomes = sim.execute(stack(*[action for _, action in cases]))
+    assert sim._execute._cache_size() <= 2
+    for i, (start, action) in enumerate(cases):
+        outcome, world = native_of(start, action)
+        assert outcomes.reason(i) == outcome.failure
+        assert abs(int(outcomes.steps[i]) - outcome.steps) <= 100
+        np.testing.assert_array_equal(outcomes.fallen[i], outcome.fallen)
+        if not outcome.fallen.any():
+            assert np.abs(np.asarray(sim.world.position[i] - world.position)).max() < 3e-3
+            assert angle(sim.world.rotation[i], world.rotation).max() < 2
+    assert outcomes.retrieved.tolist() == [i == 2 for i in range(len(cases))]
+    assert bool(outcomes.held[2] & outcomes.outside[2])
+    assert outcomes.fallen[5, 0]
+
+    # The world goes on from there, without a new compilation; a fallen object spoils a retrieval.
+    compiled = sim._execute._cache_size()
+    again = sim.execute(stack(*[taken] * len(cases)), jnp.arange(len(cases)) == 5)
+    assert again.reason(5) == "fallen"
+    assert bool(again.held[5])
+    assert not bool(again.retrieved[5])
+    assert not bool(again.fallen[5, TARGET])
+    assert sim._execute._cache_size() == compiled
+
+
+@pytest.mark.slow
+def test_a_world_that_diverges_touches_no_other(sim):
+    """One world's mass is not a number: it gets its state back, and its neighbours never notice."""
+    starts, actions = [scene(BOX)] * 3, stack(*[sideways()] * 3)
+    sim.reset(starts)
+    sim.execute(actions)
+    fine = sim.world
+    before = sim.reset(starts)
+    sim._fields = sim._fields.replace(body_mass=sim._fields.body_mass.at[1].set(jnp.nan))
+    outcomes = sim.execute(actions)
+    assert [outcomes.reason(i) for i in range(3)] == [None, "unstable", None]
+    assert outcomes.settled.tolist() == [True, False, True]
+    np.testing.assert_allclose(sim.world.position[1], before.position[1], atol=1e-6)
+    for i in (0, 2):
+        np.testing.assert_allclose(sim.world.position[i], fine.position[i], atol=1e-5)
+    # Healed, it is a world like any other.
+    kept = sim.world.position[0]
+    sim.load(before, np.array([False, True, False]))
+    np.testing.assert_array_equal(sim.world.position[0], kept)
+    np.testing.assert_array_equal(sim.world.position[1], before.position[1])
+    healed = sim.execute(actions, jnp.array([False, True, False]))
+    assert healed.reason(1) is None
+    np.testing.assert_allclose(sim.world.position[1], fine.position[1], atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("config", "flag"), [(MjxConfig(rows=30), Overflow.ROWS), (MjxConfig(contacts=2), Overflow.CONTACTS)]
+)
+def test_what_overflows_is_reported(config, flag):
+    """The target alone has rows enough, which are its own; the contacts are everybody's."""
+    small = MjxSimulator(config=config)
+    small.reset([scene(BOX, BOTTLE, target=GOAL), scene()])
+    hold = jnp.broadcast_to(small._data.ctrl, (5, *small._data.ctrl.shape))
+    overflow = small.follow(hold).overflow
+    assert int(overflow[0]) & flag
+    assert bool(int(overflow[1]) & flag) == (flag is Overflow.CONTACTS)
+
+
+@pytest.mark.slow
+def test_worlds_come_to_rest():
+    """What hangs in the air falls onto the board and stays there, each in its own time."""
+    quick = MjxSimulator(config=MjxConfig(simulator=SimulatorConfig(motion=MotionConfig(waypoints=5))))
+    low, high = (dataclasses.replace(BOX, position=(0.6, 0.1, BOARD + 0.054 + drop)) for drop in (0.0, 0.03))
+    quick.reset([scene(low), scene(high)])
+    outcomes = quick.settle()
+    assert outcomes.settled.all()
+    assert outcomes.failure.tolist() == [Failure.NONE, Failure.NONE]
+    assert 0 < int(outcomes.steps[0]) < int(outcomes.steps[1])
+    np.testing.assert_allclose(quick.world.position[:, 0, 2], BOARD + 0.054, atol=5e-4)
