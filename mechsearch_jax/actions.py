@@ -620,15 +620,6 @@ def free_ways(options: Candidates) -> tuple[Bool[Array, "n a"], Bool[Array, "n b
     return grasps, pushes
 
 
-def obstruction(options: Candidates) -> Float[Array, "n n"]:
-    """How much each object (second axis) is in the way of moving each other: the share of its ways that it blocks."""
-    pushes = jnp.any(options.push_reached, axis=-1)
-    blocked = jnp.sum(options.grasp_hits & options.grasp_reached[..., None], axis=1)
-    blocked += jnp.sum(options.push_hits & pushes[..., None], axis=1)
-    ways = jnp.sum(options.grasp_reached, axis=1) + jnp.sum(pushes, axis=1)
-    return blocked / jnp.maximum(ways, 1)[:, None]
-
-
 def followable(space: ActionSpace, action: Action) -> Bool[Array, ""]:
     """Whether the arm can follow an action closely, in one configuration and without passing a singularity.
 
@@ -779,9 +770,8 @@ def sample_action(
     possible: PossibleSpace,
     options: Candidates,
     available: Bool[Array, " n"],
-    preference: Float[Array, " n"],
 ) -> Sample:
-    """Draw an action: an object and a kind (the multi-set of B.5), then one of its ways at random.
+    """Draw an action: an object and a kind with equal weight (the multi-set of B.5), then one of its ways at random.
 
     Args:
       key: PRNG key.
@@ -791,7 +781,6 @@ def sample_action(
       possible: where the target may be. An object's actions that enter it are drawn only if it has no others.
       options: of this scene.
       available: which objects may be moved.
-      preference: how likely each object is drawn, relative to the others; positive.
     """
     config = space.config
     wrists = tables.q7.shape[1]
@@ -810,8 +799,7 @@ def sample_action(
             jnp.pad(options.push_enters.reshape(n, -1), ((0, 0), (0, width - b * d))),
         ]
     )
-    weights = _weights(ways & ~enters, ways) * jnp.tile(preference, 2)[:, None]
-    choice, possible_at_all = _choose(key_choice, weights.reshape(-1))
+    choice, possible_at_all = _choose(key_choice, _weights(ways & ~enters, ways).reshape(-1))
     row, way = choice // width, choice % width
     is_grasp = row < n
     index = row % n

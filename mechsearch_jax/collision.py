@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax import superquadric
-from mechsearch_jax.masked import masked_vmap
+from mechsearch_jax.masked import block_size, for_each, merged, rows_of
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 
@@ -60,6 +60,65 @@ class Pair(NamedTuple):
     exponents: Array
 
 
+def mark_hits(
+    hits: Bool[Array, " m"],
+    mask: Bool[Array, " n"],
+    pair: Callable[[Array], Pair],
+    where: Callable[[Array], Array],
+    block: int,
+    coarse: int = 0,
+    gap: Array | float = 0.0,
+) -> Bool[Array, " m"]:
+    """Set `hits[where(i)]` for the masked `i` whose pair collides.
+
+    Three tests, each only for what the one before left open: a first part of the cloud, the whole cloud with bounds
+    that need no powers, and the exact gauge.
+
+    Args:
+      hits: what was hit before.
+      mask: which of the `n` pairs are worth a look.
+      pair: makes pair `i`.
+      where: place of pair `i` in `hits`; beyond its end where `i` is `n`.
+      block: how many pairs are tested at once.
+      coarse: how many points the first part has; 0 leaves that test out.
+      gap: how far a point of the cloud may be from the nearest one of its first part [m].
+    """
+    n = mask.shape[0]
+
+    def bounded(cut):
+        def bounds(i):
+            cloud, T, size, exponents = pair(i)
+            lower, upper = _bounds(cloud[:, :cut] if cut else cloud, T, size, exponents)
+            # The gauge is a norm, at most the length over the least half-extent, or twice that below 2-norms.
+            slack = jnp.where(jnp.max(exponents) > 1.0, 2.0, 1.0) * gap / jnp.min(size) if cut else 0.0
+            return lower < 1.0 + slack, upper < 1.0
+
+        return jax.vmap(bounds)
+
+    def test(hits, index, mask, cut):
+        """Test the masked ones of pairs `index`, and those that stay open further."""
+
+        def body(hits, inner, active):
+            chosen = jnp.where(active, index[jnp.minimum(inner, index.shape[0] - 1)], n)
+            near, sure = bounded(cut)(jnp.minimum(chosen, n - 1))
+            sure &= active
+            hits = hits.at[where(jnp.where(sure, chosen, n))].set(True, mode="drop")
+            still_open = active & near & ~sure
+            return test(hits, chosen, still_open, 0) if cut else exact(hits, chosen, still_open)
+
+        return for_each(mask, body, hits, block)
+
+    def exact(hits, index, mask):
+        def body(hits, inner, active):
+            chosen = jnp.where(active, index[jnp.minimum(inner, index.shape[0] - 1)], n)
+            least = jax.vmap(lambda i: _least_gauge(*pair(i)))(jnp.minimum(chosen, n - 1))
+            return hits.at[where(jnp.where(active & (least < 1.0), chosen, n))].set(True, mode="drop")
+
+        return for_each(mask, body, hits, max(block // 8, 1))
+
+    return test(hits, jnp.arange(n, dtype=jnp.int32), mask, coarse)
+
+
 def any_inside(
     mask: Bool[Array, " n"], pair: Callable[[Any, Any, Array], Pair], shared: Any, row: Any, block: int = 256
 ) -> Bool[Array, " n"]:
@@ -69,15 +128,19 @@ def any_inside(
       mask: pairs that are worth a look; the others are reported as free of collision.
       pair: makes pair `i` from `shared`, `row` and `i`; see `masked.masked_vmap`.
       shared, row: what pairs are made from.
-      block: how many pairs are evaluated at once.
+      block: how many pairs are evaluated at once on a CPU.
 
     Returns:
       True where a masked pair collides.
     """
-    lower, upper = masked_vmap(lambda *a: _bounds(*pair(*a)), mask, shared, row, block)
-    grazes = mask & (lower < 1.0) & (upper >= 1.0)
-    least = masked_vmap(lambda *a: _least_gauge(*pair(*a)), grazes, shared, row, min(block, 64))
-    return mask & ((upper < 1.0) | (grazes & (least < 1.0)))
+
+    def run(mask, shared, rows):
+        batch, n = mask.shape[:-1], mask.shape[-1]
+        make = lambda i: pair(shared, rows_of(rows, i // n, batch), i % n)  # noqa: E731
+        hits = jnp.zeros(mask.size, bool)
+        return mark_hits(hits, mask.reshape(-1), make, lambda i: i, block_size(block)).reshape(mask.shape)
+
+    return merged(run)(mask, shared, row)
 
 
 def points_inside(scene: Superquadrics, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch n"]:

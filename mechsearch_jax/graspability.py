@@ -15,20 +15,24 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.spatial
 import trimesh
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.collision import Pair, any_inside, hits_shelf
+from mechsearch_jax.collision import Pair, hits_shelf, mark_hits
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.gripper import Gripper, arm_hits_shelf, swept_cloud
 from mechsearch_jax.kinematics import line_kinematics
-from mechsearch_jax.masked import masked_vmap
+from mechsearch_jax.masked import block_size, for_each, masked_vmap, merged, rows_of
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.target import Target
 from mechsearch_jax.transforms import compose, inverse, make, transform, upright_pose
 
 WRIST_ORIGIN = math.pi / 4
+# So many grasps of a pose are looked at together, and so many points of a cloud first.
+GROUP = 16
+COARSE = 320
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +85,10 @@ class GraspTables(flax.struct.PyTreeNode):
       gripper_clouds: what the open gripper sweeps in its own frame, by wrist, shape (W, 3, P') [m].
       T_world_target: candidate poses, shape (X, 4, 4).
       pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose.
+      group_pose, group_pair: the pairs and, after them, the grasps of a target that has been found, in groups of at
+        most `GROUP` with the same pose: the pose of each, shape (C,), and its pairs, shape (C, GROUP), with -1 for
+        none.
+      gap: how far a point of a cloud may be from the nearest of its first `COARSE` [m].
     """
 
     T_target_gripper: jax.Array
@@ -93,6 +101,9 @@ class GraspTables(flax.struct.PyTreeNode):
     T_world_target: jax.Array
     pair_pose: jax.Array
     pair_grasp: jax.Array
+    group_pose: jax.Array
+    group_pair: jax.Array
+    gap: jax.Array
 
 
 def gripper_rotation(yaw: Float[Array, "*batch"], tilt: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
@@ -182,6 +193,9 @@ def grasp_tables(
     angles = [WRIST_ORIGIN + a for a in config.wrists]
     swept = [swept_cloud(gripper, gripper.max_opening, a, config.points) for a in angles]
     outward = -np.asarray(T_target_gripper)[:, :3, 2]
+    # Every first part of a cloud covers the gripper and the target alike.
+    progress = [np.arange(n) / n for n in (config.points, config.target_points)]
+    order = np.argsort(np.concatenate(progress), kind="stable")
     clouds, low, high = [], [], []
     # Grasps that differ in their wrists only take the target out the same way.
     ways = {d.tobytes(): d for d in outward}
@@ -193,7 +207,7 @@ def grasp_tables(
         own = swept_targets[direction.tobytes()]
         inside = (own - T[:3, 3]) @ T[:3, :3]
         both = np.concatenate([swept[w], inside])
-        clouds.append(np.concatenate([swept[w] @ T[:3, :3].T + T[:3, 3], own]).T)
+        clouds.append(np.concatenate([swept[w] @ T[:3, :3].T + T[:3, 3], own])[order].T)
         low.append(both.min(axis=0))
         high.append(both.max(axis=0))
     poses = jax.jit(upright_pose)(target.candidate_poses(shelf), target.height(shelf))
@@ -208,12 +222,38 @@ def grasp_tables(
         T_world_target=poses,
         pair_pose=jnp.zeros(0, jnp.int32),
         pair_grasp=jnp.zeros(0, jnp.int32),
+        group_pose=jnp.zeros(0, jnp.int32),
+        group_pair=jnp.zeros((0, GROUP), jnp.int32),
+        gap=jnp.float32(max(_gap(cloud.T, COARSE) for cloud in clouds)),
     )
-    if not candidates:
-        return tables.replace(T_world_target=poses[:0])
-    feasible = jax.jit(lambda tables: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))(tables)
-    pose, grasp = np.nonzero(np.asarray(feasible))
-    return tables.replace(pair_pose=jnp.int32(pose), pair_grasp=jnp.int32(grasp))
+    if candidates:
+        judge = jax.jit(lambda tables: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))
+        pose, grasp = np.nonzero(np.asarray(judge(tables)))
+    else:
+        pose = grasp = np.zeros(0, int)
+        tables = tables.replace(T_world_target=poses[:0])
+    group_pose, group_pair = _groups(np.append(pose, np.full(len(clouds), len(tables.T_world_target))))
+    return tables.replace(
+        pair_pose=jnp.int32(pose),
+        pair_grasp=jnp.int32(grasp),
+        group_pose=jnp.int32(group_pose),
+        group_pair=jnp.int32(group_pair),
+    )
+
+
+def _gap(points: np.ndarray, first: int) -> float:
+    """How far a point is at most from the nearest of the first ones [m]."""
+    return float(scipy.spatial.KDTree(points[:first]).query(points)[0].max()) if len(points) > first else 0.0
+
+
+def _groups(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs, given by their poses in ascending order, in groups of the same pose; see `GraspTables`."""
+    place = np.arange(len(pose)) - np.searchsorted(pose, pose)
+    starts = np.flatnonzero(place % GROUP == 0)
+    group = np.cumsum(place % GROUP == 0) - 1
+    pairs = np.full((len(starts), GROUP), -1)
+    pairs[group, place % GROUP] = np.arange(len(pose))
+    return pose[starts], pairs
 
 
 def boxes_overlap(
@@ -272,26 +312,65 @@ def grasp_hits(
     Returns:
       H, shape (pairs, N).
     """
-    pose, grasp, allowed, T_world_target = pairs(tables, found)
-    n = scene.capacity
     fresh = scene.valid if moved is None else moved & scene.valid
-    T_gripper_world = inverse(compose(T_world_target[pose], tables.T_target_gripper[grasp]))
-    T_world_object = make(scene.rotation, scene.position)
-    T = compose(T_gripper_world[:, None], T_world_object[None])
-    near = boxes_overlap(tables.low[grasp][:, None], tables.high[grasp][:, None], T, scene.size[None])
-    mask = near & (exists[pose] & allowed)[:, None] & fresh[None]
-
-    def pair(tables, row, i):
-        scene, T_world_target, pose, grasp = row
-        k, j = i // n, i % n
-        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
-        T = compose(T_object_world, T_world_target[pose[k]])
-        return Pair(tables.clouds[grasp[k]], T, scene.size[j], scene.exponents[j])
-
-    hit = any_inside(mask.reshape(-1), pair, tables, (scene, T_world_target, pose, grasp)).reshape(mask.shape)
+    mask = exists[tables.group_pose][:, None] & fresh[None]
+    hit = merged(_marked)(mask.reshape(-1), tables, (found, scene))
     if previous is None or moved is None:
         return hit
     return jnp.where(moved[None], hit, previous)
+
+
+def _marked(mask: Bool[Array, "... e"], tables: GraspTables, rows: tuple[FoundGrasps, Superquadrics]) -> Array:
+    """H where a mask of all (group, object) is true; with the axes of a batch in front, see `masked.merged`."""
+    batch, n = mask.shape[:-1], rows[1].size.shape[-2]
+    each, poses = mask.shape[-1], tables.T_world_target.shape[0]
+    known, grasps = tables.pair_pose.shape[0], tables.q7.shape[0]
+    total = known + grasps
+    grasp_of = jnp.concatenate([tables.pair_grasp, jnp.arange(grasps, dtype=jnp.int32)])
+
+    def place(index):
+        """Row of the batch, pair, object and pose index of entry `index`, of all entries times `GROUP`."""
+        entry, slot = index // GROUP, index % GROUP
+        group, thing = (entry % each) // n, entry % n
+        return entry // each, tables.group_pair[group, slot], thing, tables.group_pose[group]
+
+    def target_pose(row, pose):
+        ours = tables.T_world_target[jnp.minimum(pose, poses - 1)] if poses else row[0].T_world_target[...]
+        return jnp.where(pose < poses, ours, row[0].T_world_target[...])
+
+    def near(index):
+        b, k, thing, pose = place(index)
+        row = rows_of(rows, b, batch)
+        grasp = grasp_of[jnp.maximum(k, 0)]
+        allowed = (k >= 0) & ((k < known) | row[0].feasible[grasp])
+        T_gripper_world = inverse(compose(target_pose(row, pose), tables.T_target_gripper[grasp]))
+        scene = row[1]
+        T = compose(T_gripper_world, make(scene.rotation[thing], scene.position[thing]))
+        return allowed & boxes_overlap(tables.low[grasp], tables.high[grasp], T, scene.size[thing])
+
+    def pair(index):
+        b, k, thing, pose = place(index)
+        row = rows_of(rows, b, batch)
+        scene, grasp = row[1], grasp_of[jnp.maximum(k, 0)]
+        T_object_world = inverse(make(scene.rotation[thing], scene.position[thing]))
+        T = compose(T_object_world, target_pose(row, pose))
+        return Pair(tables.clouds[grasp], T, scene.size[thing], scene.exponents[thing])
+
+    size = math.prod(batch) * total * n
+
+    def body(hits, entry, active):
+        inner = (entry[:, None] * GROUP + jnp.arange(GROUP)[None]).reshape(-1)
+        safe = jnp.minimum(inner, mask.size * GROUP - 1)
+        worth = jax.vmap(near)(safe) & jnp.repeat(active, GROUP)
+
+        def where(local):
+            b, k, thing, _ = place(safe[jnp.minimum(local, safe.shape[0] - 1)])
+            return jnp.where(local < safe.shape[0], (b * total + k) * n + thing, size)
+
+        return mark_hits(hits, worth, lambda i: pair(safe[i]), where, block_size(256), COARSE, tables.gap)
+
+    hits = for_each(mask.reshape(-1), body, jnp.zeros(size, bool), block_size(256))
+    return hits.reshape(*batch, total, n)
 
 
 def graspability(tables: GraspTables, found: FoundGrasps, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:

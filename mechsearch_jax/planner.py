@@ -29,7 +29,6 @@ from mechsearch_jax.actions import (
     action_tables,
     candidates,
     followable,
-    obstruction,
     push_hits_others,
     sample_action,
     widen,
@@ -88,8 +87,6 @@ class PlannerConfig:
       push_distances: how far pushes go [m].
       caution: what touching the target unseen would cost, in units of J: a sampled action is charged with J times the
         share of the possible poses at which it would do so.
-      guidance: in [0, 1): how much less likely than the most relevant object an irrelevant one is drawn; 0 draws all
-        alike, as in the paper.
       max_steps: T, actions in an episode.
     """
 
@@ -101,7 +98,6 @@ class PlannerConfig:
     criterion: Literal["detector", "depth-mse", "depth-norm"] = "detector"
     push_distances: tuple[float, ...] = (0.05, 0.10, 0.15)
     caution: float = 1.0
-    guidance: float = 0.75
     max_steps: int = 10
 
     def __post_init__(self):
@@ -111,8 +107,6 @@ class PlannerConfig:
             raise InputError(f"gamma {self.gamma} is outside (0, 1]; the paper uses 0.9")
         if not 0.0 <= self.caution < math.inf:
             raise InputError(f"caution {self.caution} must be a number that is not negative; the default is 1")
-        if not 0.0 <= self.guidance < 1.0:
-            raise InputError(f"guidance {self.guidance} is outside [0, 1); 0 draws all objects alike")
         for name in ("horizon", "sequences", "max_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} {getattr(self, name)} must be at least 1")
@@ -461,22 +455,11 @@ def _update(problem, belief, space, config, node: _Node, moved: Array, last: Arr
     return node.replace(exists=exists, views=views, hits=hits, options=options)
 
 
-def _preference(belief: Belief, node: _Node, config: PlannerConfig) -> Float[Array, " n"]:
-    """How likely each object is drawn: more if it blocks grasps of a possible target, or ways to move one that does."""
-    blocks = jnp.sum(node.hits, axis=0, dtype=jnp.float32)
-    blocks = blocks / jnp.maximum(jnp.max(blocks), 1.0)
-    both = jnp.maximum(blocks, blocks @ obstruction(node.options))
-    return 1.0 - config.guidance * (1.0 - both / jnp.maximum(jnp.max(both), 1e-6))
-
-
-def _act(
-    problem, belief, space, config, push_model, node: _Node, key: Array, last: Array
-) -> tuple[_Node, Action, Array]:
+def _act(problem, belief, space, push_model, node: _Node, key: Array, last: Array) -> tuple[_Node, Action, Array]:
     """Sample an action and predict the scene after it; also the share of possible poses that it would touch."""
     possible = _possible_space(problem, belief, node.exists)
     available = node.available & node.alive & ~last
-    preference = _preference(belief, node, config)
-    sample = sample_action(key, space, problem.actions, node.scene, possible, node.options, available, preference)
+    sample = sample_action(key, space, problem.actions, node.scene, possible, node.options, available)
     scene, acted = _predict(problem, space, push_model, node.scene, sample)
     acted &= node.alive
     action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
@@ -529,7 +512,7 @@ def plan(
     count, horizon = config.sequences, config.horizon
     nodes = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *a.shape)), _root(problem, belief, scene, space, config))
     update = jax.vmap(functools.partial(_update, problem, belief, space, config), in_axes=(0, 0, None))
-    act = jax.vmap(functools.partial(_act, problem, belief, space, config, push_model), in_axes=(0, 0, None))
+    act = jax.vmap(functools.partial(_act, problem, belief, space, push_model), in_axes=(0, 0, None))
     cost_of = jax.vmap(lambda node: _cost(problem, belief, node.exists, node.hits, config.method))
 
     def step(nodes, keys_and_time):

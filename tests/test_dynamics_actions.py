@@ -136,7 +136,7 @@ def sampled(problem):
         possible = planner._possible_space(problem, belief, belief.exists)
         options = actions.candidates(space, problem.actions, objects, possible)
         sample = lambda key: actions.sample_action(  # noqa: E731
-            key, space, problem.actions, objects, possible, options, objects.valid, jnp.ones(objects.capacity)
+            key, space, problem.actions, objects, possible, options, objects.valid
         )
         return options, jax.vmap(sample)(keys)
 
