@@ -55,7 +55,7 @@ class GraspConfig:
     max_yaw: float = math.radians(45)
     tilts: tuple[float, ...] = (math.radians(20), math.radians(25), math.radians(30))
     wrists: tuple[float, ...] = (math.radians(-60), 0.0, math.radians(60))
-    height: float = 0.025
+    height: float = 0.03
     points: int = 2048
     target_points: int = 512
     waypoints: int = 4
@@ -69,8 +69,9 @@ class GraspConfig:
 
     @classmethod
     def dense(cls) -> GraspConfig:
-        """Several times as many grasps as the default, for the one pose at which the target has been found."""
-        return cls(yaws=13, wrists=tuple(math.radians(a) for a in (-60, -30, 0, 30, 60)))
+        """Ten times as many grasps as the default, for the one pose at which the target has been found."""
+        tilts, wrists = (20.0, 22.5, 25.0, 27.5, 30.0), (-60.0, -30.0, 0.0, 30.0, 60.0)
+        return cls(yaws=25, tilts=tuple(map(math.radians, tilts)), wrists=tuple(map(math.radians, wrists)))
 
 
 class GraspTables(flax.struct.PyTreeNode):
