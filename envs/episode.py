@@ -15,10 +15,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol, runtime_checkable
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax import planner, results
 from mechsearch_jax.actions import Action, ActionKind
@@ -69,13 +70,12 @@ class Snapshot:
         return observe(self.camera, self.world, self.shelf)
 
     @functools.cached_property
-    def target_seen(self) -> bool:
+    def target_seen(self) -> Bool[Array, ""]:
         """Whether the detector finds the target in the image; much cheaper than the image."""
-        return bool(is_found(self.camera, self.world))
+        return is_found(self.camera, self.world)
 
 
-@dataclasses.dataclass(frozen=True)
-class Recognition:
+class Recognition(flax.struct.PyTreeNode):
     """What a recogniser makes of a snapshot.
 
     Attributes:
@@ -85,13 +85,13 @@ class Recognition:
     """
 
     scene: Superquadrics
-    found: bool
+    found: Bool[Array, ""] | bool
     target_pose: Float[Array, " 3"]
 
 
 @runtime_checkable
 class Recogniser(Protocol):
-    """Turns what the camera sees into what the planner plans with."""
+    """Turns what the camera sees into what the planner plans with. For batches it has to be traceable by JAX."""
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Recognition: ...
 
@@ -212,66 +212,47 @@ def run_episode(
     watcher = watcher or _Blind()
     world = simulator.reset(scenario)
     belief = planner.initial_belief(problem)
-    steps: list[Step] = []
-    found_step = graspable_step = failure = None
-    retrieved = False
+    log = EpisodeLog(config)
+    ended = False
 
-    for index in range(config.max_steps + 1):
-        last = index == config.max_steps
+    while not ended:
         clock = _Stopwatch(watcher.busy)
         snapshot = Snapshot(problem.camera, problem.shelf, world)
         with clock("recognise"):
-            seen = recogniser(jax.random.fold_in(environment_key, index), snapshot)
-            jax.block_until_ready(seen.scene)
+            seen = recogniser(jax.random.fold_in(environment_key, log.index), snapshot)
+            jax.block_until_ready(seen)
         with clock("believe"):
             found = jnp.asarray(seen.found)
             belief = planner.observe_belief(problem, belief, seen.scene, found, seen.target_pose, config)
             jax.block_until_ready(belief)
 
         trouble = _target_trouble(snapshot) if belief.found else None
-        grasp = decision = None
+        grasp = decision = choice = None
         if belief.found and trouble is None:
             with clock("grasp"):
                 grasp = _grasp(problem, seen.scene, belief.found_pose)
-        if grasp is None and trouble is None and not last:
+        if grasp is None and trouble is None and not log.last:
             with clock("plan"):
-                key = jax.random.fold_in(planner_key, index)
+                key = jax.random.fold_in(planner_key, log.index)
                 decision = jax.block_until_ready(planner.plan(key, problem, belief, seen.scene, config))
+            choice = chosen(decision)
+            trouble = distrust(choice)
 
+        size = 1 if belief.found else int(jnp.sum(belief.exists))
         graspable = bool(belief.found) and _truly_graspable(problem, snapshot)
-        found_step = index if belief.found and found_step is None else found_step
-        graspable_step = index if graspable and graspable_step is None else graspable_step
-        record = _record(belief, graspable, grasp, decision, config)
-        if steps:
-            steps[-1] = dataclasses.replace(steps[-1], observed_cost=record.cost)
-
-        moment = Moment(index, snapshot, seen.scene, belief, decision, grasp, record, None)
-        deed = None
-        if record.action is not None:
+        index = log.index
+        step = log.decide(record(bool(belief.found), size, graspable, grasp, None if trouble else choice, config))
+        moment = Moment(index, snapshot, seen.scene, belief, decision, grasp, step, None)
+        deed = outcome = None
+        if log.acts:
             watcher.decided(moment)
             with clock("simulate"):
-                deed = _act(simulator, grasp, decision)
-        step = dataclasses.replace(record, failure=deed and deed.failure, timings=clock.seconds)
-        steps.append(step)
-        watcher.acted(dataclasses.replace(moment, record=step, outcome=deed and deed.outcome))
-
-        retrieved = deed is not None and deed.retrieved
-        failure = None if retrieved else trouble or _end(belief, step, last)
-        if retrieved or failure is not None:
-            break
+                deed, outcome = _act(simulator, grasp, decision)
+        ended = log.act(deed, trouble, clock.seconds)
+        watcher.acted(dataclasses.replace(moment, record=log.steps[-1], outcome=outcome))
         world = simulator.world or world
 
-    return Episode(
-        scenario=scenario.name,
-        objects=len(scenario.objects),
-        config=describe(seed, problem, config, recognition, simulator),
-        versions=results.versions(),
-        steps=tuple(steps),
-        found_step=found_step,
-        graspable_step=graspable_step,
-        retrieved=retrieved,
-        failure=failure,
-    )
+    return log.episode(scenario, describe(seed, problem, config, recognition, type(simulator).__name__))
 
 
 def _grasp(problem: Problem, scene: Superquadrics, pose: Array) -> GraspChoice | None:
@@ -288,49 +269,170 @@ def _truly_graspable(problem: Problem, snapshot: Snapshot) -> bool:
 
 
 def _target_trouble(snapshot: Snapshot) -> str | None:
-    """Why the target can no longer be taken out as the planner knows it; None if it can."""
-    position = np.asarray(snapshot.world.position[TARGET])
-    rotation = np.asarray(snapshot.world.rotation[TARGET])
-    if position[0] < snapshot.shelf.front or position[2] < snapshot.shelf.board:
+    position, rotation = snapshot.world.position[TARGET], snapshot.world.rotation[TARGET]
+    return target_trouble(snapshot.shelf, np.asarray(position), np.asarray(rotation))
+
+
+def target_trouble(
+    shelf: Shelf, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"]
+) -> str | None:
+    """Why a target at this pose can no longer be taken out as the planner knows it; None if it can."""
+    if position[0] < shelf.front or position[2] < shelf.board:
         return "the target fell off the board"
     return "the target fell over" if abs(rotation[2, 2]) < math.cos(MAX_TILT) else None
 
 
 @dataclasses.dataclass(frozen=True)
-class _Deed:
-    """What came of a retrieval or an action."""
+class Deed:
+    """What came of a retrieval or an action.
 
-    outcome: Outcome | Retrieval
+    Attributes:
+      retrieved: whether it took the target out.
+      failure: why it was not carried out as planned; None if it was.
+    """
+
     retrieved: bool
     failure: str | None
 
+    @classmethod
+    def of_action(cls, kind: Array | int, failure: str | None) -> Deed:
+        """What came of an action that the planner chose."""
+        return cls(False, "no action is possible" if kind == ActionKind.NONE else failure)
 
-def _act(simulator: Simulator, grasp: GraspChoice | None, decision: Plan | None) -> _Deed:
+    @classmethod
+    def of_retrieval(cls, retrieved: bool, failure: str | None) -> Deed:
+        """What came of an attempt to take the target out."""
+        return cls(retrieved, failure and f"retrieval: {failure}")
+
+
+def _act(simulator: Simulator, grasp: GraspChoice | None, decision: Plan | None) -> tuple[Deed, Outcome | Retrieval]:
     """Take the target out if there is a grasp, or else execute the decision."""
     if grasp is not None:
         retrieval = simulator.retrieve(grasp.T_world_gripper, grasp.q7, grasp.opening)
-        return _Deed(retrieval, retrieval.retrieved, retrieval.failure and f"retrieval: {retrieval.failure}")
+        return Deed.of_retrieval(retrieval.retrieved, retrieval.failure), retrieval
     assert decision is not None
     outcome = simulator.execute(decision.action)
-    idle = decision.action.kind == ActionKind.NONE
-    return _Deed(outcome, False, "no action is possible" if idle else outcome.failure)
+    return Deed.of_action(decision.action.kind, outcome.failure), outcome
 
 
-def _end(belief: Belief, step: Step, last: bool) -> str | None:
+class Choice(flax.struct.PyTreeNode):
+    """What `planner.plan` decided, without the sequences that it did not choose.
+
+    Attributes:
+      action, cost, predicted_cost, overflow: of the `Plan`.
+      sequences: how many sequences it was chosen from.
+    """
+
+    action: Action
+    cost: jax.Array
+    predicted_cost: jax.Array
+    sequences: jax.Array
+    overflow: jax.Array
+
+
+def chosen(plan: Plan) -> Choice:
+    """What a plan comes down to."""
+    count = jnp.sum(jnp.isfinite(plan.sequences.value))
+    return Choice(plan.action, plan.cost, plan.predicted_cost, count, plan.overflow)
+
+
+def distrust(choice: Choice) -> str | None:
+    """Why a choice must not be acted upon; None if it may."""
+    if choice.overflow:
+        return "error: an object's image outgrew its window, so that f may be too small"
+    numbers = [choice.cost, *jax.tree.leaves(choice.action)]
+    return None if all(np.all(np.isfinite(n)) for n in numbers) else "error: the decision is not finite"
+
+
+class EpisodeLog:
+    """The steps of an episode that is running, and the verdicts on them.
+
+    At every step `decide` notes what was known and decided, and then `act` what came of it.
+
+    Attributes:
+      steps: those that are over, and the one that was decided.
+    """
+
+    def __init__(self, config: PlannerConfig) -> None:
+        self.steps: list[Step] = []
+        self._max_steps = config.max_steps
+        self._index = 0
+        self._found_step: int | None = None
+        self._graspable_step: int | None = None
+        self._retrieved = False
+        self._failure: str | None = None
+
+    @property
+    def index(self) -> int:
+        """Number of the present step: how many steps came before it."""
+        return self._index
+
+    @property
+    def last(self) -> bool:
+        """Whether at the present step only a retrieval is allowed any more."""
+        return self._index == self._max_steps
+
+    @property
+    def acts(self) -> bool:
+        """Whether an action was decided upon."""
+        return self.steps[-1].action is not None
+
+    def decide(self, step: Step) -> Step:
+        """Note what is known and decided at the present step."""
+        if self.steps:
+            self.steps[-1] = dataclasses.replace(self.steps[-1], observed_cost=step.cost)
+        if step.found and self._found_step is None:
+            self._found_step = self._index
+        if step.graspable and self._graspable_step is None:
+            self._graspable_step = self._index
+        self.steps.append(step)
+        return step
+
+    def act(self, deed: Deed | None, trouble: str | None, timings: dict[str, float]) -> bool:
+        """Note what came of the decision; whether the episode ends with it.
+
+        Args:
+          deed: None if nothing was done.
+          trouble: why the episode cannot go on, unless it was a success; None if it can.
+          timings: of the step's stages [s].
+        """
+        step = self.steps[-1] = dataclasses.replace(self.steps[-1], failure=deed and deed.failure, timings=timings)
+        self._retrieved = deed is not None and deed.retrieved and not (trouble or "").startswith("error")
+        self._failure = None if self._retrieved else trouble or _end(step, self.last)
+        self._index += 1
+        return self._retrieved or self._failure is not None
+
+    def episode(self, scenario: Scenario, options: dict[str, Any]) -> Episode:
+        """The record of the episode, which has ended."""
+        return Episode(
+            scenario=scenario.name,
+            objects=len(scenario.objects),
+            config=options,
+            versions=results.versions(),
+            steps=tuple(self.steps),
+            found_step=self._found_step,
+            graspable_step=self._graspable_step,
+            retrieved=self._retrieved,
+            failure=self._failure,
+        )
+
+
+def _end(step: Step, last: bool) -> str | None:
     """Why an episode without a retrieval ends here; None if it goes on."""
     # Trying once more would neither make the same grasp reachable nor put a fallen object back on the board.
     if step.failure in ("retrieval: unreachable", "retrieval: fallen"):
         return step.failure
     if not last:
         return None
-    return step.failure or ("found, but not graspable" if belief.found else "not found")
+    return step.failure or ("found, but not graspable" if step.found else "not found")
 
 
-def _record(
-    belief: Belief,
+def record(
+    found: bool,
+    belief_size: int,
     graspable: bool,
     grasp: GraspChoice | None,
-    decision: Plan | None,
+    choice: Choice | None,
     config: PlannerConfig,
 ) -> Step:
     """A step as it is decided: what comes of it is filled in later."""
@@ -340,13 +442,13 @@ def _record(
         cost = 1.0 if config.method == "search-for-grasp" else 0.0
         T = np.asarray(grasp.T_world_gripper).tolist()
         action = ActionRecord("retrieve", None, T, [0.0, 0.0, 0.0], T, float(grasp.q7), float(grasp.opening))
-    elif decision is not None:
-        cost, predicted = float(decision.cost), float(decision.predicted_cost)
-        action = results.record_action(decision.action)
-        sequences = int(jnp.sum(jnp.isfinite(decision.sequences.value)))
+    elif choice is not None:
+        cost, predicted = float(choice.cost), float(choice.predicted_cost)
+        action = results.record_action(choice.action)
+        sequences = int(choice.sequences)
     return Step(
-        belief_size=1 if belief.found else int(jnp.sum(belief.exists)),
-        found=bool(belief.found),
+        belief_size=belief_size,
+        found=found,
         graspable=graspable,
         cost=cost,
         action=action,
@@ -359,7 +461,7 @@ def _record(
 
 
 def describe(
-    seed: int, problem: Problem, config: PlannerConfig, recognition: str, simulator: Simulator
+    seed: int, problem: Problem, config: PlannerConfig, recognition: str, simulator: str
 ) -> dict[str, Any]:
     """The options of an episode, as its record keeps them."""
     return {
@@ -367,7 +469,7 @@ def describe(
         "push_distances": list(config.push_distances),
         "target": problem.target.shape,
         "recognition": recognition,
-        "simulator": type(simulator).__name__,
+        "simulator": simulator,
         "seed": seed,
     }
 

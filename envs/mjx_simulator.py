@@ -30,7 +30,7 @@ import dataclasses
 import enum
 import functools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import flax.struct
@@ -244,9 +244,12 @@ class MjxSimulator:
     On a CPU the same scenarios and actions always give the same results, on a GPU they do not.
 
     Attributes:
+      engine: what steps a world.
       shelf, camera, config: as given.
       world: the present state of all worlds; None before the first `reset`.
     """
+
+    engine = "MjxSimulator"
 
     def __init__(self, shelf: Shelf | None = None, camera: Camera | None = None, config: MjxConfig | None = None):
         """Raises:
@@ -290,6 +293,19 @@ class MjxSimulator:
             raise InputError("MjxSimulator: no scenarios are given; reset it with one for each world")
         worlds = [from_scenario(scenario) for scenario in scenarios]
         return self.load(jax.tree.map(lambda *leaves: np.stack(leaves), *worlds))
+
+    def replace(self, scenarios: Mapping[int, Scenario]) -> World:
+        """Start episodes in some of the worlds, as `reset` does; the others stay exactly as they are.
+
+        Raises:
+          InputError: the simulator was not reset, or there are more objects in a scenario than slots.
+        """
+        count = self._count()
+        new = jax.tree.map(np.array, self.world)
+        for i, scenario in scenarios.items():
+            for old, value in zip(jax.tree.leaves(new), jax.tree.leaves(from_scenario(scenario)), strict=True):
+                old[i] = value
+        return self.load(new, np.isin(np.arange(count), list(scenarios)))
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
         """Take over the state of all worlds, or of some; the robot is at home there and everything at rest.
