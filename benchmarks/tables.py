@@ -96,10 +96,11 @@ class EpisodeProgress:
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
+            TextColumn("{task.fields[stage]}"),
             console=console,
             disable=not console.is_terminal,
         )
-        self._task = self._bar.add_task("episodes", total=total)
+        self._task = self._bar.add_task("episodes", total=total, stage="")
 
     def __enter__(self) -> EpisodeProgress:
         self._bar.start()
@@ -107,6 +108,10 @@ class EpisodeProgress:
 
     def __exit__(self, *details: object) -> None:
         self._bar.stop()
+
+    def busy(self, stage: str, episodes: int) -> None:
+        """Say what a batch is at."""
+        self._bar.update(self._task, stage=f"{stage} ({episodes})")
 
     def ended(self, row: Row, rows: Sequence[Row]) -> None:
         """Take note of one more episode; `rows` are all of them, those of earlier runs too."""

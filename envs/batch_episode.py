@@ -1,8 +1,8 @@
-"""The closed loop of `episode.run_episode` for many episodes at once: one batched look, decision and action per round.
+"""The closed loop of `episode.run_episode` for many episodes: one batched look, decision and action per round.
 
-Each episode has a slot. All slots look, decide and act together; an episode that ends leaves its slot to the next one, so
-that short episodes do not wait for long ones. Looking and deciding happen a fixed number of slots at a time, those that
-need it only: memory does not grow with the number of slots, and a slot in which the target has been found costs no plan.
+Each episode has a slot. All slots look, decide and act together; an episode that ends leaves its slot to the next one,
+so that short episodes do not wait for long ones. Looking and deciding happen a fixed number of slots at a time, those
+that need it only: memory does not grow with the number of slots, and where the target is found nothing is planned.
 
 The random numbers of an episode are its own. What it decides depends neither on its slot nor on its neighbours.
 """

@@ -273,9 +273,7 @@ def _target_trouble(snapshot: Snapshot) -> str | None:
     return target_trouble(snapshot.shelf, np.asarray(position), np.asarray(rotation))
 
 
-def target_trouble(
-    shelf: Shelf, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"]
-) -> str | None:
+def target_trouble(shelf: Shelf, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"]) -> str | None:
     """Why a target at this pose can no longer be taken out as the planner knows it; None if it can."""
     if position[0] < shelf.front or position[2] < shelf.board:
         return "the target fell off the board"
@@ -460,9 +458,7 @@ def record(
     )
 
 
-def describe(
-    seed: int, problem: Problem, config: PlannerConfig, recognition: str, simulator: str
-) -> dict[str, Any]:
+def describe(seed: int, problem: Problem, config: PlannerConfig, recognition: str, simulator: str) -> dict[str, Any]:
     """The options of an episode, as its record keeps them."""
     return {
         **dataclasses.asdict(config),

@@ -413,6 +413,18 @@ class MjxSimulator:
         self._data, self.world, outcomes = self._rollout(self._fields, data, self.world, controls)
         return outcomes
 
+    def bytes_per_world(self) -> int:
+        """About how much of the device's memory a world takes [bytes]: its state, and the commands of an action.
+
+        Each is counted as often as it lies in memory when one becomes the next.
+        """
+        state = self._mjx.make_data(self._blank, impl="warp", naconmax=self.config.contacts, njmax=self.config.rows)
+        plan = self.config.simulator.motion
+        longest = plan.release_step + plan.open_steps + plan.approach_steps
+        # One row of commands for each kind of motion, the chosen one, and the joint angles that they came from.
+        commands = 8 * longest * ROBOT * np.dtype(np.float32).itemsize
+        return 3 * sum(leaf.nbytes for leaf in jax.tree.leaves(state)) + commands
+
     def _count(self) -> int:
         """Number of worlds."""
         if self.world is None:

@@ -43,7 +43,8 @@ class PlannerOptions:
       criterion: what makes a target visible; "detector", the default, counts pixels as the detector does.
       max_steps: actions in an episode; 10 by default.
       recognition: what the planner sees the objects through; "oracle" knows their true shapes and poses.
-      simulator: what executes the actions.
+      simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
+        batches where there is a GPU.
     """
 
     preset: Literal["paper", "best"] = "paper"
@@ -57,7 +58,7 @@ class PlannerOptions:
     ] = None
     max_steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     recognition: Literal["oracle"] = "oracle"
-    simulator: Literal["auto", "native"] = "auto"
+    simulator: Literal["auto", "native", "mjx"] = "auto"
 
     def config(self, method: Method) -> PlannerConfig:
         """The planner's configuration: the preset's, with what is given in its place.
@@ -71,6 +72,44 @@ class PlannerOptions:
         names = ("gamma", "horizon", "sequences", "actions", "criterion", "max_steps")
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return presets[self.preset](method=method, **given)
+
+    def engine(self) -> str:
+        """The class of the simulator that runs many episodes.
+
+        Raises:
+          InputError: it is not installed.
+        """
+        from mechsearch_jax.envs.mjx_simulator import import_mjx
+
+        if self.simulator == "native" or (self.simulator == "auto" and not has_gpu()):
+            return "NativeSimulator"
+        if self.simulator == "mjx":
+            import_mjx()
+            return "MjxSimulator"
+        try:
+            import_mjx()
+        except InputError as error:
+            print(f"mechsearch: {error}; using the native simulator", file=sys.stderr)
+            return "NativeSimulator"
+        return "MjxSimulator"
+
+    def only_native(self, command: str) -> None:
+        """Refuse the batch simulator where one episode is run.
+
+        Raises:
+          InputError: it was asked for.
+        """
+        if self.simulator == "mjx":
+            raise InputError(
+                f"{command}: --simulator mjx is for batches (mechsearch evaluate); leave it out for one episode"
+            )
+
+
+def has_gpu() -> bool:
+    """Whether JAX computes on something else than the CPU."""
+    import jax
+
+    return jax.default_backend() != "cpu"
 
 
 Options = Annotated[PlannerOptions, tyro.conf.arg(name="")]
@@ -162,6 +201,7 @@ def search(
         raise InputError("search: give either a scenario or --objects N, not both")
     if scenario is not None and target is not None:
         raise InputError("search: --target is for a generated scenario; a scenario file says itself what its target is")
+    options.only_native("search")
     config = options.config(method)
     known = load_scenario(find_scenario(scenario)) if scenario is not None else None
     check_writable(out)
@@ -207,6 +247,7 @@ def inspect(
     from mechsearch_jax.scenario import load_scenario
     from mechsearch_jax.viz.drawing import save_figure
 
+    options.only_native("inspect")
     config = options.config("search-for-grasp")
     scenes = [load_scenario(file) for file in find_scenarios(scenarios)]
     check_writable(out)
@@ -227,31 +268,50 @@ def evaluate(
     method: tuple[Method, ...] = ("search-for-grasp",),
     seed: tuple[int, ...] = (0,),
     workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    batch: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     options: Options = PlannerOptions(),
 ) -> None:
-    """Run many episodes in worker processes; killed and started again, it goes on where it stopped.
+    """Run many episodes; killed and started again, it goes on where it stopped.
+
+    On a GPU they run in batches in this process, on a CPU one after the other in worker processes.
 
     Args:
       scenarios: scenario files, folders of them, or names of shipped ones.
       out: Parquet file with one row for each episode; rows that it already holds are not run again.
       method: one or more.
       seed: one or more.
-      workers: number of processes; one for each core if not given.
+      workers: number of processes, which use the CPU; by default one for each core, where there is no GPU.
+      batch: number of episodes that run at the same time in this process; by default, on a GPU, what its memory holds.
       options: how the planner decides.
     """
     from rich.console import Console
 
+    from mechsearch_jax.benchmarks.batches import Batches
     from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
+    from mechsearch_jax.benchmarks.processes import Processes
     from mechsearch_jax.benchmarks.tables import EpisodeProgress, rates_table
+    from mechsearch_jax.cache import keep_compilations
 
+    for name, value in {"workers": workers, "batch": batch}.items():
+        if value is not None and value < 1:
+            raise InputError(f"evaluate: --{name} {value} must be at least 1")
+    if workers is not None and batch is not None:
+        raise InputError("evaluate: give either --workers or --batch, not both")
+    if workers is not None and options.simulator == "mjx":
+        raise InputError("evaluate: --workers run the native simulator; leave --workers out, or --simulator mjx")
+    in_processes = workers is not None or (batch is None and options.simulator != "mjx" and not has_gpu())
+    engine = "NativeSimulator" if in_processes else options.engine()
     configs = [options.config(one) for one in method]
-    jobs = make_jobs(find_scenarios(scenarios), configs, seed)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if workers is not None and workers < 1:
-        raise InputError(f"evaluate: --workers {workers} must be at least 1")
+    jobs = make_jobs(find_scenarios(scenarios), configs, seed, engine)
     console = Console(highlight=False)
     with EpisodeProgress(console, len(jobs)) as progress:
-        rows = evaluate(jobs, out, workers or cores, progress.ended)
+        if in_processes:
+            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+            runner = Processes(workers or cores)
+        else:
+            keep_compilations()
+            runner = Batches(batch, progress.busy)
+        rows = evaluate(jobs, out, runner, progress.ended)
     console.print(rates_table(rows))
     console.print(str(out), soft_wrap=True)
 

@@ -12,6 +12,7 @@ from rich.console import Console
 from mechsearch_jax import results
 from mechsearch_jax.benchmarks import tables
 from mechsearch_jax.benchmarks.evaluate import Job, evaluate, make_jobs
+from mechsearch_jax.benchmarks.processes import Processes
 from mechsearch_jax.benchmarks.worker import parse_config
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PlannerConfig
@@ -65,7 +66,7 @@ def ran(tmp_path):
 def test_all_combinations_become_rows(tmp_path, files, command):
     configs = [PlannerConfig(), PlannerConfig(method="search-and-grasp")]
     jobs = make_jobs([files[0], files[1]], configs, (0, 1))
-    rows = evaluate(jobs, tmp_path / "rows.parquet", workers=2, command=command)
+    rows = evaluate(jobs, tmp_path / "rows.parquet", Processes(2, command))
     assert len(rows) == len({results.identity(row) for row in rows}) == 8
     assert sorted(map(results.identity, results.read_rows(tmp_path / "rows.parquet"))) == sorted(
         map(results.identity, rows)
@@ -73,7 +74,7 @@ def test_all_combinations_become_rows(tmp_path, files, command):
 
 
 def test_failures_are_rows_with_their_reason_and_do_not_end_the_run(tmp_path, files, command):
-    rows = evaluate(make_jobs(files, [PlannerConfig()], (0,)), tmp_path / "rows.parquet", workers=1, command=command)
+    rows = evaluate(make_jobs(files, [PlannerConfig()], (0,)), tmp_path / "rows.parquet", Processes(1, command))
     reasons = {row.scenario: row.failure for row in rows}
     assert reasons == {
         "one": None,
@@ -93,21 +94,21 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path, files, command):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        evaluate(jobs, out, workers=1, ended=stop, command=command)
+        evaluate(jobs, out, Processes(1, command), ended=stop)
     first = results.read_rows(out)
     assert len(first) == 2
-    rows = evaluate(jobs, out, workers=1, command=command)
+    rows = evaluate(jobs, out, Processes(1, command))
     assert [row.scenario for row in rows] == ["one", "two", "crash", "raise", "three"]
     assert results.read_rows(out)[:2] == first
     (tmp_path / "log").write_text("")
-    assert evaluate(jobs, out, workers=1, command=command) == rows
+    assert evaluate(jobs, out, Processes(1, command)) == rows
     assert ran(tmp_path) == []
 
 
 def test_rows_of_other_options_stay(tmp_path, files, command):
     out = tmp_path / "rows.parquet"
     for gamma in (0.9, 0.5):
-        rows = evaluate(make_jobs(files[:1], [PlannerConfig(gamma=gamma)], (0,)), out, workers=1, command=command)
+        rows = evaluate(make_jobs(files[:1], [PlannerConfig(gamma=gamma)], (0,)), out, Processes(1, command))
         assert [row.gamma for row in rows] == [gamma]
     assert sorted(row.gamma for row in results.read_rows(out)) == [0.5, 0.9]
 
@@ -120,7 +121,7 @@ def test_rows_of_other_options_stay(tmp_path, files, command):
 def test_every_option_tells_rows_apart(tmp_path, files, command, other):
     out = tmp_path / "rows.parquet"
     for config in (PlannerConfig(), PlannerConfig(**other), PlannerConfig()):
-        rows = evaluate(make_jobs(files[:1], [config], (0,)), out, workers=1, command=command)
+        rows = evaluate(make_jobs(files[:1], [config], (0,)), out, Processes(1, command))
         assert len(rows) == 1
     assert ran(tmp_path) == ["one", "one"]
     both = results.read_rows(out)
@@ -132,10 +133,10 @@ def test_every_option_tells_rows_apart(tmp_path, files, command, other):
 def test_rows_that_do_not_say_how_they_ran_are_kept_but_not_believed(tmp_path, files, command):
     out = tmp_path / "rows.parquet"
     jobs = make_jobs(files[:1], [PlannerConfig()], (0,))
-    (row,) = evaluate(jobs, out, workers=1, command=command)
+    (row,) = evaluate(jobs, out, Processes(1, command))
     table = pyarrow.parquet.read_table(out)
     pyarrow.parquet.write_table(table.drop_columns(["configuration"]), out)
-    evaluate(jobs, out, workers=1, command=command)
+    evaluate(jobs, out, Processes(1, command))
     assert ran(tmp_path) == ["one", "one"]
     assert results.read_rows(out) == [dataclasses.replace(row, configuration=None), row]
 
@@ -143,23 +144,22 @@ def test_rows_that_do_not_say_how_they_ran_are_kept_but_not_believed(tmp_path, f
 def test_a_worker_that_ran_something_else_is_not_believed(tmp_path, command):
     save_scenario(Scenario("confused", (), TARGET), tmp_path / "confused.json")
     jobs = make_jobs([tmp_path / "confused.json"], [PlannerConfig()], (0,))
-    (row,) = evaluate(jobs, tmp_path / "rows.parquet", workers=1, command=command)
+    (row,) = evaluate(jobs, tmp_path / "rows.parquet", Processes(1, command))
     assert row.failure == "error: the worker ran the episode with other options than those asked for"
 
 
 def test_the_row_of_a_job_is_that_of_its_episode(problem):
     from mechsearch_jax.envs.episode import describe
-    from mechsearch_jax.envs.simulator import NativeSimulator
 
     config = PlannerConfig(push_distances=(0.05, 0.2))
     job = Job("", Scenario("one", (), TARGET), config, 3)
-    assert job.configuration == results.configuration(describe(3, problem, config, "oracle", NativeSimulator()))
+    assert job.configuration == results.configuration(describe(3, problem, config, "oracle", "NativeSimulator"))
 
 
 def test_another_table_is_not_overwritten(tmp_path, files, command):
     (tmp_path / "rows.parquet").write_text("mine")
     with pytest.raises(InputError):
-        evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), tmp_path / "rows.parquet", 1, command=command)
+        evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), tmp_path / "rows.parquet", Processes(1, command))
     assert (tmp_path / "rows.parquet").read_text() == "mine"
 
 
@@ -173,7 +173,7 @@ def test_progress_and_rates_are_shown(tmp_path, files, command):
     console = Console(file=screen, width=100)
     with tables.EpisodeProgress(console, 3) as progress:
         jobs = make_jobs([files[0], files[1], files[3]], [PlannerConfig()], (0,))
-        rows = evaluate(jobs, tmp_path / "rows.parquet", workers=1, ended=progress.ended, command=command)
+        rows = evaluate(jobs, tmp_path / "rows.parquet", Processes(1, command), ended=progress.ended)
     console.print(tables.rates_table(rows))
     text = screen.getvalue()
     assert "3/3 raise: error: ValueError: no" in text

@@ -1,0 +1,145 @@
+"""Episodes many at a time in this process: what makes a GPU worth having."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+
+import jax
+
+from mechsearch_jax.benchmarks.evaluate import Job
+from mechsearch_jax.cache import kept_problem
+from mechsearch_jax.envs.batch_episode import BatchSimulator, Start, run_episodes
+from mechsearch_jax.envs.episode import row, target_of
+from mechsearch_jax.envs.mjx_simulator import MjxSimulator
+from mechsearch_jax.envs.native_worlds import NativeWorlds
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.results import Episode, Row
+from mechsearch_jax.target import Target
+
+ENGINES: dict[str, Callable[[], BatchSimulator]] = {
+    NativeWorlds.engine: NativeWorlds,
+    MjxSimulator.engine: MjxSimulator,
+}
+# More worlds at once are no faster per world, but every round takes longer.
+MOST_WORLDS = 1024
+# Without a GPU a batch only shares the overhead.
+MOST_WORLDS_ON_CPU = 16
+# Of the device's memory; the planner and what comes and goes have the rest.
+SHARE_OF_WORLDS = 0.4
+# How many slots look or decide in one computation.
+AT_ONCE, AT_ONCE_ON_CPU = 64, 4
+
+
+@dataclasses.dataclass(frozen=True)
+class Batches:
+    """Runs jobs in lockstep, in the simulator that they name.
+
+    Attributes:
+      worlds: how many at the same time; as many as fit the device's memory, within reason, if None.
+      busy: told of every stage and how many episodes are in it.
+    """
+
+    worlds: int | None = None
+    busy: Callable[[str, int], None] = lambda stage, episodes: None
+
+    def __call__(self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None]) -> None:
+        """Run all jobs; see `evaluate.Runner`.
+
+        Where the device's memory does not suffice, it goes on with half as many worlds. Where anything else fails, the
+        episodes that were running become rows with the reason.
+
+        Raises:
+          Exception: whatever failed, if it fails again at once.
+        """
+        for (target, config, engine), group in _groups(jobs):
+            simulator = ENGINES[engine]()
+            worlds = self.worlds or fitting_worlds(simulator)
+            # Those that take longest come first, so that none of them begins when all others are over.
+            todo = sorted(group, key=lambda job: -len(job.scenario.objects))
+            while todo:
+                attempt = _Attempt(todo, ended)
+                try:
+                    self._run(attempt, target, config, simulator, worlds)
+                except jax.errors.JaxRuntimeError as error:
+                    if "RESOURCE_EXHAUSTED" not in str(error):
+                        attempt.fail(error)
+                    elif worlds == 1:
+                        raise
+                    simulator, worlds = ENGINES[engine](), min(worlds, len(todo)) // 2
+                except InputError:
+                    raise
+                except Exception as error:
+                    attempt.fail(error)
+                    simulator = ENGINES[engine]()
+                todo = attempt.left
+
+    def _run(
+        self, attempt: _Attempt, target: Target, config: PlannerConfig, simulator: BatchSimulator, worlds: int
+    ) -> None:
+        at_once = AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE
+        problem = kept_problem(target)
+        run_episodes(
+            attempt.starts(), problem, config, simulator, worlds, attempt.take, at_once=at_once, busy=self.busy
+        )
+
+
+class _Attempt:
+    """Which of the jobs have been begun, and which have ended."""
+
+    def __init__(self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None]) -> None:
+        self._jobs = jobs
+        self._ended = ended
+        self._begun = 0
+        self._over: set[int] = set()
+
+    def starts(self) -> Iterator[Start]:
+        """The jobs as episodes to begin."""
+        for job in self._jobs:
+            self._begun += 1
+            yield Start(job.scenario, job.seed)
+
+    def take(self, episodes: Sequence[tuple[int, Episode]]) -> None:
+        """Hand on the rows of episodes that ended."""
+        self._over |= {place for place, _ in episodes}
+        self._ended([row(episode) for _, episode in episodes])
+
+    def fail(self, error: Exception) -> None:
+        """Make a row of every episode that was running when an error came.
+
+        Raises:
+          Exception: the error, if no episode has ended before it.
+        """
+        if not self._over:
+            raise error
+        running = [place for place in range(self._begun) if place not in self._over]
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"[:500]
+        self._over |= set(running)
+        self._ended([self._jobs[place].failed(reason) for place in running])
+
+    @property
+    def left(self) -> list[Job]:
+        """The jobs that have not ended."""
+        return [job for place, job in enumerate(self._jobs) if place not in self._over]
+
+
+def _groups(jobs: Sequence[Job]) -> list[tuple[tuple[Target, PlannerConfig, str], list[Job]]]:
+    """The jobs by what is compiled for them."""
+    groups: dict[tuple[Target, PlannerConfig, str], list[Job]] = {}
+    for job in jobs:
+        groups.setdefault((target_of(job.scenario), job.config, job.engine), []).append(job)
+    return list(groups.items())
+
+
+def fitting_worlds(simulator: BatchSimulator) -> int:
+    """How many worlds fit the memory of the device."""
+    if jax.default_backend() == "cpu":
+        return MOST_WORLDS_ON_CPU
+    if not isinstance(simulator, MjxSimulator):
+        return MOST_WORLDS
+    stats = jax.local_devices()[0].memory_stats() or {}
+    if "bytes_limit" not in stats:
+        return MOST_WORLDS
+    room = SHARE_OF_WORLDS * stats["bytes_limit"]
+    return max(min(int(room // simulator.bytes_per_world()), MOST_WORLDS), 1)

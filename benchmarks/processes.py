@@ -1,0 +1,129 @@
+"""Episodes one after the other in several worker processes.
+
+Workers are separate programs with one thread each: on a machine with few cores and no GPU this is faster than sharing
+all threads, and a worker that dies takes one episode with it, not the run.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import queue
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+
+from mechsearch_jax.benchmarks.evaluate import Job
+from mechsearch_jax.results import Row, identity
+
+WORKER = (sys.executable, "-m", "mechsearch_jax.benchmarks.worker")
+# Several processes cannot share a GPU's memory, of which the first takes most.
+ENVIRONMENT = {
+    "PJRT_NPROC": "1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "JAX_PLATFORMS": "cpu",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Processes:
+    """Runs jobs on the CPU, in the native simulator.
+
+    Attributes:
+      workers: number of processes.
+      command: starts a worker; only tests have another one.
+    """
+
+    workers: int
+    command: Sequence[str] = WORKER
+
+    def __call__(self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None]) -> None:
+        """Run all jobs; see `evaluate.Runner`."""
+        todo: queue.SimpleQueue[Job] = queue.SimpleQueue()
+        for job in jobs:
+            todo.put(job)
+        results: queue.SimpleQueue[Row] = queue.SimpleQueue()
+        crew = [_Crew(todo, results, self.command) for _ in range(min(self.workers, len(jobs)))]
+        try:
+            for member in crew:
+                member.start()
+            for _ in jobs:
+                ended([results.get()])
+        finally:
+            for member in crew:
+                member.stop()
+
+
+class _Crew(threading.Thread):
+    """Feeds one worker process with jobs, and starts another one if it dies."""
+
+    def __init__(self, todo: queue.SimpleQueue[Job], results: queue.SimpleQueue[Row], command: Sequence[str]):
+        super().__init__(daemon=True)
+        self._todo = todo
+        self._results = results
+        self._command = command
+        self._process: subprocess.Popen[str] | None = None
+        self._complaints = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the workers)
+        self._stopped = False
+
+    def run(self) -> None:
+        while not self._stopped:
+            try:
+                job = self._todo.get_nowait()
+            except queue.Empty:
+                return
+            self._results.put(self._run(job))
+
+    def stop(self) -> None:
+        """End the worker, whatever it is doing."""
+        self._stopped = True
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def _run(self, job: Job) -> Row:
+        process = self._process
+        if process is None or process.poll() is not None:
+            process = self._process = self._start()
+        assert process.stdin is not None
+        assert process.stdout is not None
+        question = {"path": job.path, "config": dataclasses.asdict(job.config), "seed": job.seed}
+        try:
+            process.stdin.write(json.dumps(question) + "\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        if not line:
+            return job.failed(f"the worker process ended with status {process.wait()}{self._last_words()}")
+        answer = json.loads(line)
+        if "row" not in answer:
+            return job.failed(answer["error"])
+        row = Row(**answer["row"])
+        if identity(row) != identity(job.failed("")):
+            return job.failed("the worker ran the episode with other options than those asked for")
+        return row
+
+    def _start(self) -> subprocess.Popen[str]:
+        self._complaints.seek(0)
+        self._complaints.truncate()
+        # In a session of its own, an interrupt from the keyboard reaches only the parent, which then ends the worker.
+        return subprocess.Popen(
+            self._command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._complaints,
+            text=True,
+            env={**os.environ, **ENVIRONMENT},
+            start_new_session=True,
+        )
+
+    def _last_words(self) -> str:
+        """The last line that a dead worker wrote to standard error."""
+        self._complaints.seek(0)
+        lines = self._complaints.read().decode(errors="replace").split("\n")
+        return next((f": {line.strip()[:300]}" for line in reversed(lines) if line.strip()), "")
