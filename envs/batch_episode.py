@@ -20,7 +20,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Int, UInt
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import Action, no_action
@@ -161,10 +161,9 @@ def _forget(problem: Problem, minds: _Minds, fresh: Bool[Array, " slots"]) -> _M
 
 
 @jax.jit
-def _keys_of(seeds: Int[Array, " slots"], steps: Int[Array, " slots"]) -> tuple[Array, Array]:
+def _keys_at(data: UInt[Array, "slots 2 *words"], steps: Int[Array, " slots"]) -> tuple[Array, Array]:
     """The planner's and the environment's key of every slot at its present step."""
-    keys = jax.vmap(lambda seed: jax.random.split(jax.random.key(seed)))(seeds)
-    fold = jax.vmap(jax.random.fold_in)
+    keys, fold = jax.random.wrap_key_data(data), jax.vmap(jax.random.fold_in)
     return fold(keys[:, 0], steps), fold(keys[:, 1], steps)
 
 
@@ -176,8 +175,8 @@ class _Clock:
         self._busy = busy
 
     @contextmanager
-    def __call__(self, stage: str, rows: Int[np.ndarray, " n"]) -> Iterator[None]:
-        if len(rows):
+    def __call__(self, stage: str, rows: Sequence[int]) -> Iterator[None]:
+        if rows:
             self._busy(stage, len(rows))
         start = time.perf_counter()
         yield
@@ -250,6 +249,7 @@ class _Crew:
         self._at_once: int = at_once
         self._busy: Callable[[str, int], None] = busy
         self._slots: list[_Slot | None] = []
+        self._keys: UInt[np.ndarray, "slots 2 *words"] = np.zeros((0, 2, 2), np.uint32)
         self._minds: _Minds | None = None
 
     @property
@@ -265,6 +265,8 @@ class _Crew:
         if self._minds is None:
             world = self._simulator.reset(list(scenarios.values()))
             self._slots = [None] * len(starts)
+            key = jax.random.key_data(jax.random.key(0))
+            self._keys = np.zeros((len(starts), 2, *key.shape), key.dtype)
             look = jax.eval_shape(
                 lambda here: self._recogniser(
                     jax.random.key(0), Snapshot(self._problem.camera, self._problem.shelf, here)
@@ -278,10 +280,11 @@ class _Crew:
         fresh = np.zeros(len(self._slots), bool)
         for slot, (place, start) in starts.items():
             self._slots[slot] = _Slot(place, start, EpisodeLog(self._config))
+            self._keys[slot] = jax.random.key_data(jax.random.split(jax.random.key(start.seed)))
             fresh[slot] = True
         self._minds = _forget(self._problem, self._minds, jnp.asarray(fresh))
 
-    def _chunks(self, rows: Int[np.ndarray, " n"]) -> Iterator[tuple[Int[np.ndarray, " n"], Array]]:
+    def _chunks(self, rows: Sequence[int]) -> Iterator[tuple[Sequence[int], Array]]:
         """Rows, so many at once, with the same padded to a fixed number."""
         for i in range(0, len(rows), self._at_once):
             some = rows[i : i + self._at_once]
@@ -297,11 +300,10 @@ class _Crew:
         assert minds is not None
         slots, count = self._slots, len(self._slots)
         logs = {row: slot.log for row, slot in enumerate(slots) if slot is not None}
-        running = np.array(sorted(logs), int)
+        running = sorted(logs)
         clock = _Clock(count, self._busy)
-        seeds = jnp.array([slot.start.seed if slot else 0 for slot in slots], jnp.uint32)
         steps = jnp.array([slot.log.index if slot else 0 for slot in slots], jnp.int32)
-        planner_keys, environment_keys = _keys_of(seeds, steps)
+        planner_keys, environment_keys = _keys_at(jnp.asarray(self._keys), steps)
 
         with clock("recognise", running):
             for _, rows in self._chunks(running):
@@ -314,7 +316,7 @@ class _Crew:
 
         grasps: dict[int, GraspChoice] = {}
         truly = np.zeros(count, bool)
-        sought = np.array([r for r in running if found[r] and trouble[r] is None], int)
+        sought = [r for r in running if found[r] and trouble[r] is None]
         with clock("grasp", sought):
             for some, rows in self._chunks(sought):
                 choice, possible_in_truth = jax.device_get(_grasp(problem, minds, world, rows))
@@ -324,7 +326,6 @@ class _Crew:
 
         choices: dict[int, Choice] = {}
         undecided = [r for r in running if r not in grasps and trouble[r] is None and not logs[r].last]
-        undecided = np.array(undecided, int)
         with clock("plan", undecided):
             for some, rows in self._chunks(undecided):
                 choice = jax.device_get(_decide(problem, minds, planner_keys, rows, config))
@@ -336,10 +337,10 @@ class _Crew:
             choice = None if errors.get(r) else choices.get(r)
             logs[r].decide(record(bool(found[r]), size, bool(truly[r]), grasps.get(r), choice, config))
 
-        acting = np.array([r for r in running if logs[r].acts], int)
+        acting = [r for r in running if logs[r].acts]
         outcomes = None
         with clock("simulate", acting):
-            if len(acting):
+            if acting:
                 actions = _actions(count, grasps, choices)
                 active = np.isin(np.arange(count), acting)
                 outcomes = jax.device_get(simulator.execute(actions, jnp.asarray(active)))
@@ -354,7 +355,7 @@ class _Crew:
                 slot = slots[r]
                 assert slot is not None
                 options = describe(slot.start.seed, problem, config, self._recognition, simulator.engine)
-                done.append((int(r), (slot.place, slot.log.episode(slot.start.scenario, options))))
+                done.append((r, (slot.place, slot.log.episode(slot.start.scenario, options))))
                 slots[r] = None
         return done
 
@@ -380,7 +381,7 @@ def _deed(outcomes: Outcomes, row: int, choice: Choice | None) -> Deed:
     reason = outcomes.reason(row)
     if choice is None:
         return Deed.of_retrieval(bool(outcomes.retrieved[row]), reason)
-    return Deed.of_action(choice.action.kind, reason)
+    return Deed.of_action(int(choice.action.kind), reason)
 
 
 def _overflow(outcomes: Outcomes, row: int) -> str | None:

@@ -293,7 +293,7 @@ class Deed:
     failure: str | None
 
     @classmethod
-    def of_action(cls, kind: Array | int, failure: str | None) -> Deed:
+    def of_action(cls, kind: int, failure: str | None) -> Deed:
         """What came of an action that the planner chose."""
         return cls(False, "no action is possible" if kind == ActionKind.NONE else failure)
 
@@ -310,7 +310,7 @@ def _act(simulator: Simulator, grasp: GraspChoice | None, decision: Plan | None)
         return Deed.of_retrieval(retrieval.retrieved, retrieval.failure), retrieval
     assert decision is not None
     outcome = simulator.execute(decision.action)
-    return Deed.of_action(decision.action.kind, outcome.failure), outcome
+    return Deed.of_action(int(decision.action.kind), outcome.failure), outcome
 
 
 class Choice(flax.struct.PyTreeNode):

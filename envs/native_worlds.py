@@ -68,7 +68,7 @@ class NativeWorlds:
         if actions.kind.shape != (count,):
             raise InputError(f"NativeWorlds: {actions.kind.shape} actions for {count} worlds; give one for each")
         actions = jax.device_get(actions)
-        busy = np.flatnonzero(np.ones(count, bool) if active is None else np.asarray(active))
+        busy = np.flatnonzero(np.ones(count, bool) if active is None else np.asarray(active)).tolist()
         zero = np.zeros(count, np.int32)
         no = np.zeros(count, bool)
         fallen = np.zeros((count, BODIES), bool)
