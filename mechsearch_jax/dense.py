@@ -4,12 +4,13 @@
 is wanted, or most pairs graze each other. There are two versions of the same formula behind one function: one that XLA
 compiles, for every device, and a Pallas kernel for NVIDIA GPUs. `benchmarks/roofline.md` tells how fast they are.
 
-The formula works with logarithms to the base 2, where a power is a product and a p-norm of two numbers is
+The formula works with logarithms, where a power is a product and a p-norm of two numbers is
 
-    log ||(a, b)||_p = max(log a, log b) + log(1 + 2 ** (-p |log a - log b|)) / p,
+    log ||(a, b)||_p = max(log a, log b) + log(1 + exp(-p |log a - log b|)) / p,
 
-so that nothing overflows, whatever the exponents and however far away a point. It takes 5 logarithms and 2 powers of
-2: 7 operations of a GPU's special-function units, of which it does 16 per clock and multiprocessor.
+so that nothing overflows, whatever the exponents and however far away a point. The base is free; it is 2 in the kernel,
+because a GPU's special-function units know that one. An evaluation takes 5 logarithms and 2 powers, 7 operations of
+those units, which do 16 per clock and multiprocessor.
 
 What is exact and what is not: gauges below `TINY` read as about `TINY`. Otherwise the formula is the gauge's, and both
 versions are within a relative 1e-5 of it in float64, beside the rounding of a point's coordinates in an object's frame
@@ -60,18 +61,18 @@ class Tiling(NamedTuple):
 TILING = Tiling()
 
 
-def log_gauge(point: Sequence[Array], powers: Sequence[Array] | Array, log2: Function, exp2: Function) -> Array:
-    """log2 of the gauge.
+def log_gauge(point: Sequence[Array], powers: Sequence[Array] | Array, log: Function, exp: Function) -> Array:
+    """Logarithm of the gauge.
 
     Args:
       point: x, y, z in half-extents.
       powers: p = 2/e2, r = 2/e1, 1/p and 1/r.
-      log2, exp2: to take logarithms and powers with.
+      log, exp: of any base.
     """
-    a, b, c = (log2(jnp.maximum(jnp.abs(q), TINY)) for q in point)
+    a, b, c = (log(jnp.maximum(jnp.abs(q), TINY)) for q in point)
     p, r, over_p, over_r = powers
-    plane = jnp.maximum(a, b) + log2(1.0 + exp2(-p * jnp.abs(a - b))) * over_p
-    return jnp.maximum(plane, c) + log2(1.0 + exp2(-r * jnp.abs(plane - c))) * over_r
+    plane = jnp.maximum(a, b) + log(1.0 + exp(-p * jnp.abs(a - b))) * over_p
+    return jnp.maximum(plane, c) + log(1.0 + exp(-r * jnp.abs(plane - c))) * over_r
 
 
 def _numbers(scene: Superquadrics, T_world_cloud: Array) -> Array:
@@ -92,15 +93,15 @@ def _place(numbers: Any, x: Array, y: Array, z: Array) -> list[Array]:
 
 
 def _least_xla(clouds: Array, cloud: Array, numbers: Array) -> Array:
-    """Least log2 of the gauge, shape (M, N)."""
+    """Least gauges, shape (M, N), in natural logarithms: XLA makes those of base 2 from them."""
 
     def one(index, numbers):
         x, y, z = clouds[index]
-        evaluate = lambda n: jnp.min(log_gauge(_place(n, x, y, z), n[12:], jnp.log2, jnp.exp2))  # noqa: E731
+        evaluate = lambda n: jnp.min(log_gauge(_place(n, x, y, z), n[12:], jnp.log, jnp.exp))  # noqa: E731
         return jax.vmap(evaluate)(numbers)
 
     at_once = max(block_size(BLOCK) // (clouds.shape[2] * numbers.shape[1]), 1)
-    return jax.lax.map(lambda args: one(*args), (cloud, numbers), batch_size=min(at_once, cloud.shape[0]))
+    return jnp.exp(jax.lax.map(lambda args: one(*args), (cloud, numbers), batch_size=min(at_once, cloud.shape[0])))
 
 
 def _special(name: str) -> Function:
@@ -122,7 +123,7 @@ def least_kernel(
     interpret: bool = False,
     formula: Callable[..., Array] = log_gauge,
 ) -> Float[Array, "m n"]:
-    """Least log2 of the gauge, by the kernel; nothing may be empty.
+    """Least gauges by the kernel; nothing may be empty.
 
     Args:
       clouds, cloud: as in `least_gauges`.
@@ -166,7 +167,7 @@ def least_kernel(
         compiler_params=triton.CompilerParams(num_warps=tiling.warps, num_stages=1),
         interpret=interpret,
     )(clouds, cloud.astype(jnp.int32), numbers)
-    return out[:, :n]
+    return jnp.exp2(out[:, :n])
 
 
 def kernel_available() -> bool:
@@ -214,7 +215,7 @@ def least_gauges(
         least = _least_xla(clouds, cloud, numbers)
     else:
         least = jax.lax.platform_dependent(clouds, cloud, numbers, cuda=least_kernel, default=_least_xla)
-    return jnp.where(scene.valid[None], jnp.exp2(least), jnp.inf)
+    return jnp.where(scene.valid[None], least, jnp.inf)
 
 
 def any_inside(
