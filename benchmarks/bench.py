@@ -34,13 +34,16 @@ from mechsearch_jax.scenario import MAX_OBJECTS
 from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.transforms import make
 
+# What a call does many of; how many is in `Timing.shapes`.
+COUNTED = ("evaluations", "operations", "bytes")
+
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
     """How long one function takes.
 
     Attributes:
-      subject: "existence", "graspability", "plan" or "simulate".
+      subject: "existence", "graspability", "plan", "simulate", or a part of `roofline.bench_inside`.
       objects: number of objects in the scenes.
       shapes: sizes that the time depends on; for "simulate" also what was seen of overflows and divergence.
       compile_seconds: of tracing and compiling [s]; honest only if compilations are not kept on disk.
@@ -65,9 +68,26 @@ class Timing:
         return min(self.seconds), max(self.seconds)
 
     @property
+    def unit(self) -> str | None:
+        """What a call does many of: "steps" (of all worlds together), or one of `COUNTED`; None where nothing is."""
+        return "steps" if self.subject == "simulate" else next((unit for unit in COUNTED if unit in self.shapes), None)
+
+    @property
     def rate(self) -> float | None:
-        """Simulated time steps per second, of all worlds together; None where nothing was simulated."""
-        return self.shapes["worlds"] * self.shapes["steps"] / self.median if self.subject == "simulate" else None
+        """How many of its unit are done per second; None where nothing is counted."""
+        if self.unit is None:
+            return None
+        return self.shapes[self.unit] * self.shapes.get("worlds", 1) / self.median
+
+    def value(self) -> dict[str, Any]:
+        """What is written to a file: the fields, the median and the rate."""
+        value = {**dataclasses.asdict(self), "median_seconds": self.median}
+        return value if self.rate is None else {**value, f"{self.unit}_per_second": self.rate}
+
+
+def _save(value: dict[str, Any], path: PathLike) -> None:
+    with replacing(path) as file:
+        file.write((json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
 
 
 def save_timing(timing: Timing, path: PathLike) -> None:
@@ -76,11 +96,16 @@ def save_timing(timing: Timing, path: PathLike) -> None:
     Raises:
       InputError: the file cannot be written.
     """
-    value = {**dataclasses.asdict(timing), "median_seconds": timing.median}
-    if timing.rate is not None:
-        value["steps_per_second"] = timing.rate
-    with replacing(path) as file:
-        file.write((json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+    _save(timing.value(), path)
+
+
+def save_timings(timings: Sequence[Timing], path: PathLike) -> None:
+    """Write several timings as one JSON file, `{"timings": [...]}`.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    _save({"timings": [timing.value() for timing in timings]}, path)
 
 
 def measure(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repeats: int) -> tuple[float, list[float]]:

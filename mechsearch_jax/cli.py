@@ -459,6 +459,49 @@ def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, ou
         benches.save_timing(timing, out)
 
 
+def bench_inside(
+    *, placed: int = 1024, objects: int = 8, points: int = 2560, repeats: int = 10, out: JsonFile = None
+) -> None:
+    """Time every point of clouds against every superquadric, and what the device can do at most, apart from compiling.
+
+    Args:
+      placed: clouds in one call; a GPU needs some 100000 to be busy for milliseconds.
+      objects: that each is tested against.
+      points: of a cloud.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import roofline
+    from mechsearch_jax.benchmarks.bench import save_timings
+    from mechsearch_jax.benchmarks.tables import timings_table
+
+    jax.config.update("jax_enable_compilation_cache", False)
+    console = Console(highlight=False)
+    with console.status("timing inside"):
+        timings = roofline.bench_inside(placed, objects, points, repeats)
+    console.print(timings_table(timings))
+    if out is not None:
+        save_timings(timings, out)
+
+
+def bench_roofline(
+    results: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")], /, *, out: Path
+) -> None:
+    """Write the page that compares measured rates with what devices allow, from results of `inside` and `simulate`.
+
+    Args:
+      results: folder with their JSON files; others are left out.
+      out: Markdown file.
+    """
+    from mechsearch_jax.benchmarks.roofline import write_page
+
+    write_page(results, out)
+    print(out)
+
+
 def bench_agreement(
     scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")] = (),
     /,
@@ -508,7 +551,7 @@ def scenarios() -> None:
 
 
 def bench() -> None:
-    """Measure the parts: mechsearch bench existence|graspability|plan|simulate|agreement."""
+    """Measure the parts: mechsearch bench existence|graspability|plan|simulate|inside|roofline|agreement."""
 
 
 Commands = dict[str, Callable[..., None]]
@@ -528,6 +571,8 @@ GROUPS: dict[str, Commands] = {
         "graspability": _timing_of("graspability", "g where f = 1"),
         "plan": _timing_of("plan", "a whole decision"),
         "simulate": bench_simulate,
+        "inside": bench_inside,
+        "roofline": bench_roofline,
         "agreement": bench_agreement,
     },
 }

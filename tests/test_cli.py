@@ -90,6 +90,9 @@ WRONG = {
     "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
     "no repeats": (["bench", "plan", "--repeats", "0"], "--repeats 0"),
     "no worlds": (["bench", "simulate", "--worlds", "0"], "worlds 0 must be at least 1"),
+    "no clouds": (["bench", "inside", "--placed", "0"], "placed 0 must be at least 1"),
+    "no timings": (["bench", "roofline", "empty", "--out", "page.md"], "empty: there are no results of bench inside"),
+    "no timing": (["bench", "roofline", ".", "--out", "page.md"], "broken.json: is no result of bench"),
     "nothing to agree on": (["bench", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
     "file for a folder": (["search", "good.json", "--out", "good.json"], "good.json: cannot be written to"),
 }
