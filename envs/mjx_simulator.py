@@ -60,6 +60,9 @@ WAIT = RETRIEVE + 1
 # A state beyond this has diverged; the same bound as in C MuJoCo.
 LARGEST = 1e10
 
+# The constraint solver's tolerance: the least that MuJoCo Warp takes where it makes its model itself.
+SOLVER_TOLERANCE = 1e-6
+
 
 class Failure(enum.IntEnum):
     """Why an action was not executed as commanded; see `simulator.Outcome` and `simulator.Retrieval`."""
@@ -268,9 +271,13 @@ class MjxSimulator:
             # The planes have no friction of their own: that of a contact is the larger of the two.
             warnings.filterwarnings("ignore", message=r".*friction\[")
             self._model = self._mjx.put_model(blank, impl="warp")
+        option = self._model.opt
         # What overflows is in the outcomes; printed from the device, it would be a line for every world and step.
-        quiet = self._model.opt._impl.replace(warn_overflow=0)
-        self._model = self._model.replace(opt=self._model.opt.replace(_impl=quiet))
+        option = option.replace(_impl=option._impl.replace(warn_overflow=0))
+        # MJX takes over the tolerance of C MuJoCo, which is too small for float32: the solver would only hop about the
+        # solution, and all worlds wait for the one that hops longest.
+        option = option.replace(tolerance=jnp.maximum(option.tolerance, SOLVER_TOLERANCE))
+        self._model = self._model.replace(opt=option)
         self._axes = jax.tree.map(lambda _: None, self._model).replace(
             **dict.fromkeys(BodyFields.__dataclass_fields__, 0)
         )
