@@ -503,7 +503,10 @@ class MjxSimulator:
         qpos = data.qpos.at[:, :ROBOT].set(_where(goes_home, home, data.qpos[:, :ROBOT]))
         qvel = data.qvel.at[:, :ROBOT].set(_where(goes_home, jnp.zeros_like(home), data.qvel[:, :ROBOT]))
         clear = data._impl.replace(overflow=jnp.zeros_like(data._impl.overflow))
-        before = data.replace(qpos=qpos, qvel=qvel, ctrl=row, _impl=clear)
+        # Warp records its kernels anew whenever an array lies elsewhere. A plain row would be read where it lies among
+        # all commands, another place at every step; chosen from two, it is written to where the last one was.
+        ctrl = _where(frozen, data.ctrl, row)
+        before = data.replace(qpos=qpos, qvel=qvel, ctrl=ctrl, _impl=clear)
         after = self._step(fields, before)
 
         fine = _finite(after.qpos) & _finite(after.qvel)

@@ -55,7 +55,7 @@ class Tiling(NamedTuple):
 
     points: int = 256
     objects: int = 4
-    warps: int = 1
+    warps: int = 2
 
 
 TILING = Tiling()
