@@ -353,12 +353,17 @@ def _exit_distance(half, is_round, points, direction):
 
 
 def object_pushes(
-    shelf: Shelf, tables: ActionTables, scene: Superquadrics, prints: Footprints, config: ActionConfig
+    shelf: Shelf,
+    tables: ActionTables,
+    scene: Superquadrics,
+    prints: Footprints,
+    config: ActionConfig,
+    fresh: Bool[Array, " n"],
 ) -> tuple[Float[Array, "n b 4 4"], Bool[Array, "n b"]]:
     """Gripper poses where pushes start, beside each object at `push_gap` from it, and whether it would stay upright.
 
-    For each side (pushing towards +y, then -y), for two depths (fingers just past the object's front, then past its
-    centre so that the palm pushes), for each yaw of the gripper, for each wrist.
+    Only for `fresh` objects. For each side (pushing towards +y, then -y), for two depths (fingers just past the
+    object's front, then past its centre so that the palm pushes), for each yaw of the gripper, for each wrist.
     """
     wrists = tables.q7.shape[1]
     side, deep, yaw, _ = _push_grid(config, wrists)
@@ -377,24 +382,24 @@ def object_pushes(
     centre = jnp.stack([x, jnp.broadcast_to(prints.position[:, 1:2], shape), z], axis=-1)
     T = make(jnp.broadcast_to(rotation[None], (*shape, 3, 3)), centre)
 
-    def beside(half, is_round, position, yaw, low, high, T, side):
-        world = transform(T, tables.pusher)
-        level = (world[:, 2] > low - config.push_gap) & (world[:, 2] < high + config.push_gap)
-        local = turned(-yaw, world[:, :2] - position[None])
-        heading = turned(-yaw, jnp.array([0.0, 1.0]) * -side)
+    def beside(tables, row, i):
+        k, variant = i // len(side), i % len(side)
+        one = jax.tree.map(lambda a: a[k], row[0])
+        world = transform(row[1][k, variant], tables.pusher)
+        level = (world[:, 2] > one.low - config.push_gap) & (world[:, 2] < one.high + config.push_gap)
+        local = turned(-one.yaw, world[:, :2] - one.position[None])
+        heading = turned(-one.yaw, jnp.array([0.0, 1.0]) * -jnp.float32(side)[variant])
         # In front of the object the palm may pass close by; only sideways does it keep the whole gap.
-        grown = half + PASSING_GAP
-        away = _exit_distance(grown[None], is_round, local, jnp.broadcast_to(heading[None], local.shape))
+        grown = one.half + PASSING_GAP
+        away = _exit_distance(grown[None], one.round, local, jnp.broadcast_to(heading[None], local.shape))
         away = jnp.where(level, away, 0.0)
         farthest = jnp.max(away)
         touching = level & (away > farthest - TOUCH)
         lowest = jnp.min(jnp.where(touching, world[:, 2], jnp.inf))
         return farthest + config.push_gap - PASSING_GAP, lowest - shelf.board
 
-    each = jax.vmap(beside, in_axes=(None,) * 6 + (0, 0))
-    distance, contact = jax.vmap(each, in_axes=(0,) * 7 + (None,))(
-        prints.half, prints.round, prints.position, prints.yaw, prints.low, prints.high, T, jnp.float32(side)
-    )
+    beside_all = masked_vmap(beside, jnp.repeat(fresh, len(side)), tables, (prints, T))
+    distance, contact = (a.reshape(shape) for a in beside_all)
     stable = contact <= jnp.maximum(leverage, LOW_CONTACT)[:, None]
     return T.at[..., 1, 3].add(-jnp.float32(side)[None] * distance), stable
 
@@ -439,21 +444,24 @@ def _swept_object(cloud, R_object_gripper, distance, steps=7):
 
 
 def _gripper_hits(tables, opening, wrist, T, scene, mask):
-    """Which objects the swept gripper hits: poses (C, 4, 4) against objects (N), where the mask (C, N) is true."""
+    """Which objects the swept gripper hits: poses (C, 4, 4) against objects (N), where the mask (C, N) is true.
+
+    `opening` and `wrist` say for each pose which of the clouds is meant.
+    """
     c, n = mask.shape
-    wrist = jnp.asarray(wrist)
+    opening, wrist = jnp.broadcast_to(opening, c), jnp.asarray(wrist)
 
     def pair(tables, row, i):
-        T, wrist, scene = row
+        T, opening, wrist, scene = row
         k, j = i // n, i % n
-        cloud = tables.clouds[opening, wrist[k]]
+        cloud = tables.clouds[opening[k], wrist[k]]
         T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
         return Pair(cloud, compose(T_object_world, T[k]), scene.size[j], scene.exponents[j])
 
     T_gripper_object = compose(inverse(T)[:, None], make(scene.rotation, scene.position)[None])
-    low, high = tables.low[opening][wrist], tables.high[opening][wrist]
+    low, high = tables.low[opening, wrist], tables.high[opening, wrist]
     near = boxes_overlap(low[:, None], high[:, None], T_gripper_object, scene.size[None])
-    return any_inside((mask & near).reshape(-1), pair, tables, (T, wrist, scene)).reshape(c, n)
+    return any_inside((mask & near).reshape(-1), pair, tables, (T, opening, wrist, scene)).reshape(c, n)
 
 
 def _object_hits(T, owner, scene, clouds, distance, mask, grow=0.0):
@@ -483,21 +491,20 @@ def _object_hits(T, owner, scene, clouds, distance, mask, grow=0.0):
     return any_inside((mask & near).reshape(-1), pair, None, (T, scene, clouds, owner)).reshape(c, n)
 
 
-def _approach_clear(space: ActionSpace, tables: ActionTables, opening: int, wrist, T, mask):
+def _approach_clear(space: ActionSpace, tables: ActionTables, opening: np.ndarray, wrist: np.ndarray, T, mask):
     """Whether the arm reaches along the approaches to poses (C, 4, 4) and nothing of it touches the shelf."""
 
     def clear(tables, row, i):
-        T = row[i]
-        w = jnp.asarray(wrist)[i]
-        q, reachable = line_kinematics(T, jnp.float32(space.gripper.approach), tables.q7[opening, w], space.waypoints)
+        q7 = tables.q7[jnp.asarray(opening)[i], jnp.asarray(wrist)[i]]
+        q, reachable = line_kinematics(row[i], jnp.float32(space.gripper.approach), q7, space.waypoints)
         return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf))
 
     def touches(tables, row, i):
-        points = transform(row[i], tables.clouds[opening, jnp.asarray(wrist)[i]].T)
+        points = transform(row[i], tables.clouds[jnp.asarray(opening)[i], jnp.asarray(wrist)[i]].T)
         return jnp.any(hits_shelf(space.shelf, points))
 
-    reached = masked_vmap(clear, mask, tables, T)
-    return reached & ~masked_vmap(touches, reached, tables, T)
+    reached = masked_vmap(clear, mask, tables, T, block=512)
+    return reached & ~masked_vmap(touches, reached, tables, T, block=512)
 
 
 def _enters_possible(tables: ActionTables, space: PossibleSpace, opening: int, wrist, T, mask):
@@ -509,6 +516,23 @@ def _enters_possible(tables: ActionTables, space: PossibleSpace, opening: int, w
         return jnp.any(_enters(jax.tree.map(lambda a: a[...], space), points))
 
     return masked_vmap(enters, mask, tables, (T, space))
+
+
+def no_candidates(space: ActionSpace, tables: ActionTables, capacity: int) -> Candidates:
+    """The candidates of so many objects that are yet to be looked at."""
+    wrists = tables.q7.shape[1]
+    n, a = capacity, len(_grasp_variants(space.config, wrists)[0])
+    b, d = len(_push_grid(space.config, wrists)[0]), len(space.config.push_distances)
+    return Candidates(
+        grasp=jnp.zeros((n, a, 4, 4)),
+        grasp_reached=jnp.zeros((n, a), bool),
+        grasp_hits=jnp.zeros((n, a, n), bool),
+        grasp_enters=jnp.zeros((n, a), bool),
+        push=jnp.zeros((n, b, 4, 4)),
+        push_reached=jnp.zeros((n, b, d), bool),
+        push_hits=jnp.zeros((n, b, n), bool),
+        push_enters=jnp.zeros((n, b, d), bool),
+    )
 
 
 def candidates(
@@ -538,40 +562,29 @@ def candidates(
     clouds = _object_cloud(scene, config.object_points)
 
     grasp, fits = object_grasps(space.shelf, space.gripper, prints, config, space.max_yaw, wrists)
-    a = grasp.shape[1]
-    wrist = np.tile(_grasp_variants(config, wrists)[2], n)
-    owner = np.repeat(np.arange(n), a)
-    flat = grasp.reshape(-1, 4, 4)
-    new = (fits & fresh[:, None]).reshape(-1) & (config.kinds != "push")
-    reached = _approach_clear(space, tables, 0, wrist, flat, new)
+    push, stable = object_pushes(space.shelf, tables, scene, prints, config, fresh)
     if previous is not None:
-        reached = jnp.where(fresh[:, None], reached.reshape(n, a), previous.grasp_reached).reshape(-1)
-    # An open hand is around the object that it grasps, so that object is no obstacle.
-    mask = reached[:, None] & (concerns & others & ~jnp.eye(n, dtype=bool))[owner]
-    hits = _gripper_hits(tables, 0, wrist, flat, scene, mask)
-    hits |= _object_hits(flat, jnp.asarray(owner), scene, clouds, space.gripper.approach, mask & ~hits)
-    hits = hits.reshape(n, a, n)
-    if previous is not None:
-        hits = jnp.where(concerns[:, None, :], hits, previous.grasp_hits)
-    usable = reached & ~jnp.any(hits, axis=-1).reshape(-1)
-    grasp_enters = _enters_possible(tables, possible, 0, wrist, flat, usable).reshape(n, a)
-
-    push, stable = object_pushes(space.shelf, tables, scene, prints, config)
+        push = jnp.where(fresh[:, None, None, None], push, previous.push)
     side, push_wrist = push_variants(config, wrists)
-    b, d = push.shape[1], len(config.push_distances)
-    flat = push.reshape(-1, 4, 4)
-    owner_b = np.repeat(np.arange(n), b)
-    wrist_b = np.tile(push_wrist, n)
-    new = (stable & fresh[:, None]).reshape(-1) & (config.kinds != "pick-and-place")
-    starts = _approach_clear(space, tables, 1, wrist_b, flat, new)
+    a, b, d = grasp.shape[1], push.shape[1], len(config.push_distances)
+    # Grasps and pushes are tested together as far as they are alike: grasps of all objects first, then pushes of all.
+    opening = np.repeat([0, 1], [n * a, n * b])
+    wrist = np.concatenate([np.tile(_grasp_variants(config, wrists)[2], n), np.tile(push_wrist, n)])
+    owner = np.concatenate([np.repeat(np.arange(n), a), np.repeat(np.arange(n), b)])
+    flat = jnp.concatenate([grasp.reshape(-1, 4, 4), push.reshape(-1, 4, 4)])
+    grasps, pushes = slice(n * a), slice(n * a, None)
+
+    wanted = [fits & (config.kinds != "push"), stable & (config.kinds != "pick-and-place")]
+    new = jnp.concatenate([(w & fresh[:, None]).reshape(-1) for w in wanted])
+    near = _approach_clear(space, tables, opening, wrist, flat, new)
     displacement = jnp.asarray(np.tile(side, n))[:, None] * jnp.float32(config.push_distances)[None]
     shift = jnp.stack([jnp.zeros_like(displacement), displacement, jnp.zeros_like(displacement)], axis=-1)
-    ends = translate(jnp.broadcast_to(flat[:, None], (n * b, d, 4, 4)), shift)
+    ends = translate(jnp.broadcast_to(flat[pushes, None], (n * b, d, 4, 4)), shift)
 
     def push_path(tables, row, i):
         starts, ends = row
         T, end = starts[i // d], ends[i // d, i % d]
-        w = jnp.asarray(wrist_b)[i // d]
+        w = jnp.asarray(wrist[pushes])[i // d]
         back = jnp.float32(space.gripper.approach)
         middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
         q, reachable = path_kinematics(
@@ -580,19 +593,34 @@ def candidates(
         points = transform(end, tables.clouds[1, w].T)
         return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf)) & ~jnp.any(hits_shelf(space.shelf, points))
 
-    travels = masked_vmap(push_path, jnp.repeat(starts, d), tables, (flat, ends)).reshape(n, b, d)
+    reached = near[grasps].reshape(n, a)
+    travels = masked_vmap(push_path, jnp.repeat(near[pushes], d), tables, (flat[pushes], ends), block=512)
+    travels = travels.reshape(n, b, d)
     if previous is not None:
+        reached = jnp.where(fresh[:, None], reached, previous.grasp_reached)
         travels = jnp.where(fresh[:, None, None], travels, previous.push_reached)
-    mask = jnp.any(travels, axis=-1).reshape(-1)[:, None] & (concerns & others)[owner_b]
-    push_hits = _gripper_hits(tables, 1, wrist_b, flat, scene, mask).reshape(n, b, n)
+
+    # An open hand is around the object that it grasps, so that object is no obstacle.
+    against = concerns & others
+    against = jnp.concatenate([(against & ~jnp.eye(n, dtype=bool))[owner[grasps]], against[owner[pushes]]])
+    mask = against & jnp.concatenate([reached.reshape(-1), jnp.any(travels, axis=-1).reshape(-1)])[:, None]
+    hits = _gripper_hits(tables, opening, wrist, flat, scene, mask)
+    by_hand, push_hits = hits[grasps], hits[pushes].reshape(n, b, n)
+    by_object = _object_hits(
+        flat[grasps], jnp.asarray(owner[grasps]), scene, clouds, space.gripper.approach, mask[grasps] & ~by_hand
+    )
+    grasp_hits = (by_hand | by_object).reshape(n, a, n)
     if previous is not None:
+        grasp_hits = jnp.where(concerns[:, None, :], grasp_hits, previous.grasp_hits)
         push_hits = jnp.where(concerns[:, None, :], push_hits, previous.push_hits)
-    usable = travels & ~jnp.any(push_hits, axis=-1)[..., None]
+
+    usable = (reached & ~jnp.any(grasp_hits, axis=-1)).reshape(-1)
+    grasp_enters = _enters_possible(tables, possible, 0, wrist[grasps], flat[grasps], usable).reshape(n, a)
 
     def push_enters(tables, row, i):
         flat, shift, space, scene, clouds = row
         k, j = i // d, i % d
-        w, o = jnp.asarray(wrist_b)[k], jnp.asarray(owner_b)[k]
+        w, o = jnp.asarray(wrist[pushes])[k], jnp.asarray(owner[pushes])[k]
         # Places on the way less than two finger widths apart.
         way = shift[k, j][None] * jnp.linspace(0.0, 1.0, 5)[:, None]
         gripper = transform(flat[k], tables.clouds[1, w].T)
@@ -600,11 +628,12 @@ def candidates(
         both = jnp.concatenate([gripper[None] + way[:, None], body[None] + way[:, None]], axis=1)
         return jnp.any(_enters(jax.tree.map(lambda a: a[...], space), both))
 
-    entering = masked_vmap(push_enters, usable.reshape(-1), tables, (flat, shift, possible, scene, clouds), block=64)
+    usable = (travels & ~jnp.any(push_hits, axis=-1)[..., None]).reshape(-1)
+    entering = masked_vmap(push_enters, usable, tables, (flat[pushes], shift, possible, scene, clouds), block=64)
     return Candidates(
         grasp=grasp,
-        grasp_reached=reached.reshape(n, a),
-        grasp_hits=hits,
+        grasp_reached=reached,
+        grasp_hits=grasp_hits,
         grasp_enters=grasp_enters,
         push=push,
         push_reached=travels,

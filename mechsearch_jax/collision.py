@@ -96,10 +96,10 @@ def mark_hits(
         return jax.vmap(bounds)
 
     def test(hits, index, mask, cut):
-        """Test the masked ones of pairs `index`, and those that stay open further."""
+        """Test the masked ones of pairs `index`, or of all pairs, and those that stay open further."""
 
         def body(hits, inner, active):
-            chosen = jnp.where(active, index[jnp.minimum(inner, index.shape[0] - 1)], n)
+            chosen = inner if index is None else jnp.where(active, index[jnp.minimum(inner, mask.size - 1)], n)
             near, sure = bounded(cut)(jnp.minimum(chosen, n - 1))
             sure &= active
             hits = hits.at[where(jnp.where(sure, chosen, n))].set(True, mode="drop")
@@ -116,7 +116,7 @@ def mark_hits(
 
         return for_each(mask, body, hits, max(block // 8, 1))
 
-    return test(hits, jnp.arange(n, dtype=jnp.int32), mask, coarse)
+    return test(hits, None, mask, coarse)
 
 
 def any_inside(

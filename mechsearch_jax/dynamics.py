@@ -101,27 +101,36 @@ def turned(yaw: Float[Array, "..."], v: Float[Array, "... 2"]) -> Float[Array, "
     return jnp.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], axis=-1)
 
 
-def _contact(half, is_round, points):
-    """Depth and outward normal of points inside a footprint, in its own frame; broadcast, depth negative outside."""
+def _dot(a, b):
+    """Product of planar vectors, written out: a sum over an axis would be a kernel of its own on a GPU."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+
+
+def _depth(half, is_round, points):
+    """How deep points are inside a footprint, in its own frame; broadcast, negative outside."""
+    gap = half - jnp.abs(points)
+    scaled = points / half
+    square = _dot(scaled, scaled)
+    norm = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    mean = 0.5 * (half[..., 0] + half[..., 1])
+    return jnp.where(is_round, (1.0 - norm) * mean, jnp.minimum(gap[..., 0], gap[..., 1]))
+
+
+def _normal(half, is_round, points):
+    """Outward normal of a footprint at points inside it, in its own frame; broadcast."""
     gap = half - jnp.abs(points)
     sign = jnp.where(points < 0, -1.0, 1.0)
     x_is_nearer = gap[..., 0] < gap[..., 1]
     flat = jnp.stack([jnp.where(x_is_nearer, sign[..., 0], 0.0), jnp.where(x_is_nearer, 0.0, sign[..., 1])], axis=-1)
-    scaled = points / half
-    square = jnp.sum(scaled**2, axis=-1)
-    norm = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    mean = 0.5 * (half[..., 0] + half[..., 1])
-    gradient = scaled / half
-    length = jnp.sqrt(jnp.maximum(jnp.sum(gradient**2, axis=-1), 1e-12))
-    depth = jnp.where(is_round, (1.0 - jnp.where(square > 0, norm, 0.0)) * mean, jnp.min(gap, axis=-1))
-    return depth, jnp.where(is_round[..., None], gradient / length[..., None], flat)
+    gradient = points / half / half
+    length = jnp.sqrt(jnp.maximum(_dot(gradient, gradient), 1e-12))
+    return jnp.where(is_round[..., None], gradient / length[..., None], flat)
 
 
-def _deepest(depth, normal, point):
-    """The deepest of the contacts along the last axis of `depth`."""
+def _deepest(depth, points):
+    """Depth and place of the deepest of the points along the last axis of `depth`."""
     i = jnp.argmax(depth, axis=-1)[..., None]
-    pick = lambda v: jnp.take_along_axis(v, i[..., None], axis=-2)[..., 0, :]  # noqa: E731
-    return jnp.max(depth, axis=-1), pick(normal), pick(point)
+    return jnp.take_along_axis(depth, i, axis=-1)[..., 0], jnp.take_along_axis(points, i[..., None], axis=-2)[..., 0, :]
 
 
 def _yield_to(prints, depth, normal, arm, heading, friction):
@@ -132,22 +141,21 @@ def _yield_to(prints, depth, normal, arm, heading, friction):
     and the point at `arm` follows `heading` until it has given way by `depth` along `normal`, if the force for that is
     inside the friction cone; otherwise it slides, with the force on the cone's edge (Lynch and Mason, one contact).
     """
-    c2 = 0.36 * jnp.sum(prints.half**2, axis=-1)
+    c2 = 0.36 * _dot(prints.half, prints.half)
     side = jnp.stack([-arm[..., 1], arm[..., 0]], axis=-1)
-    dot = lambda a, b: jnp.sum(a * b, axis=-1)  # noqa: E731
-    advance = dot(heading, normal)
+    advance = _dot(heading, normal)
     follows = advance > 0.2
     target = jnp.where(follows[..., None], heading / jnp.where(follows, advance, 1.0)[..., None], normal)
-    force = target - side * (dot(side, target) / (c2 + dot(side, side)))[..., None]
+    force = target - side * (_dot(side, target) / (c2 + _dot(side, side)))[..., None]
     tangent = jnp.stack([-normal[..., 1], normal[..., 0]], axis=-1)
-    along, across = dot(force, normal), dot(force, tangent)
+    along, across = _dot(force, normal), _dot(force, tangent)
     sticks = jnp.abs(across) <= friction * along
     edge = normal + friction * jnp.where(across < 0, -1.0, 1.0)[..., None] * tangent
-    given = dot(normal, edge) + dot(normal, side) * dot(side, edge) / c2
+    given = _dot(normal, edge) + _dot(normal, side) * _dot(side, edge) / c2
     edge = edge / jnp.maximum(given, 0.1)[..., None]
     force = jnp.where(sticks[..., None], force, edge) * jnp.maximum(depth, 0.0)[..., None]
     # A disc may spin as it likes: its footprint stays the same.
-    turn = jnp.where(prints.round, 0.0, dot(side, force) / c2)
+    turn = jnp.where(prints.round, 0.0, _dot(side, force) / c2)
     return prints.replace(position=prints.position + force, yaw=prints.yaw + jnp.clip(turn, -0.2, 0.2))
 
 
@@ -159,21 +167,25 @@ def _outline(prints):
     return turned(prints.yaw[:, None], unit * prints.half[:, None, :]) + prints.position[:, None, :]
 
 
-def _resolve_pusher(prints, points, heading, friction):
+def _pusher_depth(prints, points):
+    """How deep the gripper's points are in each footprint, -1 at other heights, and where they are in its frame."""
     local = turned(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
-    depth, normal = _contact(prints.half[:, None, :], prints.round[:, None], local)
+    depth = _depth(prints.half[:, None, :], prints.round[:, None], local)
     level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
-    depth = jnp.where(level & prints.valid[:, None], depth, -1.0)
-    depth, normal, point = _deepest(depth, normal, local)
-    away = -turned(prints.yaw, normal)
+    return jnp.where(level & prints.valid[:, None], depth, -1.0), local
+
+
+def _resolve_pusher(prints, points, heading, friction):
+    depth, point = _deepest(*_pusher_depth(prints, points))
+    away = -turned(prints.yaw, _normal(prints.half, prints.round, point))
     heading = jnp.broadcast_to(heading, away.shape)
-    return _yield_to(prints, depth, away, turned(prints.yaw, point), heading, friction), jnp.max(depth)
+    return _yield_to(prints, depth, away, turned(prints.yaw, point), heading, friction)
 
 
 def _touched_high(scene, prints, points, heading, leverage):
     """Which objects points touch so high above the board that a push along `heading` tips them."""
     local = turned(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
-    depth, _ = _contact(prints.half[:, None, :], prints.round[:, None], local)
+    depth = _depth(prints.half[:, None, :], prints.round[:, None], local)
     level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
     touching = level & (depth > -TOUCH) & prints.valid[:, None]
     lowest = jnp.min(jnp.where(touching, points[None, :, 2], jnp.inf), axis=1) - prints.low
@@ -187,8 +199,8 @@ def _pair_contacts(prints):
     """For every ordered pair (i, j): the deepest contact, and the direction in which j has to give way."""
     outline = _outline(prints)
     into_j = turned(-prints.yaw[None, :, None], outline[:, None] - prints.position[None, :, None, :])
-    depth, normal = _contact(prints.half[None, :, None, :], prints.round[None, :, None], into_j)
-    depth, normal, point = _deepest(depth, normal, into_j)
+    depth, point = _deepest(_depth(prints.half[None, :, None, :], prints.round[None, :, None], into_j), into_j)
+    normal = _normal(prints.half[None], prints.round[None], point)
     yaw = jnp.broadcast_to(prints.yaw[None, :], depth.shape)
     direction, arm = -turned(yaw, normal), turned(yaw, point)
     # The same the other way round: a corner of j inside a face of i, where j gives way along i's normal.
@@ -204,7 +216,7 @@ def _pair_contacts(prints):
 def _resolve_neighbours(prints, heading, friction):
     """Objects further along the push give way to those behind them."""
     depth, direction, arm = _pair_contacts(prints)
-    along = jnp.sum((prints.position[None] - prints.position[:, None]) * heading[None, None], axis=-1)
+    along = _dot(prints.position[None] - prints.position[:, None], heading[None, None])
     depth = jnp.where(along > 0, depth, -1.0)
     i = jnp.argmax(depth, axis=0)
     j = jnp.arange(prints.valid.size)
@@ -220,11 +232,12 @@ def _wall_depth(shelf, prints):
 def _resolve_walls(shelf, prints):
     inward = jnp.array([[-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     depth, outline = _wall_depth(shelf, prints)
+    depth, points = _deepest(jnp.swapaxes(depth, -1, -2), outline[:, None])
+    depth = jnp.where(prints.valid[:, None], depth, -1.0)
     for wall in range(3):
-        deepest, _, point = _deepest(depth[..., wall], outline, outline)
+        point = points[:, wall]
         direction = jnp.broadcast_to(inward[wall], point.shape)
-        depth_in = jnp.where(prints.valid, deepest, -1.0)
-        prints = _yield_to(prints, depth_in, direction, point - prints.position, direction, 0.0)
+        prints = _yield_to(prints, depth[:, wall], direction, point - prints.position, direction, 0.0)
     return prints
 
 
@@ -256,20 +269,18 @@ class QuasiStatic:
         length = jnp.sqrt(jnp.maximum(jnp.sum(displacement**2), 1e-12))
         heading = displacement[:2] / length
 
-        def sweep(_, carry):
-            prints, points = carry
-            prints, _ = _resolve_pusher(prints, points, heading, self.gripper_friction)
-            return _resolve_walls(shelf, _resolve_neighbours(prints, heading, self.object_friction)), points
-
-        def step(prints, fraction):
-            points = start + fraction * displacement[None]
-            prints, _ = jax.lax.fori_loop(0, self.sweeps, sweep, (prints, points))
-            return prints, _resolve_pusher(prints, points, heading, self.gripper_friction)[1]
+        def step(prints, points):
+            for _ in range(self.sweeps):
+                prints = _resolve_pusher(prints, points, heading, self.gripper_friction)
+                prints = _resolve_walls(shelf, _resolve_neighbours(prints, heading, self.object_friction))
+            return prints, prints
 
         before = footprints(scene)
+        fraction = (jnp.arange(self.steps) + 1.0) / self.steps
+        points = start[None] + fraction[:, None, None] * displacement[None, None]
+        after, stages = jax.lax.scan(step, before, points)
         # A gripper that cannot move what is jammed would pass through it, so the worst moment counts, not the last.
-        after, held = jax.lax.scan(step, before, (jnp.arange(self.steps) + 1.0) / self.steps)
-        held = jnp.max(held)
+        held = jnp.max(jax.vmap(_pusher_depth)(stages, points)[0])
         jammed = jnp.max(_pair_contacts(after)[0]) - jnp.maximum(jnp.max(_pair_contacts(before)[0]), 0.0)
         wall = jnp.max(jnp.where(after.valid[:, None], jnp.max(_wall_depth(shelf, after)[0], axis=1), -1.0))
         turn = after.yaw - before.yaw

@@ -93,13 +93,13 @@ class ObjectViews(flax.struct.PyTreeNode):
     Attributes:
       depth: the object's depth in its window, shape (N, h, w) [m].
       corner: first row and column of the window, shape (N, 2).
-      collides: whether the target at a place would run into the object, shape (X, S, N).
+      collides: whether the target at a place would run into the object, shape (X, S, N); None if that does not count.
       overflow: whether the object's image did not fit the window, shape (N,): f may then be too small.
     """
 
     depth: jax.Array
     corner: jax.Array
-    collides: jax.Array
+    collides: jax.Array | None
     overflow: jax.Array
 
 
@@ -139,11 +139,21 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     return ExistenceTables(T, depth, corner, cloud.T, jnp.float32(np.linalg.norm(half)))
 
 
+def no_views(capacity: int, config: ExistenceConfig) -> ObjectViews:
+    """Views, without collisions, of so many objects that are yet to be looked at."""
+    return ObjectViews(
+        depth=jnp.zeros((capacity, *config.window)),
+        corner=jnp.zeros((capacity, 2), jnp.int32),
+        collides=None,
+        overflow=jnp.zeros(capacity, bool),
+    )
+
+
 def object_views(
     tables: ExistenceTables,
     camera: Camera,
     scene: Superquadrics,
-    exists: Bool[Array, " x"],
+    exists: Bool[Array, " x"] | None,
     config: ExistenceConfig,
     previous: ObjectViews | None = None,
     moved: Bool[Array, " n"] | None = None,
@@ -154,7 +164,8 @@ def object_views(
       tables: constants of the problem.
       camera: the camera at full resolution; static.
       scene: the objects, fields (N, ...).
-      exists: poses that matter; collisions at the others are not computed and read False.
+      exists: poses that matter; collisions at the others are not computed and read False. None if collisions do not
+        count at all.
       config: static.
       previous: views of the same objects before some of them moved.
       moved: which objects moved since; only they are computed anew.
@@ -172,7 +183,22 @@ def object_views(
 
     depth, corner, overflow = masked_vmap(view, fresh, None, scene, block=8)
     depth = jnp.where(fresh[:, None, None], depth, jnp.inf)
+    collides = None if exists is None else _collisions(tables, scene, exists, fresh)
+    views = ObjectViews(depth, corner, collides, overflow)
+    if previous is None or moved is None:
+        return views
+    if collides is not None and previous.collides is not None:
+        collides = jnp.where(moved[None, None], collides, previous.collides)
+    return ObjectViews(
+        depth=jnp.where(moved[:, None, None], views.depth, previous.depth),
+        corner=jnp.where(moved[:, None], views.corner, previous.corner),
+        collides=collides,
+        overflow=jnp.where(moved, views.overflow, previous.overflow),
+    )
 
+
+def _collisions(tables: ExistenceTables, scene: Superquadrics, exists: Array, fresh: Array) -> Bool[Array, "x s n"]:
+    """Whether the target at each place of the poses that matter would run into the objects that are fresh."""
     places, spread = tables.T_world_target.shape[:2]
     n = scene.capacity
 
@@ -186,34 +212,33 @@ def object_views(
     reach = superquadric.bounding_radius(scene.size) + tables.radius
     near = jnp.sum(offset**2, axis=-1) < reach[None, None] ** 2
     mask = near & exists[:, None, None] & fresh[None, None]
-    collides = any_inside(mask.reshape(-1), pair, tables, scene).reshape(places, spread, n)
-    views = ObjectViews(depth, corner, collides, overflow)
-    if previous is None or moved is None:
-        return views
-    return ObjectViews(
-        depth=jnp.where(moved[:, None, None], views.depth, previous.depth),
-        corner=jnp.where(moved[:, None], views.corner, previous.corner),
-        collides=jnp.where(moved[None, None], views.collides, previous.collides),
-        overflow=jnp.where(moved, views.overflow, previous.overflow),
-    )
+    return any_inside(mask.reshape(-1), pair, tables, scene).reshape(places, spread, n)
 
 
-def _depth_hidden(tables: ExistenceTables, image: Array, config: ExistenceConfig) -> Bool[Array, "x s"]:
-    """Whether a target at each place would go unnoticed in a depth image, by the configured criterion."""
+def _depth_hidden(
+    tables: ExistenceTables, image: Array, exists: Bool[Array, " x"], config: ExistenceConfig
+) -> Bool[Array, "x s"]:
+    """Whether a target at each place of the poses that matter would go unnoticed in a depth image."""
     h, w = tables.depth.shape[-2:]
-    rows = tables.corner[..., 0, None, None] + jnp.arange(h)[None, None, :, None]
-    columns = tables.corner[..., 1, None, None] + jnp.arange(w)[None, None, None, :]
-    inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
-    behind = image[jnp.clip(rows, 0, image.shape[0] - 1), jnp.clip(columns, 0, image.shape[1] - 1)]
-    if config.criterion == "detector":
-        visible = inside & (tables.depth + config.depth_margin < behind)
-        pixels = jnp.sum(visible, axis=(-1, -2)) * config.downscale**2
-        return pixels <= config.found_pixels
-    difference = jnp.where(inside, jnp.maximum(jnp.minimum(behind, FAR) - tables.depth, 0.0), 0.0)
-    square = jnp.sum(jnp.where(jnp.isfinite(tables.depth), difference, 0.0) ** 2, axis=(-1, -2))
-    if config.criterion == "depth-mse":
-        return square / image.size < config.depth_threshold
-    return jnp.sqrt(square) < config.depth_threshold
+    height, width = image.shape
+
+    def hidden(tables, image, i):
+        depth, corner = tables.depth[i], tables.corner[i]
+        rows = corner[:, 0, None, None] + jnp.arange(h)[None, :, None]
+        columns = corner[:, 1, None, None] + jnp.arange(w)[None, None, :]
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        behind = image[jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1)]
+        if config.criterion == "detector":
+            visible = inside & (depth + config.depth_margin < behind)
+            return jnp.sum(visible, axis=(-1, -2)) * config.downscale**2 <= config.found_pixels
+        difference = jnp.where(inside, jnp.maximum(jnp.minimum(behind, FAR) - depth, 0.0), 0.0)
+        square = jnp.sum(jnp.where(jnp.isfinite(depth), difference, 0.0) ** 2, axis=(-1, -2))
+        if config.criterion == "depth-mse":
+            return square / (height * width) < config.depth_threshold
+        return jnp.sqrt(square) < config.depth_threshold
+
+    # All of them at once, for every state of a batch, would be most of a plan's memory.
+    return masked_vmap(hidden, exists, tables, image, block=512)
 
 
 def existence(
@@ -224,7 +249,7 @@ def existence(
     Args:
       tables: constants of the problem.
       camera: the camera at full resolution; static.
-      views: of all objects, with the collisions of every pose where `exists`.
+      views: of all objects, with the collisions of every pose where `exists` if they count.
       exists: `f_{t-1}`; all True at the start.
       config: static.
 
@@ -232,5 +257,7 @@ def existence(
       Where the target can be.
     """
     image = render.merge_windows(camera.scaled(config.downscale), views.depth, views.corner)
-    hidden = _depth_hidden(tables, image, config)
-    return exists & jnp.any(hidden & ~jnp.any(views.collides, axis=-1), axis=-1)
+    possible = _depth_hidden(tables, image, exists, config)
+    if views.collides is not None:
+        possible &= ~jnp.any(views.collides, axis=-1)
+    return exists & jnp.any(possible, axis=-1)

@@ -292,6 +292,11 @@ def pairs(
     return pose, grasp, allowed, jnp.concatenate([tables.T_world_target, found.T_world_target[None]])
 
 
+def no_hits(tables: GraspTables, capacity: int) -> Bool[Array, "k n"]:
+    """H of so many objects that are yet to be tested."""
+    return jnp.zeros((tables.pair_pose.shape[0] + tables.q7.shape[0], capacity), bool)
+
+
 def grasp_hits(
     tables: GraspTables,
     found: FoundGrasps,
@@ -315,7 +320,7 @@ def grasp_hits(
     """
     fresh = scene.valid if moved is None else moved & scene.valid
     mask = exists[tables.group_pose][:, None] & fresh[None]
-    hit = merged(_marked)(mask.reshape(-1), tables, (found, scene))
+    hit = merged(_marked, GROUP)(mask.reshape(-1), tables, (found, scene))
     if previous is None or moved is None:
         return hit
     return jnp.where(moved[None], hit, previous)

@@ -19,6 +19,8 @@ from jaxtyping import Array, Bool
 
 # A GPU needs that many times as large blocks to be busy; beyond that its memory is the limit.
 GPU_BLOCKS = 64
+# Indices are 32 bits wide.
+LARGEST_INDEX = 2**31 - 1
 # How many entries of a mask are counted together before those that are true are looked for among them.
 WIDTH = 64
 
@@ -48,9 +50,15 @@ def rows_of(rows: Any, index: Array, batch: tuple[int, ...]) -> Any:
     return jax.tree.map(lambda a: Row(a, where), rows)
 
 
+def on_cpu() -> bool:
+    """Whether what is being traced is meant for a CPU, going by the default device, which a program may set."""
+    device = jax.default_device.value
+    return (device if isinstance(device, str) else device.platform if device else jax.default_backend()) == "cpu"
+
+
 def block_size(entries: int) -> int:
     """How many entries to evaluate at once where a CPU would be given so many."""
-    return entries if jax.default_backend() == "cpu" else entries * GPU_BLOCKS
+    return entries if on_cpu() else entries * GPU_BLOCKS
 
 
 def for_each(mask: Bool[Array, " n"], body: Callable[[Carry, Array, Array], Carry], carry: Carry, block: int) -> Carry:
@@ -59,11 +67,14 @@ def for_each(mask: Bool[Array, " n"], body: Callable[[Carry, Array, Array], Carr
     Args:
       mask: which of the `n` indices are meant.
       body: `body(carry, index, active) -> carry`, with `block` indices of which only the `active` are meant; the
-        others are `n`.
+        others are `n`. On a GPU it may be called with none that is active.
       carry: what the first block begins with.
       block: how many indices at once.
     """
     n = mask.shape[0]
+    if n <= block and not on_cpu():
+        # A GPU evaluates the idle entries of a single block faster than it finds out whether there is anything to do.
+        return body(carry, jnp.where(mask, jnp.arange(n, dtype=jnp.int32), n), mask)
     size, rows = min(block, n), math.ceil(n / WIDTH)
     bits = jnp.pad(mask, (0, rows * WIDTH - n)).reshape(rows, WIDTH)
     counts = jnp.sum(bits, axis=1, dtype=jnp.int32)
@@ -81,16 +92,18 @@ def for_each(mask: Bool[Array, " n"], body: Callable[[Carry, Array, Array], Carr
     return jax.lax.fori_loop(0, (total + size - 1) // size, step, carry)
 
 
-def merged(run: Callable[[Array, Any, Any], Any]) -> Callable[[Array, Any, Any], Any]:
+def merged(run: Callable[[Array, Any, Any], Any], indices: int = 1) -> Callable[[Array, Any, Any], Any]:
     """A function of a mask (n,), of what is shared and of rows, which sees a whole batch at once under `vmap`.
 
     Args:
       run: `run(mask, shared, rows)`, where the mask has the axes of the batch in front, if any, and so have the leaves
         of `rows`, with a length of 1 along those where they do not vary. Its results have the same axes in front. It
         must not close over traced values.
+      indices: how many indices `run` needs for each entry of the mask.
 
     Returns:
-      The function. Under `vmap`, what is shared may be batched too, but then the batch runs one by one.
+      The function. Under `vmap`, what is shared may be batched too, but then the batch runs one by one. A batch with
+      more indices than there can be runs in pieces.
     """
 
     @custom_vmap
@@ -101,19 +114,24 @@ def merged(run: Callable[[Array, Any, Any], Any]) -> Callable[[Array, Any, Any],
     def merge(axis_size, in_batched, mask, shared, rows):
         mask_batched, shared_batched, rows_batched = in_batched
         mask = mask if mask_batched else jnp.broadcast_to(mask, (axis_size, *mask.shape))
+        limit = LARGEST_INDEX // max(mask.size // axis_size * indices, 1)
+        piece = max((k for k in range(1, axis_size + 1) if axis_size % k == 0 and k <= limit), default=1)
+
+        def spread(a, batched):
+            return a if batched else jnp.broadcast_to(a, (axis_size, *a.shape))
+
         if any(jax.tree.leaves(shared_batched)):
-
-            def spread(a, batched):
-                return a if batched else jnp.broadcast_to(a, (axis_size, *a.shape))
-
             shared, rows = (
                 jax.tree.map(spread, tree, batched)
                 for tree, batched in ((shared, shared_batched), (rows, rows_batched))
             )
             result = jax.lax.map(lambda one: apply(*one), (mask, shared, rows))
+        elif piece < axis_size:
+            rows = jax.tree.map(spread, rows, rows_batched)
+            result = jax.lax.map(lambda one: apply(one[0], shared, one[1]), (mask, rows), batch_size=piece)
         else:
             rows = jax.tree.map(lambda a, batched: a if batched else a[None], rows, rows_batched)
-            result = merged(run)(mask, shared, rows)
+            result = merged(run, indices)(mask, shared, rows)
         return result, jax.tree.map(lambda _: True, result)
 
     return apply

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import flax.struct
 import jax
@@ -29,6 +29,8 @@ from mechsearch_jax.actions import (
     action_tables,
     candidates,
     followable,
+    no_action,
+    no_candidates,
     push_hits_others,
     sample_action,
     widen,
@@ -42,6 +44,7 @@ from mechsearch_jax.existence import (
     ObjectViews,
     existence,
     existence_tables,
+    no_views,
     object_views,
 )
 from mechsearch_jax.graspability import (
@@ -53,6 +56,7 @@ from mechsearch_jax.graspability import (
     grasp_hits,
     grasp_tables,
     graspability,
+    no_hits,
 )
 from mechsearch_jax.gripper import Gripper, arm_points
 from mechsearch_jax.kinematics import line_kinematics, line_poses, path_kinematics
@@ -417,59 +421,54 @@ def _predict(problem: Problem, space: ActionSpace, push_model: PushModel, scene:
     return after, possible
 
 
-def _blank(function, *arguments):
-    """What a function returns, filled with zeros."""
-    return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, *arguments))
-
-
-def _root(problem: Problem, belief: Belief, scene: Superquadrics, space: ActionSpace, config: PlannerConfig) -> _Node:
+def _root(problem: Problem, belief: Belief, scene: Superquadrics, space: ActionSpace) -> _Node:
     """The present state, of which nothing is computed yet: as if every object had just moved."""
-    settings = _existence_config(problem, config)
-    possible = _possible_space(problem, belief, belief.exists)
-    counts = _everywhere_it_can_be(belief, belief.exists)
     return _Node(
         scene=scene,
         exists=belief.exists,
-        views=_blank(lambda: object_views(problem.existence, problem.camera, scene, belief.exists, settings)),
-        hits=_blank(lambda: grasp_hits(problem.grasps, belief.grasps, scene, counts)),
-        options=_blank(lambda: candidates(space, problem.actions, scene, possible)),
+        views=no_views(scene.capacity, problem.existence_config),
+        hits=no_hits(problem.grasps, scene.capacity),
+        options=no_candidates(space, problem.actions, scene.capacity),
         moved=scene.valid,
         available=_without_target(scene).valid,
         alive=jnp.array(True),
     )
 
 
-def _update(problem, belief, space, config, node: _Node, moved: Array, last: Array) -> _Node:
-    """Bring what is known of a state up to date after some objects moved."""
+def _update(problem, belief, config, node: _Node, moved: Array) -> _Node:
+    """Bring f and g of a state up to date after some objects moved."""
     objects = _without_target(node.scene)
     settings = _existence_config(problem, config)
     # What an action covers is not ruled out: a target there would be pushed along, not found to be elsewhere. So only
-    # what it uncovers counts, and collisions (empty in these views) do not.
-    nowhere = jnp.zeros_like(node.exists)
-    views = object_views(problem.existence, problem.camera, objects, nowhere, settings, node.views, moved)
+    # what it uncovers counts, and collisions do not.
+    views = object_views(problem.existence, problem.camera, objects, None, settings, node.views, moved)
     exists = existence(problem.existence, problem.camera, views, node.exists, settings)
     counts = _where_g_counts(belief, exists, config.method)
     hits = grasp_hits(problem.grasps, belief.grasps, objects, counts, node.hits, moved)
-    possible = _possible_space(problem, belief, exists)
-    options = candidates(space, problem.actions, node.scene, possible, node.options, moved & ~last)
-    return node.replace(exists=exists, views=views, hits=hits, options=options)
+    return node.replace(exists=exists, views=views, hits=hits)
 
 
-def _act(problem, belief, space, push_model, node: _Node, key: Array, last: Array) -> tuple[_Node, Action, Array]:
-    """Sample an action and predict the scene after it; also the share of possible poses that it would touch."""
+def _options(problem, belief, space, node: _Node, moved: Array) -> Candidates:
+    """What can be done in a state after some objects moved."""
     possible = _possible_space(problem, belief, node.exists)
-    available = node.available & node.alive & ~last
+    return candidates(space, problem.actions, node.scene, possible, node.options, moved)
+
+
+def _act(problem, belief, space, push_model, node: _Node, key: Array) -> tuple[dict[str, Any], Action, Array]:
+    """Sample an action and predict what it changes in a state; also the share of possible poses that it would touch."""
+    possible = _possible_space(problem, belief, node.exists)
+    available = node.available & node.alive
     sample = sample_action(key, space, problem.actions, node.scene, possible, node.options, available)
     scene, acted = _predict(problem, space, push_model, node.scene, sample)
     acted &= node.alive
     action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
-    node = node.replace(
-        scene=scene,
-        moved=changed(node.scene, scene) & acted,
-        available=node.available & (jnp.arange(scene.capacity) != action.object),
-        alive=acted,
-    )
-    return node, action, sample.risk
+    changes = {
+        "scene": scene,
+        "moved": changed(node.scene, scene) & acted,
+        "available": node.available & (jnp.arange(scene.capacity) != action.object),
+        "alive": acted,
+    }
+    return changes, action, sample.risk
 
 
 def _prefix_values(
@@ -510,21 +509,34 @@ def plan(
     space = action_space(problem, config)
     scene = _with_target(problem, belief, scene)
     count, horizon = config.sequences, config.horizon
-    nodes = jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *a.shape)), _root(problem, belief, scene, space, config))
-    update = jax.vmap(functools.partial(_update, problem, belief, space, config), in_axes=(0, 0, None))
-    act = jax.vmap(functools.partial(_act, problem, belief, space, push_model), in_axes=(0, 0, None))
+    repeated = lambda tree: jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *a.shape)), tree)  # noqa: E731
+    nodes = repeated(_root(problem, belief, scene, space))
+    update = jax.vmap(functools.partial(_update, problem, belief, config))
+    options_of = jax.vmap(functools.partial(_options, problem, belief, space))
+    act = jax.vmap(functools.partial(_act, problem, belief, space, push_model))
     cost_of = jax.vmap(lambda node: _cost(problem, belief, node.exists, node.hits, config.method))
 
     def step(nodes, keys_and_time):
         keys, time = keys_and_time
         # All sequences begin in the same state, so only the first computes it.
-        first, last = time == 0, time == horizon
-        computes = ~first | (jnp.arange(count) == 0)
-        nodes = update(nodes, nodes.moved & computes[:, None], last)
-        nodes = jax.tree.map(lambda a: jnp.where(first, a[:1], a), nodes)
-        cost = cost_of(nodes)
-        nodes, actions, risk = act(nodes, keys, last)
-        return nodes, (actions, cost, risk, jnp.any(nodes.views.overflow))
+        first = time == 0
+        computes = (~first | (jnp.arange(count) == 0))[:, None]
+        moved = nodes.moved & computes
+        shared = lambda tree: jax.tree.map(lambda a: jnp.where(first, a[:1], a), tree)  # noqa: E731
+        nodes = shared(update(nodes.replace(exists=nodes.exists & computes), moved))
+
+        def go_on():
+            options = shared(options_of(nodes, moved))
+            changes, actions, risk = act(nodes.replace(options=options), keys)
+            return changes | {"options": options}, actions, risk
+
+        def stay():
+            changes = {name: getattr(nodes, name) for name in ("scene", "moved", "available", "alive", "options")}
+            return changes, repeated(no_action()), jnp.zeros(count)
+
+        # After the last action only the cost counts. What the actions do not change does not pass through the branches.
+        changes, actions, risk = jax.lax.cond(time < horizon, go_on, stay)
+        return nodes.replace(**changes), (actions, cost_of(nodes), risk, jnp.any(nodes.views.overflow))
 
     keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
     _, (actions, cost, risk, overflow) = jax.lax.scan(step, nodes, (keys, jnp.arange(horizon + 1)))

@@ -156,6 +156,25 @@ def test_looking_again_at_moved_objects_alone_gives_the_same_views(problem):
     np.testing.assert_allclose(update.depth, whole.depth, rtol=1e-5)
 
 
+def test_collisions_need_not_count(problem):
+    one = scenario.load_scenario(scenario.example_scenarios()["crowded-shelf"])
+    objects = scenario.superquadrics(one.objects)
+    config, tables, everywhere = problem.existence_config, problem.existence, jnp.ones(problem.poses.shape[0], bool)
+    nowhere = jnp.zeros_like(everywhere)
+    without = existence.object_views(tables, problem.camera, objects, None, config)
+    assert without.collides is None
+    empty = existence.object_views(tables, problem.camera, objects, nowhere, config)
+    whole = existence.object_views(tables, problem.camera, objects, everywhere, config)
+    hidden, same, free = (
+        existence.existence(tables, problem.camera, views, everywhere, config) for views in (without, empty, whole)
+    )
+    np.testing.assert_array_equal(hidden, same)
+    assert int(jnp.sum(free)) < int(jnp.sum(hidden))
+    # Of the poses that are asked about, the others do not change the answer.
+    some = jnp.arange(everywhere.size) % 3 == 0
+    np.testing.assert_array_equal(existence.existence(tables, problem.camera, without, some, config), hidden & some)
+
+
 @pytest.mark.parametrize("criterion", ["depth-mse", "depth-norm"])
 def test_other_criteria_are_selectable(problem, criterion):
     one = scenario.load_scenario(scenario.example_scenarios()["first-light"])

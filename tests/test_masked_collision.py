@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax import collision, superquadric, transforms
+from mechsearch_jax import collision, masked, superquadric, transforms
 from mechsearch_jax.collision import Pair
 from mechsearch_jax.masked import masked_vmap
 from mechsearch_jax.shelf import Shelf
@@ -17,6 +17,22 @@ def function(shared, row, i):
     return shared * row["a"][i], {"b": row["b"][...] + i}
 
 
+@pytest.fixture(params=["cpu", "gpu"])
+def platform(request, monkeypatch):
+    """What is traced is meant for one or the other, wherever it runs."""
+    monkeypatch.setattr(masked, "on_cpu", lambda: request.param == "cpu")
+    monkeypatch.setattr(masked, "GPU_BLOCKS", 2)
+
+
+def test_a_default_device_says_what_is_traced_for(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert not masked.on_cpu()
+    for device in ("cpu", jax.devices("cpu")[0]):
+        with jax.default_device(device):
+            assert masked.on_cpu()
+
+
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("block", [1, 4, 64])
 def test_masked_entries_are_those_of_vmap_and_the_others_zero(block):
     mask = jnp.arange(23) % 3 == 0
@@ -39,6 +55,17 @@ def test_a_batch_is_what_its_rows_are_alone():
         alone = run(masks[i], {"a": rows["a"][i], "b": rows["b"][i]})
         np.testing.assert_array_equal(together[0][i], alone[0])
         np.testing.assert_array_equal(together[1]["b"][i], alone[1]["b"])
+
+
+@pytest.mark.parametrize("most", [10, 160, 200])
+def test_a_batch_with_too_many_indices_runs_in_pieces(monkeypatch, most):
+    masks = jax.random.bernoulli(jax.random.key(0), 0.5, (3, 4, 40))
+    a, b = jax.random.normal(jax.random.key(1), (3, 4, 40)), jnp.arange(4)
+    run = lambda m, a, b: masked_vmap(function, m, jnp.float32(1.0), {"a": a, "b": b})  # noqa: E731
+    batched = jax.vmap(jax.vmap(run), in_axes=(0, 0, None))
+    whole = batched(masks, a, b)
+    monkeypatch.setattr(masked, "LARGEST_INDEX", most)
+    jax.tree.map(np.testing.assert_array_equal, batched(masks, a, b), whole)
 
 
 def test_batches_nest_and_shared_values_may_be_batched_too():
@@ -79,8 +106,8 @@ def reference_inside(size, exponents, T_object_cloud, cloud):
 
 
 @settings(deadline=None, max_examples=30)
-@given(st.integers(0, 10**6))
-def test_any_inside_is_the_minimum_of_equation_5(seed):
+@given(st.integers(0, 10**6), st.booleans())
+def test_any_inside_is_the_minimum_of_equation_5(seed, on_cpu):
     rng = np.random.default_rng(seed)
     n, points = 24, 96
     cloud = np.float32(rng.uniform(-0.1, 0.1, (points, 3)))
@@ -96,7 +123,9 @@ def test_any_inside_is_the_minimum_of_equation_5(seed):
         return Pair(cloud, *(a[i] for a in row))
 
     row = tuple(map(jnp.asarray, (T, size, exponents)))
-    got = collision.any_inside(jnp.asarray(mask), pair, jnp.asarray(cloud.T), row)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(masked, "on_cpu", lambda: on_cpu)
+        got = collision.any_inside(jnp.asarray(mask), pair, jnp.asarray(cloud.T), row, block=8)
     least = np.array([reference_inside(*a, cloud.astype(np.float64)) for a in zip(size, exponents, T, strict=True)])
     decided = np.abs(least - 1) > 1e-3
     np.testing.assert_array_equal(np.asarray(got)[decided], (mask & (least < 1))[decided])

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import planner, scenario, superquadric
+from mechsearch_jax import masked, planner, scenario, superquadric
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PlannerConfig
@@ -101,6 +101,28 @@ def test_a_found_target_is_one_pose_and_stays_found(problem):
     hidden_again = planner.observe_belief(problem, belief, objects, jnp.array(False), jnp.zeros(3), CONFIG)
     assert bool(hidden_again.found)
     np.testing.assert_allclose(hidden_again.found_pose, [0.7, 0.2, 0.0])
+
+
+def test_the_state_that_a_plan_begins_with_has_the_shapes_of_every_other(decision, problem):
+    objects, belief, _ = decision
+    space = planner.action_space(problem, CONFIG)
+    root = planner._root(problem, belief, planner._with_target(problem, belief, objects), space)
+
+    def known(node):
+        node = planner._update(problem, belief, CONFIG, node, node.moved)
+        return node.replace(options=planner.candidates(space, problem.actions, node.scene, possible))
+
+    possible = planner._possible_space(problem, belief, belief.exists)
+    shapes = lambda tree: jax.tree.map(lambda a: (a.shape, a.dtype), tree)  # noqa: E731
+    assert shapes(jax.eval_shape(known, root)) == shapes(root)
+
+
+@pytest.mark.slow
+def test_a_decision_is_the_same_in_the_blocks_of_a_gpu(decision, problem, monkeypatch):
+    objects, belief, plan = decision
+    monkeypatch.setattr(masked, "on_cpu", lambda: False)
+    again = jax.jit(lambda key: planner.plan.__wrapped__(key, problem, belief, objects, CONFIG))(jax.random.key(0))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), plan, again)
 
 
 def test_an_empty_shelf_leaves_nothing_to_do(problem):
