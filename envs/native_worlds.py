@@ -69,31 +69,34 @@ class NativeWorlds:
             raise InputError(f"NativeWorlds: {actions.kind.shape} actions for {count} worlds; give one for each")
         actions = jax.device_get(actions)
         busy = np.flatnonzero(np.ones(count, bool) if active is None else np.asarray(active)).tolist()
-        zero = np.zeros(count, np.int32)
-        no = np.zeros(count, bool)
-        fallen = np.zeros((count, BODIES), bool)
-        outcomes = Outcomes(zero.copy(), zero.copy(), ~no, fallen, no.copy(), no.copy(), no.copy(), zero.copy())
+        found: dict[str, np.ndarray] = {
+            **{name: np.zeros(count, np.int32) for name in ("failure", "steps", "overflow")},
+            **{name: np.zeros(count, bool) for name in ("held", "outside", "retrieved")},
+            "settled": np.ones(count, bool),
+            "fallen": np.zeros((count, BODIES), bool),
+        }
 
         def run(world: int) -> None:
             simulator = self._simulators[world]
             action = jax.tree.map(lambda leaf: jnp.asarray(leaf[world]), actions)
             if actions.kind[world] == RETRIEVE:
                 result = simulator.retrieve(action.T_world_gripper, action.q7, action.opening)
-                outcomes.held[world], outcomes.outside[world] = result.held, result.outside
-                outcomes.retrieved[world] = result.retrieved
+                found["held"][world], found["outside"][world] = result.held, result.outside
+                found["retrieved"][world] = result.retrieved
             else:
                 result = simulator.execute(action)
-                outcomes.settled[world] = result.settled
-            outcomes.failure[world] = Failure[(result.failure or "none").upper()]
-            outcomes.steps[world] = result.steps
-            outcomes.fallen[world] = result.fallen
+                found["settled"][world] = result.settled
+            found["failure"][world] = Failure[(result.failure or "none").upper()]
+            found["steps"][world] = result.steps
+            found["fallen"][world] = result.fallen
 
         with ThreadPoolExecutor(self._threads) as pool:
             list(pool.map(run, busy))
         self._gather()
-        return jax.tree.map(jnp.asarray, outcomes)
+        return Outcomes(**{name: jnp.asarray(value) for name, value in found.items()})
 
     def _gather(self) -> World:
         worlds = [jax.device_get(simulator.world) for simulator in self._simulators]
-        self.world = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *worlds)
-        return self.world
+        world: World = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *worlds)
+        self.world = world
+        return world
