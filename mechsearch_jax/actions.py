@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import math
 from typing import Literal
 
@@ -22,6 +23,7 @@ from mechsearch_jax.dynamics import (
     Footprints,
     bounding_half_extents,
     footprints,
+    in_hand,
     turned,
 )
 from mechsearch_jax.errors import InputError
@@ -29,6 +31,7 @@ from mechsearch_jax.graspability import WRIST_ORIGIN, boxes_overlap, gripper_rot
 from mechsearch_jax.gripper import Gripper, arm_hits_shelf, gripper_cloud, swept_cloud
 from mechsearch_jax.kinematics import line_kinematics, line_poses, path_kinematics
 from mechsearch_jax.masked import masked_vmap
+from mechsearch_jax.object_grasps import PASSING_GAP, ObjectGraspConfig, grasp_variants, object_grasps
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.transforms import (
@@ -43,16 +46,13 @@ from mechsearch_jax.transforms import (
     yaw_rotation,
 )
 
-# How close to an object's front the palm may pass [m].
-PASSING_GAP = 0.003
 # Longer pushes would leave the shelf [m].
 LONGEST_PUSH = 0.5
 # Number of poses on each stretch of a motion where it is followed closely, and of places on the way of a push that
 # are tested for collision.
 CLOSE_WAYPOINTS = 12
 PUSH_PLACES = 3
-# How far the palm's flat front is behind the finger tips' centres, and how far it extends above and below them [m].
-PALM = 0.033
+# How far the hand extends behind the finger tips' centres [m].
 HAND_LENGTH = 0.11
 
 
@@ -113,9 +113,7 @@ class ActionConfig:
       topple: a push is not executed if an object is predicted to fall over with a probability above this.
       push_gap: distance between gripper and object where a push starts [m].
       push_depths: how far the finger tips reach past the object's front, or past its centre, in a push [m].
-      grasp_tilts: angles by which the grasping gripper points downwards [rad].
-      grasp_yaws: number of approach directions for round objects, and of places to grasp on a box.
-      grasp_drops: how far below an object's top it is grasped [m]; the first two in turn for round objects.
+      grasps: the ways in which an object is grasped.
       placements: how many places are tried for a picked object, and how many of those are tested for collision.
       place_yaw: largest angle by which a picked object is turned [rad].
       clearance: distance to keep from neighbours when placing [m].
@@ -135,9 +133,7 @@ class ActionConfig:
     topple: float = 0.5
     push_gap: float = 0.01
     push_depths: tuple[float, float] = (0.02, 0.02)
-    grasp_tilts: tuple[float, ...] = (math.radians(20), math.radians(30))
-    grasp_yaws: int = 6
-    grasp_drops: tuple[float, float, float] = (0.02, 0.03, 0.045)
+    grasps: ObjectGraspConfig = dataclasses.field(default_factory=ObjectGraspConfig)
     placements: tuple[int, int] = (32, 4)
     place_yaw: float = math.radians(30)
     clearance: float = 0.005
@@ -274,70 +270,6 @@ class Candidates(flax.struct.PyTreeNode):
     push_enters: jax.Array
 
 
-def _wrap(angle):
-    return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
-
-
-def _grasp_variants(config: ActionConfig, wrists: int):
-    """Slot, tilt and wrist of each candidate grasp of an object."""
-    grid = np.meshgrid(
-        np.arange(config.grasp_yaws), np.arange(len(config.grasp_tilts)), np.arange(wrists), indexing="ij"
-    )
-    slot, tilt, wrist = (g.reshape(-1) for g in grid)
-    return slot, np.asarray(config.grasp_tilts, np.float32)[tilt], wrist
-
-
-def object_grasps(
-    shelf: Shelf,
-    gripper: Gripper,
-    prints: Footprints,
-    config: ActionConfig,
-    max_yaw: float,
-    wrists: int,
-) -> tuple[Float[Array, "n a 4 4"], Bool[Array, "n a"]]:
-    """Side grasps of objects that stand or lie on the board.
-
-    Round objects are grasped through their axis from directions spread over `max_yaw`; others square to the side that
-    faces the robot, at several heights and depths.
-
-    Returns:
-      Gripper poses in the world, and whether the object is thin enough to be grasped so.
-    """
-    slot, tilt, _ = _grasp_variants(config, wrists)
-    n, a = prints.yaw.shape[0], len(slot)
-    count = config.grasp_yaws
-    spread = np.linspace(-max_yaw, max_yaw, count) if count > 1 else np.zeros(1)
-    quarter = jnp.arange(4) * (jnp.pi / 2)
-    faces = _wrap(prints.yaw[:, None] + quarter[None])
-    face = jnp.argmin(jnp.abs(faces), axis=1)
-    square_yaw = jnp.take_along_axis(faces, face[:, None], axis=1)
-    yaw = jnp.where(prints.round[:, None], jnp.float32(spread[slot])[None], square_yaw)
-    depth = jnp.where(face % 2 == 0, prints.half[:, 0], prints.half[:, 1])
-    width = jnp.where(face % 2 == 0, prints.half[:, 1], prints.half[:, 0])
-    fits = (2 * width <= gripper.usable_opening)[:, None] & (jnp.abs(yaw) <= max_yaw + 1e-3)
-
-    drop = jnp.float32(config.grasp_drops)
-    drop = jnp.where(prints.round[:, None], drop[slot % 2][None], drop[slot % 3][None])
-    z = jnp.maximum(prints.high[:, None] - drop, shelf.board + 0.025)
-    # The palm must not run into what stands up before it: the object's front, or its top if the palm reaches that high.
-    c, t = np.cos(tilt), np.tan(tilt)
-    above = jnp.clip(prints.high[:, None] - z, 0.0, jnp.float32(PALM * np.sin(tilt) + PALM * c)[None])
-    reach = jnp.float32(PALM / c)[None] - above * jnp.float32(t)[None] - PASSING_GAP
-    reach = reach * jnp.float32(np.where(slot < 3, 1.0, 0.7))[None]
-    reach = jnp.where(prints.round[:, None], jnp.maximum(reach, 0.0), reach)
-    offset = jnp.maximum(depth[:, None] - reach, 0.0)
-    centre = jnp.stack(
-        [
-            prints.position[:, None, 0] - offset * jnp.cos(yaw),
-            prints.position[:, None, 1] - offset * jnp.sin(yaw),
-            z,
-        ],
-        axis=-1,
-    )
-    rotation = gripper_rotation(yaw, jnp.broadcast_to(jnp.asarray(tilt)[None], (n, a)))
-    return make(rotation, centre), fits & prints.valid[:, None]
-
-
 def _exit_distance(half, is_round, points, direction):
     """How far points must move along a direction to leave a footprint, in its own frame; 0 if they never are inside."""
     safe = jnp.where(jnp.abs(direction) < 1e-6, 1e-6, direction)
@@ -464,21 +396,21 @@ def _gripper_hits(tables, opening, wrist, T, scene, mask):
     return any_inside((mask & near).reshape(-1), pair, tables, (T, opening, wrist, scene)).reshape(c, n)
 
 
-def _object_hits(T, owner, scene, clouds, distance, mask, grow=0.0):
+def _object_hits(T, owner, held, scene, clouds, distance, mask):
     """Which others an object hits on its way along the gripper's -z: (C,) grasps of objects `owner` against (N).
 
-    `scene` has the owner at its place before that motion; its own column has to be masked out.
+    `held` says how each owner is turned in the hand. Its own column has to be masked out.
     """
     c, n = mask.shape
 
     def pair(_, row, i):
-        T, scene, clouds, owner = row
+        T, scene, clouds, owner, held = row
         k, j = i // n, i % n
         o = owner[k]
-        cloud = _swept_object(clouds[o], matmul(scene.rotation[o].T, T[k][:3, :3]), distance)
+        cloud = _swept_object(clouds[o], matmul(held[k].T, T[k][:3, :3]), distance)
         T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
-        T_object_owner = compose(T_object_world, make(scene.rotation[o], scene.position[o]))
-        return Pair(cloud, T_object_owner, scene.size[j] + grow, scene.exponents[j])
+        T_object_owner = compose(T_object_world, make(held[k], scene.position[o]))
+        return Pair(cloud, T_object_owner, scene.size[j], scene.exponents[j])
 
     # A sphere around the owner, swept along a segment, against a sphere around the other.
     start = scene.position[owner]
@@ -488,7 +420,7 @@ def _object_hits(T, owner, scene, clouds, distance, mask, grow=0.0):
     gap2 = jnp.sum((offset - t[..., None] * along[:, None]) ** 2, axis=-1)
     radius = superquadric.bounding_radius(scene.size)
     near = gap2 < (radius[owner][:, None] + radius[None]) ** 2
-    return any_inside((mask & near).reshape(-1), pair, None, (T, scene, clouds, owner)).reshape(c, n)
+    return any_inside((mask & near).reshape(-1), pair, None, (T, scene, clouds, owner, held)).reshape(c, n)
 
 
 def _approach_clear(space: ActionSpace, tables: ActionTables, opening: np.ndarray, wrist: np.ndarray, T, mask):
@@ -521,7 +453,7 @@ def _enters_possible(tables: ActionTables, space: PossibleSpace, opening: int, w
 def no_candidates(space: ActionSpace, tables: ActionTables, capacity: int) -> Candidates:
     """The candidates of so many objects that are yet to be looked at."""
     wrists = tables.q7.shape[1]
-    n, a = capacity, len(_grasp_variants(space.config, wrists)[0])
+    n, a = capacity, len(grasp_variants(space.config.grasps, wrists)[0])
     b, d = len(_push_grid(space.config, wrists)[0]), len(space.config.push_distances)
     return Candidates(
         grasp=jnp.zeros((n, a, 4, 4)),
@@ -561,7 +493,7 @@ def candidates(
     others = scene.valid[:, None] & scene.valid[None, :]
     clouds = _object_cloud(scene, config.object_points)
 
-    grasp, fits = object_grasps(space.shelf, space.gripper, prints, config, space.max_yaw, wrists)
+    grasp, fits = object_grasps(space.shelf, space.gripper, prints, config.grasps, space.max_yaw, wrists)
     push, stable = object_pushes(space.shelf, tables, scene, prints, config, fresh)
     if previous is not None:
         push = jnp.where(fresh[:, None, None, None], push, previous.push)
@@ -569,7 +501,7 @@ def candidates(
     a, b, d = grasp.shape[1], push.shape[1], len(config.push_distances)
     # Grasps and pushes are tested together as far as they are alike: grasps of all objects first, then pushes of all.
     opening = np.repeat([0, 1], [n * a, n * b])
-    wrist = np.concatenate([np.tile(_grasp_variants(config, wrists)[2], n), np.tile(push_wrist, n)])
+    wrist = np.concatenate([np.tile(grasp_variants(config.grasps, wrists)[1], n), np.tile(push_wrist, n)])
     owner = np.concatenate([np.repeat(np.arange(n), a), np.repeat(np.arange(n), b)])
     flat = jnp.concatenate([grasp.reshape(-1, 4, 4), push.reshape(-1, 4, 4)])
     grasps, pushes = slice(n * a), slice(n * a, None)
@@ -606,9 +538,10 @@ def candidates(
     mask = against & jnp.concatenate([reached.reshape(-1), jnp.any(travels, axis=-1).reshape(-1)])[:, None]
     hits = _gripper_hits(tables, opening, wrist, flat, scene, mask)
     by_hand, push_hits = hits[grasps], hits[pushes].reshape(n, b, n)
-    by_object = _object_hits(
-        flat[grasps], jnp.asarray(owner[grasps]), scene, clouds, space.gripper.approach, mask[grasps] & ~by_hand
-    )
+    grasped = jnp.asarray(owner[grasps])
+    held = jax.vmap(functools.partial(in_hand, scene))(grasped, flat[grasps])
+    distance = space.gripper.approach
+    by_object = _object_hits(flat[grasps], grasped, held, scene, clouds, distance, mask[grasps] & ~by_hand)
     grasp_hits = (by_hand | by_object).reshape(n, a, n)
     if previous is not None:
         grasp_hits = jnp.where(concerns[:, None, :], grasp_hits, previous.grasp_hits)
@@ -732,7 +665,7 @@ def _placement(key, space, tables, scene, possible, index, T_grasp, wrist):
     turn = jnp.clip(turn, -space.max_yaw - approach, space.max_yaw - approach)
 
     position = jnp.stack([x, y, jnp.full(tries, scene.position[index, 2])], axis=-1)
-    rotation = matmul(yaw_rotation(turn), scene.rotation[index])
+    rotation = matmul(yaw_rotation(turn), in_hand(scene, index, T_grasp))
     cloud = superquadric.sample_surface(scene.size[index], scene.exponents[index], config.object_points)
     points = transform(make(rotation, position)[:, None], cloud[None])
     on_board = ~jnp.any(hits_shelf(shelf, points + jnp.array([0.0, 0.0, 1e-3])[None, None]), axis=1)
@@ -833,7 +766,7 @@ def sample_action(
     is_grasp = row < n
     index = row % n
 
-    grasp_wrist = jnp.asarray(_grasp_variants(config, wrists)[2])
+    grasp_wrist = jnp.asarray(grasp_variants(config.grasps, wrists)[1])
     side, push_wrist = (jnp.asarray(v) for v in push_variants(config, wrists))
     grasp = jnp.clip(way, 0, a - 1)
     push, distance = jnp.clip(way, 0, b * d - 1) // d, jnp.clip(way, 0, b * d - 1) % d

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Protocol
 
 import flax.struct
@@ -22,6 +23,7 @@ BOUNDARY_POINTS = 24
 # very bottom never does.
 LEVERAGE = (1.8, 1.5)
 LOW_CONTACT = 0.03
+QUARTER_TURN = math.pi / 2
 # Parts of the gripper that come this close together touch an object together [m].
 TOUCH = 0.004
 
@@ -304,13 +306,26 @@ def rigid_motion(
     )
 
 
+def in_hand(scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Array, "4 4"]) -> Float[Array, "3 3"]:
+    """`R_world_object` of an object once the fingers have closed on it.
+
+    An approximation: one with flat sides turns about its own vertical axis until the nearest of them lies flat against
+    a finger, and does not shift; a round one stays as it is.
+    """
+    one = footprints(jax.tree.map(lambda a: a[index][None], scene))
+    approach = jnp.arctan2(T_world_grasp[1, 2], T_world_grasp[0, 2])
+    skew = approach - one.yaw[0]
+    skew = skew - QUARTER_TURN * jnp.round(skew / QUARTER_TURN)
+    return matmul(yaw_rotation(jnp.where(one.round[0], 0.0, skew)), scene.rotation[index])
+
+
 def pick_and_place(
     scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Array, "4 4"], T_world_place: Float[Array, "4 4"]
 ) -> Superquadrics:
-    """The scene after an object has moved rigidly with the gripper from one pose to the other."""
+    """The scene after an object, turned `in_hand`, has moved with the gripper from one pose to the other."""
     motion = compose(T_world_place, inverse(T_world_grasp))
     position = transform(motion, scene.position[index])
-    rotation = matmul(motion[:3, :3], scene.rotation[index])
+    rotation = matmul(motion[:3, :3], in_hand(scene, index, T_world_grasp))
     return scene.replace(
         position=scene.position.at[index].set(position), rotation=scene.rotation.at[index].set(rotation)
     )

@@ -10,6 +10,7 @@ import pytest
 from mechsearch_jax import actions, dynamics, planner, scenario, superquadric, transforms
 from mechsearch_jax.actions import ActionConfig, ActionKind
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.planner import PlannerConfig
 from mechsearch_jax.shelf import Shelf
 
@@ -101,13 +102,20 @@ def test_a_push_that_misses_moves_nothing():
     assert not np.any(dynamics.changed(scene, after))
 
 
-def test_pick_and_place_is_a_rigid_motion():
-    scene = on_board((*BOX, 0.6, 0.1, 0.2), (*ROUND, 0.55, -0.1, 0.0))
-    grasp = transforms.upright_pose(jnp.float32([0.6, 0.1, 0.0]), 0.45)
-    place = transforms.upright_pose(jnp.float32([0.7, -0.05, 0.5]), 0.45)
+def side_grasp(x, y, yaw):
+    """A horizontal grasp whose approach turns by `yaw` from +x."""
+    rotation = gripper_rotation(jnp.float32(yaw), jnp.float32(0.0))
+    return transforms.make(rotation, jnp.float32([x, y, 0.45]))
+
+
+@pytest.mark.parametrize(("body", "expected"), [(ROUND, 0.2 + 0.5), (BOX, 0.1 + 0.5), (BOX, 0.1 + 0.5 - np.pi / 2)])
+def test_pick_and_place_turns_flat_sides_into_the_hand_and_then_moves_rigidly(body, expected):
+    yaw = expected - 0.5 + 0.1 * (body == BOX)
+    scene = on_board((*body, 0.6, 0.1, yaw), (*ROUND, 0.55, -0.1, 0.0))
+    grasp, place = side_grasp(0.6, 0.1, 0.1), side_grasp(0.7, -0.05, 0.6)
     after = jax.jit(dynamics.pick_and_place)(scene, jnp.int32(0), grasp, place)
     np.testing.assert_allclose(after.position[0], [0.7, -0.05, scene.position[0, 2]], atol=1e-6)
-    np.testing.assert_allclose(yaw_of(np.asarray(after.rotation[0])), 0.7, atol=1e-5)
+    np.testing.assert_allclose(yaw_of(np.asarray(after.rotation[0])), expected, atol=1e-5)
     np.testing.assert_array_equal(after.position[1:], scene.position[1:])
 
 
