@@ -54,8 +54,8 @@ class Case:
       rotation_difference: between the final rotations, likewise [degrees]; a cylinder's spin about its axis is nothing.
       spin_difference: the same with the spin.
       overflow: flags of `mjx_simulator.Overflow`.
-      nudged_position_difference, nudged_rotation_difference: between two runs of the native simulator, one of them with
-        the objects nudged.
+      nudged_position_difference, nudged_rotation_difference: between the native simulator and itself with the objects
+        nudged, the largest where it was nudged more than once.
     """
 
     scenario: str
@@ -266,12 +266,14 @@ def _nudged(scene: Scenario, rng: np.random.Generator) -> Scenario:
     return dataclasses.replace(scene, objects=tuple(objects))
 
 
-def agreement(cases: Sequence[tuple[Scenario, Action]], config: MjxConfig | None = None) -> Agreement:
+def agreement(cases: Sequence[tuple[Scenario, Action]], config: MjxConfig | None = None, nudges: int = 1) -> Agreement:
     """Execute actions with both simulators; the batch simulator executes them all at once.
 
     Args:
       cases: scenes, and what to do in them.
       config: of the batch simulator; the native one takes its `simulator`.
+      nudges: how often the native simulator repeats every action with the objects nudged. Once tells how much the
+        actions agree on average; to tell which of them are sensitive takes several times.
 
     Raises:
       InputError: Warp is missing.
@@ -291,8 +293,11 @@ def agreement(cases: Sequence[tuple[Scenario, Action]], config: MjxConfig | None
     records, expected = _native(native, cases)
     native_seconds = time.perf_counter() - start
     rng = np.random.default_rng(0)
-    _, again = _native(native, [(_nudged(scene, rng), action) for scene, action in cases])
-    nudged_distance, nudged_angle, _ = pose_differences(expected, again)
+    nudged_distance, nudged_angle = np.zeros((2, len(cases)))
+    for _ in range(nudges):
+        _, again = _native(native, [(_nudged(scene, rng), action) for scene, action in cases])
+        distance, angle, _ = pose_differences(expected, again)
+        nudged_distance, nudged_angle = np.maximum(nudged_distance, distance), np.maximum(nudged_angle, angle)
     objects = np.asarray(actions.object)
     distance, angle, spin = pose_differences(expected, after)
     native_moved = _displacement(before, expected, objects)

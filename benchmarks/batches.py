@@ -51,7 +51,8 @@ class Batches:
         episodes that were running become rows with the reason.
 
         Raises:
-          Exception: whatever failed, if it fails again at once.
+          Exception: whatever failed, if no episode has ended since the start or the last failure, or if the memory
+            does not suffice for a single world.
         """
         for (target, config, engine), group in _groups(jobs):
             simulator = ENGINES[engine]()
@@ -63,11 +64,14 @@ class Batches:
                 try:
                     self._run(attempt, target, config, simulator, worlds)
                 except jax.errors.JaxRuntimeError as error:
+                    used = min(worlds, len(todo))
                     if "RESOURCE_EXHAUSTED" not in str(error):
                         attempt.fail(error)
-                    elif worlds == 1:
+                    elif used == 1:
                         raise
-                    simulator, worlds = ENGINES[engine](), min(worlds, len(todo)) // 2
+                    else:
+                        worlds = used // 2
+                    simulator = ENGINES[engine]()
                 except InputError:
                     raise
                 except Exception as error:

@@ -8,14 +8,18 @@ was killed goes on where it stopped.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import hashlib
+import importlib.metadata
 from collections.abc import Callable, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Protocol
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.results import Row, configuration, identity, read_rows, write_rows
+from mechsearch_jax.results import Row, configuration, identity, read_code, read_rows, write_rows
 from mechsearch_jax.scenario import Scenario, load_scenario
 
 
@@ -94,6 +98,35 @@ def make_jobs(
     return jobs
 
 
+@functools.cache
+def present_code() -> str:
+    """The code that decides about an episode: the package's version, and a digest of planner and environment.
+
+    The version alone would not tell a checkout from the next commit. The command line decides nothing.
+    """
+    digest = hashlib.sha256()
+    for package in ("mechsearch_jax", "mechsearch_jax.envs"):
+        for file in sorted(resources.files(package).iterdir(), key=lambda file: file.name):
+            if file.name.endswith(".py") and file.name != "cli.py":
+                source = file.read_bytes()
+                digest.update(f"{package} {file.name} {len(source)} ".encode() + source)
+    return f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')} ({digest.hexdigest()[:12]})"
+
+
+def _check_code(path: PathLike, rows: Sequence[Row]) -> None:
+    """Refuse a table whose rows would be taken for those of the present code.
+
+    Raises:
+      InputError: some of them would, but other code ran them.
+    """
+    code = read_code(path)
+    if code != present_code() and any(row.configuration is not None for row in rows):
+        raise InputError(
+            f"{path}: its episodes were run by {code or 'other code, it does not say which'}, this is "
+            f"{present_code()}; give another file, or delete this one to run all of them again"
+        )
+
+
 class Runner(Protocol):
     """Runs episodes in whatever order it likes."""
 
@@ -113,7 +146,8 @@ def evaluate(
     Args:
       jobs: what is wanted.
       out: the Parquet file; rows that it holds already are kept, and stand for a job only if every option was the
-        same. (Files of version 0.1.0 do not hold every option: their rows are kept, but run again.)
+        same. (Files of version 0.1.0 do not hold every option: their rows are kept, but run again.) The file says
+        which code ran the episodes, and only that code adds to it.
       runner: runs the episodes.
       ended: called after every episode with its row and with all rows.
 
@@ -121,17 +155,20 @@ def evaluate(
       The rows of all jobs, in the order of the jobs.
 
     Raises:
-      InputError: the table is there, but not one of episodes, or it cannot be written.
+      InputError: the table is there, but not one of episodes, or other code ran them, or it cannot be written.
     """
-    rows = read_rows(out) if Path(out).exists() else []
+    rows: list[Row] = []
+    if Path(out).exists():
+        rows = read_rows(out)
+        _check_code(out, rows)
     done = {identity(row) for row in rows}
     missing = [job for job in jobs if identity(job.failed("")) not in done]
-    write_rows(rows, out)
+    write_rows(rows, out, present_code())
 
     def take(new: Sequence[Row]) -> None:
         start = len(rows)
         rows.extend(new)
-        write_rows(rows, out)
+        write_rows(rows, out, present_code())
         for i, row in enumerate(new):
             ended(row, rows[: start + i + 1])
 

@@ -76,7 +76,11 @@ class _Crew(threading.Thread):
                 job = self._todo.get_nowait()
             except queue.Empty:
                 return
-            self._results.put(self._run(job))
+            try:
+                row = self._run(job)
+            except Exception as error:  # Were there no row, it would be waited for for ever.
+                row = job.failed(f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
+            self._results.put(row)
 
     def stop(self) -> None:
         """End the worker, whatever it is doing."""

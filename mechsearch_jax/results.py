@@ -289,6 +289,8 @@ SCHEMA = pyarrow.schema(
 )
 
 OPTIONS = ("target", "method", "recognition", "gamma", "horizon", "sequences", "actions")
+# Where the table's metadata say what ran the episodes.
+_CODE = b"mechsearch_code"
 # What version 0.1.0 wrote.
 _FIRST_COLUMNS = SCHEMA.names[:-1]
 
@@ -359,13 +361,35 @@ def _check_configuration(row: Row, path: PathLike) -> None:
         raise InputError(f"{path}: the configuration of {row.scenario!r} is not a JSON object; use another file")
 
 
-def write_rows(rows: Sequence[Row], path: PathLike) -> None:
+def read_code(path: PathLike) -> str | None:
+    """What `write_rows` was told of the code that ran the episodes; None where it was told nothing.
+
+    Raises:
+      InputError: the file cannot be read.
+    """
+    try:
+        metadata = pyarrow.parquet.read_schema(path).metadata or {}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or ' '.join(str(error).split())})") from error
+    except pyarrow.ArrowException as error:
+        raise InputError(f"{path}: is not a Parquet file ({' '.join(str(error).split())})") from error
+    code = metadata.get(_CODE)
+    return None if code is None else code.decode(errors="replace")
+
+
+def write_rows(rows: Sequence[Row], path: PathLike, code: str | None = None) -> None:
     """Write a table of episodes as Parquet, in place of the one that is there.
+
+    Args:
+      rows: the episodes.
+      path: of the file.
+      code: what ran them, which is kept beside them: see `read_code`.
 
     Raises:
       InputError: the file cannot be written.
     """
-    table = pyarrow.Table.from_pylist([dataclasses.asdict(row) for row in rows], schema=SCHEMA)
+    schema = SCHEMA if code is None else SCHEMA.with_metadata({_CODE: code.encode()})
+    table = pyarrow.Table.from_pylist([dataclasses.asdict(row) for row in rows], schema=schema)
     with replacing(path) as file:
         pyarrow.parquet.write_table(table, file)
 

@@ -73,14 +73,17 @@ def test_impossible_numbers_are_refused():
 
 @pytest.mark.slow
 def test_actions_that_are_drawn_agree():
+    """Where the native simulator ends in the same place whatever the nudge, the batch simulator ends there too."""
     scene = load_scenario(example_scenarios()["first-light"])
-    cases = draw_actions([scene], 2, seed=1)
-    assert {int(action.kind) for _, action in cases} <= {ActionKind.PUSH, ActionKind.PICK_AND_PLACE}
-    found = agreement(cases)
-    assert [case.overflow for case in found.cases] == [0, 0]
+    cases = draw_actions([scene], 8, seed=1)
+    assert {int(action.kind) for _, action in cases} == {ActionKind.PUSH, ActionKind.PICK_AND_PLACE}
+    found = agreement(cases, nudges=8)
+    assert not any(case.overflow for case in found.cases)
     assert all(case.native_failure == case.batch_failure for case in found.cases)
-    assert all(case.agrees for case in found.cases)
     assert all(case.native_moved > 0.01 for case in found.cases)
+    steady = [case for case in found.cases if case.native_agrees]
+    assert len(steady) >= 5
+    assert all(case.agrees for case in steady)
     with pytest.raises(InputError, match="take more scenes"):
         draw_actions([scene], 100, tries=2)
 

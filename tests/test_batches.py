@@ -71,6 +71,24 @@ def test_where_memory_does_not_suffice_it_goes_on_with_half_the_worlds(problem, 
     assert all(row.failure == "not found" for row in rows)
 
 
+def test_where_memory_does_not_suffice_for_one_world_the_run_ends(problem, tmp_path, files, monkeypatch):
+    stand = Stand(problem, monkeypatch, lambda name, slots: jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: full"))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="full"):
+        evaluate(jobs_of(files[:2]), tmp_path / "rows.parquet", Batches(worlds=16))
+    assert stand.slots == [16, 1]
+
+
+def test_an_error_of_the_device_costs_its_episode_alone(problem, tmp_path, files, monkeypatch):
+    def fail(name, slots):
+        return jax.errors.JaxRuntimeError("INTERNAL: no luck") if name == "hidden-1" else None
+
+    stand = Stand(problem, monkeypatch, fail)
+    rows = evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=1))
+    assert stand.slots == [1, 1]
+    assert [row.failure for row in rows if row.scenario == "hidden-1"] == ["error: JaxRuntimeError: INTERNAL: no luck"]
+    assert sum(row.failure == "not found" for row in rows) == 3
+
+
 def test_what_fails_in_a_batch_is_a_row_and_the_others_go_on(problem, tmp_path, files, monkeypatch):
     Stand(problem, monkeypatch, lambda name, slots: ValueError("out of\nluck") if name == "hidden-1" else None)
     rows = evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=2))

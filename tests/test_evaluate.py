@@ -10,8 +10,9 @@ import pytest
 from rich.console import Console
 
 from mechsearch_jax import results
+from mechsearch_jax.benchmarks import evaluate as benchmark
 from mechsearch_jax.benchmarks import tables
-from mechsearch_jax.benchmarks.evaluate import Job, evaluate, make_jobs
+from mechsearch_jax.benchmarks.evaluate import Job, evaluate, make_jobs, present_code
 from mechsearch_jax.benchmarks.processes import Processes
 from mechsearch_jax.benchmarks.worker import parse_config
 from mechsearch_jax.errors import InputError
@@ -139,6 +140,44 @@ def test_rows_that_do_not_say_how_they_ran_are_kept_but_not_believed(tmp_path, f
     evaluate(jobs, out, Processes(1, command))
     assert ran(tmp_path) == ["one", "one"]
     assert results.read_rows(out) == [dataclasses.replace(row, configuration=None), row]
+
+
+def test_rows_of_other_code_are_not_added_to(tmp_path, files, command, monkeypatch):
+    out = tmp_path / "rows.parquet"
+    evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), out, Processes(1, command))
+    assert results.read_code(out) == present_code()
+    before = out.read_bytes()
+    monkeypatch.setattr(benchmark, "present_code", lambda: "mechsearch-jax 9.9 (abc)")
+    with pytest.raises(InputError, match=r"rows.parquet: .* run by mechsearch-jax 0.* is mechsearch-jax 9.9 \(abc\);"):
+        evaluate(make_jobs(files[:2], [PlannerConfig()], (0,)), out, Processes(1, command))
+    assert out.read_bytes() == before
+    assert ran(tmp_path) == ["one"]
+
+    # A table that does not say what ran it may be anything.
+    results.write_rows(results.read_rows(out), out)
+    with pytest.raises(InputError, match="does not say which"):
+        evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), out, Processes(1, command))
+
+
+def test_the_code_is_that_of_planner_and_environment(tmp_path, monkeypatch):
+    for name in ("mechsearch_jax", "mechsearch_jax.envs"):
+        (tmp_path / name).mkdir()
+        for file in ("planner.py", "cli.py"):
+            (tmp_path / name / file).write_text(name)
+    monkeypatch.setattr(benchmark.resources, "files", lambda package: tmp_path / package)
+    found = {}
+    for change in ("nothing", "mechsearch_jax/cli.py", "mechsearch_jax/planner.py", "mechsearch_jax.envs/planner.py"):
+        if change != "nothing":
+            (tmp_path / change).write_text("changed")
+        found[change] = present_code.__wrapped__()
+    assert found["nothing"] == found["mechsearch_jax/cli.py"]
+    assert len(set(found.values())) == 3
+
+
+def test_a_worker_that_cannot_be_started_makes_rows_too(tmp_path, files):
+    jobs = make_jobs(files[:2], [PlannerConfig()], (0,))
+    rows = evaluate(jobs, tmp_path / "rows.parquet", Processes(1, (str(tmp_path / "nothing"),)))
+    assert all("FileNotFoundError" in str(row.failure) for row in rows)
 
 
 def test_a_worker_that_ran_something_else_is_not_believed(tmp_path, command):
