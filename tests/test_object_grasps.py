@@ -109,12 +109,13 @@ def test_a_box_that_fills_the_hand_is_grasped_square_only():
     way, _, _ = grasp_variants(CONFIG, WRISTS)
     _, _, fits = grasps_of((0.05, 0.036, 0.05), superquadric.BOX_EXPONENTS, 0.1)
     turned = np.array([box.turn != 0 for box in CONFIG.boxes])[way]
-    assert fits[~turned].all() and not fits[turned].any()
+    assert fits[~turned].all()
+    assert not fits[turned].any()
 
 
 @pytest.mark.parametrize("change", [{"turn": 1.5}, {"reach": 0.0}, {"drop": 0.0}, {"face": 4}])
 def test_impossible_ways_are_refused(change):
-    with pytest.raises(InputError, match="must be|face must"):
+    with pytest.raises(InputError, match="face must be"):
         dataclasses.replace(BoxGrasp(), **change)
 
 
