@@ -192,6 +192,10 @@ def _slide(moving: Footprint, other: Footprint) -> Footprint:
     return jax.lax.fori_loop(0, _SLIDES, step, moving)
 
 
+def _row(vector: np.ndarray, like: Array) -> Array:
+    return jnp.asarray(vector, jnp.float32).reshape(*[1] * (like.ndim - 1), -1)
+
+
 def _within(shelf: Shelf, one: Footprint, clearance: float = 0.002) -> Array:
     """Whether a footprint lies on the board, and its centre where objects are dropped."""
     reach = jnp.sum(jnp.abs(jnp.swapaxes(_axes(one.yaw), -1, -2)) * one.half[..., None, :], axis=-1)
@@ -199,11 +203,8 @@ def _within(shelf: Shelf, one: Footprint, clearance: float = 0.002) -> Array:
     low, high = one.centre - reach, one.centre + reach
     on_board = (low[..., 0] > shelf.front) & (high[..., 0] < shelf.back - clearance)
     on_board &= (low[..., 1] > shelf.right + clearance) & (high[..., 1] < shelf.left - clearance)
-    spawn = jnp.array([shelf.spawn_x, shelf.spawn_y])
-    grown = 0.01
-    centred = (one.centre > spawn[:, 0].reshape(*[1] * reach.ndim)[0] - grown) & (
-        one.centre < spawn[:, 1].reshape(*[1] * reach.ndim)[0] + grown
-    )
+    low, high = (np.array(ends) for ends in zip(shelf.spawn_x, shelf.spawn_y, strict=True))
+    centred = (one.centre > _row(low - 0.01, one.centre)) & (one.centre < _row(high + 0.01, one.centre))
     return on_board & centred.all(axis=-1)
 
 

@@ -1,1 +1,1 @@
-"""From a depth image to superquadrics: point clouds, segments, recognition (paper section 4.1 and appendix B.1)."""
+"""From images to superquadrics: recognition, its refinement and scores, and the path from a real camera."""

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
-from mechsearch_jax.camera import Camera, pixel_rays, project
+from mechsearch_jax.camera import Camera, project
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.shelf import Shelf
 
@@ -107,29 +107,11 @@ class PointCloud(flax.struct.PyTreeNode):
     pixel: jax.Array
 
 
-def image_points(camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
-    """World points of a depth image [m]; NaN where nothing was measured (depth 0, infinite or NaN)."""
-    measured = jnp.isfinite(depth) & (depth > 0)
-    rows, columns = jnp.meshgrid(jnp.arange(camera.height) * 1.0, jnp.arange(camera.width) * 1.0, indexing="ij")
-    origin = jnp.array(camera.position).reshape(1, 1, 3)
-    return origin + jnp.where(measured, depth, jnp.nan)[..., None] * pixel_rays(camera, rows, columns)
-
-
 def cloud_of(points: Float[Array, "h w 3"]) -> PointCloud:
-    """The cloud of an image of points; those that are NaN are absent."""
+    """The cloud of an image of points [m], such as `camera.back_project` gives; those that are NaN are absent."""
     flat = points.reshape(-1, 3)
     valid = jnp.isfinite(flat).all(axis=-1)
     return PointCloud(jnp.where(valid[:, None], flat, 0.0), valid, jnp.arange(flat.shape[0], dtype=jnp.int32))
-
-
-def back_project(camera: Camera, depth: Float[Array, "h w"]) -> PointCloud:
-    """The point cloud of a depth image, one slot for each pixel.
-
-    Args:
-      camera: the camera; static.
-      depth: along the optical axis [m]; where it is 0, infinite or NaN nothing was measured.
-    """
-    return cloud_of(image_points(camera, depth))
 
 
 def above_board(shelf: Shelf, points: Float[Array, "*batch 3"], margin: float = MARGIN) -> Bool[Array, "*batch"]:

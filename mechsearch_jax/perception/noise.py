@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mechsearch_jax.camera import Camera
+from mechsearch_jax.camera import Camera, back_project
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.perception.cloud import image_points
 
 
 class NoiseModel(Protocol):
@@ -30,7 +29,7 @@ class NoiseModel(Protocol):
 
 def no_noise(key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
     """The `NoiseModel` of a perfect sensor."""
-    return image_points(camera, depth)
+    return back_project(camera, depth)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +47,7 @@ class RandomDirection:
             raise InputError(f"RandomDirection: deviation {self.deviation} must be at least 0 m")
 
     def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
-        points = image_points(camera, depth)
+        points = back_project(camera, depth)
         towards, along = jax.random.split(key)
         direction = jax.random.normal(towards, points.shape)
         direction = direction / jnp.maximum(jnp.linalg.norm(direction, axis=-1, keepdims=True), 1e-9)
@@ -88,7 +87,7 @@ class TimeOfFlight:
 
     def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
         mix, blend, noise, lost = jax.random.split(key, 4)
-        points = image_points(camera, depth)
+        points = back_project(camera, depth)
         cosine = _incidence(camera, points)
         right, below = jnp.roll(depth, -1, axis=1), jnp.roll(depth, -1, axis=0)
         other = jnp.where(jnp.abs(right - depth) > self.edge, right, below)
@@ -101,7 +100,7 @@ class TimeOfFlight:
         # An edge has no angle of incidence: what is lost there is lost as mixtures.
         returns = jnp.where(at_edge, 1.0, jax.nn.sigmoid((cosine - self.grazing) / self.softness))
         kept = jax.random.uniform(lost, depth.shape) < returns * (1.0 - self.missing)
-        return image_points(camera, jnp.where(kept, measured, jnp.nan))
+        return back_project(camera, jnp.where(kept, measured, jnp.nan))
 
 
 def _incidence(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
