@@ -96,7 +96,9 @@ def _cut_cylinder(origin: list[Array], direction: list[Array], half: Array) -> A
     return jnp.where(chord >= 0.0, _first(near, far), jnp.inf)
 
 
-def cast_body(camera: Camera, world: World, slot: Array | int, directions: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels"]:
+def cast_body(
+    camera: Camera, world: World, slot: Array | int, directions: Float[Array, "*pixels 3"]
+) -> Float[Array, "*pixels"]:
     """Depth of one body along rays from the camera [m]; infinite where it is not.
 
     Args:

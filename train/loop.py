@@ -146,7 +146,8 @@ def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
 def initial_state(task: Task, config: TrainConfig) -> TrainState:
     """The state before the first step."""
     parameters = task.init(jax.random.fold_in(jax.random.key(config.seed), 2**32 - 1))
-    return TrainState(parameters, parameters, _optimiser(config).init(parameters), jnp.zeros((), jnp.int32))
+    averaged = jax.tree.map(jnp.copy, parameters)
+    return TrainState(parameters, averaged, _optimiser(config).init(parameters), jnp.zeros((), jnp.int32))
 
 
 def make_steps(task: Task, config: TrainConfig) -> Callable[[TrainState, Float[Array, " chunk"]], Any]:
@@ -230,7 +231,9 @@ def load_checkpoint(folder: Path, state: TrainState, identity: dict[str, Any]) -
     try:
         restored = serialization.from_state_dict(state, content["state"])
     except (ValueError, KeyError) as error:
-        raise InputError(f"{path}: does not fit the network ({str(error).splitlines()[0]}); choose another --out") from None
+        raise InputError(
+            f"{path}: does not fit the network ({str(error).splitlines()[0]}); choose another --out"
+        ) from None
     return jax.tree.map(jnp.asarray, restored), seconds
 
 
@@ -304,12 +307,8 @@ def train(task: Task, config: TrainConfig, folder: Path, watcher: Watcher = sile
         if config.steps is not None:
             rates = rates[: config.steps - step]
         began = time.monotonic()
-        try:
-            state, scalars = steps(state, jnp.asarray(rates))
-            scalars = {name: float(value) for name, value in jax.device_get(scalars).items()}
-        except KeyboardInterrupt:
-            # The interrupted dispatch has used up the state that it was given; the last checkpoint stands.
-            raise
+        state, scalars = steps(state, jnp.asarray(rates))
+        scalars = {name: float(value) for name, value in jax.device_get(scalars).items()}
         step += len(rates)
         seconds = before + time.monotonic() - start
         # The first dispatch compiles: its pace tells nothing.

@@ -156,9 +156,7 @@ def _draw_shape(key: Array, config: SceneConfig) -> _Shape:
     width, depth = _log_uniform(keys[3], config.sides, (2,)) / 2
     radius = _log_uniform(keys[4], config.diameters) / 2
     height = _log_uniform(keys[5], config.heights) / 2
-    free = jnp.where(
-        kind == CYLINDER, jnp.stack([radius, radius, height]), jnp.stack([width, depth, height])
-    )
+    free = jnp.where(kind == CYLINDER, jnp.stack([radius, radius, height]), jnp.stack([width, depth, height]))
     half = jnp.where(is_known, known[1:], free)
     pose = jax.random.uniform(keys[6])
     angle = jnp.where(
@@ -208,9 +206,7 @@ def _within(shelf: Shelf, one: Footprint, clearance: float = 0.002) -> Array:
     return on_board & centred.all(axis=-1)
 
 
-def random_world(
-    key: Key[Array, ""], config: SceneConfig | None = None, shelf: Shelf | None = None
-) -> World:
+def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: Shelf | None = None) -> World:
     """A random scene: bodies that rest on the board and do not overlap.
 
     Bodies find their places one after the other among `config.placements` tries each; one that finds none is left
@@ -275,15 +271,18 @@ class Capture(flax.struct.PyTreeNode):
 
     Attributes:
       points: as measured [m], shape (h, w, 3); NaN where nothing was.
-      labels: int8, shape (h, w): 0 to 7 an object's slot, OTHER the target, FREE the shelf, MISSING nothing.
+      labels: int8, shape (h, w): 0 to 7 an object's slot, 8 the target, FREE the shelf, OTHER the shelf
+        where noise has lifted it, MISSING nothing.
       pixels: how many pixels show each object, int32, shape (8,).
       alone: how many would if it stood there alone.
+      sensor: which of the noises it has.
     """
 
     points: jax.Array
     labels: jax.Array
     pixels: jax.Array
     alone: jax.Array
+    sensor: jax.Array
 
 
 def cast_world(
@@ -324,12 +323,14 @@ def capture(
     which, sensing = jax.random.split(key)
     depth, owner, alone = cast_world(camera, shelf, world)
     sensors = [lambda k, d, noise=noise: noise(k, camera, d) for noise in config.noises]
-    points = jax.lax.switch(jax.random.randint(which, (), 0, len(sensors)), sensors, sensing, depth)
+    sensor = jax.random.randint(which, (), 0, len(sensors))
+    points = jax.lax.switch(sensor, sensors, sensing, depth)
     return Capture(
         points=points,
         labels=true_labels(points, owner, shelf),
         pixels=jnp.sum(owner[..., None] == jnp.arange(TARGET).reshape(1, 1, -1), axis=(0, 1)),
         alone=alone[:TARGET],
+        sensor=sensor,
     )
 
 
@@ -337,9 +338,20 @@ def true_labels(
     points: Float[Array, "h w 3"], owner: Int[Array, "h w"], shelf: Shelf, margin: float = MARGIN
 ) -> Int[Array, "h w"]:
     """Labels (see `Capture`) of an image whose pixels show the bodies `owner`; what is near the shelf counts as it."""
-    body = jnp.where(owner == TARGET, OTHER, jnp.where(owner < 0, OTHER, owner))
+    body = jnp.where(owner < 0, OTHER, owner)
     labels = jnp.where(above_board(shelf, points, margin), body, FREE)
     return jnp.where(jnp.isfinite(points).all(axis=-1), labels, MISSING).astype(jnp.int8)
+
+
+def is_known(world: World) -> Bool[Array, " bodies"]:
+    """Which bodies are of the size of one of the paper's eleven objects."""
+    own = jnp.concatenate([world.kind[:, None].astype(jnp.float32), world.half_size], axis=1)
+    return (jnp.abs(own[:, None] - jnp.asarray(_KNOWN)[None]) < 1e-5).all(axis=-1).any(axis=-1)
+
+
+def noise_names(config: SceneConfig) -> list[str]:
+    """Names of the sensors, as `Capture.sensor` numbers them."""
+    return [getattr(noise, "__name__", type(noise).__name__) for noise in config.noises]
 
 
 def visible_share(seen: Capture) -> Float[Array, " objects"]:

@@ -23,7 +23,7 @@ from mechsearch_jax.perception.labels import INSTANCES, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train.loop import HELD_OUT_SEED
-from mechsearch_jax.train.scenes import SceneConfig, capture, random_world
+from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, random_world
 
 # What a layer's loss counts against the next one's.
 _EARLIER = 0.5
@@ -39,12 +39,16 @@ class Example(flax.struct.PyTreeNode):
       labels: of each point the slot of its object, or OTHER, (P,).
       centres: centre of each point's object [m], (P, 3).
       weight: 1, or 0 where the camera sees no object.
+      objects: how many objects there are, seen or not.
+      sensor: which noise the points have.
     """
 
     points: jax.Array
     labels: jax.Array
     centres: jax.Array
     weight: jax.Array
+    objects: jax.Array
+    sensor: jax.Array
 
 
 def match(logits: Float[Array, "p classes"], labels: Int[Array, " p"]) -> Int[Array, " classes"]:
@@ -103,9 +107,9 @@ class SegmentationTask:
       precision: type in which the network computes.
     """
 
-    network: SegmentationConfig = SegmentationConfig()
-    scenes: SceneConfig = SceneConfig()
-    shelf: Shelf = Shelf()
+    network: SegmentationConfig = dataclasses.field(default_factory=SegmentationConfig)
+    scenes: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+    shelf: Shelf = dataclasses.field(default_factory=Shelf)
     view: View = dataclasses.field(default_factory=shelf_view)
     points: int = POINTS
     precision: Any = jnp.bfloat16
@@ -118,18 +122,20 @@ class SegmentationTask:
     def scene(self, key: Key[Array, ""]) -> Example:
         """A random scene's cloud.
 
-        The target is in sight of no cloud that is segmented: the detector has found it by then, and taken it out.
+        The target's points are left out, as the detector's mask leaves them out; points of the shelf that noise has lifted
+        off it are not, and are OTHER.
         """
         worlds, sensing, drawing = jax.random.split(key, 3)
         world = random_world(worlds, self.scenes, self.shelf)
         seen = capture(sensing, world, self.scenes, self.shelf, self.view)
         cloud = cloud_of(seen.points)
         labels = seen.labels.reshape(-1)
-        cloud = cloud.replace(valid=cloud.valid & (labels >= 0))
+        cloud = cloud.replace(valid=cloud.valid & (labels >= OTHER) & (labels != TARGET))
         cloud = resample(drawing, cloud, self.points)
         label = jnp.where(cloud.valid, labels[cloud.pixel], OTHER)
         centres = world.position[jnp.clip(label, 0, TARGET - 1)]
-        return Example(cloud.points, label, centres, cloud.valid[0].astype(jnp.float32))
+        weight = cloud.valid[0].astype(jnp.float32)
+        return Example(cloud.points, label, centres, weight, jnp.sum(world.valid[:TARGET]), seen.sensor)
 
     def sample(self, key: Key[Array, ""], batch: int) -> Example:
         return jax.vmap(self.scene)(jax.random.split(key, batch))
@@ -181,25 +187,25 @@ def _score_batch(task: SegmentationTask, parameters: Any, key: Array, batch: int
     raw = labels_of(told.logits[-1].reshape(-1, INSTANCES + 1)).reshape(batch, -1)
     valid = jnp.broadcast_to(examples.weight[:, None] > 0, raw.shape)
     clean = jax.vmap(clean_up)(examples.points, raw, valid)
-    return [jax.vmap(instance_overlaps)(found, examples.labels) for found in (raw, clean)]
+    overlaps = [jax.vmap(instance_overlaps)(found, examples.labels) for found in (raw, clean)]
+    return overlaps, examples.objects, examples.sensor
 
 
-def held_out_scores(task: SegmentationTask, parameters: Any, scenes: int, batch: int = 16) -> dict[str, Any]:
+def held_out_scores(task: SegmentationTask, parameters: Any, scenes: int, batch: int = 32) -> dict[str, Any]:
     """Mean instance IoU on scenes of seeds that are never trained on, before and after the clean-up, by the number of
     objects in a scene and for every kind of noise, with shapes as in training."""
+    key = jax.random.key(HELD_OUT_SEED)
+    parts = [_score_batch(task, parameters, jax.random.fold_in(key, i), batch) for i in range(-(-scenes // batch))]
+    overlaps, objects, sensors = jax.tree.map(lambda *a: np.concatenate([np.asarray(x) for x in a]), *parts)
     result: dict[str, Any] = {}
-    for noise in task.scenes.noises:
-        for objects in (2, 4, 6, 8):
-            config = dataclasses.replace(task.scenes, noises=(noise,), objects=(objects, objects))
-            scored = dataclasses.replace(task, scenes=config)
-            parts = [
-                _score_batch(scored, parameters, jax.random.fold_in(jax.random.key(HELD_OUT_SEED), i), batch)
-                for i in range(-(-scenes // (4 * batch)))
-            ]
-            names = ("iou_raw", "iou_clean")
-            name = f"{objects} objects, {getattr(noise, '__name__', type(noise).__name__)}"
-            result[name] = {
-                which: round(float(np.mean(np.concatenate([np.asarray(p[i][0])[np.asarray(p[i][1])] for p in parts]))), 4)
-                for i, which in enumerate(names)
+    for sensor, noise in enumerate(noise_names(task.scenes)):
+        for count in range(1, TARGET + 1):
+            chosen = (objects == count) & (sensors == sensor)
+            found = {
+                name: round(float(np.mean(overlap[chosen][present[chosen]])), 4)
+                for name, (overlap, present) in zip(("iou_raw", "iou_clean"), overlaps, strict=True)
+                if present[chosen].any()
             }
+            if found:
+                result[f"{count} objects, {noise}"] = {"scenes": int(chosen.sum()), **found}
     return result

@@ -47,9 +47,9 @@ def _yaws(count: int, period: float) -> np.ndarray:
 
 
 _LAID = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-BASE_ROTATIONS = np.concatenate(
-    [_yaws(BOX_YAWS, np.pi / 2), np.eye(3)[None], _yaws(LYING_YAWS, np.pi) @ _LAID]
-).astype(np.float32)
+BASE_ROTATIONS = np.concatenate([_yaws(BOX_YAWS, np.pi / 2), np.eye(3)[None], _yaws(LYING_YAWS, np.pi) @ _LAID]).astype(
+    np.float32
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -73,7 +73,7 @@ def nearest_neighbours(points: Float[Array, "p 3"], count: int) -> Int[Array, "p
 
 
 class EdgeConvolution(nn.Module):
-    """The strongest response to a point's neighbours, by their features and where they lie; to be added to its input."""
+    """The strongest response to a point's neighbours, by what they are and where; to be added to its input."""
 
     width: int
     dtype: Any = jnp.float32

@@ -125,7 +125,7 @@ def _read_card(path: Path, name: str) -> dict[str, Any]:
     if not isinstance(card, dict) or card.get("format") != FORMAT or card.get("version") != VERSION:
         raise InputError(f'{path}: is not a card of format "{FORMAT}", version {VERSION}; train or install them anew')
     if card.get("network") != name:
-        raise InputError(f'{path}: is of a {json.dumps(card.get("network"))} network; give the one for {name}')
+        raise InputError(f"{path}: is of a {json.dumps(card.get('network'))} network; give the one for {name}")
     return card
 
 

@@ -127,9 +127,7 @@ def remove_shelf(cloud: PointCloud, shelf: Shelf, margin: float = MARGIN) -> Poi
     return cloud.replace(valid=cloud.valid & above_board(shelf, cloud.points, margin))
 
 
-def draw(
-    key: Key[Array, ""], chosen: Bool[Array, " p"], count: int
-) -> tuple[Int[Array, " count"], Int[Array, ""]]:
+def draw(key: Key[Array, ""], chosen: Bool[Array, " p"], count: int) -> tuple[Int[Array, " count"], Int[Array, ""]]:
     """Random indices of true elements, in rising order and spread evenly: each of `count` equal shares gives one.
 
     Where fewer than `count` elements are true, some come more than once; where none is, all indices are 0.
@@ -142,7 +140,7 @@ def draw(
     total = ends[-1]
     share = (jnp.arange(count) + jax.random.uniform(key, (count,))) / count
     rank = jnp.minimum(jnp.floor(share * total).astype(jnp.int32), jnp.maximum(total - 1, 0))
-    block = jnp.minimum(jnp.searchsorted(ends, rank, side="right", method="scan_unrolled"), len(ends) - 1)
+    block = jnp.minimum(jnp.searchsorted(ends, rank, side="right", method="scan"), len(ends) - 1)
     within = rank - jnp.where(block > 0, ends[block - 1], 0)
     passed = jnp.cumsum(blocks[block], axis=1, dtype=jnp.int32)
     index = block * _BLOCK + jnp.sum(passed <= within[:, None], axis=1)
