@@ -96,24 +96,36 @@ def _cut_cylinder(origin: list[Array], direction: list[Array], half: Array) -> A
     return jnp.where(chord >= 0.0, _first(near, far), jnp.inf)
 
 
+def cast_body(
+    camera: Camera, world: World, slot: Array | int, directions: Float[Array, "*pixels 3"]
+) -> Float[Array, "*pixels"]:
+    """Depth of one body along rays from the camera [m]; infinite where it is not.
+
+    Args:
+      camera: where the rays start.
+      world: the bodies.
+      slot: which of them.
+      directions: as `pixel_rays` gives them, so that they are of unit depth.
+    """
+    origin = _local(world.rotation[slot], jnp.array(camera.position) - world.position[slot])
+    direction = _local(world.rotation[slot], directions)
+    branches = [partial(cut, origin, direction, world.half_size[slot]) for cut in (_cut_box, _cut_cylinder)]
+    shown = jax.lax.cond(world.kind[slot] == CYLINDER, branches[1], branches[0])
+    return jnp.where(world.valid[slot], shown, jnp.inf)
+
+
 def _cast_bodies(
     camera: Camera, world: World, directions: Float[Array, "*pixels 3"]
 ) -> tuple[Float[Array, "*pixels"], Int[Array, "*pixels"]]:
     """Depth along each ray and the slot of the first body that it meets; infinity and -1 where there is none."""
-    start = jnp.array(camera.position)
-
-    def cut(i):
-        origin = _local(world.rotation[i], start - world.position[i])
-        direction = _local(world.rotation[i], directions)
-        shapes = (_cut_box, _cut_cylinder)
-        branches = [partial(shape, origin, direction, world.half_size[i]) for shape in shapes]
-        shown = jax.lax.cond(world.kind[i] == CYLINDER, branches[1], branches[0])
-        return jnp.where(world.valid[i], shown, jnp.inf)
 
     def nearer(i, best):
         depth, owner = best
         candidate = jax.lax.cond(
-            world.valid[i], cut, lambda _: jnp.full(directions.shape[:-1], jnp.inf, directions.dtype), i
+            world.valid[i],
+            lambda i: cast_body(camera, world, i, directions),
+            lambda _: jnp.full(directions.shape[:-1], jnp.inf, directions.dtype),
+            i,
         )
         return jnp.minimum(depth, candidate), jnp.where(candidate < depth, jnp.int8(i), owner)
 
@@ -122,7 +134,8 @@ def _cast_bodies(
     return jax.lax.fori_loop(0, BODIES, nearer, (nothing, none))
 
 
-def _cast_shelf(camera: Camera, shelf: Shelf, directions: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels"]:
+def cast_shelf(camera: Camera, shelf: Shelf, directions: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels"]:
+    """Depth of the empty shelf along rays from the camera [m]; infinite where it is not."""
     depth = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
     for low, high in shelf_boxes(shelf).values():
         centre, half = (low + high) / 2, (high - low) / 2
@@ -171,7 +184,7 @@ def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Observa
     shelf = shelf or Shelf()
     directions = rays(camera)
     depth, owner = _cast_bodies(camera, world, directions)
-    behind = _cast_shelf(camera, shelf, directions)
+    behind = cast_shelf(camera, shelf, directions)
     owner = jnp.where(behind < depth, jnp.int8(SHELF), owner)
     depth = jnp.minimum(depth, behind)
 

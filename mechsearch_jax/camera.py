@@ -95,3 +95,10 @@ def project(
     row = camera.fy * y / safe + camera.cy - 0.5
     column = camera.fx * x / safe + camera.cx - 0.5
     return jnp.stack([row, column], axis=-1), z
+
+
+def back_project(camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+    """The point in the world that every pixel of a depth image sees [m]; NaN where the depth is not finite."""
+    seen = jnp.isfinite(depth)
+    points = jnp.array(camera.position).reshape(1, 1, 3) + jnp.where(seen, depth, 0.0)[..., None] * rays(camera)
+    return jnp.where(seen[..., None], points, jnp.nan)

@@ -546,6 +546,59 @@ def bench_agreement(
         save_agreement(found, out)
 
 
+def _training_of(name: Literal["segmentation", "recognition"], batch: int, rate: float) -> Callable[..., None]:
+    """The command that trains one network of perception."""
+    default_batch, default_rate = batch, rate
+
+    def command(
+        *,
+        out: Path,
+        seed: int = 0,
+        steps: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+        minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None,
+        batch: int = default_batch,
+        rate: float = default_rate,
+        chunk: int = 20,
+        held_out: int = 512,
+    ) -> None:
+        from mechsearch_jax.results import check_writable
+        from mechsearch_jax.train.loop import TrainConfig
+        from mechsearch_jax.train.run import run
+
+        if steps is None and minutes is None:
+            minutes = 10.0
+        config = TrainConfig(
+            seed=seed,
+            steps=steps,
+            minutes=minutes,
+            batch=batch,
+            rate=rate,
+            chunk=chunk,
+            held_out=held_out,
+        )
+        check_writable(out)
+        run(name, config, out)
+
+    command.__name__ = name
+    command.__doc__ = f"""Train the network of {name} on scenes made as they are needed; goes on where it was stopped.
+
+    Args:
+      out: folder for the checkpoint, the curves (scalars.jsonl), and in the end {name}.npz and its card {name}.json.
+      seed: of the weights and the scenes.
+      steps: length in steps; with the same steps, seed and machine the weights are the same.
+      minutes: length in minutes instead, without the scoring at the end; 10 if neither is given.
+      batch: scenes in a step.
+      rate: highest learning rate.
+      chunk: steps that the device makes before it reports.
+      held_out: scenes for each of the scores at the end.
+    """
+    return command
+
+
+def train() -> None:
+    """Train the networks of perception: mechsearch train segmentation|recognition."""
+
+
 def scenarios() -> None:
     """Generate and check scenario files: mechsearch scenarios generate|check."""
 
@@ -562,10 +615,15 @@ COMMANDS: Commands = {
     "evaluate": evaluate,
     "report": report,
     "scenarios": scenarios,
+    "train": train,
     "bench": bench,
 }
 GROUPS: dict[str, Commands] = {
     "scenarios": {"generate": generate, "check": check},
+    "train": {
+        "segmentation": _training_of("segmentation", batch=32, rate=1e-3),
+        "recognition": _training_of("recognition", batch=64, rate=1e-3),
+    },
     "bench": {
         "existence": _timing_of("existence", "f"),
         "graspability": _timing_of("graspability", "g where f = 1"),

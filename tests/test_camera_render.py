@@ -172,3 +172,15 @@ def test_depth_has_the_gradient_of_finite_differences():
     np.testing.assert_allclose(
         gradient[1], (depth(jnp.zeros(3), 1 + h) - depth(jnp.zeros(3), 1 - h)) / (2 * h), atol=0.05
     )
+
+
+def test_back_projected_points_project_to_their_pixels():
+    depth = jnp.linspace(0.5, 1.5, COARSE.height * COARSE.width).reshape(COARSE.height, COARSE.width)
+    depth = depth.at[3, 5].set(jnp.inf)
+    points = camera.back_project(COARSE, depth)
+    assert jnp.all(jnp.isnan(points[3, 5]))
+    pixels, z = camera.project(COARSE, jnp.where(jnp.isnan(points), 0.0, points))
+    rows, columns = np.indices(depth.shape)
+    seen = np.isfinite(depth)
+    np.testing.assert_allclose(pixels[seen], np.stack([rows, columns], axis=-1)[seen], atol=0.01)
+    np.testing.assert_allclose(z[seen], depth[seen], atol=1e-5)

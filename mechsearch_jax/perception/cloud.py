@@ -1,0 +1,157 @@
+"""Point clouds of what stands on the shelf: the part of the image that shows it, its points, without the shelf.
+
+An image has one row and column for each ray. Of a camera's full image only a `View` is used: the rows and columns that
+the space above the board can appear in, every `stride`-th of them. Training renders exactly these rays, so that what
+a network is shown later, `view.of(depth)`, is spread over objects in the same way.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
+
+from mechsearch_jax.camera import Camera, project
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.shelf import Shelf
+
+POINTS = 2048
+STRIDE = 2
+# How near to the shelf's known faces a point still counts as the shelf [m].
+MARGIN = 0.004
+# How far objects may stick out over the board's front edge [m].
+OVERHANG = 0.06
+# Pixels in a block of `draw`.
+_BLOCK = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Every `stride`-th ray of a part of a camera's image.
+
+    Attributes:
+      camera: the pinhole camera whose image consists of exactly these rays.
+      row, column: of the first ray in the full image.
+      stride: distance of neighbouring rays in the full image, in pixels.
+    """
+
+    camera: Camera
+    row: int
+    column: int
+    stride: int
+
+    def of(self, image: Shaped[Array, "height width *channels"]) -> Shaped[Array, "h w *channels"]:
+        """The view's pixels of a full image."""
+        rows = slice(self.row, self.row + self.camera.height * self.stride, self.stride)
+        columns = slice(self.column, self.column + self.camera.width * self.stride, self.stride)
+        return image[rows, columns]
+
+
+def view(camera: Camera, rows: tuple[int, int], columns: tuple[int, int], stride: int = 1) -> View:
+    """The view of a range of rows and columns (first, last + 1) of a camera's image.
+
+    Raises:
+      InputError: the ranges are empty or outside the image, or the stride is not positive.
+    """
+    inside = 0 <= rows[0] < rows[1] <= camera.height and 0 <= columns[0] < columns[1] <= camera.width
+    if not inside or stride < 1:
+        raise InputError(
+            f"view: rows {rows}, columns {columns}, stride {stride} do not fit an image of "
+            f"{camera.height} rows and {camera.width} columns"
+        )
+    seen = dataclasses.replace(
+        camera,
+        height=-(-(rows[1] - rows[0]) // stride),
+        width=-(-(columns[1] - columns[0]) // stride),
+        fx=camera.fx / stride,
+        fy=camera.fy / stride,
+        cx=(camera.cx - columns[0] - 0.5) / stride + 0.5,
+        cy=(camera.cy - rows[0] - 0.5) / stride + 0.5,
+    )
+    return View(seen, rows[0], columns[0], stride)
+
+
+def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride: int = STRIDE) -> View:
+    """The part of the image in which things on the board can appear, up to 0.25 m above it.
+
+    Raises:
+      InputError: the camera does not see the shelf.
+    """
+    camera, shelf = camera or Camera(), shelf or Shelf()
+    tops = (shelf.board, min(shelf.board + 0.25, shelf.ceiling))
+    sides = ((shelf.front - OVERHANG, shelf.back), (shelf.right, shelf.left), tops)
+    corners = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(8, 3)
+    pixels, depth = project(camera, jnp.array(corners, jnp.float32))
+    low = np.maximum(np.floor(np.asarray(pixels).min(axis=0)), 0).astype(int)
+    high = np.minimum(np.ceil(np.asarray(pixels).max(axis=0)) + 1, (camera.height, camera.width)).astype(int)
+    if (np.asarray(depth) <= 0).any() or (low >= high).any():
+        raise InputError("shelf_view: the camera does not look into the shelf; check its pose")
+    return view(camera, (int(low[0]), int(high[0])), (int(low[1]), int(high[1])), stride)
+
+
+class PointCloud(flax.struct.PyTreeNode):
+    """Points in the world, a fixed number of them, some of which may be absent.
+
+    Attributes:
+      points: [m], shape (P, 3); finite even where absent.
+      valid: whether the slot holds a point, shape (P,).
+      pixel: row * width + column of the pixel that each point was seen at, int32, shape (P,).
+    """
+
+    points: jax.Array
+    valid: jax.Array
+    pixel: jax.Array
+
+
+def cloud_of(points: Float[Array, "h w 3"]) -> PointCloud:
+    """The cloud of an image of points [m], such as `camera.back_project` gives; those that are NaN are absent."""
+    flat = points.reshape(-1, 3)
+    valid = jnp.isfinite(flat).all(axis=-1)
+    return PointCloud(jnp.where(valid[:, None], flat, 0.0), valid, jnp.arange(flat.shape[0], dtype=jnp.int32))
+
+
+def above_board(shelf: Shelf, points: Float[Array, "*batch 3"], margin: float = MARGIN) -> Bool[Array, "*batch"]:
+    """Whether points lie in the free space of the shelf, farther than `margin` [m] from its faces. False for NaN."""
+    x, y, z = (points[..., i] for i in range(3))
+    deep = (x > shelf.front - OVERHANG) & (x < shelf.back - margin)
+    wide = (y > shelf.right + margin) & (y < shelf.left - margin)
+    return deep & wide & (z > shelf.board + margin) & (z < shelf.ceiling - margin)
+
+
+def remove_shelf(cloud: PointCloud, shelf: Shelf, margin: float = MARGIN) -> PointCloud:
+    """The cloud without the points on the shelf, or outside it."""
+    return cloud.replace(valid=cloud.valid & above_board(shelf, cloud.points, margin))
+
+
+def draw(key: Key[Array, ""], chosen: Bool[Array, " p"], count: int) -> tuple[Int[Array, " count"], Int[Array, ""]]:
+    """Random indices of true elements, in rising order and spread evenly: each of `count` equal shares gives one.
+
+    Where fewer than `count` elements are true, some come more than once; where none is, all indices are 0.
+
+    Returns:
+      The indices, and how many elements are true.
+    """
+    blocks = jnp.pad(chosen, (0, -chosen.size % _BLOCK)).reshape(-1, _BLOCK)
+    ends = jnp.cumsum(jnp.sum(blocks, axis=1, dtype=jnp.int32))
+    total = ends[-1]
+    share = (jnp.arange(count) + jax.random.uniform(key, (count,))) / count
+    rank = jnp.minimum(jnp.floor(share * total).astype(jnp.int32), jnp.maximum(total - 1, 0))
+    block = jnp.minimum(jnp.searchsorted(ends, rank, side="right", method="scan"), len(ends) - 1)
+    within = rank - jnp.where(block > 0, ends[block - 1], 0)
+    passed = jnp.cumsum(blocks[block], axis=1, dtype=jnp.int32)
+    index = block * _BLOCK + jnp.sum(passed <= within[:, None], axis=1)
+    return jnp.where(total > 0, index, 0).astype(jnp.int32), total
+
+
+def resample(key: Key[Array, ""], cloud: PointCloud, count: int = POINTS) -> PointCloud:
+    """A cloud of `count` of the valid points, up- or down-sampled at random (paper appendix B.1).
+
+    A cloud without valid points stays without.
+    """
+    index, total = draw(key, cloud.valid, count)
+    taken = jax.tree.map(lambda a: a[index], cloud)
+    return taken.replace(valid=jnp.broadcast_to(total > 0, (count,)))

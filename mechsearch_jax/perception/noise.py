@@ -1,0 +1,113 @@
+"""Sensor noise: what a depth camera makes of the true depth. Interchangeable: any `NoiseModel` will do."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from mechsearch_jax.camera import Camera, back_project
+from mechsearch_jax.errors import InputError
+
+
+class NoiseModel(Protocol):
+    """Makes a sensor's image of points from the true depth."""
+
+    def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+        """World points [m] as measured, NaN where nothing was.
+
+        Args:
+          key: PRNG key.
+          camera: the camera; static.
+          depth: along the optical axis [m]; infinite where nothing is.
+        """
+        ...
+
+
+def no_noise(key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+    """The `NoiseModel` of a perfect sensor."""
+    return back_project(camera, depth)
+
+
+@dataclasses.dataclass(frozen=True)
+class RandomDirection:
+    """The paper's noise: each point moves along a random direction by a Gaussian distance (appendix B.1).
+
+    Attributes:
+      deviation: standard deviation of the distance [m].
+    """
+
+    deviation: float = 0.001
+
+    def __post_init__(self):
+        if not self.deviation >= 0:
+            raise InputError(f"RandomDirection: deviation {self.deviation} must be at least 0 m")
+
+    def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+        points = back_project(camera, depth)
+        towards, along = jax.random.split(key)
+        direction = jax.random.normal(towards, points.shape)
+        direction = direction / jnp.maximum(jnp.linalg.norm(direction, axis=-1, keepdims=True), 1e-9)
+        return points + self.deviation * jax.random.normal(along, depth.shape)[..., None] * direction
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeOfFlight:
+    """Noise like that of a time-of-flight camera.
+
+    Depth is noisier the farther and the more slanting a surface is; surfaces seen at a grazing angle may return
+    nothing; a pixel across an edge may measure a mixture of what is before and behind it. The model is
+    phenomenological: it has these three effects in the size that such cameras show, and stands for none in particular.
+
+    Attributes:
+      deviation: standard deviation of the depth at 1 m of a surface seen face on [m]; it grows with the square of the
+        depth and with the inverse of the cosine of the angle of incidence, of which at least 0.2 is taken.
+      grazing: cosine of the angle of incidence below which a return is missing half of the time.
+      softness: how gradually that sets in, in units of that cosine.
+      missing: share of returns that are missing anywhere.
+      mixed: share of the pixels at an edge that measure a mixture.
+      edge: jump in depth between neighbouring pixels that makes an edge [m].
+    """
+
+    deviation: float = 0.0015
+    grazing: float = 0.1
+    softness: float = 0.03
+    missing: float = 0.005
+    mixed: float = 0.5
+    edge: float = 0.01
+
+    def __post_init__(self):
+        if min(self.deviation, self.missing, self.mixed) < 0 or max(self.missing, self.mixed) > 1:
+            raise InputError("TimeOfFlight: deviation must be at least 0 m, missing and mixed between 0 and 1")
+        if self.softness <= 0 or self.edge <= 0:
+            raise InputError("TimeOfFlight: softness and edge must be positive")
+
+    def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+        mix, blend, noise, lost = jax.random.split(key, 4)
+        points = back_project(camera, depth)
+        cosine = _incidence(camera, points)
+        right, below = jnp.roll(depth, -1, axis=1), jnp.roll(depth, -1, axis=0)
+        other = jnp.where(jnp.abs(right - depth) > self.edge, right, below)
+        at_edge = (jnp.abs(other - depth) > self.edge) & jnp.isfinite(other) & jnp.isfinite(depth)
+        mixes = at_edge & (jax.random.uniform(mix, depth.shape) < self.mixed)
+        share = jax.random.uniform(blend, depth.shape)
+        mean = jnp.where(mixes, depth + share * (jnp.where(at_edge, other, depth) - depth), depth)
+        deviation = self.deviation * mean**2 / jnp.maximum(cosine, 0.2)
+        measured = mean + jnp.where(jnp.isfinite(mean), deviation, 0.0) * jax.random.normal(noise, depth.shape)
+        # An edge has no angle of incidence: what is lost there is lost as mixtures.
+        returns = jnp.where(at_edge, 1.0, jax.nn.sigmoid((cosine - self.grazing) / self.softness))
+        kept = jax.random.uniform(lost, depth.shape) < returns * (1.0 - self.missing)
+        return back_project(camera, jnp.where(kept, measured, jnp.nan))
+
+
+def _incidence(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
+    """Cosine of the angle between each pixel's ray and the normal of the surface that its neighbours span."""
+    across, down = jnp.roll(points, -1, axis=1) - points, jnp.roll(points, -1, axis=0) - points
+    normal = jnp.cross(across, down)
+    ray = points - jnp.array(camera.position).reshape(1, 1, 3)
+    lengths = jnp.linalg.norm(normal, axis=-1) * jnp.linalg.norm(ray, axis=-1)
+    cosine = jnp.abs(jnp.sum(normal * ray, axis=-1)) / jnp.where(lengths > 0, lengths, 1.0)
+    return jnp.where(jnp.isfinite(cosine) & (lengths > 0), cosine, 1.0)

@@ -1,0 +1,117 @@
+"""From a network's answer to clean labels of points, and from them to labels of an image."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
+
+
+@dataclasses.dataclass(frozen=True)
+class CleanUpConfig:
+    """How labels of points are cleaned up.
+
+    Attributes:
+      neighbours: points that vote on a point's label, itself among them.
+      rounds: of voting.
+      minimum: segments of fewer points are dissolved into the segments nearest to their points.
+      reach: what no segment is so near to becomes OTHER [m].
+    """
+
+    neighbours: int = 9
+    rounds: int = 1
+    minimum: int = 8
+    reach: float = 0.02
+
+    def __post_init__(self):
+        if self.neighbours < 1 or self.rounds < 0 or self.minimum < 0 or self.reach <= 0:
+            raise InputError("CleanUpConfig: neighbours must be at least 1, rounds and minimum 0, reach positive")
+
+
+def _squares(a: Array, b: Array) -> Array:
+    """Squared distances between two clouds [m2]."""
+    return sum(((a[:, None, i] - b[None, :, i]) ** 2 for i in range(3)), jnp.zeros(()))
+
+
+def labels_of(logits: Float[Array, "p classes"]) -> Int[Array, " p"]:
+    """The likeliest label of each point: an instance's number, or OTHER for the last class."""
+    best = jnp.argmax(logits, axis=-1)
+    return jnp.where(best == INSTANCES, OTHER, best).astype(jnp.int8)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def clean_up(
+    points: Float[Array, "p 3"], labels: Int[Array, " p"], valid: Bool[Array, " p"], config: CleanUpConfig | None = None
+) -> Int[Array, " p"]:
+    """Labels after neighbours voted and small segments were dissolved, int8; OTHER where `valid` is false.
+
+    Args:
+      points: [m].
+      labels: instances' numbers, or OTHER.
+      valid: which points there are.
+      config: how; static.
+    """
+    config = config or CleanUpConfig()
+    instances = jnp.arange(INSTANCES)
+    square = jnp.where(valid[None, :], _squares(points, points), jnp.inf)
+    nearest = jax.lax.top_k(-square, config.neighbours)[1]
+    member = (labels[:, None] == instances[None, :]) & valid[:, None]
+
+    def vote(_, member):
+        votes = jnp.sum(member[nearest], axis=1)
+        # A tie stays as it was.
+        best = jnp.argmax(2 * votes + member, axis=1)
+        elected = (best[:, None] == instances[None, :]) & (jnp.max(votes, axis=1) > 0)[:, None]
+        return elected & member.any(axis=1)[:, None] & valid[:, None]
+
+    member = jax.lax.fori_loop(0, config.rounds, vote, member)
+    kept = jnp.sum(member, axis=0) >= config.minimum
+    lost = member.any(axis=1) & ~(member & kept[None]).any(axis=1)
+    stays = (member & kept[None]).any(axis=1)
+    distance = jnp.where(stays[None, :], square, jnp.inf)
+    source = jnp.argmin(distance, axis=1)
+    near = jnp.min(distance, axis=1) < config.reach**2
+    own = jnp.where(stays, jnp.argmax(member & kept[None], axis=1), OTHER)
+    return jnp.where(lost & near, own[source], own).astype(jnp.int8)
+
+
+@functools.partial(jax.jit, static_argnames=("reach", "rows"))
+def spread_labels(
+    points: Float[Array, "h w 3"],
+    candidates: Bool[Array, "h w"],
+    cloud: Float[Array, "p 3"],
+    labels: Int[Array, " p"],
+    reach: float = 0.015,
+    rows: int = 4,
+) -> Int[Array, "h w"]:
+    """Labels of an image's pixels from those of a cloud drawn from it: each takes that of the nearest cloud point.
+
+    Args:
+      points: of the pixels [m]; NaN where nothing was measured.
+      candidates: which pixels show something on the shelf, not the shelf itself.
+      cloud: [m].
+      labels: of the cloud's points; OTHER points count as any.
+      reach: a pixel with no cloud point so near becomes OTHER [m]; static.
+      rows: how many rows are done at once, which bounds the memory; static.
+
+    Returns:
+      Labels as `perception.labels` has them, int8.
+    """
+    height, width, _ = points.shape
+    measured = jnp.isfinite(points).all(axis=-1)
+    clean = jnp.where(measured[..., None], points, 0.0)
+    padded = jnp.pad(clean, ((0, -height % rows), (0, 0), (0, 0))).reshape(-1, rows * width, 3)
+
+    def nearest(block):
+        square = _squares(block, cloud)
+        best = jnp.argmin(square, axis=1)
+        return jnp.where(jnp.take_along_axis(square, best[:, None], axis=1)[:, 0] < reach**2, labels[best], OTHER)
+
+    found = jax.lax.map(nearest, padded).reshape(-1, width)[:height]
+    return jnp.where(~measured, MISSING, jnp.where(candidates, found, FREE)).astype(jnp.int8)

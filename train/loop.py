@@ -1,0 +1,322 @@
+"""The training loop of every network: seeded, resumable, and never waiting for data.
+
+One dispatch runs several steps in a scan, each of which makes its own scenes: nothing crosses from the host but a key
+and the learning rates. Checkpoints are written beside their place and moved there, so that a kill at any moment leaves
+the last one whole; started again with the same settings, training goes on from it, to the same weights where the length
+is given in steps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import serialization
+from jaxtyping import Array, Float, Key
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import replacing
+
+HELD_OUT_SEED = 2**31 - 1
+CHECKPOINT = "checkpoint.msgpack"
+SCALARS = "scalars.jsonl"
+
+Scalars = dict[str, Any]
+LossFunction = Callable[[Any, Any], tuple[jax.Array, Scalars]]
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """How a network is trained.
+
+    Attributes:
+      seed: of the weights and the scenes; the same seed, settings and machine give the same weights.
+      steps: length in steps, or ...
+      minutes: ... in minutes of training, compilation included and held-out scoring not; exactly one of the two.
+      batch: scenes in a step.
+      rate: the highest learning rate.
+      warm_up: share of the length in which the rate rises to it; it then falls to zero along a cosine.
+      decay: weight decay (AdamW).
+      clip: largest norm of a gradient.
+      average: the weights that are kept are an exponential average over the last 1 / (1 - average) steps.
+      chunk: steps in one dispatch; the last may do more than the length asks for.
+      save_every: seconds between checkpoints.
+      held_out: scenes for the scores at the end.
+    """
+
+    seed: int = 0
+    steps: int | None = None
+    minutes: float | None = None
+    batch: int = 64
+    rate: float = 1e-3
+    warm_up: float = 0.03
+    decay: float = 0.01
+    clip: float = 1.0
+    average: float = 0.999
+    chunk: int = 20
+    save_every: float = 45.0
+    held_out: int = 512
+
+    def __post_init__(self):
+        if (self.steps is None) == (self.minutes is None):
+            raise InputError("train: give either --steps or --minutes, not both")
+        if not 0 <= self.seed < HELD_OUT_SEED:
+            raise InputError(f"train: --seed {self.seed} must be from 0 to {HELD_OUT_SEED - 1}; the next is held out")
+        for name in ("batch", "chunk", "held_out"):
+            if getattr(self, name) < 1:
+                raise InputError(f"train: --{name.replace('_', '-')} {getattr(self, name)} must be at least 1")
+        for name in ("rate", "clip", "save_every"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"train: {name} {getattr(self, name)} must be positive")
+        if (self.steps is not None and self.steps < 1) or (self.minutes is not None and not self.minutes > 0):
+            raise InputError("train: --steps must be at least 1, --minutes positive")
+        if not (0 <= self.warm_up < 1 and 0 <= self.average < 1 and self.decay >= 0):
+            raise InputError("train: warm_up and average must be from 0 to below 1, decay at least 0")
+
+
+class Task(Protocol):
+    """What is trained."""
+
+    name: str
+
+    def init(self, key: Key[Array, ""]) -> Any:
+        """Fresh parameters of the network."""
+        ...
+
+    def sample(self, key: Key[Array, ""], batch: int) -> Any:
+        """A batch of examples from `batch` random scenes; pure, called under jit."""
+        ...
+
+    def loss(self, parameters: Any, examples: Any) -> tuple[Float[Array, ""], Scalars]:
+        """What is to be made small, and scalars worth plotting; pure, called under jit."""
+        ...
+
+    def scores(self, parameters: Any, scenes: int) -> Scalars:
+        """Scores on so many held-out scenes."""
+        ...
+
+    def save(self, path: Path, parameters: Any, card: dict[str, Any]) -> None:
+        """Write the network's weights and their card."""
+        ...
+
+
+class TrainState(flax.struct.PyTreeNode):
+    """All that training goes on from.
+
+    Attributes:
+      parameters: as trained.
+      averaged: their exponential average, which is what is kept.
+      optimiser: its state.
+      step: how many steps were made, int32.
+    """
+
+    parameters: Any
+    averaged: Any
+    optimiser: Any
+    step: jax.Array
+
+
+def learning_rate(progress: float, config: TrainConfig) -> float:
+    """The rate at a share of the length: a linear warm-up, then a cosine down to zero."""
+    if progress < config.warm_up:
+        return config.rate * max(progress / config.warm_up, 1e-3)
+    share = min((progress - config.warm_up) / (1.0 - config.warm_up), 1.0)
+    return config.rate * 0.5 * (1.0 + math.cos(math.pi * share))
+
+
+def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
+    """AdamW but for the learning rate; only matrices decay."""
+    return optax.chain(
+        optax.clip_by_global_norm(config.clip),
+        optax.scale_by_adam(b1=0.9, b2=0.99),
+        optax.add_decayed_weights(config.decay, mask=lambda tree: jax.tree.map(lambda a: a.ndim > 1, tree)),
+    )
+
+
+def initial_state(task: Task, config: TrainConfig) -> TrainState:
+    """The state before the first step."""
+    parameters = task.init(jax.random.fold_in(jax.random.key(config.seed), 2**32 - 1))
+    averaged = jax.tree.map(jnp.copy, parameters)
+    return TrainState(parameters, averaged, _optimiser(config).init(parameters), jnp.zeros((), jnp.int32))
+
+
+def make_steps(task: Task, config: TrainConfig) -> Callable[[TrainState, Float[Array, " chunk"]], Any]:
+    """A jitted function that makes one step for each learning rate it is given.
+
+    It takes the state, whose memory it uses, and the rates; it returns the state and the mean of every scalar.
+    """
+    optimiser = _optimiser(config)
+
+    def step(state: TrainState, rate: jax.Array):
+        key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+        examples = task.sample(key, config.batch)
+        (loss, scalars), gradient = jax.value_and_grad(task.loss, has_aux=True)(state.parameters, examples)
+        # One bad step must not spoil all that was learnt: a gradient that is not finite is left out.
+        norm = optax.global_norm(gradient)
+        sound = jnp.isfinite(norm) & jnp.isfinite(loss)
+        gradient = jax.tree.map(lambda g: jnp.where(sound, g, 0.0), gradient)
+        updates, moments = optimiser.update(gradient, state.optimiser, state.parameters)
+        parameters = jax.tree.map(lambda p, u: p - rate * u, state.parameters, updates)
+        # Early on, the average is over what there is so far.
+        weight = jnp.minimum(config.average, (1.0 + state.step) / (10.0 + state.step))
+        averaged = jax.tree.map(lambda a, p: weight * a + (1.0 - weight) * p, state.averaged, parameters)
+        after = TrainState(parameters, averaged, moments, state.step)
+        kept = jax.tree.map(lambda new, old: jnp.where(sound, new, old), after, state)
+        scalars = scalars | {"loss": loss, "gradient": norm, "skipped": 1.0 - sound}
+        return kept.replace(step=state.step + 1), scalars
+
+    def steps(state, rates):
+        state, scalars = jax.lax.scan(step, state, rates)
+        return state, jax.tree.map(lambda a: jnp.mean(a.astype(jnp.float32)), scalars)
+
+    return jax.jit(steps, donate_argnums=0)
+
+
+def _identity(task: Task, config: TrainConfig) -> dict[str, Any]:
+    """What has to be the same for training to go on."""
+    settings = dataclasses.asdict(config)
+    return {"task": task.name, **{k: v for k, v in settings.items() if k not in ("save_every", "held_out")}}
+
+
+def save_checkpoint(folder: Path, state: TrainState, identity: dict[str, Any], seconds: float) -> None:
+    """Write a checkpoint.
+
+    Raises:
+      InputError: it cannot be written.
+    """
+    content = {
+        "settings": json.dumps(identity, sort_keys=True),
+        "seconds": seconds,
+        "state": serialization.to_state_dict(jax.device_get(state)),
+    }
+    with replacing(folder / CHECKPOINT) as file:
+        file.write(serialization.msgpack_serialize(content))
+
+
+def load_checkpoint(folder: Path, state: TrainState, identity: dict[str, Any]) -> tuple[TrainState, float] | None:
+    """The state that a folder's checkpoint holds and the seconds that it took, None where there is none.
+
+    Args:
+      folder: where training writes.
+      state: one of the same structure.
+      identity: the settings that it has to be of.
+
+    Raises:
+      InputError: it is damaged, or of other settings.
+    """
+    path = folder / CHECKPOINT
+    if not path.exists():
+        return None
+    try:
+        content = serialization.msgpack_restore(path.read_bytes())
+        settings, seconds = json.loads(content["settings"]), float(content["seconds"])
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); choose another --out") from None
+    except Exception:
+        raise InputError(f"{path}: is no checkpoint of this program; remove it or choose another --out") from None
+    wanted = json.loads(json.dumps(identity))
+    different = sorted(k for k in settings.keys() | wanted.keys() if settings.get(k) != wanted.get(k))
+    if different:
+        raise InputError(f"{path}: is of other settings ({', '.join(different)}); repeat them or choose another --out")
+    try:
+        restored = serialization.from_state_dict(state, content["state"])
+    except (ValueError, KeyError) as error:
+        raise InputError(
+            f"{path}: does not fit the network ({str(error).splitlines()[0]}); choose another --out"
+        ) from None
+    return jax.tree.map(jnp.asarray, restored), seconds
+
+
+class Curves:
+    """Scalars in a file of JSON lines, one for each dispatch: `{"step": ..., "seconds": ..., "loss": ..., ...}`."""
+
+    def __init__(self, path: Path, steps: int):
+        """Args:
+        path: of the file; what it holds beyond a step is forgotten, because training repeats it.
+        steps: how many steps were made.
+
+        Raises:
+          InputError: the file cannot be written.
+        """
+        self._path = path
+        kept = [line for line in self._lines() if json.loads(line)["step"] <= steps]
+        with replacing(path) as file:
+            file.write("".join(line + "\n" for line in kept).encode())
+
+    def _lines(self) -> list[str]:
+        lines = self._path.read_text().splitlines() if self._path.exists() else []
+        # A kill may have cut the last line short.
+        return [line for line in lines if line.startswith("{") and line.endswith("}")]
+
+    def add(self, scalars: dict[str, float]) -> None:
+        """Append one line."""
+        with open(self._path, "a") as file:
+            file.write(json.dumps(scalars) + "\n")
+
+
+class Watcher(Protocol):
+    """Is told how training gets on."""
+
+    def __call__(self, progress: float, step: int, seconds: float, scalars: dict[str, float]) -> None:
+        """Called after each dispatch with the share of the length that is done."""
+        ...
+
+
+def silent(progress: float, step: int, seconds: float, scalars: dict[str, float]) -> None:
+    """The `Watcher` that says nothing."""
+
+
+def train(task: Task, config: TrainConfig, folder: Path, watcher: Watcher = silent) -> TrainState:
+    """Train to the end, from the folder's checkpoint if it holds one.
+
+    Args:
+      task: what is trained.
+      config: how.
+      folder: for the checkpoint and the curves.
+      watcher: is told how it gets on.
+
+    Raises:
+      InputError: the folder holds a checkpoint of other settings, or cannot be written.
+    """
+    identity = _identity(task, config)
+    state = initial_state(task, config)
+    state, before = load_checkpoint(folder, state, identity) or (state, 0.0)
+    step = int(state.step)
+    curves = Curves(folder / SCALARS, step)
+    steps = make_steps(task, config)
+    start = saved = time.monotonic()
+    seconds, pace, chunks = before, 0.0, 0
+
+    def progress(ahead: int) -> float:
+        if config.steps is not None:
+            return (step + ahead) / config.steps
+        return (seconds + pace * ahead) / (60.0 * (config.minutes or 1.0))
+
+    while progress(0) < 1.0:
+        rates = np.array([learning_rate(progress(i), config) for i in range(config.chunk)], np.float32)
+        if config.steps is not None:
+            rates = rates[: config.steps - step]
+        began = time.monotonic()
+        state, scalars = steps(state, jnp.asarray(rates))
+        scalars = {name: float(value) for name, value in jax.device_get(scalars).items()}
+        step += len(rates)
+        seconds = before + time.monotonic() - start
+        # The first dispatch compiles: its pace tells nothing.
+        chunks += 1
+        pace = (time.monotonic() - began) / len(rates) if chunks > 1 else 0.0
+        curves.add({"step": step, "seconds": round(seconds, 2), "rate": float(rates[-1]), **scalars})
+        watcher(min(progress(0), 1.0), step, seconds, scalars)
+        if time.monotonic() - saved > config.save_every or progress(0) >= 1.0:
+            save_checkpoint(folder, state, identity, seconds)
+            saved = time.monotonic()
+    return state

@@ -1,0 +1,358 @@
+"""Training of the recognition network: its examples, its loss (paper equations 6 and 7) and its held-out scores."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from pathlib import Path
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from mechsearch_jax import superquadric
+from mechsearch_jax.envs.world import CYLINDER, TARGET, World, true_superquadrics
+from mechsearch_jax.models.recognition import (
+    BASE_ROTATIONS,
+    HYPOTHESES,
+    IS_CYLINDER,
+    Hypotheses,
+    RecognitionConfig,
+    RecognitionNetwork,
+)
+from mechsearch_jax.models.weights import save_weights
+from mechsearch_jax.perception.cloud import View, shelf_view
+from mechsearch_jax.perception.recognition import best_hypothesis
+from mechsearch_jax.perception.scores import centre_error, intersection_over_union, sharpened
+from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.train.loop import HELD_OUT_SEED
+from mechsearch_jax.train.scenes import (
+    Capture,
+    SceneConfig,
+    capture,
+    is_known,
+    noise_names,
+    random_world,
+    surface_points,
+    visible_share,
+    worth_seeing,
+)
+from mechsearch_jax.transforms import matmul, rotate
+
+# Points of the true surface that equation 7 is averaged over.
+SURFACE = 512
+# What sizes, positions and the root of equation 7 are told in [m].
+_UNIT = 0.01
+# How far beyond its own part of the yaw angles a hypothesis is still taught [rad].
+_OVERLAP = np.deg2rad(6.0)
+# Exponents that stand for an edge that is sharp, and for a round.
+_SHARP, _ROUND = 0.06, 1.0
+# Objects that show fewer pixels of the full image are not scored, nor taught below a quarter of that.
+PIXELS = 100
+
+
+def _cube_symmetries() -> np.ndarray:
+    """The 24 rotations that map a cube's axes onto each other."""
+    turns = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[range(3), order] = signs
+            if np.linalg.det(matrix) > 0:
+                turns.append(matrix)
+    return np.stack(turns).astype(np.float32)
+
+
+SYMMETRIES = _cube_symmetries()
+
+
+class Truth(flax.struct.PyTreeNode):
+    """A true body in a segment's frame; every field may have leading axes.
+
+    Attributes:
+      kind: BOX or CYLINDER.
+      half_size: [m], (..., 3).
+      position: `t_segment_object` [m], (..., 3).
+      rotation: `R_segment_object`, (..., 3, 3).
+      surface: points spread over its surface, in the segment's frame [m], (..., 512, 3).
+    """
+
+    kind: jax.Array
+    half_size: jax.Array
+    position: jax.Array
+    rotation: jax.Array
+    surface: jax.Array
+
+
+class Example(flax.struct.PyTreeNode):
+    """Segments and what they are segments of; every field has the leading axis of the batch.
+
+    Attributes:
+      segments: what the network sees.
+      truth: what it should say.
+      weight: 1, or 0 where there is no segment.
+    """
+
+    segments: Segments
+    truth: Truth
+    weight: jax.Array
+
+
+class Answers(flax.struct.PyTreeNode):
+    """The right answer of every hypothesis for one true body.
+
+    Attributes:
+      turn: rotation vector from the hypothesis' own orientation [rad], (13, 3).
+      half_size: along the axes of that description of the body [m], (13, 3).
+      taught: whether the hypothesis is near enough to be taught, (13,).
+      right: whether it is the one that should win, (13,).
+    """
+
+    turn: jax.Array
+    half_size: jax.Array
+    taught: jax.Array
+    right: jax.Array
+
+
+def rotation_vector(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
+    """The vector [rad] of a rotation by less than a half turn."""
+    off = jnp.stack([rotation[..., i, j] - rotation[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=-1)
+    trace = rotation[..., 0, 0] + rotation[..., 1, 1] + rotation[..., 2, 2]
+    sine = jnp.linalg.norm(off, axis=-1)
+    angle = jnp.arctan2(sine, trace - 1.0)
+    return off * jnp.where(sine > 1e-6, angle / jnp.maximum(sine, 1e-6), 0.5)[..., None]
+
+
+def answers(kind: Int[Array, ""], half_size: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> Answers:
+    """What each hypothesis should say of a body with `R_segment_object = rotation`.
+
+    A box is the same under 24 rotations that swap its axes, a cylinder under any about its axis and under half a turn;
+    of the equal descriptions each hypothesis takes the one nearest to its own orientation.
+    """
+    base = jnp.asarray(BASE_ROTATIONS)
+    relative = matmul(jnp.swapaxes(base, -1, -2), rotation)
+    symmetric = matmul(relative[:, None], jnp.asarray(SYMMETRIES)[None])
+    best = jnp.argmax(jnp.trace(symmetric, axis1=-2, axis2=-1), axis=1)
+    box_turn = rotation_vector(jnp.take_along_axis(symmetric, best[:, None, None, None], axis=1)[:, 0])
+    box_size = jnp.sum(jnp.abs(jnp.asarray(SYMMETRIES))[best] * half_size[None, :, None], axis=1)
+
+    axis = relative[:, :, 2]
+    axis = axis * jnp.where(axis[:, 2:] < 0, -1.0, 1.0)
+    sine = jnp.sqrt(axis[:, 0] ** 2 + axis[:, 1] ** 2)
+    angle = jnp.arctan2(sine, axis[:, 2])
+    ratio = jnp.where(sine > 1e-6, angle / jnp.maximum(sine, 1e-6), 1.0)
+    can_turn = jnp.stack([-axis[:, 1] * ratio, axis[:, 0] * ratio, jnp.zeros_like(ratio)], axis=-1)
+
+    round_ones = jnp.asarray(IS_CYLINDER)
+    turn = jnp.where(round_ones[:, None], can_turn, box_turn)
+    size = jnp.where(round_ones[:, None], half_size[None], box_size)
+    distance = jnp.linalg.norm(turn, axis=-1)
+    fits = round_ones == (kind == CYLINDER)
+    right = jnp.argmin(jnp.where(fits, distance, jnp.inf)) == jnp.arange(HYPOTHESES)
+    near = distance < jnp.min(jnp.where(fits, distance, jnp.inf)) + _OVERLAP
+    return Answers(turn, size, fits & near, right)
+
+
+@dataclasses.dataclass(frozen=True)
+class RecognitionTask:
+    """A `loop.Task`.
+
+    Attributes:
+      network: sizes of the network.
+      scenes: what scenes look like.
+      segments: how clouds are drawn.
+      shelf: the shelf.
+      view: which rays are cast.
+      share: examples per scene; of its up to eight objects, so many are taught in the mean.
+      ragged: share of scenes whose labels are ragged, as a segmentation's are.
+      precision: type in which the network computes.
+    """
+
+    network: RecognitionConfig = dataclasses.field(default_factory=RecognitionConfig)
+    scenes: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+    segments: SegmentConfig = dataclasses.field(default_factory=SegmentConfig)
+    shelf: Shelf = dataclasses.field(default_factory=Shelf)
+    view: View = dataclasses.field(default_factory=shelf_view)
+    share: int = 5
+    ragged: float = 0.25
+    precision: Any = jnp.bfloat16
+    name: str = "recognition"
+
+    def init(self, key: Key[Array, ""]) -> Any:
+        segments = self.segments.points
+        inputs = jnp.zeros((1, segments, 3)), jnp.zeros((1, segments), jnp.int8), jnp.zeros((1, 3))
+        return RecognitionNetwork(self.network).init(key, *inputs)["params"]
+
+    def scene(self, key: Key[Array, ""]) -> tuple[World, Capture, Example]:
+        """A random scene, its image, and the examples of its eight slots."""
+        worlds, sensing, drawing, surfaces, tearing, torn = jax.random.split(key, 6)
+        world = random_world(worlds, self.scenes, self.shelf)
+        seen = capture(sensing, world, self.scenes, self.shelf, self.view)
+        labels = jnp.where(jax.random.bernoulli(torn, self.ragged), tear(tearing, seen.labels), seen.labels)
+        segments = segment_clouds(drawing, self.view.camera, seen.points, labels, self.shelf, TARGET, self.segments)
+        objects = jax.tree.map(lambda a: a[:TARGET], world)
+        local = jax.vmap(functools.partial(surface_points, count=SURFACE))(
+            jax.random.split(surfaces, TARGET), objects.kind, objects.half_size
+        )
+        surface = rotate(objects.rotation[:, None], local) + objects.position[:, None]
+        R_segment_world = jnp.swapaxes(segments.T_world_segment[:, :3, :3], -1, -2)
+        origin = segments.T_world_segment[:, :3, 3]
+        truth = Truth(
+            kind=objects.kind,
+            half_size=objects.half_size,
+            position=rotate(R_segment_world, objects.position - origin),
+            rotation=matmul(R_segment_world, objects.rotation),
+            surface=rotate(R_segment_world[:, None], surface - origin[:, None]),
+        )
+        taught = segments.valid & objects.valid & worth_seeing(seen, self.view, PIXELS // 4)
+        return world, seen, Example(segments, truth, taught.astype(jnp.float32))
+
+    def sample(self, key: Key[Array, ""], batch: int) -> Example:
+        examples = jax.vmap(lambda k: self.scene(k)[2])(jax.random.split(key, batch))
+        flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), examples)
+        order = jnp.argsort(-flat.weight)[: batch * self.share]
+        return jax.tree.map(lambda a: a[order], flat)
+
+    def loss(self, parameters: Any, examples: Example) -> tuple[Float[Array, ""], dict[str, Any]]:
+        segments = examples.segments
+        network = RecognitionNetwork(self.network, self.precision)
+        told = network.apply({"params": parameters}, segments.points, segments.mark, segments.camera)
+        terms = jax.vmap(example_loss)(told, examples.truth)
+        total = jnp.maximum(jnp.sum(examples.weight), 1.0)
+        means = jax.tree.map(lambda a: jnp.sum(a * examples.weight) / total, terms)
+        loss = sum(weight * means[name] for name, weight in LOSS_WEIGHTS.items())
+        return loss, means | {"examples": total}
+
+    def scores(self, parameters: Any, scenes: int) -> dict[str, Any]:
+        return held_out_scores(self, parameters, scenes)
+
+    def save(self, path: Path, parameters: Any, card: dict[str, Any]) -> None:
+        save_weights(path, self.name, self.network, parameters, card)
+
+
+LOSS_WEIGHTS = {
+    "class": 0.5,
+    "turn": 1.0,
+    "size": 1.0,
+    "position": 1.0,
+    "surface": 1.0,
+    "exponents": 0.1,
+    "scale": 0.02,
+}
+
+
+def example_loss(told: Hypotheses, truth: Truth) -> dict[str, Float[Array, ""]]:
+    """The terms of one example's loss.
+
+    `surface` is the root of equation 7 for the hypothesis that should win, in centimetres: the root, so that objects
+    that are mostly hidden do not drown the others. The other terms lead every hypothesis that is near the truth there
+    directly.
+    """
+    right = answers(truth.kind, truth.half_size, truth.rotation)
+    share = right.taught / jnp.maximum(jnp.sum(right.taught), 1)
+
+    def mean(error, unit):
+        return jnp.sum(share * jnp.mean(jnp.abs(error) / unit, axis=-1))
+
+    size_error = told.size - right.half_size
+    position_error = told.position - truth.position[None]
+    edges = jnp.stack([jnp.full(HYPOTHESES, _SHARP), jnp.where(jnp.asarray(IS_CYLINDER), _ROUND, _SHARP)], axis=-1)
+    errors = jax.lax.stop_gradient(jnp.abs(jnp.concatenate([size_error, position_error], axis=-1)))
+    scale = jnp.exp(told.log_scale)
+    winner = jnp.argmax(right.right)
+    one = jax.tree.map(lambda a: a[winner], told)
+    local = rotate(one.rotation.T, truth.surface - one.position[None])
+    radial = superquadric.radial_distance(one.size, one.exponents, local)
+    return {
+        "class": optax.softmax_cross_entropy(told.logit, _soft(right)),
+        "correct": (jnp.argmax(told.logit) == winner).astype(jnp.float32),
+        "turn": mean(told.turn - right.turn, 0.1),
+        "size": mean(size_error, _UNIT),
+        "position": mean(position_error, _UNIT),
+        "exponents": mean(told.exponents - edges, 0.1),
+        "scale": jnp.sum(share * jnp.mean(errors / scale + told.log_scale, axis=-1)),
+        "surface": jnp.sqrt(jnp.mean(radial**2) + 1e-10) / _UNIT,
+    }
+
+
+def _soft(right: Answers) -> Float[Array, " k"]:
+    """What the probabilities should be: mostly the winner's, the rest spread over those that are as good as it."""
+    near = right.taught / jnp.maximum(jnp.sum(right.taught), 1)
+    return 0.8 * right.right + 0.2 * near
+
+
+def tear(key: Key[Array, ""], labels: Int[Array, "h w"], reach: int = 2) -> Int[Array, "h w"]:
+    """Labels with ragged borders: each pixel takes that of one up to `reach` pixels away, if both show objects."""
+    height, width = labels.shape
+    shift = jax.random.randint(key, (2, height, width), -reach, reach + 1)
+    rows = jnp.clip(jnp.arange(height)[:, None] + shift[0], 0, height - 1)
+    columns = jnp.clip(jnp.arange(width)[None, :] + shift[1], 0, width - 1)
+    other = labels[rows, columns]
+    return jnp.where((labels >= 0) & (other >= 0), other, labels)
+
+
+class _Scored(flax.struct.PyTreeNode):
+    overlap: jax.Array
+    centre: jax.Array
+    cylinder: jax.Array
+    share: jax.Array
+    counted: jax.Array
+    known: jax.Array
+    sensor: jax.Array
+
+
+@functools.partial(jax.jit, static_argnames=("task", "batch"))
+def _score_batch(task: RecognitionTask, parameters: Any, key: Array, batch: int) -> _Scored:
+    worlds, seen, examples = jax.vmap(task.scene)(jax.random.split(key, batch))
+    flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), examples.segments)
+    told = RecognitionNetwork(task.network).apply({"params": parameters}, flat.points, flat.mark, flat.camera)
+    found = jax.tree.map(lambda a: a.reshape(batch, TARGET, *a.shape[1:]), best_hypothesis(told, flat))  # pyright: ignore
+    truth = sharpened(true_superquadrics(worlds))
+    return _Scored(
+        overlap=intersection_over_union(truth, found),
+        centre=centre_error(truth, found),
+        cylinder=(found.exponents[..., 1] > 0.5) == (worlds.kind[:, :TARGET] == CYLINDER),
+        share=jax.vmap(visible_share)(seen),
+        counted=truth.valid & jax.vmap(lambda s: worth_seeing(s, task.view, PIXELS))(seen),
+        known=jax.vmap(is_known)(worlds)[:, :TARGET],
+        sensor=jnp.broadcast_to(seen.sensor[:, None], (batch, TARGET)),
+    )
+
+
+def held_out_scores(task: RecognitionTask, parameters: Any, scenes: int, batch: int = 32) -> dict[str, Any]:
+    """Scores on scenes of a seed that is never trained on, apart for every kind of noise and of shapes.
+
+    Objects with at least 100 pixels of the full image count; masks are true ones; nothing is refined.
+    """
+    scored = dataclasses.replace(task, ragged=0.0)
+    key = jax.random.key(HELD_OUT_SEED)
+    parts = [_score_batch(scored, parameters, jax.random.fold_in(key, i), batch) for i in range(-(-scenes // batch))]
+    all_ = jax.tree.map(lambda *a: np.concatenate([np.asarray(x).reshape(-1) for x in a]), *parts)
+    result: dict[str, Any] = {}
+    for shapes, known in (("paper's shapes", True), ("random shapes", False)):
+        for sensor, noise in enumerate(noise_names(task.scenes)):
+            chosen = all_.counted & (all_.known == known) & (all_.sensor == sensor)
+            result[f"{shapes}, {noise}"] = {
+                "all": _summary(all_, chosen),
+                "visible 60% and more": _summary(all_, chosen & (all_.share >= 0.6)),
+                "visible below 30%": _summary(all_, chosen & (all_.share < 0.3)),
+            }
+    return result
+
+
+def _summary(scored: _Scored, chosen: Bool[np.ndarray, " n"]) -> dict[str, float]:
+    if not chosen.any():
+        return {"objects": 0}
+    return {
+        "objects": int(chosen.sum()),
+        "iou_mean": round(float(np.mean(scored.overlap[chosen])), 4),
+        "iou_median": round(float(np.median(scored.overlap[chosen])), 4),
+        "centre_median_mm": round(1e3 * float(np.median(scored.centre[chosen])), 3),
+        "shape_right": round(float(np.mean(scored.cylinder[chosen])), 4),
+    }

@@ -1,0 +1,384 @@
+"""Random scenes: made, ray-cast and turned into images of points on the accelerator, as many at once as wanted."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from mechsearch_jax.camera import Camera, rays
+from mechsearch_jax.envs.generator import BOXES, CYLINDERS
+from mechsearch_jax.envs.observation import cast_body, cast_shelf
+from mechsearch_jax.envs.world import BODIES, BOX, CYLINDER, TARGET, World
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.perception.cloud import MARGIN, View, above_board, shelf_view
+from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
+from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.transforms import matmul, yaw_rotation
+
+# Steps of `_slide`; each shortens the gap to at most about a third.
+_SLIDES = 8
+_TARGETS = np.array([(0.02, 0.02, 0.05), (0.015, 0.02, 0.05)])
+_KNOWN = np.array(
+    [(BOX, *half) for w, d, h in BOXES for half in ((w / 2, d / 2, h / 2), (d / 2, w / 2, h / 2))]
+    + [(CYLINDER, r, r, h / 2) for r, h in CYLINDERS for _ in range(2)],
+    np.float32,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneConfig:
+    """What scenes look like. Sizes are full sizes [m]; ranges are drawn from evenly on a logarithmic scale.
+
+    Attributes:
+      objects: least and largest number of objects; some may find no room and are left out.
+      known: share of objects that are one of the paper's eleven.
+      sides: range of a box's width and depth.
+      heights: range of heights.
+      diameters: range of a cylinder's diameter.
+      lying: share of objects that lie on their side.
+      leaning: share of objects that lean, none of whose faces is level.
+      lean: range of the angle by which they lean [rad].
+      touching: share of objects that are pushed against another.
+      target: share of scenes in which the camera sees the target, or may: its points are none of an object.
+      placements: how many places are tried at once for an object.
+      noises: each scene's sensor is one of these, drawn evenly.
+    """
+
+    objects: tuple[int, int] = (2, 8)
+    known: float = 0.5
+    sides: tuple[float, float] = (0.022, 0.17)
+    heights: tuple[float, float] = (0.04, 0.23)
+    diameters: tuple[float, float] = (0.03, 0.1)
+    lying: float = 0.07
+    leaning: float = 0.03
+    lean: tuple[float, float] = (0.05, 0.6)
+    touching: float = 0.2
+    target: float = 0.3
+    placements: int = 24
+    noises: tuple[NoiseModel, ...] = (no_noise, RandomDirection(), TimeOfFlight())
+
+    def __post_init__(self):
+        low, high = self.objects
+        if not 1 <= low <= high <= TARGET:
+            raise InputError(f"SceneConfig: objects {self.objects} must be a range within 1 to {TARGET}")
+        for name in ("known", "lying", "leaning", "touching", "target"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"SceneConfig: {name} {getattr(self, name)} must be between 0 and 1")
+        for name in ("sides", "heights", "diameters", "lean"):
+            if not 0 < getattr(self, name)[0] <= getattr(self, name)[1]:
+                raise InputError(f"SceneConfig: {name} {getattr(self, name)} must be a range of positive numbers")
+        if self.placements < 1 or not self.noises:
+            raise InputError("SceneConfig: placements must be at least 1 and noises not empty")
+
+
+class Footprint(flax.struct.PyTreeNode):
+    """What bodies cover, seen from above: a rectangle, or a disc where `radius` is not 0.
+
+    Attributes:
+      centre: [m], shape (..., 2).
+      half: half-extents of the rectangle along its own axes [m], shape (..., 2); 0 for a disc.
+      yaw: of the rectangle [rad], shape (...).
+      radius: of the disc [m], shape (...).
+    """
+
+    centre: jax.Array
+    half: jax.Array
+    yaw: jax.Array
+    radius: jax.Array
+
+
+def _axes(yaw: Array) -> Array:
+    """A rectangle's axes as rows, shape (..., 2, 2)."""
+    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    return jnp.stack([jnp.stack([c, s], axis=-1), jnp.stack([-s, c], axis=-1)], axis=-2)
+
+
+def gap(a: Footprint, b: Footprint) -> Float[Array, "..."]:
+    """A lower bound of the distance between footprints [m] that is positive where they are apart, else not.
+
+    Rectangles by the axis that separates them most, exact where one side faces the other; discs exactly.
+    """
+    offset = b.centre - a.centre
+    axes_a, axes_b = _axes(a.yaw), _axes(b.yaw)
+
+    def along(axes):
+        reach = sum(
+            jnp.sum(jnp.abs(jnp.sum(axes[..., :, None, :] * own[..., None, :, :], axis=-1)) * f.half[..., None, :], -1)
+            for f, own in ((a, axes_a), (b, axes_b))
+        )
+        return jnp.max(jnp.abs(jnp.sum(axes * offset[..., None, :], axis=-1)) - reach, axis=-1)
+
+    def to_rectangle(axes, half):
+        outside = jnp.abs(jnp.sum(axes * offset[..., None, :], axis=-1)) - half
+        return jnp.linalg.norm(jnp.maximum(outside, 0.0), axis=-1) + jnp.minimum(jnp.max(outside, axis=-1), 0.0)
+
+    rectangles = jnp.maximum(along(axes_a), along(axes_b))
+    round_a, round_b = a.radius > 0, b.radius > 0
+    mixed = jnp.where(round_a, to_rectangle(axes_b, b.half), to_rectangle(axes_a, a.half))
+    discs = jnp.linalg.norm(offset, axis=-1)
+    apart = jnp.where(round_a & round_b, discs, jnp.where(round_a | round_b, mixed, rectangles))
+    return apart - a.radius - b.radius
+
+
+class _Shape(flax.struct.PyTreeNode):
+    """A body at the origin, its lowest point at height 0: what it is, how it is turned, and what it covers."""
+
+    kind: jax.Array
+    half_size: jax.Array
+    rotation: jax.Array
+    height: jax.Array
+    half: jax.Array
+    radius: jax.Array
+
+
+def _log_uniform(key: Array, limits: tuple[float, float], shape: tuple[int, ...] = ()) -> Array:
+    return jnp.exp(jax.random.uniform(key, shape, minval=np.log(limits[0]), maxval=np.log(limits[1])))
+
+
+def _tilt(angle: Array) -> Array:
+    """Rotation about the x axis."""
+    c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
+    return jnp.stack([jnp.stack(r) for r in ([one, zero, zero], [zero, c, -s], [zero, s, c])])
+
+
+def _draw_shape(key: Array, config: SceneConfig) -> _Shape:
+    """A random body, in the frame that its yaw turns."""
+    keys = jax.random.split(key, 8)
+    known = jnp.array(_KNOWN)[jax.random.randint(keys[0], (), 0, len(_KNOWN))]
+    is_known = jax.random.bernoulli(keys[1], config.known)
+    kind = jnp.where(is_known, known[0].astype(jnp.int32), jax.random.randint(keys[2], (), 0, 2))
+    width, depth = _log_uniform(keys[3], config.sides, (2,)) / 2
+    radius = _log_uniform(keys[4], config.diameters) / 2
+    height = _log_uniform(keys[5], config.heights) / 2
+    free = jnp.where(kind == CYLINDER, jnp.stack([radius, radius, height]), jnp.stack([width, depth, height]))
+    half = jnp.where(is_known, known[1:], free)
+    pose = jax.random.uniform(keys[6])
+    angle = jnp.where(
+        pose < config.leaning,
+        jax.random.uniform(keys[7], minval=config.lean[0], maxval=config.lean[1]),
+        jnp.where(pose < config.leaning + config.lying, jnp.pi / 2, 0.0),
+    )
+    rotation = _tilt(angle)
+    return _shape(kind, half, rotation)
+
+
+def _shape(kind: Array, half: Array, rotation: Array) -> _Shape:
+    extent = jnp.sum(jnp.abs(rotation) * half[None, :], axis=-1)
+    side = jnp.sqrt(jnp.maximum(1.0 - rotation[:, 2] ** 2, 0.0))
+    round_extent = half[0] * side + half[2] * jnp.abs(rotation[:, 2])
+    extent = jnp.where(kind == CYLINDER, round_extent, extent)
+    standing = (kind == CYLINDER) & (rotation[2, 2] > 0.999)
+    return _Shape(
+        kind, half, rotation, extent[2], jnp.where(standing, 0.0, extent[:2]), jnp.where(standing, half[0], 0.0)
+    )
+
+
+def _slide(moving: Footprint, other: Footprint) -> Footprint:
+    """The footprint moved towards another until they all but touch; a gap bounds the distance from below."""
+
+    def step(_, one):
+        offset = other.centre - one.centre
+        away = offset / jnp.maximum(jnp.linalg.norm(offset), 1e-6)
+        return one.replace(centre=one.centre + away * jnp.maximum(gap(one, other), 0.0))
+
+    return jax.lax.fori_loop(0, _SLIDES, step, moving)
+
+
+def _row(vector: np.ndarray, like: Array) -> Array:
+    return jnp.asarray(vector, jnp.float32).reshape(*[1] * (like.ndim - 1), -1)
+
+
+def _within(shelf: Shelf, one: Footprint, clearance: float = 0.002) -> Array:
+    """Whether a footprint lies on the board, and its centre where objects are dropped."""
+    reach = jnp.sum(jnp.abs(jnp.swapaxes(_axes(one.yaw), -1, -2)) * one.half[..., None, :], axis=-1)
+    reach = reach + one.radius[..., None]
+    low, high = one.centre - reach, one.centre + reach
+    on_board = (low[..., 0] > shelf.front) & (high[..., 0] < shelf.back - clearance)
+    on_board &= (low[..., 1] > shelf.right + clearance) & (high[..., 1] < shelf.left - clearance)
+    low, high = (np.array(ends) for ends in zip(shelf.spawn_x, shelf.spawn_y, strict=True))
+    centred = (one.centre > _row(low - 0.01, one.centre)) & (one.centre < _row(high + 0.01, one.centre))
+    return on_board & centred.all(axis=-1)
+
+
+def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: Shelf | None = None) -> World:
+    """A random scene: bodies that rest on the board and do not overlap.
+
+    Bodies find their places one after the other among `config.placements` tries each; one that finds none is left
+    out. What leans is not held by anything: it stands for what physics leaves leaning, without the physics.
+
+    Args:
+      key: PRNG key.
+      config: what scenes look like; static.
+      shelf: the shelf; static.
+    """
+    config, shelf = config or SceneConfig(), shelf or Shelf()
+    keys = jax.random.split(key, 5)
+    count = jax.random.randint(keys[0], (), config.objects[0], config.objects[1] + 1)
+    shapes = jax.vmap(lambda k: _draw_shape(k, config))(jax.random.split(keys[1], TARGET))
+    target_kind = jax.random.randint(keys[2], (), 0, 2)
+    target = _shape(
+        jnp.where(target_kind == 0, CYLINDER, BOX), jnp.array(_TARGETS, jnp.float32)[target_kind], jnp.eye(3)
+    )
+    shapes = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), shapes, target)
+    wanted = (jnp.arange(BODIES) < count).at[TARGET].set(jax.random.bernoulli(keys[3], config.target))
+    low = jnp.array([shelf.spawn_x[0], shelf.spawn_y[0]])
+    high = jnp.array([shelf.spawn_x[1], shelf.spawn_y[1]])
+
+    def place(placed, slot_key_shape):
+        slot, key, shape = slot_key_shape
+        footprints, present = placed
+        draws, turns, pick, touch = jax.random.split(key, 4)
+        tries = config.placements
+        centre = low[None] + (high - low)[None] * jax.random.uniform(draws, (tries, 2))
+        yaw = jax.random.uniform(turns, (tries,), minval=-jnp.pi, maxval=jnp.pi)
+        candidates = Footprint(
+            centre, jnp.broadcast_to(shape.half, (tries, 2)), yaw, jnp.broadcast_to(shape.radius, (tries,))
+        )
+        neighbour = jax.random.randint(pick, (tries,), 0, jnp.maximum(slot, 1)) % BODIES
+        beside = jax.vmap(_slide)(candidates, jax.tree.map(lambda a: a[neighbour], footprints))
+        touches = jax.random.bernoulli(touch, config.touching) & present[neighbour]
+        candidates = candidates.replace(centre=jnp.where(touches[:, None], beside.centre, candidates.centre))
+        gaps = jax.vmap(lambda one: jax.vmap(lambda other: gap(one, other))(footprints))(candidates)
+        clear = jnp.all((gaps > 0.0) | ~present[None, :], axis=1)
+        fits = clear & jax.vmap(lambda one: _within(shelf, one))(candidates)
+        best = jnp.argmax(fits)
+        one = jax.tree.map(lambda a: a[best], candidates)
+        footprints = jax.tree.map(lambda a, b: a.at[slot].set(b), footprints, one)
+        return (footprints, present.at[slot].set(fits[best] & wanted[slot])), None
+
+    nowhere = Footprint(jnp.zeros((BODIES, 2)), jnp.zeros((BODIES, 2)), jnp.zeros(BODIES), jnp.zeros(BODIES))
+    (footprints, present), _ = jax.lax.scan(
+        place, (nowhere, jnp.zeros(BODIES, bool)), (jnp.arange(BODIES), jax.random.split(keys[4], BODIES), shapes)
+    )
+    position = jnp.concatenate([footprints.centre, (shelf.board + shapes.height)[:, None]], axis=1)
+    return World(
+        kind=shapes.kind,
+        half_size=shapes.half_size,
+        position=position,
+        rotation=matmul(yaw_rotation(footprints.yaw), shapes.rotation),
+        valid=present,
+    )
+
+
+class Capture(flax.struct.PyTreeNode):
+    """What a sensor makes of a scene.
+
+    Attributes:
+      points: as measured [m], shape (h, w, 3); NaN where nothing was.
+      labels: int8, shape (h, w): 0 to 7 an object's slot, 8 the target, FREE the shelf, OTHER the shelf
+        where noise has lifted it, MISSING nothing.
+      pixels: how many pixels show each object, int32, shape (8,).
+      alone: how many would if it stood there alone.
+      sensor: which of the noises it has.
+    """
+
+    points: jax.Array
+    labels: jax.Array
+    pixels: jax.Array
+    alone: jax.Array
+    sensor: jax.Array
+
+
+def cast_world(
+    camera: Camera, shelf: Shelf, world: World
+) -> tuple[Float[Array, "h w"], Int[Array, "h w"], Int[Array, " bodies"]]:
+    """Depth [m], the slot of the body that is seen (-1 for none), and how many pixels each body has if alone."""
+    directions = rays(camera)
+
+    def nearer(slot, best):
+        depth, owner, alone = best
+        candidate = cast_body(camera, world, slot, directions)
+        alone = alone.at[slot].set(jnp.sum(jnp.isfinite(candidate)))
+        return jnp.minimum(depth, candidate), jnp.where(candidate < depth, slot.astype(jnp.int8), owner), alone
+
+    behind = cast_shelf(camera, shelf, directions)
+    none = jnp.full(behind.shape, -1, jnp.int8)
+    return jax.lax.fori_loop(0, BODIES, nearer, (behind, none, jnp.zeros(BODIES, jnp.int32)))
+
+
+def capture(
+    key: Key[Array, ""],
+    world: World,
+    config: SceneConfig | None = None,
+    shelf: Shelf | None = None,
+    view: View | None = None,
+) -> Capture:
+    """The image of a scene by one of the sensors of `config.noises`.
+
+    Args:
+      key: PRNG key.
+      world: the scene.
+      config: what scenes look like; static.
+      shelf: the shelf; static.
+      view: which part of the camera's image, by default `shelf_view()`; static.
+    """
+    config, shelf = config or SceneConfig(), shelf or Shelf()
+    camera = (view or shelf_view()).camera
+    which, sensing = jax.random.split(key)
+    depth, owner, alone = cast_world(camera, shelf, world)
+    sensors = [lambda k, d, noise=noise: noise(k, camera, d) for noise in config.noises]
+    sensor = jax.random.randint(which, (), 0, len(sensors))
+    points = jax.lax.switch(sensor, sensors, sensing, depth)
+    return Capture(
+        points=points,
+        labels=true_labels(points, owner, shelf),
+        pixels=jnp.sum(owner[..., None] == jnp.arange(TARGET).reshape(1, 1, -1), axis=(0, 1)),
+        alone=alone[:TARGET],
+        sensor=sensor,
+    )
+
+
+def true_labels(
+    points: Float[Array, "h w 3"], owner: Int[Array, "h w"], shelf: Shelf, margin: float = MARGIN
+) -> Int[Array, "h w"]:
+    """Labels (see `Capture`) of an image whose pixels show the bodies `owner`; what is near the shelf counts as it."""
+    body = jnp.where(owner < 0, OTHER, owner)
+    labels = jnp.where(above_board(shelf, points, margin), body, FREE)
+    return jnp.where(jnp.isfinite(points).all(axis=-1), labels, MISSING).astype(jnp.int8)
+
+
+def is_known(world: World) -> Bool[Array, " bodies"]:
+    """Which bodies are of the size of one of the paper's eleven objects."""
+    own = jnp.concatenate([world.kind[:, None].astype(jnp.float32), world.half_size], axis=1)
+    return (jnp.abs(own[:, None] - jnp.asarray(_KNOWN)[None]) < 1e-5).all(axis=-1).any(axis=-1)
+
+
+def noise_names(config: SceneConfig) -> list[str]:
+    """Names of the sensors, as `Capture.sensor` numbers them."""
+    return [getattr(noise, "__name__", type(noise).__name__) for noise in config.noises]
+
+
+def visible_share(seen: Capture) -> Float[Array, " objects"]:
+    """Which share of its pixels each object shows; 0 where it has none."""
+    return jnp.where(seen.alone > 0, seen.pixels / jnp.maximum(seen.alone, 1), 0.0)
+
+
+def surface_points(
+    key: Key[Array, ""], kind: Int[Array, ""], half_size: Float[Array, "3"], count: int
+) -> Float[Array, "count 3"]:
+    """Points spread uniformly over the surface of a box or cylinder, in its own frame [m]."""
+    a, b, c = half_size
+    faces, flat, sign = jax.random.split(key, 3)
+    box_area = jnp.stack([b * c, a * c, a * b])
+    round_area = jnp.stack([2.0 * a * c, 0.0 * a, a * a])
+    area = jnp.where(kind == CYLINDER, round_area, box_area)
+    face = jax.random.categorical(faces, jnp.log(jnp.maximum(area, 1e-12)), shape=(count,))
+    u = jax.random.uniform(flat, (count, 3), minval=-1.0)
+    side = jnp.where(jax.random.bernoulli(sign, shape=(count,)), 1.0, -1.0)
+    box = jnp.where(face[:, None] == jnp.arange(3)[None], side[:, None], u)
+    angle = jnp.pi * u[:, 0]
+    radius = jnp.where(face == 2, jnp.sqrt(jnp.abs(u[:, 1])), 1.0)
+    height = jnp.where(face == 2, side, u[:, 2])
+    can = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), height], axis=-1)
+    return jnp.where(kind == CYLINDER, can, box) * half_size[None]
+
+
+def worth_seeing(seen: Capture, view: View, pixels: int) -> Bool[Array, " objects"]:
+    """Which objects show at least so many pixels of the full image."""
+    return seen.pixels * view.stride**2 >= pixels

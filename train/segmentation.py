@@ -1,0 +1,211 @@
+"""Training of the segmentation network: its examples, its Hungarian-matched loss and its held-out scores."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, Int, Key
+from optax.assignment import hungarian_algorithm
+
+from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork
+from mechsearch_jax.models.weights import save_weights
+from mechsearch_jax.perception.cloud import POINTS, View, cloud_of, resample, shelf_view
+from mechsearch_jax.perception.labels import INSTANCES, OTHER
+from mechsearch_jax.perception.segmentation import clean_up, labels_of
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.train.loop import HELD_OUT_SEED
+from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, random_world
+
+# What a layer's loss counts against the next one's.
+_EARLIER = 0.5
+# Centres are told in these [m].
+_UNIT = 0.05
+
+
+class Example(flax.struct.PyTreeNode):
+    """Clouds and what they show; every field has the leading axis of the batch.
+
+    Attributes:
+      points: in the world [m], (P, 3).
+      labels: of each point the slot of its object, or OTHER, (P,).
+      centres: centre of each point's object [m], (P, 3).
+      weight: 1, or 0 where the camera sees no object.
+      objects: how many objects there are, seen or not.
+      sensor: which noise the points have.
+    """
+
+    points: jax.Array
+    labels: jax.Array
+    centres: jax.Array
+    weight: jax.Array
+    objects: jax.Array
+    sensor: jax.Array
+
+
+def match(logits: Float[Array, "p classes"], labels: Int[Array, " p"]) -> Int[Array, " classes"]:
+    """Which of the network's instances each label is matched with, by the Hungarian method.
+
+    The cost of a pair is what both terms of `segmentation_loss` would be for it. Labels that no point has are matched
+    with what is left over. The last entry stands for OTHER, which matches itself.
+    """
+    log_probability = jax.nn.log_softmax(logits)[:, :INSTANCES]
+    member = (labels[:, None] == jnp.arange(INSTANCES)[None]).astype(jnp.float32)
+    count = jnp.sum(member, axis=0)
+    likelihood = -jnp.matmul(member.T, log_probability, precision="highest") / jnp.maximum(count, 1.0)[:, None]
+    cost = likelihood + 2.0 * dice(jnp.exp(log_probability), member).T
+    cost = jnp.where(count[:, None] > 0, cost, 0.0)
+    rows, columns = hungarian_algorithm(jax.lax.stop_gradient(cost))
+    instance = jnp.zeros(INSTANCES, jnp.int32).at[rows].set(columns.astype(jnp.int32))
+    return jnp.append(instance, INSTANCES)
+
+
+def dice(probability: Float[Array, "p a"], member: Float[Array, "p b"]) -> Float[Array, "a b"]:
+    """One minus the overlap (F. Milletari et al., "V-Net", 2016) of soft memberships with hard ones."""
+    shared = jnp.matmul(probability.T, member, precision="highest")
+    total = jnp.sum(probability, axis=0)[:, None] + jnp.sum(member, axis=0)[None, :]
+    return 1.0 - (2.0 * shared + 1.0) / (total + 1.0)
+
+
+def segmentation_loss(logits: Float[Array, "p classes"], labels: Int[Array, " p"]) -> dict[str, Float[Array, ""]]:
+    """The matched loss of one cloud: mean cross-entropy of its points, mean overlap loss of its objects, and accuracy.
+
+    It is the same however the labels, or the network's instances, are numbered.
+    """
+    instance = match(logits, labels)
+    wanted = instance[jnp.where(labels == OTHER, INSTANCES, labels)]
+    cross_entropy = optax.softmax_cross_entropy_with_integer_labels(logits, wanted)
+    probability = jax.nn.softmax(logits)[:, instance[:INSTANCES]]
+    member = (labels[:, None] == jnp.arange(INSTANCES)[None]).astype(jnp.float32)
+    present = jnp.sum(member, axis=0) > 0
+    overlap = jnp.diagonal(dice(probability, member))
+    return {
+        "cross_entropy": jnp.mean(cross_entropy),
+        "dice": jnp.sum(overlap * present) / jnp.maximum(jnp.sum(present), 1),
+        "accuracy": jnp.mean(jnp.argmax(logits, axis=-1) == wanted),
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class SegmentationTask:
+    """A `loop.Task`.
+
+    Attributes:
+      network: sizes of the network.
+      scenes: what scenes look like.
+      shelf: the shelf.
+      view: which rays are cast.
+      points: in a cloud.
+      precision: type in which the network computes.
+    """
+
+    network: SegmentationConfig = dataclasses.field(default_factory=SegmentationConfig)
+    scenes: SceneConfig = dataclasses.field(default_factory=SceneConfig)
+    shelf: Shelf = dataclasses.field(default_factory=Shelf)
+    view: View = dataclasses.field(default_factory=shelf_view)
+    points: int = POINTS
+    precision: Any = jnp.bfloat16
+    name: str = "segmentation"
+
+    def init(self, key: Key[Array, ""]) -> Any:
+        points = jnp.zeros((1, max(64, self.network.neighbours), 3))
+        return SegmentationNetwork(self.network).init(key, points)["params"]
+
+    def scene(self, key: Key[Array, ""]) -> Example:
+        """A random scene's cloud.
+
+        The target's points are left out, as the detector's mask leaves them out; points of the shelf that noise has lifted
+        off it are not, and are OTHER.
+        """
+        worlds, sensing, drawing = jax.random.split(key, 3)
+        world = random_world(worlds, self.scenes, self.shelf)
+        seen = capture(sensing, world, self.scenes, self.shelf, self.view)
+        cloud = cloud_of(seen.points)
+        labels = seen.labels.reshape(-1)
+        cloud = cloud.replace(valid=cloud.valid & (labels >= OTHER) & (labels != TARGET))
+        cloud = resample(drawing, cloud, self.points)
+        label = jnp.where(cloud.valid, labels[cloud.pixel], OTHER)
+        centres = world.position[jnp.clip(label, 0, TARGET - 1)]
+        weight = cloud.valid[0].astype(jnp.float32)
+        return Example(cloud.points, label, centres, weight, jnp.sum(world.valid[:TARGET]), seen.sensor)
+
+    def sample(self, key: Key[Array, ""], batch: int) -> Example:
+        return jax.vmap(self.scene)(jax.random.split(key, batch))
+
+    def loss(self, parameters: Any, examples: Example) -> tuple[Float[Array, ""], dict[str, Any]]:
+        network = SegmentationNetwork(self.network, self.precision)
+        told = network.apply({"params": parameters}, examples.points)
+        terms = jax.vmap(jax.vmap(segmentation_loss), in_axes=(0, None))(told.logits, examples.labels)
+        total = jnp.maximum(jnp.sum(examples.weight), 1.0)
+        layers = {name: jnp.sum(a * examples.weight[None], axis=1) / total for name, a in terms.items()}
+        error = jnp.abs(told.centres - examples.centres) / _UNIT
+        of_object = (examples.labels != OTHER)[..., None] * examples.weight[:, None, None]
+        centres = jnp.sum(error * of_object) / jnp.maximum(3.0 * jnp.sum(of_object), 1.0)
+        share = _EARLIER ** jnp.arange(len(told.logits))[::-1]
+        loss = jnp.sum(share * (layers["cross_entropy"] + 2.0 * layers["dice"])) / jnp.sum(share) + centres
+        return loss, {name: a[-1] for name, a in layers.items()} | {"centres": centres}
+
+    def scores(self, parameters: Any, scenes: int) -> dict[str, Any]:
+        return held_out_scores(self, parameters, scenes)
+
+    def save(self, path: Path, parameters: Any, card: dict[str, Any]) -> None:
+        save_weights(path, self.name, self.network, parameters, card)
+
+
+def instance_overlaps(
+    found: Int[Array, " p"], labels: Int[Array, " p"]
+) -> tuple[Float[Array, " instances"], Bool[Array, " instances"]]:
+    """Intersection over union of each true instance's points with those of the segment it is matched with.
+
+    Segments are matched so that the sum is largest; one that is missed counts as 0.
+
+    Returns:
+      The overlaps, and which true instances there are.
+    """
+    instances = jnp.arange(INSTANCES)
+    own = (labels[:, None] == instances[None]).astype(jnp.float32)
+    other = (found[:, None] == instances[None]).astype(jnp.float32)
+    shared = jnp.matmul(own.T, other, precision="highest")
+    union = jnp.sum(own, axis=0)[:, None] + jnp.sum(other, axis=0)[None] - shared
+    overlap = shared / jnp.maximum(union, 1.0)
+    rows, columns = hungarian_algorithm(-overlap)
+    return jnp.zeros(INSTANCES).at[rows].set(overlap[rows, columns]), jnp.sum(own, axis=0) > 0
+
+
+@functools.partial(jax.jit, static_argnames=("task", "batch"))
+def _score_batch(task: SegmentationTask, parameters: Any, key: Array, batch: int):
+    examples = task.sample(key, batch)
+    told = SegmentationNetwork(task.network).apply({"params": parameters}, examples.points)
+    raw = labels_of(told.logits[-1].reshape(-1, INSTANCES + 1)).reshape(batch, -1)
+    valid = jnp.broadcast_to(examples.weight[:, None] > 0, raw.shape)
+    clean = jax.vmap(clean_up)(examples.points, raw, valid)
+    overlaps = [jax.vmap(instance_overlaps)(found, examples.labels) for found in (raw, clean)]
+    return overlaps, examples.objects, examples.sensor
+
+
+def held_out_scores(task: SegmentationTask, parameters: Any, scenes: int, batch: int = 32) -> dict[str, Any]:
+    """Mean instance IoU on scenes of seeds that are never trained on, before and after the clean-up, by the number of
+    objects in a scene and for every kind of noise, with shapes as in training."""
+    key = jax.random.key(HELD_OUT_SEED)
+    parts = [_score_batch(task, parameters, jax.random.fold_in(key, i), batch) for i in range(-(-scenes // batch))]
+    overlaps, objects, sensors = jax.tree.map(lambda *a: np.concatenate([np.asarray(x) for x in a]), *parts)
+    result: dict[str, Any] = {}
+    for sensor, noise in enumerate(noise_names(task.scenes)):
+        for count in range(1, TARGET + 1):
+            chosen = (objects == count) & (sensors == sensor)
+            found = {
+                name: round(float(np.mean(overlap[chosen][present[chosen]])), 4)
+                for name, (overlap, present) in zip(("iou_raw", "iou_clean"), overlaps, strict=True)
+                if present[chosen].any()
+            }
+            if found:
+                result[f"{count} objects, {noise}"] = {"scenes": int(chosen.sum()), **found}
+    return result
