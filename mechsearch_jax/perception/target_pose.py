@@ -1,0 +1,113 @@
+"""Where a target of known shape stands, from the points of it that the camera sees."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.target import Target
+from mechsearch_jax.transforms import yaw_rotation
+
+ITERATIONS = 12
+# Residuals beyond this count only in proportion: mixed pixels at edges, and points of others [m].
+OUTLIER = 0.003
+# Damping of a step, relative to what the points say, and how far one step may go [m, m, rad].
+DAMPING = 1e-3
+LONGEST_STEP = (0.01, 0.01, 0.3)
+
+
+def _gap(along: Array) -> Array:
+    """Signed distance of points to a convex prism, from their signed distances to its side and to its ends (..., 2)."""
+    outside = jnp.maximum(along, 0.0)
+    square = jnp.sum(outside**2, axis=-1)
+    beyond = square > 0
+    return jnp.where(beyond, jnp.sqrt(jnp.where(beyond, square, 1.0)), jnp.max(along, axis=-1))
+
+
+def distance(target: Target, shelf: Shelf, pose: Float[Array, " 3"], points: Float[Array, "p 3"]) -> Float[Array, " p"]:
+    """Signed distance of world points to the surface of a target that stands at x, y [m] and yaw [rad]; [m]."""
+    half = target.half_size
+    level = points[:, :2] - pose[None, :2]
+    end = jnp.abs(points[:, 2] - target.height(shelf)) - half[2]
+    if target.shape == "cylinder":
+        square = jnp.sum(level**2, axis=-1)
+        apart = square > 0
+        side = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0) - half[0]
+    else:
+        R = yaw_rotation(pose[2])
+        own = level[:, :1] * R[None, 0, :2] + level[:, 1:] * R[None, 1, :2]
+        side = _gap(jnp.abs(own) - jnp.array([half[:2]]))
+    return _gap(jnp.stack([side, end], axis=-1))
+
+
+def _cost(residual, weight):
+    size = jnp.abs(residual)
+    return jnp.sum(weight * jnp.where(size < OUTLIER, 0.5 * size**2, OUTLIER * (size - 0.5 * OUTLIER)))
+
+
+def _descend(residuals, weight, start):
+    """Damped Gauss-Newton steps from a start; each is kept only if it lowers the cost."""
+
+    def step(state, _):
+        pose, cost, damping = state
+        r, J = residuals(pose), jax.jacfwd(residuals)(pose)
+        w = weight * jnp.minimum(1.0, OUTLIER / jnp.maximum(jnp.abs(r), 1e-9))
+        JtJ = jnp.sum(w[:, None, None] * J[:, :, None] * J[:, None, :], axis=0)
+        gradient = jnp.sum((w * r)[:, None] * J, axis=0)
+        scale = jnp.diag(JtJ)
+        # A direction of which the points say nothing, like the yaw of a cylinder, is left alone.
+        H = JtJ + jnp.diag(damping * scale + jnp.where(scale > 0, 1e-9, 1.0))
+        move = jnp.clip(-jnp.linalg.solve(H, gradient), -jnp.array(LONGEST_STEP), jnp.array(LONGEST_STEP))
+        trial = pose + move
+        trial_cost = _cost(residuals(trial), weight)
+        better = trial_cost < cost
+        pose, cost = jnp.where(better, trial, pose), jnp.where(better, trial_cost, cost)
+        return (pose, cost, damping * jnp.where(better, 0.3, 10.0)), None
+
+    first = (start, _cost(residuals(start), weight), jnp.float32(DAMPING))
+    (pose, cost, _), _ = jax.lax.scan(step, first, None, length=ITERATIONS)
+    return pose, cost
+
+
+@functools.partial(jax.jit, static_argnames=("target", "shelf"))
+def target_pose(
+    target: Target,
+    shelf: Shelf,
+    camera_position: Float[Array, " 3"],
+    points: Float[Array, "p 3"],
+    valid: Bool[Array, " p"],
+) -> Float[Array, " 3"]:
+    """Fit an upright target that stands on the board to points on its visible side.
+
+    Robust least squares of the distance between points and surface, from one start for each of eight yaw angles if the
+    target is a box, which leaves its pose free by half a turn.
+
+    Args:
+      target: its known shape; static.
+      shelf: static.
+      camera_position: in the world [m].
+      points: in the world [m], shape (P, 3).
+      valid: which of them are the target's, shape (P,). If none are, the result means nothing, but is finite.
+
+    Returns:
+      x, y [m] and yaw [rad] within half a turn; the yaw of a cylinder is 0.
+    """
+    weight = valid.astype(jnp.float32)
+    points = jnp.where(valid[:, None], points, 0.0)
+    count = jnp.maximum(jnp.sum(weight), 1.0)
+    centre = jnp.sum(points, axis=0)[:2] / count
+    away = centre - camera_position[:2]
+    away = away / jnp.maximum(jnp.sqrt(jnp.sum(away**2) + 1e-12), 1e-6)
+    # The visible side is nearer to the camera than the centre, by about two thirds of the radius on average.
+    xy = centre + away * (0.65 * min(target.half_size[:2]))
+    yaws = jnp.arange(8) * (math.pi / 8) if target.shape == "box" else jnp.zeros(1)
+    starts = jnp.concatenate([jnp.broadcast_to(xy[None], (len(yaws), 2)), yaws[:, None]], axis=1)
+    residuals = lambda pose: distance(target, shelf, pose, points)  # noqa: E731
+    poses, costs = jax.vmap(lambda start: _descend(residuals, weight, start))(starts)
+    best = poses[jnp.argmin(costs)]
+    return best.at[2].set(jnp.mod(best[2], math.pi) if target.shape == "box" else 0.0)

@@ -1,0 +1,98 @@
+"""A target of known shape is found where it stands, from the part of it that the camera sees."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mechsearch_jax.camera import Camera
+from mechsearch_jax.perception.target_pose import distance, target_pose
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.target import Target
+
+CAMERA, SHELF = Camera(), Shelf()
+TARGETS = {"cylinder": Target.cylinder(), "box": Target.box()}
+
+
+def visible_points(target, pose, rng, count=120, noise=0.001, side="both"):
+    """float64: points on the surface, of which the camera sees the part that faces it; hidden below the middle."""
+    a, b, h = target.half_size
+    if target.shape == "cylinder":
+        angle = rng.uniform(-np.pi, np.pi, 6000)
+        normal = np.stack([np.cos(angle), np.sin(angle)], -1)
+        own = a * normal
+    else:
+        face, t = rng.integers(0, 4, 6000), rng.uniform(-1, 1, 6000)
+        normal = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])[face]
+        own = normal * (a, b) + (1 - np.abs(normal)) * (a, b) * t[:, None]
+    R = np.array([[np.cos(pose[2]), -np.sin(pose[2])], [np.sin(pose[2]), np.cos(pose[2])]])
+    z = rng.uniform(0, h, 6000) + target.height(SHELF)
+    points = np.column_stack([own @ R.T + pose[:2], z])
+    seen = np.einsum("pi,pi->p", normal @ R.T, np.array(CAMERA.position[:2]) - points[:, :2]) > 0
+    across = np.array([0.9, -0.43])
+    if side != "both":
+        seen &= (own @ R.T) @ np.array([-across[1], across[0]]) * {"left": 1, "right": -1}[side] > 0
+    points = points[seen][:count]
+    direction = rng.normal(size=points.shape)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return points + rng.normal(scale=noise, size=(len(points), 1)) * direction
+
+
+def fit(target, points, capacity=256):
+    valid = np.arange(capacity) < len(points)
+    padded = np.zeros((capacity, 3), np.float32)
+    padded[: len(points)] = points
+    return np.asarray(target_pose(target, SHELF, jnp.float32(CAMERA.position), jnp.asarray(padded), jnp.asarray(valid)))
+
+
+@pytest.mark.parametrize("shape", TARGETS)
+def test_distance_is_that_to_the_nearest_of_many_surface_points(shape):
+    target, rng, pose = TARGETS[shape], np.random.default_rng(0), np.array([0.6, 0.1, 0.7])
+    R = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 81)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    inside = np.abs(grid).max(1) <= 1 if shape == "box" else np.hypot(grid[:, 0], grid[:, 1]) <= 1
+    own = grid[inside] * target.half_size
+    solid = np.column_stack([own[:, :2] @ R.T + pose[:2], own[:, 2] + target.height(SHELF)])
+    points = rng.uniform(-0.05, 0.05, (40, 3)) * (1, 1, 2) + [0.6, 0.1, target.height(SHELF)]
+    nearest = np.array([np.linalg.norm(solid - p, axis=1).min() for p in points])
+    found = np.asarray(distance(target, SHELF, jnp.float32(pose), jnp.float32(points)))
+    outside = nearest > 0.004
+    assert 5 < outside.sum() < 40
+    np.testing.assert_allclose(found[outside], nearest[outside], atol=1.5e-3)
+    assert (found[~outside] < 0.005).all()
+
+
+@pytest.mark.parametrize("shape", TARGETS)
+@pytest.mark.parametrize("side", ["both", "left", "right"])
+def test_the_pose_is_found_within_millimetres_from_noisy_points(shape, side):
+    target, rng = TARGETS[shape], np.random.default_rng(1)
+    errors, turns = [], []
+    for _ in range(12):
+        pose = np.array([rng.uniform(0.47, 0.73), rng.uniform(-0.2, 0.4), rng.uniform(0, np.pi)])
+        found = fit(target, visible_points(target, pose, rng, side=side))
+        errors.append(np.linalg.norm(found[:2] - pose[:2]))
+        turns.append(abs((found[2] - pose[2] + np.pi / 2) % np.pi - np.pi / 2))
+    assert np.median(errors) < (0.0015 if side == "both" else 0.003)
+    if shape == "box" and side == "both":
+        assert np.median(turns) < np.radians(6)
+
+
+def test_points_of_others_among_them_move_it_little():
+    target, rng, pose = TARGETS["cylinder"], np.random.default_rng(2), np.array([0.6, 0.1, 0.0])
+    points = visible_points(target, pose, rng)
+    stray = points[:15] + np.array([0.03, 0.0, 0.0])
+    found = fit(target, np.concatenate([points, stray]))
+    assert np.linalg.norm(found[:2] - pose[:2]) < 0.004
+
+
+def test_without_points_it_is_finite_and_a_batch_gives_what_each_gives_alone():
+    target, rng = TARGETS["box"], np.random.default_rng(3)
+    poses = np.array([[0.5, 0.0, 0.3], [0.7, 0.3, 2.0]])
+    clouds = np.stack([visible_points(target, pose, rng, count=100) for pose in poses] + [np.zeros((100, 3))])
+    valid = jnp.array([True, True, False])[:, None] & jnp.ones((1, 100), bool)
+    batch = jax.vmap(lambda p, v: target_pose(target, SHELF, jnp.float32(CAMERA.position), p, v))(
+        jnp.float32(clouds), valid
+    )
+    assert np.isfinite(batch).all()
+    for i in range(2):
+        np.testing.assert_allclose(batch[i], fit(target, clouds[i], 100), atol=2e-4)
