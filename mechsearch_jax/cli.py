@@ -563,7 +563,7 @@ def _training_of(name: Literal["segmentation", "recognition"], batch: int, rate:
     ) -> None:
         from mechsearch_jax.results import check_writable
         from mechsearch_jax.train.loop import TrainConfig
-        from mechsearch_jax.train.run import run
+        from mechsearch_jax.train.run import TASKS, run
 
         if steps is None and minutes is None:
             minutes = 10.0
@@ -577,7 +577,7 @@ def _training_of(name: Literal["segmentation", "recognition"], batch: int, rate:
             held_out=held_out,
         )
         check_writable(out)
-        run(name, config, out)
+        run(TASKS[name](), config, out)
 
     command.__name__ = name
     command.__doc__ = f"""Train the network of {name} on scenes made as they are needed; goes on where it was stopped.

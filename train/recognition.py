@@ -24,6 +24,7 @@ from mechsearch_jax.models.recognition import (
     Hypotheses,
     RecognitionConfig,
     RecognitionNetwork,
+    told_by,
 )
 from mechsearch_jax.models.weights import save_weights
 from mechsearch_jax.perception.cloud import View, shelf_view
@@ -222,11 +223,11 @@ class RecognitionTask:
     def loss(self, parameters: Any, examples: Example) -> tuple[Float[Array, ""], dict[str, Any]]:
         segments = examples.segments
         network = RecognitionNetwork(self.network, self.precision)
-        told = network.apply({"params": parameters}, segments.points, segments.mark, segments.camera)
+        told = told_by(network, parameters, segments.points, segments.mark, segments.camera)
         terms = jax.vmap(example_loss)(told, examples.truth)
         total = jnp.maximum(jnp.sum(examples.weight), 1.0)
         means = jax.tree.map(lambda a: jnp.sum(a * examples.weight) / total, terms)
-        loss = sum(weight * means[name] for name, weight in LOSS_WEIGHTS.items())
+        loss = sum((weight * means[name] for name, weight in LOSS_WEIGHTS.items()), jnp.zeros(()))
         return loss, means | {"examples": total}
 
     def scores(self, parameters: Any, scenes: int) -> dict[str, Any]:
@@ -311,8 +312,8 @@ class _Scored(flax.struct.PyTreeNode):
 def _score_batch(task: RecognitionTask, parameters: Any, key: Array, batch: int) -> _Scored:
     worlds, seen, examples = jax.vmap(task.scene)(jax.random.split(key, batch))
     flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), examples.segments)
-    told = RecognitionNetwork(task.network).apply({"params": parameters}, flat.points, flat.mark, flat.camera)
-    found = jax.tree.map(lambda a: a.reshape(batch, TARGET, *a.shape[1:]), best_hypothesis(told, flat))  # pyright: ignore
+    told = told_by(RecognitionNetwork(task.network), parameters, flat.points, flat.mark, flat.camera)
+    found = jax.tree.map(lambda a: a.reshape(batch, TARGET, *a.shape[1:]), best_hypothesis(told, flat))
     truth = sharpened(true_superquadrics(worlds))
     return _Scored(
         overlap=intersection_over_union(truth, found),

@@ -6,6 +6,7 @@ import dataclasses
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from mechsearch_jax.train.loop import Task, TrainConfig, train
 from mechsearch_jax.train.recognition import RecognitionTask
 from mechsearch_jax.train.segmentation import SegmentationTask
 
-TASKS = {"segmentation": SegmentationTask, "recognition": RecognitionTask}
+TASKS: dict[str, Callable[[], Task]] = {"segmentation": SegmentationTask, "recognition": RecognitionTask}
 # Seconds between lines where the output is no terminal.
 _QUIET = 20.0
 
@@ -26,7 +27,7 @@ _QUIET = 20.0
 class ProgressLine:
     """A `Watcher` that shows rate, time left and the loss: as a bar in a terminal, elsewhere as a line now and then."""
 
-    def __init__(self, console: Console, name: str, begun: int = 0):
+    def __init__(self, console: Console, name: str):
         self._console = console
         self._bar = Progress(
             TextColumn(name),
@@ -77,14 +78,13 @@ def _data(task: Any) -> dict[str, Any]:
     return {"source": "random scenes, ray-cast as they were needed", **scenes, "noises": noises}
 
 
-def run(name: str, config: TrainConfig, out: Path, task: Task | None = None) -> dict[str, Any]:
+def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
     """Train a network, score it on held-out scenes, and write its weights and card.
 
     Args:
-      name: "segmentation" or "recognition".
-      config: how it is trained.
+      task: what is trained.
+      config: how.
       out: folder for everything.
-      task: what is trained, if it is not the default.
 
     Returns:
       The card.
@@ -94,7 +94,7 @@ def run(name: str, config: TrainConfig, out: Path, task: Task | None = None) -> 
     """
     keep_compilations()
     console = Console(highlight=False)
-    task = task or TASKS[name]()
+    name = task.name
     with ProgressLine(console, name) as progress:
         state = train(task, config, out, progress)
     parameters = jax.device_get(state.averaged)

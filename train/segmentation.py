@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from optax.assignment import hungarian_algorithm
 
 from mechsearch_jax.envs.world import TARGET
-from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork
+from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork, told_by
 from mechsearch_jax.models.weights import save_weights
 from mechsearch_jax.perception.cloud import POINTS, View, cloud_of, resample, shelf_view
 from mechsearch_jax.perception.labels import INSTANCES, OTHER
@@ -122,8 +122,8 @@ class SegmentationTask:
     def scene(self, key: Key[Array, ""]) -> Example:
         """A random scene's cloud.
 
-        The target's points are left out, as the detector's mask leaves them out; points of the shelf that noise has lifted
-        off it are not, and are OTHER.
+        The target's points are left out, as the detector's mask leaves them out; points of the shelf that noise has
+        lifted off it are not, and are OTHER.
         """
         worlds, sensing, drawing = jax.random.split(key, 3)
         world = random_world(worlds, self.scenes, self.shelf)
@@ -141,8 +141,7 @@ class SegmentationTask:
         return jax.vmap(self.scene)(jax.random.split(key, batch))
 
     def loss(self, parameters: Any, examples: Example) -> tuple[Float[Array, ""], dict[str, Any]]:
-        network = SegmentationNetwork(self.network, self.precision)
-        told = network.apply({"params": parameters}, examples.points)
+        told = told_by(SegmentationNetwork(self.network, self.precision), parameters, examples.points)
         terms = jax.vmap(jax.vmap(segmentation_loss), in_axes=(0, None))(told.logits, examples.labels)
         total = jnp.maximum(jnp.sum(examples.weight), 1.0)
         layers = {name: jnp.sum(a * examples.weight[None], axis=1) / total for name, a in terms.items()}
@@ -183,7 +182,7 @@ def instance_overlaps(
 @functools.partial(jax.jit, static_argnames=("task", "batch"))
 def _score_batch(task: SegmentationTask, parameters: Any, key: Array, batch: int):
     examples = task.sample(key, batch)
-    told = SegmentationNetwork(task.network).apply({"params": parameters}, examples.points)
+    told = told_by(SegmentationNetwork(task.network), parameters, examples.points)
     raw = labels_of(told.logits[-1].reshape(-1, INSTANCES + 1)).reshape(batch, -1)
     valid = jnp.broadcast_to(examples.weight[:, None] > 0, raw.shape)
     clean = jax.vmap(clean_up)(examples.points, raw, valid)

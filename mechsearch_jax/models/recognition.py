@@ -11,7 +11,7 @@ that rests on it, and tilt relative to one that is level.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import flax.struct
@@ -190,3 +190,14 @@ class RecognitionNetwork(nn.Module):
             HYPOTHESES * (OUTPUTS + UNCERTAIN), name="outputs", kernel_init=nn.initializers.normal(1e-3)
         )(pooled)
         return decode(outputs.reshape(-1, HYPOTHESES, OUTPUTS + UNCERTAIN), logit)
+
+
+def told_by(
+    network: RecognitionNetwork,
+    parameters: Any,
+    points: Float[Array, "s p 3"],
+    mark: Int[Array, "s p"],
+    camera: Float[Array, "s 3"],
+) -> Hypotheses:
+    """What the network with these parameters says of segments."""
+    return cast(Hypotheses, network.apply({"params": parameters}, points, mark, camera))

@@ -10,7 +10,7 @@ DGCNN's, the neighbours are those in space in every layer: they are found once.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import flax.struct
@@ -125,3 +125,8 @@ class SegmentationNetwork(nn.Module):
             logits.append(jnp.concatenate([matched / config.width**0.5, none], axis=-1))
         centres = points + 0.1 * nn.Dense(3, name="centres")(nn.LayerNorm()(x))
         return SegmentationOutput(jnp.stack(logits), centres)
+
+
+def told_by(network: SegmentationNetwork, parameters: Any, points: Float[Array, "batch p 3"]) -> SegmentationOutput:
+    """What the network with these parameters says of clouds."""
+    return cast(SegmentationOutput, network.apply({"params": parameters}, points))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from mechsearch_jax.camera import Camera
-from mechsearch_jax.models.recognition import Hypotheses, RecognitionNetwork
+from mechsearch_jax.models.recognition import Hypotheses, RecognitionNetwork, told_by
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
@@ -61,5 +61,5 @@ def recognise(
       config: how segments' clouds are drawn; static.
     """
     segments = segment_clouds(key, camera, points, labels, shelf, count, config)
-    told = network.apply({"params": parameters}, segments.points, segments.mark, segments.camera)
-    return best_hypothesis(told, segments)  # pyright: ignore[reportArgumentType]
+    told = told_by(network, parameters, segments.points, segments.mark, segments.camera)
+    return best_hypothesis(told, segments)
