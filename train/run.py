@@ -73,7 +73,7 @@ def commit() -> str | None:
 
 def _data(task: Any) -> dict[str, Any]:
     """What the examples are, for the card."""
-    scenes = {f.name: getattr(task.scenes, f.name) for f in dataclasses.fields(task.scenes)}
+    scenes = dataclasses.asdict(task.scenes)
     noises = [repr(n) if dataclasses.is_dataclass(n) else getattr(n, "__name__", str(n)) for n in task.scenes.noises]
     return {"source": "random scenes, ray-cast as they were needed", **scenes, "noises": noises}
 

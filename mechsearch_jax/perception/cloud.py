@@ -130,7 +130,7 @@ def remove_shelf(cloud: PointCloud, shelf: Shelf, margin: float = MARGIN) -> Poi
 def draw(key: Key[Array, ""], chosen: Bool[Array, " p"], count: int) -> tuple[Int[Array, " count"], Int[Array, ""]]:
     """Random indices of true elements, in rising order and spread evenly: each of `count` equal shares gives one.
 
-    Where fewer than `count` elements are true, some come more than once; where none is, all indices are 0.
+    Neighbouring shares may give the same element, and do where there are few; where none is true, all indices are 0.
 
     Returns:
       The indices, and how many elements are true.
