@@ -10,9 +10,9 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
-import scipy.spatial
+import scipy.sparse.csgraph
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import KDTree
 
 from mechsearch_jax.errors import InputError
 
@@ -177,7 +177,7 @@ def cluster_by_colour(
     flat, tints = points.reshape(-1, 3), tint.reshape(-1, 3)
     members = [np.flatnonzero(part == p) for p in large]
     means = np.array([tints[m].mean(axis=0) for m in members]).reshape(-1, 3)
-    trees = [scipy.spatial.cKDTree(flat[m]) for m in members]
+    trees = [KDTree(flat[m]) for m in members]
     joined = [
         (i, j)
         for i in range(len(large))

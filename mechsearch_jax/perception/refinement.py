@@ -155,7 +155,7 @@ class _Fit(flax.struct.PyTreeNode):
 
 
 def select(labels: Int[Array, " p"], label: Int[Array, ""], count: int) -> tuple[Int[Array, " c"], Float[Array, " c"]]:
-    """Indices of `count` points with a label, spread evenly over all of them; and weights, 0 where there are no more."""
+    """Indices of `count` points with a label, spread evenly over all; and weights, 0 where there are no more."""
     rank = jnp.cumsum(labels == label)
     j = jnp.arange(count)
     total = rank[-1]
@@ -205,12 +205,13 @@ def _evidence(camera, scene_object, label, points, labels, depth, config) -> _Ev
 
 
 def _value_and_gradient(size: Array, exponents: Array, points: Array) -> tuple[Array, Array]:
-    """The gauge and its gradient at points in the object's frame."""
+    """The gauge and its gradient at points in the object's frame; the gradient is a constant for differentiation."""
 
     def gauge(point):
         return superquadric.gauge(size, exponents, point)
 
-    return jax.vmap(jax.value_and_grad(gauge))(points)
+    value, gradient = jax.vmap(jax.value_and_grad(gauge))(points)
+    return value, jax.lax.stop_gradient(gradient)
 
 
 def _local(shape: _Shape, vectors: Array) -> Array:
@@ -314,7 +315,13 @@ def _priors(step: Array, shape: _Shape, guess: _Shape, shelf: Shelf, config: Ref
 
 
 def _evaluate(
-    shape: _Shape, guess: _Shape, origin: Array, evidence: _Evidence, scale: float, shelf: Shelf, config
+    shape: _Shape,
+    guess: _Shape,
+    origin: Array,
+    evidence: _Evidence,
+    scale: Array,
+    shelf: Shelf,
+    config: RefinementConfig,
 ) -> tuple[Array, Array, Array]:
     """The cost of a shape, its gradient, and the Gauss-Newton approximation of its second derivatives."""
     surface, surface_jacobian = _distances(shape, evidence.points)
@@ -347,21 +354,26 @@ def _fit(
         cost, gradient, normal = _evaluate(shape, guess, origin, evidence, scale, shelf, config)
         return _Fit(shape, normal, gradient, cost, damping)
 
-    def improve(_, fit, scale):
-        diagonal = jnp.diagonal(fit.normal)
-        step = jnp.linalg.solve(fit.normal + jnp.diag(fit.damping * diagonal + 1e-6), -fit.gradient)
+    def improve(fit, schedule):
+        scale, restart = schedule
+        regular = fit.normal + jnp.diag(fit.damping * jnp.diagonal(fit.normal) + 1e-6)
         limit = jnp.array(LARGEST_STEP)
-        candidate = evaluated(_moved(fit.shape, jnp.clip(step, -limit, limit)), scale, fit.damping / DAMPING_FACTOR)
-        better = candidate.cost < fit.cost
+        step = jnp.clip(jnp.linalg.solve(regular, -fit.gradient), -limit, limit)
+        shape = _moved(fit.shape, jnp.where(restart, 0.0, step))
+        candidate = evaluated(shape, scale, jnp.where(restart, config.damping, fit.damping / DAMPING_FACTOR))
+        better = restart | (candidate.cost < fit.cost)
         refused = fit.replace(damping=fit.damping * DAMPING_FACTOR)
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), candidate, refused)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), candidate, refused), candidate.cost
 
-    shape = guess
-    for steps, scale in config.stages:
-        start = evaluated(shape, scale, jnp.float32(config.damping))
-        shape = jax.lax.fori_loop(0, steps, functools.partial(improve, scale=scale), start).shape
-    scale = config.stages[-1][1]
-    return shape, evaluated(shape, scale, 0.0).cost, evaluated(guess, scale, 0.0).cost
+    # One loop for everything, so that the residuals are compiled once: first the guess's cost at the last scale, then
+    # the stages, each of which starts by taking the shape as it is at the new scale.
+    last = config.stages[-1][1]
+    schedule = [(last, True), *((scale, i == 0) for steps, scale in config.stages for i in range(steps + 1))]
+    scales, restarts = (jnp.array(column) for column in zip(*schedule, strict=True))
+    n = PARAMETERS
+    fit = _Fit(guess, jnp.zeros((n, n)), jnp.zeros(n), jnp.float32(jnp.inf), jnp.float32(1.0))
+    fit, costs = jax.lax.scan(improve, fit, (scales, restarts))
+    return fit.shape, fit.cost, costs[0]
 
 
 def _supposed(scene_object: Superquadrics, hypothesis: Hypothesis, config: RefinementConfig) -> _Shape:
@@ -408,7 +420,16 @@ def refine(
     config = config or RefinementConfig()
     origin = jnp.array(camera.position)
 
-    def one(scene_object, label):
+    # Stands in for what is not fitted, so that its slot stays finite in value and derivative.
+    middle = ((shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board + 0.05)
+    stand_in = Superquadrics(
+        jnp.full(3, 0.05), jnp.array(superquadric.BOX_EXPONENTS), jnp.array(middle), jnp.eye(3), jnp.array(False)
+    )
+
+    def one(given, label):
+        finite = jnp.all(jnp.isfinite(points), axis=-1)
+        usable = given.valid & (jnp.sum((labels == label) & finite) >= config.minimum_points)
+        scene_object = jax.tree.map(lambda a, b: jnp.where(usable, a, b), given, stand_in)
         evidence = _evidence(camera, scene_object, label, points, labels, depth, config)
         if config.hypotheses:
             numbers = jnp.array(config.hypotheses, jnp.float32)
@@ -421,11 +442,8 @@ def refine(
         best = jnp.argmin(costs + config.switch * switched)
         shape, cost, initial = jax.tree.map(lambda a: a[best], (shapes, costs, before))
         count = jnp.sum(evidence.point_weight).astype(jnp.int32)
-        refined = Superquadrics(
-            jnp.exp(shape.log_size), shape.exponents, shape.position, shape.rotation, scene_object.valid
-        )
-        usable = scene_object.valid & (count >= config.minimum_points) & jnp.isfinite(cost)
-        kept = jax.tree.map(lambda a, b: jnp.where(usable, a, b), refined, scene_object)
+        refined = Superquadrics(jnp.exp(shape.log_size), shape.exponents, shape.position, shape.rotation, given.valid)
+        kept = jax.tree.map(lambda a, b: jnp.where(usable & jnp.isfinite(cost), a, b), refined, given)
         return Refined(kept, cost, initial, count, best.astype(jnp.int32))
 
     return jax.vmap(one)(scene, jnp.arange(scene.capacity))
