@@ -25,6 +25,8 @@ from mechsearch_jax.superquadric import Superquadrics
 
 EXPONENTS = (0.05, 2.0)
 LEAST_POINTS = 11
+# A mean square distance at which there is nothing to be improved, relative to the square of the scale.
+EXACT = 1e-7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,7 +175,7 @@ def recover(points: Float[np.ndarray, "n 3"], config: EmsConfig | None = None) -
             odds, _ = _expect(shape, points, sigma, volume, config.outliers)
             moved = _maximise(shape, points, odds, limit, config.evaluations)
             _, cost = _expect(moved, points, sigma, volume, config.outliers)
-            settled = abs(shape.cost - cost) < config.tolerance * cost
+            settled = abs(shape.cost - cost) < config.tolerance * cost or cost < EXACT
             shape = dataclasses.replace(moved, cost=cost, iterations=shape.iterations + 1)
             sigma = max(np.sqrt(cost / 3.0), 1e-3)
             if settled:

@@ -9,7 +9,7 @@ import pytest
 from published import published_scenarios
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.camera import Camera, back_project, rays
+from mechsearch_jax.camera import Camera, back_project, pixel_rays, project
 from mechsearch_jax.envs import observation, world
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception import refinement, scores
@@ -259,7 +259,9 @@ def test_support_and_closest_approach_are_those_of_dense_samples(exponents):
         reach = float(refinement._support(shape, direction))
         assert np.max(surface @ direction) == pytest.approx(reach, abs=6e-4)
 
-    directions = rays(CAMERA)[100:160:5, 150:200:5].reshape(-1, 3)
+    (row, column), _ = project(CAMERA, shape.position)
+    around = jnp.arange(-25.0, 26.0, 5.0)
+    directions = pixel_rays(CAMERA, *jnp.meshgrid(row + around, column + around)).reshape(-1, 3)
     free = jnp.asarray(rng.uniform(0.5, 1.2, len(directions)), jnp.float32)
     evidence = refinement._Evidence(directions, free, directions, free, free)
     origin = jnp.array(CAMERA.position)
@@ -271,7 +273,7 @@ def test_support_and_closest_approach_are_those_of_dense_samples(exponents):
         local = refinement._local(shape, jnp.asarray(world_points, jnp.float32) - shape.position[None])
         return refinement._value_and_gradient(jnp.exp(shape.log_size), shape.exponents, local)[0]
 
-    least = np.min([gauge(row) for row in dense[::8]], axis=0)
+    least = np.min(np.array(gauge(dense[::8].reshape(-1, 3))).reshape(-1, len(directions)), axis=0)
     reached = np.array(gauge(found))
     inside = least < 1.2
     assert inside.sum() > 10
