@@ -94,6 +94,26 @@ def _radial(shape: Recovered, points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(local, axis=1) * (1.0 - 1.0 / np.maximum(gauge, 1e-6))
 
 
+def _radial_jacobian(shape: Recovered, points: np.ndarray) -> np.ndarray:
+    """Derivatives of `_radial` in log half-extents, exponents, centre and a turn about the shape's own axes."""
+    local = (points - shape.position) @ shape.rotation
+    x, y, z = np.maximum(np.abs(local.T) / shape.size[:, None], 1e-9)
+    p, r = 2.0 / shape.exponents[1], 2.0 / shape.exponents[0]
+    plane = _norm2(x, y, p)
+    gauge = np.maximum(_norm2(plane, z, r), 1e-6)
+    along = np.minimum(plane / gauge, 1.0) ** (r - 1.0)
+    parts = [along * (x / plane) ** (p - 1.0), along * (y / plane) ** (p - 1.0), (z / gauge) ** (r - 1.0)]
+    gradient = np.stack(parts, axis=1) * np.sign(local) / shape.size
+    radius = np.linalg.norm(local, axis=1)[:, None]
+    stretch = radius / gauge[:, None] ** 2
+    outward = stretch * gradient + (1.0 - 1.0 / gauge[:, None]) * local / np.maximum(radius, 1e-9)
+    step, base = 1e-6, _radial(shape, points)
+    bent = [dataclasses.replace(shape, exponents=shape.exponents + step * np.eye(2)[i]) for i in range(2)]
+    exponents = np.stack([(_radial(b, points) - base) / step for b in bent], axis=1)
+    turning = stretch * np.cross(gradient, local)
+    return np.concatenate([-stretch * gradient * local, exponents, -outward @ shape.rotation.T, turning], axis=1)
+
+
 def _start(points: np.ndarray) -> Recovered:
     """An ellipsoid along the principal axes, as long as all but the outermost points reach."""
     centre = points.mean(axis=0)
@@ -119,8 +139,14 @@ def _maximise(shape: Recovered, points: np.ndarray, weight: np.ndarray, limit: f
     high = [np.log(limit)] * 3 + [EXPONENTS[1]] * 2 + [np.inf] * 6
     x = np.concatenate([np.log(shape.size), shape.exponents, shape.position, np.zeros(3)])
     x = np.clip(x, np.array(low) + 1e-9, np.array(high) - 1e-9)
+    # The derivative of a turn is exact at no turn; the turns of a few steps are small.
     result = least_squares(
-        lambda x: root * _radial(unpacked(x), points), x, bounds=(low, high), x_scale=0.1, max_nfev=evaluations
+        lambda x: root * _radial(unpacked(x), points),
+        x,
+        lambda x: root[:, None] * _radial_jacobian(unpacked(x), points),
+        bounds=(low, high),
+        x_scale=0.1,
+        max_nfev=evaluations,
     )
     return unpacked(result.x)
 

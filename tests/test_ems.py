@@ -39,6 +39,23 @@ def iou(points, truth):
     return float(scores.intersection_over_union(scene, truth)[0])
 
 
+def test_jacobian_is_that_of_finite_differences():
+    rng = np.random.default_rng(5)
+    rotation = Rotation.random(random_state=rng).as_matrix()
+    shape = ems.Recovered(np.array([0.6, 0.9, 1.2]), np.array([0.4, 0.8]), rng.normal(size=3), rotation, 0.0, 0)
+    points = rng.normal(size=(40, 3)) + shape.position
+
+    def moved(x):
+        turned = rotation @ Rotation.from_rotvec(x[8:]).as_matrix()
+        return ems.Recovered(
+            shape.size * np.exp(x[:3]), shape.exponents + x[3:5], shape.position + x[5:8], turned, 0.0, 0
+        )
+
+    steps = 1e-5 * np.eye(11)
+    expected = [(ems._radial(moved(s), points) - ems._radial(moved(-s), points)) / 2e-5 for s in steps]
+    np.testing.assert_allclose(ems._radial_jacobian(shape, points), np.transpose(expected), atol=2e-4)
+
+
 @pytest.mark.parametrize("name", SHAPES)
 def test_full_clouds_are_recovered(name):
     assert iou(*cloud(name, 0)) > 0.98

@@ -228,7 +228,7 @@ def test_jacobian_of_the_distance_is_that_of_finite_differences(exponents):
     )
     local = sample_surface(jnp.exp(shape.log_size), shape.exponents, 60) * 1.05
     points = local @ shape.rotation.T + shape.position[None]
-    _, jacobian = refinement._distances(shape, points)
+    distance, jacobian = jax.jit(refinement._distances)(shape, points)
 
     def first_order(step):
         """The gauge at the moved shape, over the gradient's length at the shape itself."""
@@ -238,10 +238,9 @@ def test_jacobian_of_the_distance_is_that_of_finite_differences(exponents):
             size, shape.exponents, refinement._local(moved, points - moved.position[None])
         )[0]
 
-    _, gradient = refinement._value_and_gradient(jnp.exp(shape.log_size), shape.exponents, local)
-    expected = jax.jacfwd(first_order)(jnp.zeros(9)) / jnp.linalg.norm(gradient, axis=1)[:, None]
+    _, gradient = jax.jit(refinement._value_and_gradient)(jnp.exp(shape.log_size), shape.exponents, local)
+    expected = jax.jit(jax.jacfwd(first_order))(jnp.zeros(9)) / jnp.linalg.norm(gradient, axis=1)[:, None]
     np.testing.assert_allclose(jacobian, expected, atol=2e-3)
-    distance, _ = refinement._distances(shape, points)
     assert jnp.all(distance > 0)
 
 
@@ -265,10 +264,11 @@ def test_support_and_closest_approach_are_those_of_dense_samples(exponents):
     free = jnp.asarray(rng.uniform(0.5, 1.2, len(directions)), jnp.float32)
     evidence = refinement._Evidence(directions, free, directions, free, free)
     origin = jnp.array(CAMERA.position)
-    found = refinement._closest_approach(shape, origin, evidence)
+    found = jax.jit(refinement._closest_approach)(shape, origin, evidence)
     depth = np.linspace(0, 1, 4000)[:, None] * np.array(free)
     dense = np.array(origin) + depth[..., None] * np.array(directions)
 
+    @jax.jit
     def gauge(world_points):
         local = refinement._local(shape, jnp.asarray(world_points, jnp.float32) - shape.position[None])
         return refinement._value_and_gradient(jnp.exp(shape.log_size), shape.exponents, local)[0]
