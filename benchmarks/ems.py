@@ -143,7 +143,7 @@ def _maximise(shape: Recovered, points: np.ndarray, weight: np.ndarray, limit: f
     result = least_squares(
         lambda x: root * _radial(unpacked(x), points),
         x,
-        lambda x: root[:, None] * _radial_jacobian(unpacked(x), points),
+        lambda x: root[:, None] * _radial_jacobian(unpacked(x), points),  # pyright: ignore[reportArgumentType]
         bounds=(low, high),
         x_scale=0.1,
         max_nfev=evaluations,
