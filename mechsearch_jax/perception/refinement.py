@@ -339,10 +339,11 @@ def _evaluate(
 
     prior_residual = _priors(jnp.zeros(PARAMETERS), shape, guess, shelf, config)
     prior_jacobian = jax.jacfwd(_priors)(jnp.zeros(PARAMETERS), shape, guess, shelf, config)
-    rows = jnp.concatenate([jacobian * jnp.sqrt(weight)[:, None], prior_jacobian])
-    right = jnp.concatenate([residual * jnp.sqrt(weight), prior_residual])
+    rows = jnp.concatenate([jacobian, prior_jacobian])
+    right = jnp.concatenate([residual, prior_residual])
+    weighted = rows * jnp.concatenate([weight, jnp.ones_like(prior_residual)])[:, None]
     dot = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
-    return cost + 0.5 * jnp.sum(prior_residual**2), dot(rows.T, right), dot(rows.T, rows)
+    return cost + 0.5 * jnp.sum(prior_residual**2), dot(weighted.T, right), dot(weighted.T, rows)
 
 
 def _fit(
