@@ -74,6 +74,19 @@ def yaw_rotation(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def exponential(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The rotation about a vector's direction by its length [rad] (Rodrigues); smooth at zero."""
+    square = jnp.sum(vector**2)
+    small = square < 1e-8
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    a = jnp.where(small, 1.0 - square / 6.0, jnp.sin(angle) / angle)
+    b = jnp.where(small, 0.5 - square / 24.0, (1.0 - jnp.cos(angle)) / angle**2)
+    x, y, z = vector
+    zero = jnp.zeros_like(x)
+    cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    return jnp.eye(3) + a * cross + b * matmul(cross, cross)
+
+
 def upright_pose(pose: Float[Array, "*batch 3"], z: float | Array) -> Float[Array, "*batch 4 4"]:
     """`T_world_target` of a target upright at `pose` = x, y [m], yaw [rad], with its centre at height `z` [m]."""
     height = jnp.full(pose.shape[:-1], z, pose.dtype)

@@ -1,0 +1,219 @@
+"""The camera's pose from what it sees of the robot, whose shape and joint angles are known (appendix C.1).
+
+Iterative closest point, point to plane: every observed point that may be the robot's is matched with the nearest point
+of the robot's surface, in closed form, because the robot is made of boxes and capsules. Only observed points look for a
+partner, so the sides of the robot that the camera cannot see need not be left out.
+
+The primitives lie up to 8 mm outside the real hand, fingers and links 6 and 7, and farther from links 1 to 5; on a real
+robot that limits the accuracy. Give `robot_distance` a closer shape of your own where it matters.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax import kinematics
+from mechsearch_jax.camera import Camera
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
+from mechsearch_jax.transforms import compose, exponential, inverse, make, matmul, rotate, transform
+
+HAND_FRAME = 7
+# Keeps steps small in directions in which the robot's shape says nothing: as much as one point, at this distance [m].
+LEVER = 0.1
+
+# Signed distances of points (P, 3) in the base frame to the robot's surface, and outward unit normals (P, 3), for joint
+# angles (7,) and the distance between the fingers.
+RobotDistance = Callable[[Array, Array, Array], tuple[Array, Array]]
+
+
+class _Solids(NamedTuple):
+    """All primitives as boxes with rounded edges: a capsule is a box of no thickness with a large rounding."""
+
+    frame: np.ndarray
+    T_frame_solid: np.ndarray
+    half: np.ndarray
+    rounding: np.ndarray
+    finger: np.ndarray
+
+
+@functools.cache
+def _solids() -> _Solids:
+    turned = np.diag([-1.0, -1.0, 1.0, 1.0])
+    lifted = np.eye(4)
+    lifted[2, 3] = FINGER_BASE
+    parts: list[tuple[int, np.ndarray, Primitive, float]] = [
+        (i, np.eye(4), primitive, 0.0) for i, link in enumerate(LINKS) for primitive in link
+    ]
+    parts += [(HAND_FRAME, np.eye(4), primitive, 0.0) for primitive in HAND]
+    parts += [(HAND_FRAME, lifted, primitive, 1.0) for primitive in FINGER]
+    parts += [(HAND_FRAME, lifted @ turned, primitive, -1.0) for primitive in FINGER]
+    box = [primitive.kind == "box" for _, _, primitive, _ in parts]
+    return _Solids(
+        frame=np.array([frame for frame, _, _, _ in parts]),
+        T_frame_solid=np.array([T @ p.T_frame_primitive for _, T, p, _ in parts], np.float32),
+        half=np.array(
+            [p.size if b else (0.0, 0.0, p.size[1]) for b, (_, _, p, _) in zip(box, parts, strict=True)], np.float32
+        ),
+        rounding=np.array([0.0 if b else p.size[0] for b, (_, _, p, _) in zip(box, parts, strict=True)], np.float32),
+        finger=np.array([finger for _, _, _, finger in parts], np.float32),
+    )
+
+
+def panda_distance(
+    points: Float[Array, "p 3"], joints: Float[Array, "7"], opening: Float[Array, ""]
+) -> tuple[Float[Array, " p"], Float[Array, "p 3"]]:
+    """Signed distances to links 1 to 7, the hand and the fingers, and outward normals of the nearest surface.
+
+    Outside exact for the union of the primitives; inside it is the depth in the primitive that is entered deepest.
+
+    Args:
+      points: in the base frame [m].
+      joints: joint angles [rad].
+      opening: distance between the fingers [m].
+    """
+    solids = _solids()
+    frames = kinematics.forward_kinematics(joints)[solids.frame]
+    # Both fingers move outwards along the hand's y; the right one's frame is turned by half a turn.
+    slide = jnp.zeros((len(solids.frame), 3)).at[:, 1].set(solids.finger * opening / 2.0)
+    placed = compose(frames, jnp.asarray(solids.T_frame_solid))
+    placed = placed.at[:, :3, 3].add(rotate(frames[:, :3, :3], slide))
+
+    def nearer(best, solid):
+        T_base_solid, half, rounding = solid
+        local = transform(inverse(T_base_solid), points)
+        beyond = jnp.abs(local) - half[None]
+        outside = jnp.maximum(beyond, 0.0)
+        square = jnp.sum(outside**2, axis=-1)
+        is_out = square > 1e-14
+        length = jnp.sqrt(jnp.where(is_out, square, 1.0))
+        depth = jnp.max(beyond, axis=-1)
+        face = jax.nn.one_hot(jnp.argmax(beyond, axis=-1), 3)
+        normal = jnp.where(is_out[:, None], outside / length[:, None], face) * jnp.where(local < 0.0, -1.0, 1.0)
+        distance = jnp.where(is_out, length, depth) - rounding
+        closer = distance < best[0]
+        normal = rotate(T_base_solid[:3, :3], normal)
+        return (jnp.where(closer, distance, best[0]), jnp.where(closer[:, None], normal, best[1])), None
+
+    start = (jnp.full(points.shape[0], jnp.inf), jnp.zeros_like(points))
+    best, _ = jax.lax.scan(nearer, start, (placed, jnp.asarray(solids.half), jnp.asarray(solids.rounding)))
+    return best
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseConfig:
+    """How the camera's pose is refined.
+
+    Attributes:
+      stages: numbers of Gauss-Newton steps, each with the distance within which a point is taken to be the robot's
+        [m]; the first must hold the largest error of the given pose, at the robot.
+      robot_distance: the robot's shape.
+      minimum_points: the pose stays as given if fewer points are within the last stage's distance.
+    """
+
+    stages: tuple[tuple[int, float], ...] = ((10, 0.06), (10, 0.02), (10, 0.006))
+    robot_distance: RobotDistance = panda_distance
+    minimum_points: int = 100
+
+    def __post_init__(self):
+        if not self.stages or any(steps < 1 or distance <= 0 for steps, distance in self.stages):
+            raise InputError(f"PoseConfig: stages {self.stages} must be pairs of a number of steps and a distance")
+        if self.minimum_points < 6:
+            raise InputError(f"PoseConfig: minimum_points ({self.minimum_points}) must be at least 6")
+
+
+class PoseEstimate(flax.struct.PyTreeNode):
+    """A corrected camera pose.
+
+    Attributes:
+      T_world_camera: the corrected pose, shape (4, 4); the given one where `points` are too few.
+      points: number of observed points that lie on the robot in the end, int32.
+      error: root mean square of their distances to its surface [m].
+      corrected: whether the points were enough.
+    """
+
+    T_world_camera: jax.Array
+    points: jax.Array
+    error: jax.Array
+    corrected: jax.Array
+
+    def camera(self, camera: Camera) -> Camera:
+        """The same camera at the corrected pose; not for use under `jit`, where cameras are constants."""
+        return with_pose(camera, np.asarray(self.T_world_camera))
+
+
+def with_pose(camera: Camera, T_world_camera: Float[np.ndarray, "4 4"]) -> Camera:
+    """The same camera elsewhere."""
+    turn = Rotation.from_matrix(np.asarray(T_world_camera[:3, :3], float)).as_matrix()
+    return dataclasses.replace(
+        camera,
+        rotation=tuple(tuple(float(x) for x in row) for row in turn),
+        position=tuple(float(x) for x in T_world_camera[:3, 3]),
+    )
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def estimate_pose(
+    T_world_camera: Float[Array, "4 4"],
+    points: Float[Array, "p 3"],
+    valid: Bool[Array, " p"],
+    joints: Float[Array, "7"],
+    opening: Float[Array, ""],
+    config: PoseConfig | None = None,
+) -> PoseEstimate:
+    """Correct a camera's pose so that what it sees of the robot lies on the robot (appendix C.1).
+
+    Point-to-plane iterative closest point (Y. Chen and G. Medioni, 1992) with a robust weight, Tukey's, of every point.
+    From 2 cm and 2 degrees away it finds the true pose to 1.5 mm and 0.15 degrees where hand and forearm are in view
+    (tested on images of the primitives, with 1 mm of noise), to 3 mm and 0.6 degrees where a corner of the hand is.
+
+    Args:
+      T_world_camera: the given pose; the world is the robot's base.
+      points: observed points in the camera's frame [m]: of the robot, and of anything else, which is left out as far as
+        it is farther from the robot than `config.stages` say.
+      valid: which points count; leave out the shelf and what stands on it.
+      joints: the robot's joint angles when the image was taken [rad].
+      opening: the distance between its fingers [m].
+      config: static; the default if None.
+    """
+    config = config or PoseConfig()
+    points = jnp.where(valid[:, None], points, 0.0)
+    dot = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+    damping = jnp.diag(jnp.array([LEVER**2] * 3 + [1.0] * 3))
+
+    def weights(T, reach):
+        world = transform(T, points)
+        distance, normal = config.robot_distance(world, joints, opening)
+        share = jnp.minimum((distance / reach) ** 2, 1.0)
+        return world, distance, normal, valid * (1.0 - share) ** 2
+
+    def step(_, T, reach):
+        world, distance, normal, weight = weights(T, reach)
+        # Turned about the points' centre, the rotation and the translation hardly depend on each other.
+        centre = jnp.sum(world * weight[:, None], axis=0) / jnp.maximum(jnp.sum(weight), 1e-6)
+        jacobian = jnp.concatenate([jnp.cross(world - centre[None], normal), normal], axis=-1)
+        weighted = jacobian * weight[:, None]
+        move = jnp.linalg.solve(dot(weighted.T, jacobian) + damping, -dot(weighted.T, distance))
+        turn = exponential(move[:3])
+        shift = centre + move[3:] - rotate(turn, centre)
+        return make(matmul(turn, T[:3, :3]), rotate(turn, T[:3, 3]) + shift)
+
+    T = T_world_camera
+    for steps, reach in config.stages:
+        T = jax.lax.fori_loop(0, steps, functools.partial(step, reach=reach), T)
+    _, distance, _, weight = weights(T, config.stages[-1][1])
+    on = weight > 0.0
+    count = jnp.sum(on)
+    corrected = (count >= config.minimum_points) & jnp.all(jnp.isfinite(T))
+    error = jnp.sqrt(jnp.sum(jnp.where(on, distance, 0.0) ** 2) / jnp.maximum(count, 1))
+    return PoseEstimate(jnp.where(corrected, T, T_world_camera), count.astype(jnp.int32), error, corrected)

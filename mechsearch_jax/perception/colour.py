@@ -1,0 +1,195 @@
+"""What colour tells: whether the target is among the segments, and segments where nobody else makes them."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse.csgraph
+from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import KDTree
+
+from mechsearch_jax.errors import InputError
+
+# Maps colours (..., 3) and a reference colour (3,) to dissimilarities (...).
+ColourDifference = Callable[[Array, Array], Array]
+
+
+def mean_square(colours: Float[Array, "*batch 3"], reference: Float[Array, "3"]) -> Float[Array, "*batch"]:
+    """Mean squared difference of red, green and blue, as in appendix C.3. Depends on how brightly a thing is lit."""
+    return jnp.mean((colours - reference.reshape([1] * (colours.ndim - 1) + [3])) ** 2, axis=-1)
+
+
+def chromaticity(colours: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    """Colours divided by their sum, which a light's strength leaves alone; grey for black."""
+    total = jnp.sum(colours, axis=-1, keepdims=True)
+    dark = total < 1e-3
+    return jnp.where(dark, 1.0 / 3.0, colours / jnp.where(dark, 1.0, total))
+
+
+def chromatic(colours: Float[Array, "*batch 3"], reference: Float[Array, "3"]) -> Float[Array, "*batch"]:
+    """Mean squared difference of the chromaticities: the same in light and shadow."""
+    return mean_square(chromaticity(colours), chromaticity(reference))
+
+
+@dataclasses.dataclass(frozen=True)
+class TargetColour:
+    """How the target is told from other things by its colour.
+
+    The paper's threshold of 0.1 on the mean square also takes in brown and dark red things, and "exactly one" segment
+    then means none. `TargetColour.lit` compares chromaticities, which tells a red target from them in any light.
+
+    Attributes:
+      rgb: the target's colour, each in 0 to 1.
+      threshold: largest difference at which a segment is the target's.
+      difference: how colours are compared.
+      minimum_pixels: a segment with fewer is not looked at.
+    """
+
+    rgb: tuple[float, float, float] = (0.7282, 0.1558, 0.2099)
+    threshold: float = 0.1
+    difference: ColourDifference = mean_square
+    minimum_pixels: int = 1
+
+    def __post_init__(self):
+        if len(self.rgb) != 3 or not all(0 <= c <= 1 for c in self.rgb):
+            raise InputError(f"TargetColour: rgb {self.rgb} must be red, green and blue, each in 0 to 1")
+        if not self.threshold > 0 or self.minimum_pixels < 1:
+            raise InputError(
+                f"TargetColour: threshold ({self.threshold}) must be positive, minimum_pixels "
+                f"({self.minimum_pixels}) at least 1"
+            )
+
+    @classmethod
+    def lit(cls, rgb: tuple[float, float, float] = (0.7282, 0.1558, 0.2099)) -> TargetColour:
+        return cls(rgb, threshold=0.01, difference=chromatic)
+
+
+class Detection(flax.struct.PyTreeNode):
+    """Which segment is the target.
+
+    Attributes:
+      found: whether exactly one segment has the target's colour.
+      segment: that segment, int32; the most similar one where none or several have it.
+      difference: of every segment's mean colour from the target's, infinite for those too small, shape (N,).
+    """
+
+    found: jax.Array
+    segment: jax.Array
+    difference: jax.Array
+
+
+@functools.partial(jax.jit, static_argnames=("segments", "target"))
+def detect_target(
+    colours: Float[Array, "p 3"], labels: Int[Array, " p"], segments: int, target: TargetColour | None = None
+) -> Detection:
+    """Look for the target among segments by their mean colours (appendix C.3).
+
+    Args:
+      colours: of points or pixels, red, green and blue in 0 to 1.
+      labels: the segment of each, 0 to `segments - 1`; others belong to none.
+      segments: number of segments; static.
+      target: its colour; static; the paper's if None.
+    """
+    target = target or TargetColour()
+    slot = jnp.where((labels >= 0) & (labels < segments), labels, segments)
+    count = jax.ops.segment_sum(jnp.ones_like(colours[:, 0]), slot, segments + 1)[:-1]
+    mean = jax.ops.segment_sum(colours, slot, segments + 1)[:-1] / jnp.maximum(count, 1.0)[:, None]
+    difference = target.difference(mean, jnp.array(target.rgb))
+    difference = jnp.where(count >= target.minimum_pixels, difference, jnp.inf)
+    alike = difference < target.threshold
+    return Detection(jnp.sum(alike) == 1, jnp.argmin(difference).astype(jnp.int32), difference)
+
+
+@dataclasses.dataclass(frozen=True)
+class ClusterConfig:
+    """When neighbouring pixels show the same thing.
+
+    Attributes:
+      colour: largest distance between the chromaticities of neighbours.
+      depth: largest difference between the depths of neighbours [m].
+      rejoin: parts whose mean chromaticities are within `colour` and that come this close to each other are one thing,
+        split by what stands in front of it [m].
+      minimum: a thing with fewer pixels is dropped.
+    """
+
+    colour: float = 0.05
+    depth: float = 0.015
+    rejoin: float = 0.04
+    minimum: int = 20
+
+    def __post_init__(self):
+        if not (self.colour > 0 and self.depth > 0 and self.rejoin >= 0 and self.minimum >= 1):
+            raise InputError(f"ClusterConfig: lengths must be positive, minimum at least 1, not {self}")
+
+
+def _components(size: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    graph = scipy.sparse.coo_array((np.ones(len(a), bool), (a, b)), shape=(size, size))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+
+
+def cluster_by_colour(
+    colour: Float[np.ndarray, "h w 3"],
+    depth: Float[np.ndarray, "h w"],
+    points: Float[np.ndarray, "h w 3"],
+    foreground: Bool[np.ndarray, "h w"],
+    config: ClusterConfig | None = None,
+) -> Int[np.ndarray, "h w"]:
+    """Segments of like colour that hang together, for images that come without a mask.
+
+    Things of one colour that touch in the image are one segment: give neighbouring objects different colours, as the
+    paper does, or use a segmentation network. Runs on the host, by SciPy's connected components.
+
+    Args:
+      colour: red, green and blue in 0 to 1.
+      depth: along the camera's axis [m].
+      points: what the pixels see, in the world [m].
+      foreground: pixels to be clustered.
+      config: the default if None.
+
+    Returns:
+      segment of every pixel, the one with the most pixels first; -1 for none.
+    """
+    config = config or ClusterConfig()
+    tint = np.array(chromaticity(jnp.asarray(colour, jnp.float32)))
+    index = np.arange(foreground.size).reshape(foreground.shape)
+    pairs = []
+    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])):
+        with np.errstate(invalid="ignore"):
+            near = np.abs(depth[here] - depth[there]) <= config.depth
+        alike = np.linalg.norm(tint[here] - tint[there], axis=-1) <= config.colour
+        linked = foreground[here] & foreground[there] & near & alike
+        pairs.append((index[here][linked], index[there][linked]))
+    part = _components(foreground.size, *(np.concatenate(ends) for ends in zip(*pairs, strict=True)))
+    part = np.where(foreground.ravel(), part, -1)
+    names, part = np.unique(part, return_inverse=True)
+    part = part - (names[0] == -1)
+    sizes = np.bincount(part[part >= 0], minlength=1)
+    large = np.flatnonzero(sizes >= config.minimum)
+
+    if not large.size:
+        return np.full(foreground.shape, -1, np.int32)
+    flat, tints = points.reshape(-1, 3), tint.reshape(-1, 3)
+    members = [np.flatnonzero(part == p) for p in large]
+    means = np.array([tints[m].mean(axis=0) for m in members]).reshape(-1, 3)
+    trees = [KDTree(flat[m]) for m in members]
+    joined = [
+        (i, j)
+        for i in range(len(large))
+        for j in range(i)
+        if np.linalg.norm(means[i] - means[j]) <= config.colour
+        and np.min(trees[i].query(flat[members[j]], distance_upper_bound=config.rejoin)[0]) <= config.rejoin
+    ]
+    whole = _components(len(large), *np.array(joined, int).reshape(-1, 2).T)
+    labels = np.full(foreground.size, -1, np.int32)
+    for m, w in zip(members, whole, strict=True):
+        labels[m] = w
+    order = np.argsort(-np.bincount(whole, sizes[large], minlength=1), kind="stable")
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order))
+    return np.where(labels >= 0, rank[labels], -1).astype(np.int32).reshape(foreground.shape)

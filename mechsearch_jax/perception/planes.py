@@ -1,0 +1,123 @@
+"""The plane that most points lie on, by random sample consensus: the shelf's floor in a real image."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.errors import InputError
+
+UP = (0.0, 0.0, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlaneConfig:
+    """How a plane is searched.
+
+    Attributes:
+      hypotheses: number of planes through three random points that are tried.
+      tolerance: a point at most so far from a plane lies on it [m].
+      within: largest angle between the plane's normal and the expected one [rad].
+      fits: how often the best plane is then fitted to the points on it.
+    """
+
+    hypotheses: int = 256
+    tolerance: float = 0.004
+    within: float = math.radians(10.0)
+    fits: int = 3
+
+    def __post_init__(self):
+        if self.hypotheses < 1 or self.fits < 0:
+            raise InputError(
+                f"PlaneConfig: hypotheses ({self.hypotheses}) must be at least 1, fits ({self.fits}) at least 0"
+            )
+        if not (self.tolerance > 0 and 0 < self.within <= math.pi / 2):
+            raise InputError(
+                f"PlaneConfig: tolerance ({self.tolerance}) must be positive, within ({self.within}) in (0, pi/2]"
+            )
+
+
+class Plane(flax.struct.PyTreeNode):
+    """All x with `normal @ x = offset`.
+
+    Attributes:
+      normal: unit vector, on the side of the expected one, shape (3,).
+      offset: of the plane from the origin along the normal [m].
+      support: number of points on it, int32; 0 if no plane was found, which is then the expected normal's through 0.
+    """
+
+    normal: jax.Array
+    offset: jax.Array
+    support: jax.Array
+
+    def height(self, points: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
+        """Distance of points from the plane, positive on the side that the normal points to [m]."""
+        return sum(points[..., k] * self.normal[k] for k in range(3)) - self.offset
+
+
+def _fitted(plane: Plane, points: Array, valid: Array, config: PlaneConfig) -> Plane:
+    """The least-squares plane of the points on a plane, by the direction in which they spread least."""
+    on = (valid & (jnp.abs(plane.height(points)) <= config.tolerance)).astype(points.dtype)
+    count = jnp.sum(on)
+    centre = jnp.sum(points * on[:, None], axis=0) / jnp.maximum(count, 1.0)
+    offset = (points - centre[None]) * on[:, None]
+    spread = jnp.matmul(offset.T, offset, precision=jax.lax.Precision.HIGHEST)
+    _, axes = jnp.linalg.eigh(spread)
+    normal = axes[:, 0] * jnp.where(jnp.sum(axes[:, 0] * plane.normal) < 0.0, -1.0, 1.0)
+    better = Plane(normal, jnp.sum(normal * centre), jnp.int32(count))
+    return jax.tree.map(lambda a, b: jnp.where(count >= 3.0, a, b), better, plane)
+
+
+@functools.partial(jax.jit, static_argnames=("expected", "config"))
+def find_plane(
+    key: Array,
+    points: Float[Array, "p 3"],
+    valid: Bool[Array, " p"],
+    expected: tuple[float, float, float] = UP,
+    config: PlaneConfig | None = None,
+) -> Plane:
+    """The plane with most points on it, of those that are nearly perpendicular to a direction.
+
+    A fixed number of planes through three valid points each are compared by their support, and the best is fitted to
+    the points that lie on it (M. Fischler and R. Bolles, "Random sample consensus", 1981).
+
+    Args:
+      key: the same key finds the same plane.
+      points: in the world [m].
+      valid: which points count.
+      expected: unit vector near the normal; static.
+      config: static; the default if None.
+    """
+    config = config or PlaneConfig()
+    points = jnp.where(valid[:, None], points, 0.0)
+    direction = jnp.array(expected)
+    rank = jnp.cumsum(valid)
+    draws = jax.random.uniform(key, (config.hypotheses, 3)) * rank[-1]
+    triples = points[jnp.minimum(jnp.searchsorted(rank, jnp.floor(draws).astype(rank.dtype) + 1), len(points) - 1)]
+    cross = jnp.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    square = jnp.sum(cross**2, axis=-1)
+    flat = square > 1e-14
+    normals = cross / jnp.sqrt(jnp.where(flat, square, 1.0))[:, None]
+    along = jnp.sum(normals * direction[None], axis=-1)
+    normals = normals * jnp.where(along < 0.0, -1.0, 1.0)[:, None]
+    plausible = flat & (jnp.abs(along) >= math.cos(config.within))
+
+    def hypothesis(normal, point):
+        plane = Plane(normal, jnp.sum(normal * point), jnp.int32(0))
+        return plane.replace(support=jnp.sum(valid & (jnp.abs(plane.height(points)) <= config.tolerance)))
+
+    planes = jax.lax.map(lambda pair: hypothesis(*pair), (normals, triples[:, 0]), batch_size=16)
+    best = jnp.argmax(jnp.where(plausible, planes.support, -1))
+    found = plausible[best] & (planes.support[best] >= 3)
+    nothing = Plane(direction, jnp.float32(0.0), jnp.int32(0))
+    plane = jax.tree.map(lambda a, b: jnp.where(found, a[best].astype(b.dtype), b), planes, nothing)
+    for _ in range(config.fits):
+        fitted = _fitted(plane, points, valid, config)
+        plane = jax.tree.map(lambda a, b: jnp.where(found, a, b), fitted, plane)
+    return plane

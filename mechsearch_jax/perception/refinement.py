@@ -1,0 +1,450 @@
+"""Recognised superquadrics, fitted to what the camera measured: damped Gauss-Newton steps on all objects at once.
+
+A recogniser sees a few hundred points and guesses well; what it guessed can then be held against every pixel. Two facts
+do most of the work. The object's own points lie on its surface. And what the camera sees, it sees through free space:
+no ray may pass through the object before it ends, whatever it ends on, which bounds the silhouette from outside and the
+depth of the object from above and the sides. Where neither says anything, behind the object and behind what hides it,
+the guess stays as a prior, together with what is known about things on a shelf: most stand upright on the board, and
+none is inside the walls.
+
+The distance of a point to the surface is `(gauge - 1) / |gradient of the gauge|`: exact for flat faces, of first order
+elsewhere. The gauge depends on the point only by its coordinates over the half-extents, so its gradient is all that the
+Jacobian is made of.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mechsearch_jax import superquadric
+from mechsearch_jax.camera import Camera, pixel_rays, project
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.perception.scores import EDGE
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.transforms import exponential, make, matmul, rotate, transform, yaw_rotation
+
+PARAMETERS = 9
+BISECTIONS = 12
+DAMPING_FACTOR = 4.0
+# How far a ray that ends on nothing is known to be free [m].
+FAR = 3.0
+# Steps larger than these are cut: relative change of a half-extent, metres, radians.
+LARGEST_STEP = (0.3,) * 3 + (0.03,) * 3 + (0.3,) * 3
+HALF_EXTENTS = (0.004, 0.3)
+
+
+class Hypothesis(flax.struct.PyTreeNode):
+    """A shape class that an object may have; every field may have leading axes."""
+
+    exponents: jax.Array
+    yaw: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class RefinementConfig:
+    """How recognised shapes are refined; lengths in metres, angles in radians.
+
+    Attributes:
+      hypotheses: shapes that are tried side by side for every object, as (e1, e2, turn about the object's own z from
+        the recognised heading); the one that explains the image best is kept. With none, the recognised exponents stay
+        as they are.
+      points: at most so many of the object's own points are used.
+      rays: pixels in and around the object's image whose rays are used.
+      border: how far those pixels reach beyond the image of the object's bounding box, relative to its size.
+      stages: numbers of steps, each with the scale of its robust loss, beyond which a residual loses its weight.
+      damping: at the start of a stage, relative to the diagonal of the normal equations. Sharp edges make the distances
+        kinked, and bold first steps end in poor local minima.
+      noise: standard deviation of a point's distance to the surface; what priors are weighed against.
+      ray_noise: standard deviation of how deep a ray seems to pass through the object: pixels know silhouettes better
+        than depths.
+      tolerance: the last part of a ray that need not be free, for the noise of its end.
+      size_prior: standard deviation of the recognised half-extents, relative to them.
+      position_prior: that of the recognised centre.
+      yaw_prior: that of the recognised heading.
+      tilt_prior: that of the angle between the vertical and the axis that is upright.
+      upright_within: an object whose most upright axis is farther from the vertical is not taken to stand.
+      contact: standard deviation of the height of the lowest point over the board.
+      switch: by how much another exponent than the recognised one must lower the cost, in halves of squared standard
+        deviations.
+      minimum_points: an object with fewer points stays as it is.
+    """
+
+    hypotheses: tuple[tuple[float, float, float], ...] = ((0.06, 0.06, 0.0), (0.06, 1.0, 0.0))
+    points: int = 256
+    rays: int = 512
+    border: float = 0.25
+    stages: tuple[tuple[int, float], ...] = ((6, 0.01), (10, 0.003))
+    damping: float = 1.0
+    noise: float = 0.001
+    ray_noise: float = 0.0005
+    tolerance: float = 0.003
+    size_prior: float = 0.15
+    position_prior: float = 0.015
+    yaw_prior: float = 0.2
+    tilt_prior: float = 0.01
+    upright_within: float = 0.3
+    contact: float = 0.001
+    switch: float = 4.0
+    minimum_points: int = 10
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, int | float) and not (math.isfinite(value) and value > 0):
+                raise InputError(f"RefinementConfig: {field.name} ({value}) must be positive")
+        if not self.stages or any(steps < 1 or scale <= 0 for steps, scale in self.stages):
+            raise InputError(f"RefinementConfig: stages {self.stages} must be pairs of a number of steps and a length")
+        if any(not (0 < e1 <= 2 and 0 < e2 <= 2) for e1, e2, _ in self.hypotheses):
+            raise InputError(f"RefinementConfig: exponents in hypotheses {self.hypotheses} must be in (0, 2]")
+
+
+class Refined(flax.struct.PyTreeNode):
+    """Refined superquadrics and how they came about.
+
+    Attributes:
+      scene: the superquadrics, in the slots of those that were given.
+      cost: half the sum of robust squared residuals at the end, in units of the noise, shape (N,).
+      initial_cost: the same for the shapes as they were given, under the chosen hypothesis' exponents, shape (N,).
+      points: how many of the object's own points were used, int32, shape (N,); no change where there were too few.
+      hypothesis: index of the hypothesis that was chosen, int32, shape (N,).
+    """
+
+    scene: Superquadrics
+    cost: jax.Array
+    initial_cost: jax.Array
+    points: jax.Array
+    hypothesis: jax.Array
+
+
+class _Shape(flax.struct.PyTreeNode):
+    """What is fitted: logarithms of the half-extents, centre and rotation; the exponents stay."""
+
+    log_size: jax.Array
+    position: jax.Array
+    rotation: jax.Array
+    exponents: jax.Array
+
+
+class _Evidence(flax.struct.PyTreeNode):
+    """What the image says about one object: its own points, and rays with the depth to which they are free."""
+
+    points: jax.Array
+    point_weight: jax.Array
+    directions: jax.Array
+    free: jax.Array
+    ray_weight: jax.Array
+
+
+class _Fit(flax.struct.PyTreeNode):
+    """A shape with the normal equations of its residuals."""
+
+    shape: _Shape
+    normal: jax.Array
+    gradient: jax.Array
+    cost: jax.Array
+    damping: jax.Array
+
+
+def select(labels: Int[Array, " p"], label: Int[Array, ""], count: int) -> tuple[Int[Array, " c"], Float[Array, " c"]]:
+    """Indices of `count` points with a label, spread evenly over all; and weights, 0 where there are no more."""
+    rank = jnp.cumsum(labels == label)
+    j = jnp.arange(count)
+    total = rank[-1]
+    # A stride that drifts, so that it never keeps step with the rows of an image.
+    drift = jnp.asarray((np.arange(count) * 0.6180339887) % 1.0, jnp.float32)
+    spread = jnp.floor((j + drift) * (total / count)).astype(jnp.int32)
+    wanted = jnp.where(total > count, spread, j)
+    index = jnp.searchsorted(rank, wanted + 1)
+    return jnp.minimum(index, labels.shape[0] - 1), (j < total).astype(jnp.float32)
+
+
+def _plane_points(count: int) -> np.ndarray:
+    """Points spread evenly over the unit square, without the rows and columns of a grid: an additive recurrence."""
+    ratio = 1.32471795724
+    return ((0.5 + np.arange(1, count + 1)[:, None] / ratio ** np.arange(1.0, 3.0)) % 1.0).astype(np.float32)
+
+
+def _window(camera: Camera, scene_object: Superquadrics, config: RefinementConfig) -> tuple[Array, Array]:
+    """Rows and columns of pixels in and around the image of an object's bounding box."""
+    corners = jnp.stack(jnp.meshgrid(*[jnp.array([-1.0, 1.0])] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+    T_world_object = make(scene_object.rotation, scene_object.position)
+    pixels, _ = project(camera, transform(T_world_object, corners * scene_object.size[None]))
+    low, high = jnp.min(pixels, axis=0), jnp.max(pixels, axis=0)
+    low, high = low - config.border * (high - low), high + config.border * (high - low)
+    # Outside the image there is nothing to be seen: spend all pixels inside.
+    edge = jnp.array([camera.height - 1.0, camera.width - 1.0])
+    low, high = jnp.clip(low, 0.0, edge), jnp.clip(high, 0.0, edge)
+    pixels = jnp.round(low[None] + jnp.asarray(_plane_points(config.rays)) * (high - low)[None]).astype(jnp.int32)
+    return pixels[:, 0], pixels[:, 1]
+
+
+def _evidence(camera, scene_object, label, points, labels, depth, config) -> _Evidence:
+    index, weight = select(labels, label, config.points)
+    own = points[index]
+    finite = jnp.all(jnp.isfinite(own), axis=-1)
+    rows, columns = _window(camera, scene_object, config)
+    seen = depth[rows, columns]
+    free = jnp.where(seen > FAR, FAR, seen) - config.tolerance
+    informative = ~jnp.isnan(seen) & (free > 0.0)
+    return _Evidence(
+        points=jnp.where(finite[:, None], own, 0.0),
+        point_weight=weight * finite,
+        directions=pixel_rays(camera, rows * 1.0, columns * 1.0),
+        free=jnp.where(informative, free, 0.0),
+        ray_weight=informative.astype(jnp.float32),
+    )
+
+
+def _value_and_gradient(size: Array, exponents: Array, points: Array) -> tuple[Array, Array]:
+    """The gauge and its gradient at points in the object's frame; the gradient is a constant for differentiation."""
+
+    def gauge(point):
+        return superquadric.gauge(size, exponents, point)
+
+    value, gradient = jax.vmap(jax.value_and_grad(gauge))(points)
+    return value, jax.lax.stop_gradient(gradient)
+
+
+def _local(shape: _Shape, vectors: Array) -> Array:
+    return rotate(shape.rotation.T, vectors)
+
+
+def _closest_approach(shape: _Shape, origin: Array, evidence: _Evidence) -> Array:
+    """The point of the free part of every ray at which the gauge is least, by bisection of its convex course, in the
+    world."""
+    size = jnp.exp(shape.log_size)
+    start, direction = _local(shape, origin - shape.position), _local(shape, evidence.directions)
+    square = jnp.sum(direction**2, axis=-1)
+    middle = -jnp.sum(start[None] * direction, axis=-1) / square
+    reach = superquadric.bounding_radius(size) / jnp.sqrt(square)
+    low, high = (jnp.clip(middle + s * reach, 0.0, evidence.free) for s in (-1.0, 1.0))
+
+    def bisect(_, bracket):
+        low, high = bracket
+        half = (low + high) / 2.0
+        _, gradient = _value_and_gradient(size, shape.exponents, start[None] + half[:, None] * direction)
+        falling = jnp.sum(gradient * direction, axis=-1) < 0.0
+        return jnp.where(falling, half, low), jnp.where(falling, high, half)
+
+    low, high = jax.lax.fori_loop(0, BISECTIONS, bisect, (low, high))
+    depth = jax.lax.stop_gradient((low + high) / 2.0)
+    return origin[None] + depth[:, None] * evidence.directions
+
+
+def _distances(shape: _Shape, points: Array) -> tuple[Array, Array]:
+    """Signed distances of world points to the surface, negative inside, and their Jacobians, shape (points, 9)."""
+    size = jnp.exp(shape.log_size)
+    offset = points - shape.position[None]
+    local = _local(shape, offset)
+    value, gradient = _value_and_gradient(size, shape.exponents, local)
+    steep = jnp.sqrt(jnp.maximum(jnp.sum(gradient**2, axis=-1), 0.25 / jnp.max(size) ** 2))
+    normal = gradient / steep[:, None]
+    world_normal = rotate(shape.rotation, normal)
+    turning = jnp.cross(world_normal, offset)
+    return (value - 1.0) / steep, jnp.concatenate([-normal * local, -world_normal, turning], axis=-1)
+
+
+def _moved(shape: _Shape, step: Float[Array, "9"]) -> _Shape:
+    """A shape after a step in the parameters: log half-extents, centre, and a rotation about the world's axes."""
+    return shape.replace(
+        log_size=jnp.clip(shape.log_size + step[:3], *(math.log(h) for h in HALF_EXTENTS)),
+        position=shape.position + step[3:6],
+        rotation=matmul(exponential(step[6:]), shape.rotation),
+    )
+
+
+def _support(shape: _Shape, direction: tuple[float, float, float]) -> Array:
+    """How far a shape reaches from its centre in a direction: the dual norm of its gauge."""
+
+    def norm(a, b, p):
+        big = jnp.maximum(jnp.maximum(a, b), 1e-9)
+        return big * ((a / big) ** p + (b / big) ** p) ** (1.0 / p)
+
+    # The dual of a p-norm with p = 2/e is the one with 1/(1 - e/2); an exponent of 2 is the largest.
+    dual = 1.0 / (1.0 - jnp.minimum(shape.exponents, 1.9) / 2.0)
+    a, b, c = jnp.maximum(jnp.abs(jnp.exp(shape.log_size) * _local(shape, jnp.array(direction))), 1e-7)
+    return norm(norm(a, b, dual[1]), c, dual[0])
+
+
+def _upright(rotation: Array, config: RefinementConfig) -> Array:
+    """The nearest rotation with one of the object's axes vertical, if one is nearly so; else the same rotation."""
+    axis = jnp.argmax(jnp.abs(rotation[2]))
+    vertical = rotation[:, axis] * jnp.where(rotation[2, axis] < 0.0, -1.0, 1.0)
+    sine = jnp.sqrt(jnp.sum(vertical[:2] ** 2) + 1e-16)
+    angle = jnp.arctan2(sine, vertical[2])
+    turn = jnp.cross(vertical, jnp.array([0.0, 0.0, 1.0])) * (angle / sine)
+    return jnp.where(angle < config.upright_within, matmul(exponential(turn), rotation), rotation)
+
+
+def _priors(step: Array, shape: _Shape, guess: _Shape, shelf: Shelf, config: RefinementConfig) -> Array:
+    """Residuals of all that is known without the image, in units of their standard deviations."""
+    shape = _moved(shape, step)
+    turned = matmul(shape.rotation, guess.rotation.T)
+    angle = 0.5 * jnp.stack([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
+    deviation = jnp.array([config.tilt_prior, config.tilt_prior, config.yaw_prior])
+    x, y, z = shape.position
+    height = (z - _support(shape, (0.0, 0.0, 1.0)) - shelf.board) / config.contact
+    walls = jnp.stack(
+        [
+            x + _support(shape, (1.0, 0.0, 0.0)) - shelf.back,
+            y + _support(shape, (0.0, 1.0, 0.0)) - shelf.left,
+            shelf.right - y + _support(shape, (0.0, 1.0, 0.0)),
+        ]
+    )
+    out_of_round = (shape.log_size[0] - shape.log_size[1]) * jnp.where(shape.exponents[1] > EDGE, 100.0, 0.0)
+    return jnp.concatenate(
+        [
+            (shape.log_size - guess.log_size) / config.size_prior,
+            (shape.position - guess.position) / config.position_prior,
+            angle / deviation,
+            jnp.maximum(walls, 0.0) / config.noise,
+            # Bounded pull: what stands on something else is not dragged down to the board.
+            5.0 * jnp.arctan(height / 5.0)[None],
+            out_of_round[None],
+        ]
+    )
+
+
+def _evaluate(
+    shape: _Shape,
+    guess: _Shape,
+    origin: Array,
+    evidence: _Evidence,
+    scale: Array,
+    shelf: Shelf,
+    config: RefinementConfig,
+) -> tuple[Array, Array, Array]:
+    """The cost of a shape, its gradient, and the Gauss-Newton approximation of its second derivatives."""
+    surface, surface_jacobian = _distances(shape, evidence.points)
+    blocked, blocked_jacobian = _distances(shape, _closest_approach(shape, origin, evidence))
+    sharpness = config.noise / config.ray_noise
+    blocked = jnp.minimum(blocked, 0.0) * sharpness
+    blocked_jacobian = blocked_jacobian * (blocked < 0.0)[:, None] * sharpness
+    residual = jnp.concatenate([surface, blocked]) / config.noise
+    jacobian = jnp.concatenate([surface_jacobian, blocked_jacobian]) / config.noise
+    weight = jnp.concatenate([evidence.point_weight, evidence.ray_weight])
+    # Cauchy's loss: quadratic up to the scale, logarithmic beyond.
+    square = (scale / config.noise) ** 2
+    cost = 0.5 * square * jnp.sum(weight * jnp.log1p(residual**2 / square))
+    weight = weight / (1.0 + residual**2 / square)
+
+    prior_residual = _priors(jnp.zeros(PARAMETERS), shape, guess, shelf, config)
+    prior_jacobian = jax.jacfwd(_priors)(jnp.zeros(PARAMETERS), shape, guess, shelf, config)
+    rows = jnp.concatenate([jacobian, prior_jacobian])
+    right = jnp.concatenate([residual, prior_residual])
+    weighted = rows * jnp.concatenate([weight, jnp.ones_like(prior_residual)])[:, None]
+    dot = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+    return cost + 0.5 * jnp.sum(prior_residual**2), dot(weighted.T, right), dot(weighted.T, rows)
+
+
+def _fit(
+    guess: _Shape, origin: Array, evidence: _Evidence, shelf: Shelf, config: RefinementConfig
+) -> tuple[_Shape, Array, Array]:
+    """Levenberg and Marquardt's method from a guess: the shape, its cost and the guess's."""
+
+    def evaluated(shape, scale, damping):
+        cost, gradient, normal = _evaluate(shape, guess, origin, evidence, scale, shelf, config)
+        return _Fit(shape, normal, gradient, cost, damping)
+
+    def improve(fit, schedule):
+        scale, restart = schedule
+        regular = fit.normal + jnp.diag(fit.damping * jnp.diagonal(fit.normal) + 1e-6)
+        limit = jnp.array(LARGEST_STEP)
+        step = jnp.clip(jnp.linalg.solve(regular, -fit.gradient), -limit, limit)
+        shape = _moved(fit.shape, jnp.where(restart, 0.0, step))
+        candidate = evaluated(shape, scale, jnp.where(restart, config.damping, fit.damping / DAMPING_FACTOR))
+        better = restart | (candidate.cost < fit.cost)
+        refused = fit.replace(damping=fit.damping * DAMPING_FACTOR)
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), candidate, refused), candidate.cost
+
+    # One loop for everything, so that the residuals are compiled once: first the guess's cost at the last scale, then
+    # the stages, each of which starts by taking the shape as it is at the new scale.
+    last = config.stages[-1][1]
+    schedule = [(last, True), *((scale, i == 0) for steps, scale in config.stages for i in range(steps + 1))]
+    scales, restarts = (jnp.array(column) for column in zip(*schedule, strict=True))
+    n = PARAMETERS
+    fit = _Fit(guess, jnp.zeros((n, n)), jnp.zeros(n), jnp.float32(jnp.inf), jnp.float32(1.0))
+    fit, costs = jax.lax.scan(improve, fit, (scales, restarts))
+    return fit.shape, fit.cost, costs[0]
+
+
+def _supposed(scene_object: Superquadrics, hypothesis: Hypothesis, config: RefinementConfig) -> _Shape:
+    """An object as it would be under a hypothesis: upright if it nearly is, a cylinder with one radius."""
+    round_ = hypothesis.exponents[1] > EDGE
+    a, b, c = jnp.log(jnp.clip(scene_object.size, *HALF_EXTENTS))
+    mean = (a + b) / 2.0
+    turned = matmul(scene_object.rotation, yaw_rotation(hypothesis.yaw))
+    return _Shape(
+        log_size=jnp.stack([jnp.where(round_, mean, a), jnp.where(round_, mean, b), c]),
+        position=scene_object.position,
+        rotation=_upright(turned, config),
+        exponents=hypothesis.exponents,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("camera", "shelf", "config"))
+def refine(
+    camera: Camera,
+    shelf: Shelf,
+    scene: Superquadrics,
+    points: Float[Array, "p 3"],
+    labels: Int[Array, " p"],
+    depth: Float[Array, "h w"],
+    config: RefinementConfig | None = None,
+) -> Refined:
+    """Fit recognised superquadrics to a depth image.
+
+    `jax.vmap` over scenes, points, labels and images refines a batch. The rays from the camera to what it sees must not
+    pass through an object, whatever it is that they end on, so no segmentation of the image is asked for.
+
+    Args:
+      camera: the camera of the depth image; static.
+      shelf: the shelf that the objects are on; static.
+      scene: what a recogniser made of the points, fields (N, ...).
+      points: observed points in the world [m]; what is not finite is left out.
+      labels: the slot of `scene` that each point belongs to; others for what belongs to none.
+      depth: along the camera's axis [m]; infinite where nothing is seen, NaN where nothing was measured.
+      config: static; the default if None.
+
+    Returns:
+      the refined scene and diagnostics. Absent objects and those with too few points are as they were.
+    """
+    config = config or RefinementConfig()
+    origin = jnp.array(camera.position)
+
+    # Stands in for what is not fitted, so that its slot stays finite in value and derivative.
+    middle = ((shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board + 0.05)
+    stand_in = Superquadrics(
+        jnp.full(3, 0.05), jnp.array(superquadric.BOX_EXPONENTS), jnp.array(middle), jnp.eye(3), jnp.array(False)
+    )
+
+    def one(given, label):
+        finite = jnp.all(jnp.isfinite(points), axis=-1)
+        usable = given.valid & (jnp.sum((labels == label) & finite) >= config.minimum_points)
+        scene_object = jax.tree.map(lambda a, b: jnp.where(usable, a, b), given, stand_in)
+        evidence = _evidence(camera, scene_object, label, points, labels, depth, config)
+        if config.hypotheses:
+            numbers = jnp.array(config.hypotheses, jnp.float32)
+            hypotheses = Hypothesis(numbers[:, :2], numbers[:, 2])
+        else:
+            hypotheses = Hypothesis(scene_object.exponents[None], jnp.zeros(1))
+        guesses = jax.vmap(lambda h: _supposed(scene_object, h, config))(hypotheses)
+        shapes, costs, before = jax.vmap(lambda guess: _fit(guess, origin, evidence, shelf, config))(guesses)
+        switched = (guesses.exponents[:, 1] > EDGE) != (scene_object.exponents[1] > EDGE)
+        best = jnp.argmin(costs + config.switch * switched)
+        shape, cost, initial = jax.tree.map(lambda a: a[best], (shapes, costs, before))
+        count = jnp.sum(evidence.point_weight).astype(jnp.int32)
+        refined = Superquadrics(jnp.exp(shape.log_size), shape.exponents, shape.position, shape.rotation, given.valid)
+        kept = jax.tree.map(lambda a, b: jnp.where(usable & jnp.isfinite(cost), a, b), refined, given)
+        return Refined(kept, cost, initial, count, best.astype(jnp.int32))
+
+    return jax.vmap(one)(scene, jnp.arange(scene.capacity))

@@ -1,0 +1,199 @@
+"""Rendered images with the robot in them, a wrong camera pose and sensor noise, to segments and points."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from robot_images import ROBOT, robot_image
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.camera import Camera, back_project
+from mechsearch_jax.envs.observation import SHELF
+from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.kinematics import HOME
+from mechsearch_jax.perception import camera_pose, real_camera
+from mechsearch_jax.perception.camera_pose import PoseConfig, with_pose
+from mechsearch_jax.perception.colour import TargetColour
+from mechsearch_jax.perception.real_camera import RealCameraConfig
+from mechsearch_jax.scenario import Body, Scenario
+from mechsearch_jax.shelf import Shelf
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+CAMERA = Camera().scaled(4)
+JOINTS, OPENING = np.array(HOME) + np.array([-0.3, 0.5, 0.0, -0.1, 0.0, 0.0, 0.0], np.float32), 0.05
+SCENE = Scenario(
+    "scene",
+    (
+        Body("box", (0.054, 0.025, 0.054), (0.6, 0.2, 0.4585), (0.966, 0.0, 0.0, 0.259)),
+        Body("cylinder", (0.034, 0.034, 0.107), (0.62, 0.0, 0.5115), UPRIGHT),
+        Body("box", (0.042, 0.018, 0.035), (0.52, -0.1, 0.4395), UPRIGHT),
+    ),
+    Body("cylinder", (0.02, 0.02, 0.05), (0.5, 0.08, 0.4545), UPRIGHT),
+)
+
+
+def pose_of(camera):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = camera.rotation, camera.position
+    return T
+
+
+def wrong(camera, seed, metres=0.02, degrees=2.0):
+    """The camera where it is not: off by the full distance and angle, in random directions."""
+    rng = np.random.default_rng(seed)
+    shift, axis = rng.normal(size=(2, 3))
+    T = pose_of(camera)
+    T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(np.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix()
+    T[:3, 3] += metres * shift / np.linalg.norm(shift)
+    return with_pose(camera, T)
+
+
+def pose_error(found, camera):
+    """Error of the camera's position [m] and rotation [degrees]."""
+    E = np.linalg.inv(pose_of(camera)) @ np.asarray(found, float)
+    return np.linalg.norm(E[:3, 3]), np.degrees(np.linalg.norm(Rotation.from_matrix(E[:3, :3]).as_rotvec()))
+
+
+def sensed(camera, depth, colour, seed):
+    """Images as a sensor gives them: 1 mm of noise, 3 % of the depths missing, noisy 8-bit colours."""
+    rng = np.random.default_rng(seed)
+    depth = depth + rng.normal(0, 0.001, depth.shape)
+    depth = np.where(np.isfinite(depth) & (rng.random(depth.shape) > 0.03), depth, 0.0)
+    colour = np.clip(colour + rng.normal(0, 0.01, colour.shape), 0, 1)
+    return depth.astype(np.float32), (np.round(colour * 255) / 255).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def images():
+    return robot_image(CAMERA, Shelf(), SCENE, JOINTS, OPENING)
+
+
+def test_distance_to_the_robot_is_that_of_another_implementation(images):
+    """The simulator draws the robot's surface in by half a millimetre."""
+    depth, _, owners = images
+    points = back_project(CAMERA, jnp.asarray(depth))[owners == ROBOT]
+    assert len(points) > 1000
+    distance, normal = camera_pose.panda_distance(points, jnp.asarray(JOINTS), jnp.float32(OPENING))
+    np.testing.assert_allclose(distance, -5e-4, atol=2e-5)
+    off, _ = camera_pose.panda_distance(points + 0.003 * normal, jnp.asarray(JOINTS), jnp.float32(OPENING))
+    assert np.mean(np.abs(np.asarray(off) - 0.0025) < 2e-5) > 0.95
+    np.testing.assert_allclose(jnp.linalg.norm(normal, axis=1), 1.0, atol=1e-5)
+    towards = np.sum(np.asarray(normal) * (np.array([CAMERA.position]) - np.asarray(points)), axis=1)
+    assert np.mean(towards > 0) > 0.98
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_wrong_pose_is_corrected_on_the_robot(images, seed):
+    depth, colour = sensed(CAMERA, *images[:2], seed)
+    given = wrong(CAMERA, seed)
+    key = jax.random.key(seed)
+    prepared = real_camera.prepare(key, given, Shelf(), depth, colour, None, JOINTS, OPENING)
+    before = pose_error(pose_of(given), CAMERA)
+    after = pose_error(prepared.pose.T_world_camera, CAMERA)
+    assert before == pytest.approx((0.02, 2.0), abs=1e-3)
+    assert after[0] < 0.0015
+    assert after[1] < 0.15
+    assert prepared.pose.corrected
+    assert prepared.pose.error < 0.002
+    np.testing.assert_allclose(pose_of(prepared.camera), prepared.pose.T_world_camera, atol=1e-6)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_segments_are_the_objects(images, seed, masked):
+    """From the wrong pose, with noise: every object's segment, no shelf, no robot, and the floor as it was measured."""
+    owners = images[2]
+    depth, colour = sensed(CAMERA, *images[:2], seed)
+    mask = np.where(owners <= TARGET, owners, -1) if masked else None
+    given = wrong(CAMERA, seed + 10)
+    prepared = real_camera.prepare(jax.random.key(seed), given, Shelf(), depth, colour, mask, JOINTS, OPENING)
+    segmentation = np.array(prepared.segmentation)
+    segments = np.unique(segmentation[segmentation >= 0])
+    assert len(segments) == 4
+    for body in np.unique(owners[(owners >= 0) & (owners <= TARGET)]):
+        own = (owners == body) & (depth > 0)
+        label = body if masked else np.bincount(segmentation[own & (segmentation >= 0)]).argmax()
+        overlap = np.sum(own & (segmentation == label)) / np.sum(own | (segmentation == label))
+        # What touches the floor or the robot's outline is given up.
+        assert overlap > 0.85
+        if body == TARGET:
+            assert prepared.detection.found
+            assert prepared.detection.segment == label
+    assert np.mean(owners[segmentation >= 0] == SHELF) < 0.01
+    assert prepared.floor.support > 500
+    assert np.degrees(np.arccos(min(1.0, float(prepared.floor.normal[2])))) < 0.6
+    assert abs(float(prepared.floor.height(jnp.array([0.6, 0.1, Shelf().board])))) < 0.003
+
+    cloud = prepared.cloud
+    assert cloud.points.shape == (2048, 3)
+    assert jnp.all(cloud.valid)
+    assert set(np.unique(cloud.labels)) == set(segments)
+    truth = np.array(back_project(CAMERA, jnp.asarray(images[0])))[(owners <= TARGET) & (owners >= 0)]
+    low, high = truth.min(axis=0) - 0.01, truth.max(axis=0) + 0.01
+    assert np.all((np.array(cloud.points) > low) & (np.array(cloud.points) < high))
+
+
+def test_the_same_key_draws_the_same_points_and_few_are_repeated(images):
+    depth, colour = sensed(CAMERA, *images[:2], 5)
+    mask = np.full(depth.shape, -1)
+    mask[images[2] == 2] = 0
+    first, second, other = (
+        real_camera.prepare(jax.random.key(s), CAMERA, Shelf(), depth, colour, mask) for s in (0, 0, 1)
+    )
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert not jnp.array_equal(first.cloud.points, other.cloud.points)
+    distinct = np.unique(first.cloud.points, axis=0)
+    assert len(distinct) == np.sum(first.segmentation == 0) < 2048
+    assert first.pose is None
+    assert first.camera == CAMERA
+
+
+def test_too_little_of_the_robot_leaves_the_pose_as_it_was(images):
+    depth, colour, owners = images
+    depth = np.where(owners == ROBOT, 0.0, depth).astype(np.float32)
+    prepared = real_camera.prepare(jax.random.key(0), CAMERA, Shelf(), depth, colour, None, JOINTS, OPENING)
+    assert not prepared.pose.corrected
+    np.testing.assert_allclose(prepared.pose.T_world_camera, pose_of(CAMERA), atol=1e-6)
+
+
+def test_an_empty_shelf_has_no_points(images):
+    depth, colour, owners = images
+    depth = np.where(owners == SHELF, depth, 0.0).astype(np.float32)
+    prepared = real_camera.prepare(jax.random.key(0), CAMERA, Shelf(), depth, colour)
+    assert not jnp.any(prepared.cloud.valid)
+    assert jnp.all(prepared.segmentation == -1)
+    assert not prepared.detection.found
+
+
+def test_bad_images_are_refused_in_one_line(images):
+    depth, colour, _ = images
+    depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+    mask = np.zeros(depth.shape, int)
+
+    def call(depth=depth, colour=colour, mask=mask):
+        return real_camera.prepare(jax.random.key(0), CAMERA, Shelf(), depth, colour, mask)
+
+    for arguments, word in (
+        ({"depth": depth[1:]}, "depth image: its shape"),
+        ({"colour": colour[:, 1:]}, "colour image: its shape"),
+        ({"mask": mask[1:]}, "mask image: its shape"),
+        ({"colour": (colour * 255).astype(np.uint8)}, "divide 8-bit"),
+        ({"mask": mask * 1.0}, "whole numbers"),
+        ({"depth": depth * 0}, "no positive depth"),
+        ({"depth": depth * 1000}, "not millimetres"),
+    ):
+        with pytest.raises(InputError, match=word):
+            call(**arguments)
+    for wrong_config in (
+        lambda: RealCameraConfig(points=0),
+        lambda: RealCameraConfig(floor_clearance=-1.0),
+        lambda: PoseConfig(stages=()),
+        lambda: dataclasses.replace(PoseConfig(), minimum_points=3),
+        lambda: TargetColour(minimum_pixels=0),
+    ):
+        with pytest.raises(InputError):
+            wrong_config()
