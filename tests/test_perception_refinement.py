@@ -217,7 +217,7 @@ def test_reverse_gradients_are_finite():
         assert jnp.any(gradient != 0)
 
 
-@pytest.mark.parametrize("exponents", [(0.06, 0.06), (0.06, 1.0), (0.2, 0.2), (1.0, 1.0)])
+@pytest.mark.parametrize("exponents", [(0.06, 0.06), (0.2, 1.0)])
 def test_jacobian_of_the_distance_is_that_of_finite_differences(exponents):
     rng = np.random.default_rng(7)
     shape = refinement._Shape(
@@ -244,7 +244,7 @@ def test_jacobian_of_the_distance_is_that_of_finite_differences(exponents):
     assert jnp.all(distance > 0)
 
 
-@pytest.mark.parametrize("exponents", [(0.06, 0.06), (0.06, 1.0), (0.2, 0.2), (1.0, 1.0)])
+@pytest.mark.parametrize("exponents", [(0.06, 0.06), (0.2, 1.0)])
 def test_support_and_closest_approach_are_those_of_dense_samples(exponents):
     rng = np.random.default_rng(8)
     shape = refinement._Shape(
