@@ -258,7 +258,7 @@ class Curves:
         # A kill may have cut the last line short.
         return [line for line in lines if line.startswith("{") and line.endswith("}")]
 
-    def add(self, scalars: dict[str, float]) -> None:
+    def add(self, scalars: dict[str, float | int]) -> None:
         """Append one line."""
         with open(self._path, "a") as file:
             file.write(json.dumps(scalars) + "\n")

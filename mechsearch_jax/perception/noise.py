@@ -97,17 +97,25 @@ class TimeOfFlight:
         mean = jnp.where(mixes, depth + share * (jnp.where(at_edge, other, depth) - depth), depth)
         deviation = self.deviation * mean**2 / jnp.maximum(cosine, 0.2)
         measured = mean + jnp.where(jnp.isfinite(mean), deviation, 0.0) * jax.random.normal(noise, depth.shape)
-        # An edge has no angle of incidence: what is lost there is lost as mixtures.
-        returns = jnp.where(at_edge, 1.0, jax.nn.sigmoid((cosine - self.grazing) / self.softness))
+        returns = jax.nn.sigmoid((cosine - self.grazing) / self.softness)
         kept = jax.random.uniform(lost, depth.shape) < returns * (1.0 - self.missing)
         return back_project(camera, jnp.where(kept, measured, jnp.nan))
 
 
 def _incidence(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
-    """Cosine of the angle between each pixel's ray and the normal of the surface that its neighbours span."""
-    across, down = jnp.roll(points, -1, axis=1) - points, jnp.roll(points, -1, axis=0) - points
-    normal = jnp.cross(across, down)
+    """Cosine of the angle between each pixel's ray and the normal of the surface that its neighbours span.
+
+    The neighbours to the right and below span one, those to the left and above another; the one that is met more
+    squarely counts, because at an edge the other leads across it. 1 where there is neither.
+    """
     ray = points - jnp.array(camera.position).reshape(1, 1, 3)
-    lengths = jnp.linalg.norm(normal, axis=-1) * jnp.linalg.norm(ray, axis=-1)
-    cosine = jnp.abs(jnp.sum(normal * ray, axis=-1)) / jnp.where(lengths > 0, lengths, 1.0)
-    return jnp.where(jnp.isfinite(cosine) & (lengths > 0), cosine, 1.0)
+
+    def cosine(side):
+        across, down = (jnp.roll(points, side, axis=axis) - points for axis in (1, 0))
+        normal = jnp.cross(across, down)
+        lengths = jnp.linalg.norm(normal, axis=-1) * jnp.linalg.norm(ray, axis=-1)
+        known = jnp.isfinite(lengths) & (lengths > 0)
+        return jnp.where(known, jnp.abs(jnp.sum(normal * ray, axis=-1)) / jnp.where(known, lengths, 1.0), -1.0)
+
+    best = jnp.maximum(cosine(-1), cosine(1))
+    return jnp.where(best < 0, 1.0, best)

@@ -18,10 +18,10 @@ class CleanUpConfig:
     """How labels of points are cleaned up.
 
     Attributes:
-      neighbours: points that vote on a point's label, itself among them.
+      neighbours: points that vote on a point's label, itself among them, as far as they are within reach.
       rounds: of voting.
       minimum: segments of fewer points are dissolved into the segments nearest to their points.
-      reach: what no segment is so near to becomes OTHER [m].
+      reach: points farther apart do not vote, nor take each other's label [m]; what is left over becomes OTHER.
     """
 
     neighbours: int = 9
@@ -60,11 +60,12 @@ def clean_up(
     config = config or CleanUpConfig()
     instances = jnp.arange(INSTANCES)
     square = jnp.where(valid[None, :], _squares(points, points), jnp.inf)
-    nearest = jax.lax.top_k(-square, config.neighbours)[1]
+    nearness, nearest = jax.lax.top_k(-square, config.neighbours)
+    votes_count = (-nearness < config.reach**2)[..., None]
     member = (labels[:, None] == instances[None, :]) & valid[:, None]
 
     def vote(_, member):
-        votes = jnp.sum(member[nearest], axis=1)
+        votes = jnp.sum(member[nearest] & votes_count, axis=1)
         # A tie stays as it was.
         best = jnp.argmax(2 * votes + member, axis=1)
         elected = (best[:, None] == instances[None, :]) & (jnp.max(votes, axis=1) > 0)[:, None]
