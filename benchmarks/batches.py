@@ -13,6 +13,7 @@ from mechsearch_jax.envs.batch_episode import BatchSimulator, Start, run_episode
 from mechsearch_jax.envs.episode import row, target_of
 from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.native_worlds import NativeWorlds
+from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PlannerConfig
 from mechsearch_jax.results import Episode, Row
@@ -22,6 +23,7 @@ ENGINES: dict[str, Callable[[], BatchSimulator]] = {
     NativeWorlds.engine: NativeWorlds,
     MjxSimulator.engine: MjxSimulator,
 }
+_Group = tuple[Target, PlannerConfig, str, RecognitionName]
 # More worlds at once are no faster per world, but every round takes longer.
 MOST_WORLDS = 1024
 # Without a GPU a batch only shares the overhead.
@@ -54,7 +56,7 @@ class Batches:
           Exception: whatever failed, if no episode has ended since the start or the last failure, or if the memory
             does not suffice for a single world.
         """
-        for (target, config, engine), group in _groups(jobs):
+        for (target, config, engine, recognition), group in _groups(jobs):
             simulator = ENGINES[engine]()
             worlds = self.worlds or fitting_worlds(simulator)
             # Those that take longest come first, so that none of them begins when all others are over.
@@ -62,7 +64,7 @@ class Batches:
             while todo:
                 attempt = _Attempt(todo, ended)
                 try:
-                    self._run(attempt, target, config, simulator, worlds)
+                    self._run(attempt, target, config, recognition, simulator, worlds)
                 except jax.errors.JaxRuntimeError as error:
                     used = min(worlds, len(todo))
                     if "RESOURCE_EXHAUSTED" not in str(error):
@@ -80,12 +82,27 @@ class Batches:
                 todo = attempt.left
 
     def _run(
-        self, attempt: _Attempt, target: Target, config: PlannerConfig, simulator: BatchSimulator, worlds: int
+        self,
+        attempt: _Attempt,
+        target: Target,
+        config: PlannerConfig,
+        recognition: RecognitionName,
+        simulator: BatchSimulator,
+        worlds: int,
     ) -> None:
         at_once = AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE
         problem = kept_problem(target)
         run_episodes(
-            attempt.starts(), problem, config, simulator, worlds, attempt.take, at_once=at_once, busy=self.busy
+            attempt.starts(),
+            problem,
+            config,
+            simulator,
+            worlds,
+            attempt.take,
+            at_once=at_once,
+            recogniser=recogniser(recognition, target),
+            recognition=recognition,
+            busy=self.busy,
         )
 
 
@@ -128,11 +145,11 @@ class _Attempt:
         return [job for place, job in enumerate(self._jobs) if place not in self._over]
 
 
-def _groups(jobs: Sequence[Job]) -> list[tuple[tuple[Target, PlannerConfig, str], list[Job]]]:
+def _groups(jobs: Sequence[Job]) -> list[tuple[_Group, list[Job]]]:
     """The jobs by what is compiled for them."""
-    groups: dict[tuple[Target, PlannerConfig, str], list[Job]] = {}
+    groups: dict[_Group, list[Job]] = {}
     for job in jobs:
-        groups.setdefault((target_of(job.scenario), job.config, job.engine), []).append(job)
+        groups.setdefault((target_of(job.scenario), job.config, job.engine, job.recognition), []).append(job)
     return list(groups.items())
 
 

@@ -16,6 +16,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Protocol
 
+from mechsearch_jax.envs.recognisers import RecognitionName
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.planner import PlannerConfig
@@ -41,7 +42,7 @@ class Job:
     config: PlannerConfig
     seed: int
     engine: str = "NativeSimulator"
-    recognition: str = "oracle"
+    recognition: RecognitionName = "oracle"
 
     def failed(self, reason: str) -> Row:
         """The row of an episode that could not be run to its end."""
@@ -78,6 +79,7 @@ def make_jobs(
     configs: Sequence[PlannerConfig],
     seeds: Sequence[int],
     engine: str = "NativeSimulator",
+    recognition: RecognitionName = "oracle",
 ) -> list[Job]:
     """All combinations of scenario files, configurations and seeds.
 
@@ -94,7 +96,7 @@ def make_jobs(
                 f"{file}: has the name {scenario.name!r} as {names[scenario.name]} has; rename one of them"
             )
         names[scenario.name] = str(file)
-        jobs += [Job(path, scenario, config, seed, engine) for config in configs for seed in seeds]
+        jobs += [Job(path, scenario, config, seed, engine, recognition) for config in configs for seed in seeds]
     return jobs
 
 
@@ -105,9 +107,9 @@ def present_code() -> str:
     The version alone would not tell a checkout from the next commit. The command line decides nothing.
     """
     digest = hashlib.sha256()
-    for package in ("mechsearch_jax", "mechsearch_jax.envs"):
-        for file in sorted(resources.files(package).iterdir(), key=lambda file: file.name):
-            if file.name.endswith(".py") and file.name != "cli.py":
+    for package in ("", ".perception", ".models", ".envs"):
+        for file in sorted(resources.files(f"mechsearch_jax{package}").iterdir(), key=lambda file: file.name):
+            if file.name.endswith((".py", ".npz")) and file.name != "cli.py":
                 source = file.read_bytes()
                 digest.update(f"{package} {file.name} {len(source)} ".encode() + source)
     return f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')} ({digest.hexdigest()[:12]})"

@@ -95,7 +95,12 @@ class _Crew(threading.Thread):
             process = self._process = self._start()
         assert process.stdin is not None
         assert process.stdout is not None
-        question = {"path": job.path, "config": dataclasses.asdict(job.config), "seed": job.seed}
+        question = {
+            "path": job.path,
+            "config": dataclasses.asdict(job.config),
+            "seed": job.seed,
+            "recognition": job.recognition,
+        }
         try:
             process.stdin.write(json.dumps(question) + "\n")
             process.stdin.flush()

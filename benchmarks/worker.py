@@ -12,7 +12,9 @@ import sys
 from typing import Any, TextIO
 
 from mechsearch_jax.cache import keep_compilations, kept_problem
-from mechsearch_jax.envs.episode import row, run_episode, target_of
+from mechsearch_jax.envs.episode import row as row_of
+from mechsearch_jax.envs.episode import run_episode, target_of
+from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.simulator import NativeSimulator
 from mechsearch_jax.planner import PlannerConfig, Problem
 from mechsearch_jax.results import Row
@@ -27,13 +29,15 @@ class Worker:
         self._problems: dict[Target, Problem] = {}
         self._simulator = NativeSimulator()
 
-    def run(self, path: str, config: PlannerConfig, seed: int) -> Row:
+    def run(self, path: str, config: PlannerConfig, seed: int, recognition: RecognitionName) -> Row:
         """Run one episode of a scenario file."""
         scenario = load_scenario(path)
         target = target_of(scenario)
         if target not in self._problems:
             self._problems[target] = kept_problem(target)
-        return row(run_episode(seed, scenario, self._problems[target], config, self._simulator))
+        eyes = recogniser(recognition, target)
+        episode = run_episode(seed, scenario, self._problems[target], config, self._simulator, eyes, recognition)
+        return row_of(episode)
 
 
 def parse_config(value: dict[str, Any]) -> PlannerConfig:
@@ -47,7 +51,11 @@ def serve(jobs: TextIO, answers: TextIO) -> None:
     for line in jobs:
         job = json.loads(line)
         try:
-            answer = {"row": dataclasses.asdict(worker.run(job["path"], parse_config(job["config"]), job["seed"]))}
+            answer = {
+                "row": dataclasses.asdict(
+                    worker.run(job["path"], parse_config(job["config"]), job["seed"], job["recognition"])
+                )
+            }
         except Exception as error:  # Whatever fails in one episode must not end the run.
             answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"[:500]}
         print(json.dumps(answer), file=answers, flush=True)

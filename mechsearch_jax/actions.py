@@ -52,6 +52,8 @@ LONGEST_PUSH = 0.5
 # are tested for collision.
 CLOSE_WAYPOINTS = 12
 PUSH_PLACES = 3
+# How far a joint may turn between where an object is taken out of the shelf and where it is brought in [rad].
+LARGEST_TRANSFER = 2.0
 # How far the hand extends behind the finger tips' centres [m].
 HAND_LENGTH = 0.11
 
@@ -592,9 +594,11 @@ def followable(space: ActionSpace, action: Action) -> Bool[Array, ""]:
     start, end = action.T_world_gripper, action.T_world_place
     way = translate(jnp.broadcast_to(start, (n, 4, 4)), jnp.linspace(0.0, 1.0, n)[:, None] * (end - start)[None, :3, 3])
     into, out = line_poses(start, back, n), line_poses(end, back, n)[::-1]
-    # Between picking and placing the arm is outside the shelf, where it may turn as it likes.
     pushing = path_kinematics(jnp.concatenate([into, way[1:], out[1:]]), action.q7)[1]
-    picking = jnp.all(path_kinematics(jnp.stack([into, out]), jnp.broadcast_to(action.q7, 2))[1])
+    # Between picking and placing the arm is outside the shelf, where it may turn as it likes, but not into another of
+    # its configurations: it would fling away what it holds.
+    q, reachable = path_kinematics(jnp.stack([into, out]), jnp.broadcast_to(action.q7, 2))
+    picking = jnp.all(reachable) & jnp.all(jnp.abs(q[1, -1] - q[0, 0]) < LARGEST_TRANSFER)
     return jnp.where(is_push, pushing, picking)
 
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 Method = Literal["search-for-grasp", "search-and-grasp"]
 Actions = Literal["both", "push", "pick-and-place"]
+Recognition = Literal["oracle", "masks", "full"]
 TargetShape = Literal["cylinder", "box"]
 
 
@@ -42,7 +43,8 @@ class PlannerOptions:
       actions: which actions are used; both by default.
       criterion: what makes a target visible; "detector", the default, counts pixels as the detector does.
       max_steps: actions in an episode; 10 by default.
-      recognition: what the planner sees the objects through; "oracle" knows their true shapes and poses.
+      recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses; the others see
+        a noisy depth image, "masks" with the true segmentation, "full" without.
       simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
         batches where there is a GPU.
     """
@@ -57,7 +59,7 @@ class PlannerOptions:
         tyro.conf.arg(metavar="{detector,depth-mse,depth-norm}"),
     ] = None
     max_steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    recognition: Literal["oracle"] = "oracle"
+    recognition: Recognition = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
 
     def config(self, method: Method) -> PlannerConfig:
@@ -191,6 +193,7 @@ def search(
     from mechsearch_jax.envs.episode import run_episode, target_of
     from mechsearch_jax.envs.generator import generate_scenario
     from mechsearch_jax.envs.narration import Narrator, verdict
+    from mechsearch_jax.envs.recognisers import recogniser
     from mechsearch_jax.envs.simulator import NativeSimulator
     from mechsearch_jax.results import check_writable, save_episode
     from mechsearch_jax.scenario import load_scenario, save_scenario
@@ -212,7 +215,10 @@ def search(
         console.print(f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {method}")
         problem = kept_problem(target_of(scene))
         narrator = Narrator(console, status, problem, config)
-        episode = run_episode(seed, scene, problem, config, NativeSimulator(), watcher=narrator)
+        eyes = recogniser(options.recognition, target_of(scene))
+        episode = run_episode(
+            seed, scene, problem, config, NativeSimulator(), eyes, options.recognition, watcher=narrator
+        )
         status.update("writing")
         strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
         save_figure(strip, out / "filmstrip.png")
@@ -243,6 +249,7 @@ def inspect(
     from mechsearch_jax.cache import keep_compilations, kept_problem
     from mechsearch_jax.envs.episode import target_of
     from mechsearch_jax.envs.pictures import inspect_scenario
+    from mechsearch_jax.envs.recognisers import recogniser
     from mechsearch_jax.results import check_writable, save_maps
     from mechsearch_jax.scenario import load_scenario
     from mechsearch_jax.viz.drawing import save_figure
@@ -254,7 +261,8 @@ def inspect(
     keep_compilations()
     problems = {target: kept_problem(target) for target in {target_of(scene) for scene in scenes}}
     for scene in track(scenes, "inspecting"):
-        maps, figure = inspect_scenario(scene, problems[target_of(scene)], config, seed=seed)
+        eyes = recogniser(options.recognition, target_of(scene))
+        maps, figure = inspect_scenario(scene, problems[target_of(scene)], config, eyes, seed)
         save_maps(maps, out / f"{scene.name}.npz")
         save_figure(figure, out / f"{scene.name}.png")
     print(f"{len(scenes)} scenario{'s' if len(scenes) > 1 else ''} inspected: {out}")
@@ -302,7 +310,7 @@ def evaluate(
     in_processes = workers is not None or (batch is None and options.simulator != "mjx" and not has_gpu())
     engine = "NativeSimulator" if in_processes else options.engine()
     configs = [options.config(one) for one in method]
-    jobs = make_jobs(find_scenarios(scenarios), configs, seed, engine)
+    jobs = make_jobs(find_scenarios(scenarios), configs, seed, engine, options.recognition)
     console = Console(highlight=False)
     with EpisodeProgress(console, len(jobs)) as progress:
         if in_processes:

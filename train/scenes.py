@@ -13,10 +13,10 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from mechsearch_jax.camera import Camera, rays
 from mechsearch_jax.envs.generator import BOXES, CYLINDERS
 from mechsearch_jax.envs.observation import cast_body, cast_shelf
+from mechsearch_jax.envs.recognisers import true_labels
 from mechsearch_jax.envs.world import BODIES, BOX, CYLINDER, TARGET, World
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.perception.cloud import MARGIN, View, above_board, shelf_view
-from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
+from mechsearch_jax.perception.cloud import View, shelf_view
 from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.transforms import matmul, yaw_rotation
@@ -332,26 +332,6 @@ def capture(
         alone=alone[:TARGET],
         sensor=sensor,
     )
-
-
-def true_labels(
-    points: Float[Array, "h w 3"], owner: Int[Array, "h w"], shelf: Shelf, margin: float = MARGIN
-) -> Int[Array, "h w"]:
-    """Labels (see `Capture`) of an image whose pixels show the bodies `owner`; what is near the shelf counts as it."""
-    body = jnp.where(owner < 0, OTHER, owner)
-    labels = jnp.where(above_board(shelf, points, margin), body, FREE)
-    return jnp.where(jnp.isfinite(points).all(axis=-1), labels, MISSING).astype(jnp.int8)
-
-
-def is_known(world: World) -> Bool[Array, " bodies"]:
-    """Which bodies are of the size of one of the paper's eleven objects."""
-    own = jnp.concatenate([world.kind[:, None].astype(jnp.float32), world.half_size], axis=1)
-    return (jnp.abs(own[:, None] - jnp.asarray(_KNOWN)[None]) < 1e-5).all(axis=-1).any(axis=-1)
-
-
-def noise_names(config: SceneConfig) -> list[str]:
-    """Names of the sensors, as `Capture.sensor` numbers them."""
-    return [getattr(noise, "__name__", type(noise).__name__) for noise in config.noises]
 
 
 def visible_share(seen: Capture) -> Float[Array, " objects"]:

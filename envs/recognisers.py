@@ -1,0 +1,189 @@
+"""Recognisers: what the planner sees the simulated world through, from its truth to nothing but a depth image.
+
+`oracle` knows the true shapes and poses. The others are shown the depth image of a camera with the noise of a sensor,
+and make superquadrics of it: `masks` is told which pixels are whose, `full` has to segment them too. Whether the target
+is seen is the detector's word, for all of them; where it is, only the oracle is told.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Literal, Protocol, cast, get_args
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+from optax.assignment import hungarian_algorithm
+
+from mechsearch_jax.camera import Camera, project
+from mechsearch_jax.envs.episode import Recogniser, Recognition, Snapshot, oracle
+from mechsearch_jax.envs.observation import observe
+from mechsearch_jax.envs.world import TARGET, World
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.models.recognition import RecognitionNetwork
+from mechsearch_jax.models.segmentation import SegmentationNetwork, told_by
+from mechsearch_jax.models.weights import Weights, shipped_weights
+from mechsearch_jax.perception.cloud import MARGIN, View, above_board, cloud_of, draw, resample, shelf_view
+from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.perception.noise import NoiseModel, RandomDirection
+from mechsearch_jax.perception.recognition import recognise
+from mechsearch_jax.perception.refinement import RefinementConfig, refine
+from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
+from mechsearch_jax.perception.target_pose import target_pose
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.target import Target
+
+RecognitionName = Literal["oracle", "masks", "full"]
+# Points of the target that its pose is fitted to.
+TARGET_POINTS = 256
+
+
+def true_labels(
+    points: Float[Array, "h w 3"], owner: Int[Array, "h w"], shelf: Shelf, margin: float = MARGIN
+) -> Int[Array, "h w"]:
+    """Labels of an image whose pixels show the slots `owner`, as `observe` has them: objects' slots, TARGET, and what
+    `perception.labels` has for the rest. What is measured near the shelf counts as the shelf, whatever it is.
+    """
+    body = jnp.where((owner >= 0) & (owner <= TARGET), owner, OTHER)
+    labels = jnp.where(above_board(shelf, points, margin), body, FREE)
+    return jnp.where(jnp.isfinite(points).all(axis=-1), labels, MISSING).astype(jnp.int8)
+
+
+class Labeller(Protocol):
+    """Says which pixels show which object."""
+
+    def __call__(
+        self,
+        key: Key[Array, ""],
+        shelf: Shelf,
+        points: Float[Array, "h w 3"],
+        of_target: Bool[Array, "h w"],
+        masks: Int[Array, "h w"],
+    ) -> Int[Array, "h w"]:
+        """Label an image.
+
+        Args:
+          key: PRNG key.
+          shelf: static.
+          points: in the world [m]; NaN where nothing was measured.
+          of_target: where the detector sees the target.
+          masks: the true labels; a labeller that should not know them takes no more from them than the numbers that
+            objects go by, so that what is done to an object can be judged.
+        """
+        ...
+
+
+def true_masks(key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array) -> Array:
+    """The `Labeller` that is told everything."""
+    return masks
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Segmenter:
+    """The `Labeller` that segments a cloud of the image's points with a network.
+
+    Attributes:
+      weights: of the segmentation network.
+    """
+
+    weights: Weights
+
+    def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array) -> Array:
+        objects = above_board(shelf, points) & ~of_target
+        cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)))
+        network = cast(SegmentationNetwork, self.weights.network)
+        told = told_by(network, self.weights.parameters, cloud.points[None])
+        labels = clean_up(cloud.points, labels_of(told.logits[-1, 0]), cloud.valid)
+        found = spread_labels(points, objects, cloud.points, labels)
+        return numbered(jnp.where(of_target & (found != MISSING), OTHER, found), masks)
+
+
+def numbered(found: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "h w"]:
+    """Segments renamed after the true objects that they overlap most, one each; what is left over becomes OTHER.
+
+    A planner does not care for the names; but the simulator's notes on whether the picked object slipped do.
+    """
+    segments = jnp.arange(INSTANCES)
+    own = (found.reshape(-1)[:, None] == segments[None]).astype(jnp.float32)
+    truth = (masks.reshape(-1)[:, None] == segments[None]).astype(jnp.float32)
+    shared = jnp.matmul(own.T, truth)
+    # With nothing shared, a segment still gets one of the slots of objects that nobody sees.
+    slots = shared[:, :TARGET]
+    rows, columns = hungarian_algorithm(-slots)
+    name = jnp.full(INSTANCES, OTHER, jnp.int32).at[rows].set(columns.astype(jnp.int32))
+    return jnp.where(found >= 0, name[jnp.maximum(found, 0)], found).astype(jnp.int8)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ImageRecogniser:
+    """The `Recogniser` that sees a depth image.
+
+    Attributes:
+      target: its known shape.
+      labeller: says which pixels show which object.
+      weights: of the recognition network.
+      noise: of the depth sensor.
+      refinement: how recognised shapes are refined.
+    """
+
+    target: Target
+    labeller: Labeller
+    weights: Weights
+    noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
+    refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
+
+    def __call__(self, key: Array, snapshot: Snapshot) -> Recognition:
+        view = shelf_view(snapshot.camera, snapshot.shelf)
+        scene, pose = _recognise(key, self, view, snapshot.shelf, snapshot.world)
+        return Recognition(scene, snapshot.target_seen, pose)
+
+
+@functools.partial(jax.jit, static_argnames=("recogniser", "view", "shelf"))
+def _recognise(
+    key: Array, recogniser: ImageRecogniser, view: View, shelf: Shelf, world: World
+) -> tuple[Superquadrics, Float[Array, " 3"]]:
+    """The objects, and where the target would be if it was seen."""
+    sensing, labelling, drawing, choosing = jax.random.split(key, 4)
+    camera = view.camera
+    image = observe(camera, world, shelf)
+    points = recogniser.noise(sensing, camera, image.depth)
+    masks = true_labels(points, image.segmentation, shelf)
+    of_target = image.segmentation == TARGET
+    labels = recogniser.labeller(labelling, shelf, points, of_target, masks)
+    network = cast(RecognitionNetwork, recogniser.weights.network)
+    scene = recognise(drawing, network, recogniser.weights.parameters, camera, points, labels, shelf)
+    depth = measured_depth(camera, image.depth, points)
+    refined = refine(camera, shelf, scene, points.reshape(-1, 3), labels.reshape(-1), depth, recogniser.refinement)
+
+    index, count = draw(choosing, (masks == TARGET).reshape(-1), TARGET_POINTS)
+    seen = jnp.broadcast_to(count > 0, TARGET_POINTS)
+    pose = target_pose(recogniser.target, shelf, jnp.array(camera.position), points.reshape(-1, 3)[index], seen)
+    return refined.scene, pose
+
+
+def measured_depth(camera: Camera, depth: Float[Array, "h w"], points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
+    """The depth of measured points [m]: infinite where nothing is, NaN where nothing was measured."""
+    finite: Bool[Array, "h w"] = jnp.isfinite(points).all(axis=-1)
+    _, measured = project(camera, jnp.where(finite[..., None], points, 0.0))
+    return jnp.where(finite, measured, jnp.where(jnp.isfinite(depth), jnp.nan, jnp.inf))
+
+
+@functools.cache
+def recogniser(name: RecognitionName, target: Target) -> Recogniser:
+    """The recogniser of a name; the same object for the same arguments, so that nothing is compiled twice.
+
+    Args:
+      name: "oracle", "masks" or "full".
+      target: its known shape.
+
+    Raises:
+      InputError: there is none of that name, or its weights are missing or damaged.
+    """
+    if name not in get_args(RecognitionName):
+        raise InputError(f'recognition "{name}" is unknown; use {", ".join(get_args(RecognitionName))}')
+    if name == "oracle":
+        return oracle
+    labellers = {"masks": lambda: true_masks, "full": lambda: Segmenter(shipped_weights("segmentation"))}
+    return ImageRecogniser(target, labellers[name](), shipped_weights("recognition"))
