@@ -85,10 +85,12 @@ def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride:
     tops = (shelf.board, min(shelf.board + 0.25, shelf.ceiling))
     sides = ((shelf.front - OVERHANG, shelf.back), (shelf.right, shelf.left), tops)
     corners = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(8, 3)
-    pixels, depth = project(camera, jnp.array(corners, jnp.float32))
-    low = np.maximum(np.floor(np.asarray(pixels).min(axis=0)), 0).astype(int)
-    high = np.minimum(np.ceil(np.asarray(pixels).max(axis=0)) + 1, (camera.height, camera.width)).astype(int)
-    if (np.asarray(depth) <= 0).any() or (low >= high).any():
+    # Nothing here is traced, also where the caller is.
+    with jax.ensure_compile_time_eval():
+        pixels, depth = (np.asarray(a) for a in project(camera, jnp.array(corners, jnp.float32)))
+    low = np.maximum(np.floor(pixels.min(axis=0)), 0).astype(int)
+    high = np.minimum(np.ceil(pixels.max(axis=0)) + 1, (camera.height, camera.width)).astype(int)
+    if (depth <= 0).any() or (low >= high).any():
         raise InputError("shelf_view: the camera does not look into the shelf; check its pose")
     return view(camera, (int(low[0]), int(high[0])), (int(low[1]), int(high[1])), stride)
 
