@@ -171,7 +171,7 @@ def measured_depth(camera: Camera, depth: Float[Array, "h w"], points: Float[Arr
 
 
 @functools.cache
-def recogniser(name: RecognitionName, target: Target) -> Recogniser:
+def recogniser(name: str, target: Target) -> Recogniser:
     """The recogniser of a name; the same object for the same arguments, so that nothing is compiled twice.
 
     Args:

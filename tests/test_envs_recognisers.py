@@ -1,0 +1,124 @@
+"""The planner's eyes: what recognisers make of the simulated world."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mechsearch_jax import scenario
+from mechsearch_jax.camera import Camera, back_project
+from mechsearch_jax.envs.episode import Snapshot, oracle, target_of
+from mechsearch_jax.envs.observation import observe
+from mechsearch_jax.envs.recognisers import measured_depth, numbered, recogniser, true_labels
+from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.perception.cloud import shelf_view
+from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
+from mechsearch_jax.perception.scores import intersection_over_union, sharpened
+from mechsearch_jax.shelf import Shelf
+
+CAMERA, SHELF = Camera(), Shelf()
+SCENE = scenario.load_scenario(scenario.example_scenarios()["first-light"])
+
+
+def moved(world, index, position):
+    return world.replace(position=world.position.at[index].set(jnp.float32(position)))
+
+
+@pytest.fixture(scope="module")
+def world():
+    return from_scenario(SCENE)
+
+
+@pytest.fixture(scope="module")
+def masks():
+    return recogniser("masks", target_of(SCENE))
+
+
+@pytest.fixture(scope="module")
+def seen(world, masks):
+    return masks(jax.random.key(0), Snapshot(CAMERA, SHELF, world))
+
+
+def test_true_masks_and_noisy_depth_give_the_shapes(world, seen):
+    truth = sharpened(true_superquadrics(world))
+    overlap = np.asarray(intersection_over_union(truth, seen.scene))
+    both = np.asarray(truth.valid & seen.scene.valid)
+    assert both.sum() >= np.asarray(truth.valid).sum() - 1
+    assert overlap[both].mean() > 0.85
+    assert not np.asarray(seen.scene.valid & ~truth.valid).any()
+    assert not seen.found
+
+
+def test_the_same_key_gives_the_same_and_another_key_other_noise(world, masks, seen):
+    again = masks(jax.random.key(0), Snapshot(CAMERA, SHELF, world))
+    other = masks(jax.random.key(1), Snapshot(CAMERA, SHELF, world))
+    np.testing.assert_array_equal(again.scene.size, seen.scene.size)
+    assert np.abs(np.asarray(other.scene.size - seen.scene.size)).max() > 1e-5
+
+
+def test_a_target_in_sight_is_found_where_it_stands_and_is_none_of_the_objects(world, masks, seen):
+    place = [0.46, 0.3, SHELF.board + float(world.half_size[TARGET, 2])]
+    plain = masks(jax.random.key(0), Snapshot(CAMERA, SHELF, moved(world, TARGET, place)))
+    assert plain.found
+    assert np.linalg.norm(np.asarray(plain.target_pose)[:2] - place[:2]) < 0.004
+    np.testing.assert_array_equal(plain.scene.valid, seen.scene.valid)
+
+
+def test_labels_are_float64_geometry(world):
+    view = shelf_view(CAMERA, SHELF)
+    image = observe(view.camera, world, SHELF)
+    points = back_project(view.camera, image.depth).at[:5].set(jnp.nan)
+    labels = np.asarray(true_labels(points, image.segmentation, SHELF))
+    owner, xyz = np.asarray(image.segmentation), np.asarray(points, np.float64)
+    assert (labels[:5] == MISSING).all()
+    high = xyz[..., 2] > SHELF.board + 0.005
+    for slot in range(len(SCENE.objects)):
+        inside = (owner == slot) & high & np.isfinite(xyz[..., 2])
+        assert (labels[inside] == slot).all()
+    on_board = (owner == TARGET + 1) & (np.abs(xyz[..., 2] - SHELF.board) < 0.003)
+    assert on_board.sum() > 1000
+    assert (labels[on_board] == FREE).all()
+
+
+def test_segments_are_named_after_the_objects_that_they_overlap_most():
+    truth = np.full((4, 6), FREE, np.int8)
+    truth[:, 0:2], truth[:, 2:4], truth[:, 4:5] = 5, 1, 3
+    found = np.full((4, 6), FREE, np.int8)
+    found[:, 0:2], found[:, 2:3], found[:, 3:4], found[:, 4:5], found[0, 5] = 8, 0, 2, 7, OTHER
+    found[0, 2] = 2
+    named = np.asarray(numbered(jnp.asarray(found), jnp.asarray(truth)))
+    assert (named[:, 0:2] == 5).all()
+    assert (named[:, 4] == 3).all()
+    assert (named[:, 3] == 1).all()
+    assert (named[1:, 2] != 1).all()
+    assert named[0, 5] == OTHER
+    assert (named[1:, 5] == FREE).all()
+
+
+def test_depth_is_infinite_where_nothing_is_and_nan_where_nothing_was_measured():
+    camera = dataclasses.replace(CAMERA, width=3, height=1)
+    depth = jnp.float32([[0.8, jnp.inf, 0.9]])
+    points = back_project(camera, depth).at[0, 2].set(jnp.nan)
+    found = np.asarray(measured_depth(camera, depth, points))
+    np.testing.assert_allclose(found[0, 0], 0.8, atol=1e-6)
+    assert np.isinf(found[0, 1])
+    assert np.isnan(found[0, 2])
+
+
+def test_names_stand_for_one_object_each(masks):
+    target = target_of(SCENE)
+    assert recogniser("masks", target) is masks
+    assert recogniser("oracle", target) is oracle
+    with pytest.raises(InputError, match="unknown; use oracle, masks, full"):
+        recogniser("eyes", target)
+
+
+@pytest.mark.slow
+def test_without_masks_most_visible_objects_are_told_apart(world):
+    found = recogniser("full", target_of(SCENE))(jax.random.key(0), Snapshot(CAMERA, SHELF, world))
+    truth = sharpened(true_superquadrics(world))
+    overlap = np.asarray(intersection_over_union(truth, found.scene))[np.asarray(truth.valid & found.scene.valid)]
+    assert (overlap > 0.5).sum() >= 2
