@@ -103,6 +103,7 @@ def test_visible_objects_are_refined_to_their_true_shapes(noise, least):
 
 
 @pytest.mark.skipif(not published_scenarios(), reason="the published scenes are not beside this checkout")
+@pytest.mark.slow
 def test_published_scenes_with_noise():
     """Every object with at least 100 pixels at 1280 x 720, however hidden."""
     rng = np.random.default_rng(1)
@@ -166,6 +167,7 @@ def test_rays_bound_what_no_point_bounds():
     assert height[1] > 0.04
 
 
+@pytest.mark.slow
 def test_alone_is_the_same_as_in_a_batch():
     rng = np.random.default_rng(5)
     points, labels, depth, truth = measured([SCENE, SCENE], rng, 0.001)
