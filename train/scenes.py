@@ -334,6 +334,17 @@ def capture(
     )
 
 
+def is_known(world: World) -> Bool[Array, " bodies"]:
+    """Which bodies are of the size of one of the paper's eleven objects."""
+    own = jnp.concatenate([world.kind[:, None].astype(jnp.float32), world.half_size], axis=1)
+    return (jnp.abs(own[:, None] - jnp.asarray(_KNOWN)[None]) < 1e-5).all(axis=-1).any(axis=-1)
+
+
+def noise_names(config: SceneConfig) -> list[str]:
+    """Names of the sensors, as `Capture.sensor` numbers them."""
+    return [getattr(noise, "__name__", type(noise).__name__) for noise in config.noises]
+
+
 def visible_share(seen: Capture) -> Float[Array, " objects"]:
     """Which share of its pixels each object shows; 0 where it has none."""
     return jnp.where(seen.alone > 0, seen.pixels / jnp.maximum(seen.alone, 1), 0.0)
