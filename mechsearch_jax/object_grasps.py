@@ -140,7 +140,7 @@ def object_grasps(
     fits &= is_round | (share == 0.0)[None] | (jnp.abs(turn) > config.min_turn)
     front = jnp.where(is_round, depth, depth * jnp.cos(turn) + width * jnp.abs(jnp.sin(turn)))
 
-    round_drop = np.float32(config.round_drops)[way % len(config.round_drops)]
+    round_drop = np.asarray(config.round_drops, np.float32)[way % len(config.round_drops)]
     drop = jnp.where(is_round, round_drop[None], box_drop[None])
     z = jnp.maximum(prints.high[:, None] - drop, shelf.board + LOWEST)
     # The palm must not run into what stands up before it: the object's front, or its top if the palm reaches that high.

@@ -87,7 +87,10 @@ class TrainConfig:
 class Task(Protocol):
     """What is trained."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Of the network."""
+        ...
 
     def init(self, key: Key[Array, ""]) -> Any:
         """Fresh parameters of the network."""
@@ -218,7 +221,7 @@ def load_checkpoint(folder: Path, state: TrainState, identity: dict[str, Any]) -
     if not path.exists():
         return None
     try:
-        content = serialization.msgpack_restore(path.read_bytes())
+        content: dict[str, Any] = serialization.msgpack_restore(path.read_bytes())  # pyright: ignore[reportAssignmentType]
         settings, seconds = json.loads(content["settings"]), float(content["seconds"])
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); choose another --out") from None

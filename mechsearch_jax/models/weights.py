@@ -98,7 +98,7 @@ def save_weights(path: PathLike, name: str, config: Any, parameters: Any, card: 
     """
     arrays = {key: np.asarray(value, np.float16) for key, value in flatten_dict(parameters, sep="/").items()}
     buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
+    np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
     data = buffer.getvalue()
     head = {
         "format": FORMAT,
@@ -150,7 +150,7 @@ def load_weights(path: PathLike, name: str) -> Weights:
         raise InputError(f"{path}: is not the file that its card describes (SHA-256 differs); copy both again")
     try:
         config = architecture.config(**card["config"])
-        shapes = flatten_dict(architecture.shapes(config), sep="/")
+        shapes: dict[str, Any] = flatten_dict(architecture.shapes(config), sep="/")
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
     except InputError as error:
