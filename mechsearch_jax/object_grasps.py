@@ -70,7 +70,7 @@ class ObjectGraspConfig:
         BoxGrasp(face=1, turn=0.5),
         BoxGrasp(face=1, turn=1.0),
     )
-    round_drops: tuple[float, ...] = (0.02, 0.03)
+    round_drops: tuple[float, ...] = (0.03, 0.04)
     tilts: tuple[float, ...] = (math.radians(20), math.radians(30))
     max_turn: float = math.radians(22)
     min_turn: float = math.radians(5)
