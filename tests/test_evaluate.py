@@ -159,19 +159,25 @@ def test_rows_of_other_code_are_not_added_to(tmp_path, files, command, monkeypat
         evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), out, Processes(1, command))
 
 
-def test_the_code_is_that_of_planner_and_environment(tmp_path, monkeypatch):
-    for name in ("mechsearch_jax", "mechsearch_jax.envs"):
+def test_the_code_is_that_of_planner_perception_and_environment(tmp_path, monkeypatch):
+    for name in ("mechsearch_jax", "mechsearch_jax.envs", "mechsearch_jax.perception", "mechsearch_jax.models"):
         (tmp_path / name).mkdir()
-        for file in ("planner.py", "cli.py"):
+        for file in ("planner.py", "cli.py", "network.npz", "network.json"):
             (tmp_path / name / file).write_text(name)
     monkeypatch.setattr(benchmark.resources, "files", lambda package: tmp_path / package)
-    found = {}
-    for change in ("nothing", "mechsearch_jax/cli.py", "mechsearch_jax/planner.py", "mechsearch_jax.envs/planner.py"):
-        if change != "nothing":
-            (tmp_path / change).write_text("changed")
-        found[change] = present_code.__wrapped__()
-    assert found["nothing"] == found["mechsearch_jax/cli.py"]
-    assert len(set(found.values())) == 3
+    before = present_code.__wrapped__()
+    for decides, change in (
+        (False, "mechsearch_jax/cli.py"),
+        (False, "mechsearch_jax.models/network.json"),
+        (True, "mechsearch_jax/planner.py"),
+        (True, "mechsearch_jax.envs/planner.py"),
+        (True, "mechsearch_jax.perception/planner.py"),
+        (True, "mechsearch_jax.models/network.npz"),
+    ):
+        (tmp_path / change).write_text("changed")
+        after = present_code.__wrapped__()
+        assert (after != before) == decides, change
+        before = after
 
 
 def test_a_worker_that_cannot_be_started_makes_rows_too(tmp_path, files):
