@@ -102,8 +102,8 @@ def make_jobs(
 
 @functools.cache
 def present_code() -> str:
-    """The code that decides about an episode: the package's version, and a digest of planner, perception with its weights
-    and environment.
+    """The code that decides about an episode: the package's version, and a digest of planner, perception (with its
+    weights) and environment.
 
     The version alone would not tell a checkout from the next commit. The command line decides nothing.
     """
