@@ -24,3 +24,13 @@ def problem():
     from mechsearch_jax import planner
 
     return planner.build_problem()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forget_compilations():
+    """Drop a file's compiled functions after it; what another file needs again comes from the persistent cache.
+
+    Each holds dozens of memory mappings, of which Linux allows a process 65,530; past that XLA crashes.
+    """
+    yield
+    jax.clear_caches()

@@ -107,6 +107,7 @@ def test_what_fails_at_once_ends_the_run(problem, tmp_path, files, monkeypatch):
     assert results.read_rows(tmp_path / "rows.parquet") == []
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_goes_on_to_the_same_rows(tmp_path, files):
     def facts(rows):
         return [dataclasses.replace(row, planning_seconds=0.0, simulation_seconds=0.0) for row in rows]

@@ -91,7 +91,7 @@ def test_episodes_are_the_same_alone_and_in_a_batch_whatever_their_slot(problem)
     """More episodes than slots; and in the native simulator."""
     scenarios, seeds = [OPEN, HIDDEN, TWO, HIDDEN], [0, 0, 1, 2]
     simulator = NativeWorlds(threads=2)
-    episodes, together = run(problem, scenarios, simulator, 3, seeds=seeds)
+    episodes, together = run(problem, scenarios, simulator, 2, seeds=seeds)
     assert sum(together) == 4
     alone = [run_episode(seed, s, problem, CONFIG, NativeSimulator()) for s, seed in zip(scenarios, seeds, strict=True)]
     assert [without_times(e) for e in episodes] == [without_times(e) for e in alone]
@@ -119,7 +119,7 @@ def test_a_slot_is_free_for_the_next_as_soon_as_its_episode_ends(problem):
 def test_what_fails_belongs_to_its_own_row(problem):
     stage = Troupe({"hidden": reveal, "tipped": topple}, overflows={"two": Overflow.ROWS | Overflow.CONTACTS})
     tipped = dataclasses.replace(HIDDEN, name="tipped")
-    episodes, _ = run(problem, [TWO, HIDDEN, tipped], stage, 3)
+    episodes, _ = run(problem, [TWO, HIDDEN, tipped], stage, 2)
     assert [e.failure for e in episodes] == [
         "error: the simulator's buffers were too small (rows, contacts)",
         None,

@@ -10,7 +10,7 @@ from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PlannerConfig
 
-CONFIG = PlannerConfig.paper(sequences=6, horizon=2)
+CONFIG = PlannerConfig.paper()
 
 
 def load(name):

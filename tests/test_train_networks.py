@@ -41,7 +41,7 @@ SEGMENTATION = SegmentationConfig(width=32, layers=2, heads=2, neighbours=8, lat
 def parameters(name):
     network = {"recognition": RECOGNITION, "segmentation": SEGMENTATION}[name]
     task = {"recognition": recognition.RecognitionTask, "segmentation": segmentation.SegmentationTask}[name]
-    return task(network=network).init(jax.random.key(1))
+    return jax.jit(task(network=network).init)(jax.random.key(1))
 
 
 # --- segmentation ----------------------------------------------------------------------------------------------------
@@ -50,9 +50,9 @@ def parameters(name):
 def test_segmentation_follows_the_order_of_the_points():
     points = jax.random.uniform(jax.random.key(0), (2, 96, 3)) * 0.2 + jnp.array([[[0.5, 0.0, 0.42]]])
     order = jax.random.permutation(jax.random.key(1), 96)
-    network = SegmentationNetwork(SEGMENTATION)
-    told = network.apply({"params": parameters("segmentation")}, points)
-    turned = network.apply({"params": parameters("segmentation")}, points[:, order])
+    network = jax.jit(SegmentationNetwork(SEGMENTATION).apply)
+    told = network({"params": parameters("segmentation")}, points)
+    turned = network({"params": parameters("segmentation")}, points[:, order])
     assert told.logits.shape == (2, 2, 96, 10)
     assert np.allclose(told.logits[:, :, order], turned.logits, atol=1e-3)
     assert np.allclose(told.centres[:, order], turned.centres, atol=1e-4)
@@ -111,7 +111,7 @@ def test_a_right_segmentation_costs_nothing():
     labels = jnp.asarray(np.repeat([0, 1, 4, OTHER], 30), jnp.int8)
     names = jnp.asarray([7, 2, 0, 1, 5, 3, 4, 6, 8, 9])
     logits = 20.0 * jax.nn.one_hot(names[jnp.where(labels == OTHER, 9, labels)], 10)
-    told = segmentation.segmentation_loss(logits, labels)
+    told = jax.jit(segmentation.segmentation_loss)(logits, labels)
     assert told["cross_entropy"] < 1e-6
     assert told["accuracy"] == 1.0
     found = labels_of(logits)
@@ -192,7 +192,8 @@ def test_segments_hold_their_own_points_in_their_frame():
     task, (_, seen, examples) = some_segments()
     one = jax.tree.map(lambda a: np.asarray(a[0]), examples.segments)
     labels, points = np.asarray(seen.labels[0]), np.asarray(seen.points[0], float)
-    found = segment_clouds(jax.random.key(1), task.view.camera, seen.points[0], seen.labels[0])
+    clouds_of = jax.jit(segment_clouds, static_argnums=1)
+    found = clouds_of(jax.random.key(1), task.view.camera, seen.points[0], seen.labels[0])
     assert found.valid.any()
     for slot in np.flatnonzero(np.asarray(found.valid)):
         turn, origin = np.asarray(found.T_world_segment[slot, :3, :3], float), found.T_world_segment[slot, :3, 3]
@@ -220,11 +221,9 @@ def test_recognition_does_not_mind_the_order_of_the_points():
     task, (_, _, examples) = some_segments()
     segments = jax.tree.map(lambda a: a[0], examples.segments)
     order = jax.random.permutation(jax.random.key(0), task.segments.points)
-    network = model.RecognitionNetwork(RECOGNITION)
-    told = model.told_by(network, parameters("recognition"), segments.points, segments.mark, segments.camera)
-    again = model.told_by(
-        network, parameters("recognition"), segments.points[:, order], segments.mark[:, order], segments.camera
-    )
+    told_by = jax.jit(functools.partial(model.told_by, model.RecognitionNetwork(RECOGNITION)))
+    told = told_by(parameters("recognition"), segments.points, segments.mark, segments.camera)
+    again = told_by(parameters("recognition"), segments.points[:, order], segments.mark[:, order], segments.camera)
     for a, b in zip(jax.tree.leaves(told), jax.tree.leaves(again), strict=True):
         assert np.allclose(a, b, atol=1e-4)
     assert (np.asarray(told.size) > 0).all()
@@ -239,12 +238,13 @@ def test_rotation_vectors_are_scipys():
     vectors[0] = 0
     vectors[1] *= 1e-6
     expected = Rotation.from_rotvec(vectors).as_matrix()
-    matrices = model.rotation_of(jnp.asarray(vectors, jnp.float32))
+    matrices = jax.jit(model.rotation_of)(jnp.asarray(vectors, jnp.float32))
     assert np.allclose(matrices, expected, atol=1e-5)
     back = Rotation.from_matrix(expected).as_rotvec()
     short = np.linalg.norm(back, axis=1) < 3.0
-    assert np.allclose(recognition.rotation_vector(jnp.asarray(expected, jnp.float32))[short], back[short], atol=1e-4)
-    slope = jax.jacobian(model.rotation_of)(jnp.zeros(3))
+    told = jax.jit(recognition.rotation_vector)(jnp.asarray(expected, jnp.float32))
+    assert np.allclose(told[short], back[short], atol=1e-4)
+    slope = jax.jit(jax.jacobian(model.rotation_of))(jnp.zeros(3))
     assert np.isfinite(slope).all()
     assert slope[2, 1, 0] == pytest.approx(1.0)
 
@@ -269,7 +269,7 @@ def same_body(kind, half, rotation, other_half, other_rotation):
 
 @pytest.mark.parametrize("kind", [BOX, CYLINDER])
 def test_every_answer_describes_the_same_body(kind):
-    rng = np.random.default_rng(kind)
+    rng, answers = np.random.default_rng(kind), jax.jit(recognition.answers)
     for _ in range(20):
         turn = Rotation.from_rotvec([rng.normal(0, 0.2), 0, 0]) * Rotation.from_euler("z", rng.uniform(-4, 4))
         if rng.random() < 0.5:
@@ -277,7 +277,7 @@ def test_every_answer_describes_the_same_body(kind):
         rotation = turn.as_matrix()
         half = rng.uniform(0.01, 0.1, 3)
         half[1] = half[0] if kind == CYLINDER else half[1]
-        told = recognition.answers(jnp.int32(kind), jnp.asarray(half, jnp.float32), jnp.asarray(rotation, jnp.float32))
+        told = answers(jnp.int32(kind), jnp.asarray(half, jnp.float32), jnp.asarray(rotation, jnp.float32))
         assert told.right.sum() == 1
         assert (np.asarray(told.right) <= np.asarray(told.taught)).all()
         for k in np.flatnonzero(np.asarray(told.taught)):
@@ -292,9 +292,9 @@ def test_every_answer_describes_the_same_body(kind):
 
 def outputs_for(truth):
     """Hypotheses that say just what is right of a body."""
-    right = recognition.answers(truth.kind, truth.half_size, truth.rotation)
+    right = jax.jit(recognition.answers)(truth.kind, truth.half_size, truth.rotation)
     base = jnp.asarray(BASE_ROTATIONS)
-    rotation = model.matmul(base, model.rotation_of(right.turn))
+    rotation = model.matmul(base, jax.jit(model.rotation_of)(right.turn))
     edges = np.stack([np.full(HYPOTHESES, 0.05), np.where(IS_CYLINDER, 1.0, 0.05)], axis=-1)
     return model.Hypotheses(
         logit=jnp.where(right.right, 20.0, -20.0),
@@ -316,7 +316,8 @@ def test_the_loss_is_equation_7_and_vanishes_at_the_truth(kind):
     surface = jnp.einsum("ij,pj->pi", turn, local) + position[None]
     truth = recognition.Truth(jnp.int32(kind), half, position, turn, surface)
     told = outputs_for(truth)
-    terms = recognition.example_loss(told, truth)
+    loss = jax.jit(recognition.example_loss)
+    terms = loss(told, truth)
     assert terms["correct"] == 1.0
     for name in ("turn", "size", "position"):
         assert terms[name] < 1e-5, name
@@ -324,7 +325,7 @@ def test_the_loss_is_equation_7_and_vanishes_at_the_truth(kind):
     assert terms["surface"] < 0.1
 
     wrong = told.replace(position=told.position + jnp.array([[0.004, 0.0, 0.0]]), size=told.size * 1.1)
-    terms = recognition.example_loss(wrong, truth)
+    terms = loss(wrong, truth)
     winner = int(jnp.argmax(wrong.logit))
     rotation = np.asarray(wrong.rotation[winner], float)
     x = (np.asarray(surface, float) - np.asarray(wrong.position[winner])) @ rotation
@@ -335,20 +336,20 @@ def test_the_loss_is_equation_7_and_vanishes_at_the_truth(kind):
     delta = np.linalg.norm(x, axis=1) * np.abs(1 - S ** (-e1 / 2))
     assert terms["surface"] == pytest.approx(np.sqrt(np.mean(delta**2)) / 0.01, rel=1e-3)
     assert terms["position"] == pytest.approx(0.4 / 3, rel=1e-3)
-    slope = jax.grad(lambda t: sum(recognition.example_loss(t, truth).values()))(wrong)
+    slope = jax.jit(jax.grad(lambda t: sum(loss(t, truth).values())))(wrong)
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(slope))
 
 
 def test_height_is_told_relative_to_a_body_at_rest():
     zero = jnp.zeros((1, HYPOTHESES, model.OUTPUTS + model.UNCERTAIN))
-    told = model.decode(zero, zero[..., 0])
+    told = jax.jit(model.decode)(zero, zero[..., 0])
     down = np.abs(np.asarray(told.rotation[0])[:, 2])
     size = np.asarray(told.size[0])
     for k in range(HYPOTHESES):
         box = down[k] @ size[k]
         round_one = down[k, 2] * size[k, 2] + np.sqrt(1 - min(down[k, 2], 1.0) ** 2) * size[k, 0]
         assert told.position[0, k, 2] == pytest.approx(round_one if IS_CYLINDER[k] else box, abs=1e-6)
-    slope = jax.grad(lambda o: jnp.sum(model.decode(o, zero[..., 0]).position))(zero)
+    slope = jax.jit(jax.grad(lambda o: jnp.sum(model.decode(o, zero[..., 0]).position)))(zero)
     assert np.isfinite(slope).all()
 
 
