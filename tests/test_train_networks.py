@@ -16,7 +16,12 @@ from mechsearch_jax.envs.world import BOX, CYLINDER
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.models import recognition as model
 from mechsearch_jax.models.recognition import BASE_ROTATIONS, HYPOTHESES, IS_CYLINDER, RecognitionConfig
-from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork, nearest_neighbours
+from mechsearch_jax.models.segmentation import (
+    SegmentationConfig,
+    SegmentationNetwork,
+    nearest_neighbours,
+    strongest_response,
+)
 from mechsearch_jax.models.weights import load_weights, save_weights
 from mechsearch_jax.perception import segments as clouds
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
@@ -64,6 +69,28 @@ def test_nearest_neighbours_are_the_nearest():
     found = np.asarray(nearest_neighbours(jnp.asarray(points), 5))
     distance = np.linalg.norm(points[:, None].astype(float) - points[None], axis=-1)
     assert np.array_equal(found, np.argsort(distance, axis=1)[:, :5])
+
+
+def test_the_strongest_response_and_its_gradient_are_those_of_plain_differentiation():
+    keys = jax.random.split(jax.random.key(3), 4)
+    features = jax.random.normal(keys[0], (30, 8))
+    rest = jax.random.normal(keys[1], (30, 5, 8))
+    # Some points are the neighbour of many, others of none.
+    neighbours = jax.random.randint(keys[2], (30, 5), 0, 11)
+    weight = jax.random.normal(keys[3], (30, 8))
+
+    def plain(features, rest):
+        return jnp.sum(weight * jnp.max(jax.nn.gelu(features[neighbours] + rest), axis=1))
+
+    def ours(features, rest):
+        return jnp.sum(weight * strongest_response(features, rest, neighbours))
+
+    expected, slopes = jax.jit(jax.value_and_grad(plain, argnums=(0, 1)))(features, rest)
+    told, ours_slopes = jax.jit(jax.value_and_grad(ours, argnums=(0, 1)))(features, rest)
+    assert told == pytest.approx(float(expected), rel=1e-6)
+    for a, b in zip(ours_slopes, slopes, strict=True):
+        assert np.allclose(a, b, atol=1e-5)
+        assert np.abs(b).max() > 0.1
 
 
 def numpy_segmentation_loss(logits, labels):
