@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
+from mechsearch_jax.benchmarks.recognition import SHARES, Measured
 from mechsearch_jax.results import Row, summarise
 
 
@@ -100,6 +102,60 @@ def agreement_table(agreement: Agreement) -> Table:
     add("same distribution, p", lambda row: f"{row['displacement_p_value']:.2f}")
     seconds = f"native {agreement.native_seconds:.1f} s, batch {agreement.batch_seconds:.1f} s"
     table.caption = f"{seconds}; {agreement.versions['device']}"
+    return table
+
+
+def recognition_tables(measured: Measured) -> Group:
+    """How well each method recognises: a table for every source of scenes and noise, with a row for every method."""
+    lines = {(line["source"], line["noise"], line["method"], line["visible"]): line for line in measured.summary()}
+    tables: dict[tuple[str, str], Table] = {}
+    for source, noise, method in dict.fromkeys(key[:3] for key in lines):
+        if (source, noise) not in tables:
+            tables[source, noise] = _recognition_table(f"{source} scenes, {noise}")
+        line, *parts = (lines[source, noise, method, name] for name in ("all", *(name for name, *_ in SHARES)))
+        centre, wrong = line["centre_median_mm"], line["wrong_class"]
+        gain = f"{line['gain_mean']:+.3f} ±{line['gain_standard_error']:.3f}" if "gain_mean" in line else ""
+        tables[source, noise].add_row(
+            method,
+            str(line["objects"]),
+            *(f"{part['iou_mean']:.3f}" if part["objects"] else "-" for part in (line, *parts)),
+            "-" if centre is None else f"{centre:.2f}",
+            "-" if wrong is None else f"{wrong:.3f}",
+            str(line["unanswered"] + line["not_finite"]),
+            gain,
+        )
+    explanation = (
+        "IoU: mean, of all and by visible share. mm: median error of the centre. wrong: share of the wrong class. "
+        "lost: no answer, or one that is not finite; their IoU is 0. gain: of mean IoU over the method it begins with."
+    )
+    return Group(*tables.values(), Text(explanation, style="dim"))
+
+
+def _recognition_table(title: str) -> Table:
+    table = Table(
+        box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left"
+    )
+    table.add_column("method", no_wrap=True, min_width=15)
+    for name in ("objects", "IoU", "<30%", "30-60%", "≥60%", "mm", "wrong", "lost", "gain"):
+        table.add_column(name, justify="right", no_wrap=True)
+    return table
+
+
+def recognition_times_table(measured: Measured) -> Table:
+    """How long each method takes for an object, and on what."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    table.add_column("method", no_wrap=True)
+    for name in ("median of an object", "10% to 90%", "compile"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, time in measured.times.items():
+        value = time.value()
+        median, low, high = (1e3 * value[f"{key}_seconds"] for key in ("median", "p10", "p90"))
+        row = (f"{median:.1f} ms", f"{low:.1f} to {high:.1f} ms", f"{value['compile_seconds']:.1f} s")
+        table.add_row(name, *row)
+    packages = ", ".join(f"{k} {v}" for k, v in measured.versions.items() if k != "device")
+    table.caption = (
+        f"all objects of a scene at once, with the method it begins with; {measured.versions['device']}; {packages}"
+    )
     return table
 
 

@@ -554,6 +554,83 @@ def bench_agreement(
         save_agreement(found, out)
 
 
+def bench_recognition(
+    scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")] = (),
+    /,
+    *,
+    scenes: int = 40,
+    seed: int = 0,
+    noise: tuple[Literal["clean", "gaussian", "time-of-flight"], ...] = ("clean", "gaussian"),
+    method: tuple[Literal["network", "network-refined", "ems", "ems-refined"], ...] = (
+        "network",
+        "network-refined",
+        "ems",
+        "ems-refined",
+    ),
+    ems_scenes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    out: JsonFile = None,
+    picture: JsonFile = None,
+    worst: int = 12,
+    worst_of: Literal["network", "network-refined", "ems", "ems-refined"] = "network-refined",
+) -> None:
+    """Compare recognisers, given true masks, with the truth: the network, refinement and the classical EMS.
+
+    Args:
+      scenarios: scenario files, folders of them, or names of shipped ones, beside the generated scenes.
+      scenes: how many are generated, with a seed that training cannot have; may be 0 if there are scenarios.
+      seed: of the generated scenes, of the noise and of the methods.
+      noise: of the depth image, one or more; "gaussian" is the paper's, 1 mm.
+      method: one or more; one that begins with another's answers brings it along.
+      ems_scenes: number of scenes, spread evenly over all, for EMS, which is slow; all if not given.
+      out: JSON file for the figures and for every object's row.
+      picture: PNG file for the worst answers of a method, beside the truth.
+      worst: how many of them.
+      worst_of: which method's.
+    """
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import recognition
+    from mechsearch_jax.benchmarks.tables import recognition_tables, recognition_times_table
+    from mechsearch_jax.perception.cloud import shelf_view
+    from mechsearch_jax.results import check_writable
+    from mechsearch_jax.scenario import load_scenario
+    from mechsearch_jax.shelf import Shelf
+    from mechsearch_jax.viz.drawing import save_figure
+
+    if worst < 1:
+        raise InputError(f"bench recognition: --worst {worst} must be at least 1")
+    for file in (out, picture):
+        if file is not None:
+            check_writable(file.parent)
+    given = recognition.scenes_of([load_scenario(file) for file in find_scenarios(scenarios)] if scenarios else [])
+    console = Console(highlight=False)
+    with console.status("making scenes") as status:
+        methods = recognition.shipped_methods(shelf_view().camera, Shelf())
+        bench = recognition.Bench(
+            [*recognition.held_out_scenes(scenes, seed), *given],
+            recognition.chosen_methods(methods, method),
+            tuple(dict.fromkeys(noise)),
+            seed,
+            ems_scenes,
+        )
+        if picture is not None and worst_of not in bench.methods:
+            raise InputError(f"bench recognition: --worst-of {worst_of} is not among the methods; add it to --method")
+        # A compilation that was read from disk would not tell how long compiling takes.
+        jax.config.update("jax_enable_compilation_cache", False)
+        total = len(bench.scenes) * len(bench.noises)
+        status.update("compiling")
+        measured = bench.run(lambda done: status.update(f"recognising {done}/{total}"))
+        if out is not None:
+            recognition.save_recognition(measured, out)
+        if picture is not None:
+            status.update("drawing")
+            rows = recognition.worst(measured.rows, worst_of, worst)
+            save_figure(recognition.worst_figure(bench, rows), picture)
+    console.print(recognition_tables(measured))
+    console.print(recognition_times_table(measured))
+
+
 def _training_of(name: Literal["segmentation", "recognition"], batch: int, rate: float) -> Callable[..., None]:
     """The command that trains one network of perception."""
     default_batch, default_rate = batch, rate
@@ -612,7 +689,7 @@ def scenarios() -> None:
 
 
 def bench() -> None:
-    """Measure the parts: mechsearch bench existence|graspability|plan|simulate|inside|roofline|agreement."""
+    """Measure the parts: mechsearch bench existence|graspability|plan|simulate|inside|roofline|agreement|recognition"""
 
 
 Commands = dict[str, Callable[..., None]]
@@ -640,6 +717,7 @@ GROUPS: dict[str, Commands] = {
         "inside": bench_inside,
         "roofline": bench_roofline,
         "agreement": bench_agreement,
+        "recognition": bench_recognition,
     },
 }
 

@@ -93,6 +93,17 @@ WRONG = {
     "no clouds": (["bench", "inside", "--placed", "0"], "placed 0 must be at least 1"),
     "no timings": (["bench", "roofline", "empty", "--out", "page.md"], "empty: there are no results of bench inside"),
     "no timing": (["bench", "roofline", ".", "--out", "page.md"], "broken.json: is no result of bench"),
+    "negative scenes": (["bench", "recognition", "--scenes", "-1"], "--scenes -1 must be at least 0"),
+    "nothing to recognise": (["bench", "recognition", "--scenes", "0"], "there are no scenes"),
+    "unknown noise": (["bench", "recognition", "--noise", "fog"], "'fog'"),
+    "unknown seed": (["bench", "recognition", "--seed", "-1"], "--seed -1 must be from 0"),
+    "no picture": (["bench", "recognition", "--worst", "0"], "--worst 0 must be at least 1"),
+    "the same scene twice": (["bench", "recognition", "good.json", "good.json"], '"one-box"'),
+    "picture of nothing": (
+        ["bench", "recognition", "good.json", "--scenes", "0", "--method", "network", "--picture", "worst.png"],
+        "--worst-of network-refined is not among the methods",
+    ),
+    "file in a file": (["bench", "recognition", "--out", "good.json/a.json"], "good.json: cannot be written to"),
     "nothing to agree on": (["bench", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
     "file for a folder": (["search", "good.json", "--out", "good.json"], "good.json: cannot be written to"),
 }

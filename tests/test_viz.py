@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, Polygon
 from mechsearch_jax import scenario as scenarios
 from mechsearch_jax import superquadric
 from mechsearch_jax.actions import ActionKind, no_action
-from mechsearch_jax.camera import Camera
+from mechsearch_jax.camera import Camera, project
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.results import Maps
 from mechsearch_jax.scenario import Body
@@ -78,6 +78,17 @@ def test_outlines_are_the_bodies_seen_from_above():
     radius = np.linalg.norm(round_one - np.array(BODIES[1].position[:2]), axis=1)
     np.testing.assert_allclose(radius, 0.03, atol=1e-3)
     np.testing.assert_allclose(np.ptp(lying, axis=0), [0.06, 0.2], atol=2e-3)
+
+
+def test_outlines_in_the_view_reach_as_far_as_the_projected_corners():
+    sharp = SCENE.replace(exponents=jnp.full_like(SCENE.exponents, 0.01))
+    outline, _, _, *absent = drawing.outlines_in_view(sharp, CAMERA)
+    assert absent == [None] * (SCENE.capacity - 3)
+    corners = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), axis=-1).reshape(8, 3) * BODIES[0].half_size
+    world = corners @ np.asarray(SCENE.rotation[0]).T + np.array(BODIES[0].position)
+    pixels = np.asarray(project(CAMERA, jnp.asarray(world, jnp.float32))[0])[:, ::-1]
+    np.testing.assert_allclose(outline.min(axis=0), pixels.min(axis=0), atol=1.5)
+    np.testing.assert_allclose(outline.max(axis=0), pixels.max(axis=0), atol=1.5)
 
 
 def test_a_placed_object_moves_with_the_gripper():

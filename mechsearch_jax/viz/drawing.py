@@ -66,8 +66,8 @@ def rgb(colour: str) -> np.ndarray:
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
 
 
-def outlines(scene: Superquadrics) -> list[Float[np.ndarray, "corners 2"] | None]:
-    """Each object's outline seen from above in x and y [m], counter-clockwise; None for absent objects."""
+def _surfaces(scene: Superquadrics) -> list[Float[np.ndarray, "points 3"] | None]:
+    """Points of each object's surface [m]; None for absent objects."""
     elevation = np.linspace(-np.pi / 2, np.pi / 2, 33)[:, None]
     azimuth = np.linspace(-np.pi, np.pi, 97)[None, :]
 
@@ -86,10 +86,22 @@ def outlines(scene: Superquadrics) -> list[Float[np.ndarray, "corners 2"] | None
             across * power(np.sin(azimuth), e2),
             power(np.sin(elevation), e1) + 0 * azimuth,
         ]
-        points = (np.stack(surface, axis=-1).reshape(-1, 3) * size) @ rotation.T + position
-        points = points[:, :2]
-        result.append(points[ConvexHull(points).vertices])
+        result.append((np.stack(surface, axis=-1).reshape(-1, 3) * size) @ rotation.T + position)
     return result
+
+
+def _hull(points: Float[np.ndarray, "points 2"] | None) -> Float[np.ndarray, "corners 2"] | None:
+    return None if points is None else points[ConvexHull(points).vertices]
+
+
+def outlines(scene: Superquadrics) -> list[Float[np.ndarray, "corners 2"] | None]:
+    """Each object's outline seen from above in x and y [m], counter-clockwise; None for absent objects."""
+    return [_hull(None if points is None else points[:, :2]) for points in _surfaces(scene)]
+
+
+def outlines_in_view(scene: Superquadrics, camera: Camera) -> list[Float[np.ndarray, "corners 2"] | None]:
+    """Each object's outline in the camera's image as columns and rows; None for absent objects."""
+    return [_hull(None if points is None else _pixels(camera, points)) for points in _surfaces(scene)]
 
 
 def placed_scene(scene: Superquadrics, action: Action) -> Superquadrics:

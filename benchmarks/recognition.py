@@ -1,0 +1,639 @@
+"""How well objects are recognised from true masks: the network, refinement and the classical method on the same images.
+
+Every method is shown the same points and masks and answers with superquadrics, which are compared with the true bodies
+by volumetric intersection over union and by their centres. Generated scenes come from a seed that no training can have.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, cast
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+from matplotlib.figure import Figure
+
+from mechsearch_jax.benchmarks import ems
+from mechsearch_jax.camera import Camera
+from mechsearch_jax.envs.recognisers import measured_depth, true_labels
+from mechsearch_jax.envs.world import CYLINDER, TARGET, World, from_scenario, true_superquadrics
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.models.recognition import RecognitionNetwork
+from mechsearch_jax.models.weights import Weights, shipped_weights
+from mechsearch_jax.perception.cloud import shelf_view
+from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
+from mechsearch_jax.perception.recognition import recognise
+from mechsearch_jax.perception.refinement import RefinementConfig, refine, select
+from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
+from mechsearch_jax.results import versions
+from mechsearch_jax.scenario import Scenario
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.train.loop import HELD_OUT_SEED
+from mechsearch_jax.train.scenes import cast_world, random_world
+from mechsearch_jax.viz import drawing
+
+MethodName = Literal["network", "network-refined", "ems", "ems-refined"]
+NoiseName = Literal["clean", "gaussian", "time-of-flight"]
+NOISES: Mapping[str, NoiseModel] = {"clean": no_noise, "gaussian": RandomDirection(), "time-of-flight": TimeOfFlight()}
+# Objects that show fewer pixels of the full image do not count.
+PIXELS = 100
+# Visible shares by which figures are broken down: name, from, to below.
+SHARES = (("below 30%", 0.0, 0.3), ("30 to 60%", 0.3, 0.6), ("60% and more", 0.6, np.inf))
+# A change of the intersection over union that is called better or worse.
+NOTABLE = 0.02
+# Points of a segment that the classical method is given; it is slow, and more do not make it better.
+EMS_POINTS = 250
+
+
+class Shown(flax.struct.PyTreeNode):
+    """What methods see of a scene.
+
+    Attributes:
+      points: as measured, in the world [m], shape (h, w, 3); NaN where nothing was.
+      labels: the true masks, as `envs.recognisers.true_labels` has them, shape (h, w).
+      depth: of the points along the camera's axis [m], shape (h, w); infinite where nothing is, NaN where nothing was
+        measured.
+    """
+
+    points: jax.Array
+    labels: jax.Array
+    depth: jax.Array
+
+
+class Look(flax.struct.PyTreeNode):
+    """An image of a scene, and how much of its objects it shows.
+
+    Attributes:
+      shown: the image.
+      pixels: of the full image that show each object, int32, shape (8,).
+      visible: that number over the one that there would be if the object stood alone, shape (8,).
+    """
+
+    shown: Shown
+    pixels: jax.Array
+    visible: jax.Array
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Method:
+    """A way to recognise objects.
+
+    Attributes:
+      answer: from a PRNG key, what is shown, and the answer of the method that it begins with, to superquadrics in the
+        slots of the labels. If it begins with none, that answer is an empty scene.
+      after: name of the method that it begins with; None if with none.
+      slow: whether it takes so long that it may be measured on fewer scenes.
+    """
+
+    answer: Callable[[Key[Array, ""], Shown, Superquadrics], Superquadrics]
+    after: str | None = None
+    slow: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A scene to recognise.
+
+    Attributes:
+      name: of the scenario, or of a generated scene.
+      source: "held-out" if generated, else "files".
+      world: where everything stands.
+    """
+
+    name: str
+    source: str
+    world: World
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One method's answer for one object.
+
+    Attributes:
+      source, scene, object: which object of which scene.
+      shape: "box" or "cylinder".
+      noise, method: their names.
+      pixels, visible: as in `Look`.
+      outcome: "answered"; "nothing" where the method had no answer; "not finite" where it had one with NaN or infinity.
+      iou: intersection over union with the true body; 0 where nothing finite was answered.
+      centre: distance of the centres [m]; None there.
+      right: whether a box was called a box and a cylinder a cylinder; None there.
+    """
+
+    source: str
+    scene: str
+    object: int
+    shape: str
+    noise: str
+    method: str
+    pixels: int
+    visible: float
+    outcome: str
+    iou: float
+    centre: float | None
+    right: bool | None
+
+    @property
+    def key(self) -> tuple[str, str, int, str]:
+        """What it is the answer for."""
+        return self.source, self.scene, self.object, self.noise
+
+
+@dataclasses.dataclass(frozen=True)
+class Time:
+    """How long a method takes for one object of a scene, all objects of which are recognised at once.
+
+    Attributes:
+      compile_seconds: of the first call, less the median of the others [s].
+      seconds: for every image, its time over the number of its objects [s]; with that of the method it begins with.
+    """
+
+    compile_seconds: float
+    seconds: tuple[float, ...]
+
+    def value(self) -> dict[str, float]:
+        """What is written to a file, of an object: the median, the spread [s] and the number of timed images."""
+        low, high = np.quantile(self.seconds, (0.1, 0.9)).tolist()
+        return {
+            "compile_seconds": self.compile_seconds,
+            "median_seconds": statistics.median(self.seconds),
+            "p10_seconds": low,
+            "p90_seconds": high,
+            "calls": len(self.seconds),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """What came of it.
+
+    Attributes:
+      rows: one for every method and every object that counts in every image.
+      after: of each method, the one that it begins with.
+      times: of each method.
+      settings: what scenes, noises and seed they come from.
+      versions: as `results.versions` returns them.
+    """
+
+    rows: tuple[Row, ...]
+    after: dict[str, str | None]
+    times: dict[str, Time]
+    settings: dict[str, Any]
+    versions: dict[str, str]
+
+    def summary(self) -> list[dict[str, Any]]:
+        """Figures by source, noise, method and visible share: see `figures`."""
+        by_key = {(row.method, *row.key): row for row in self.rows}
+        groups: dict[tuple[str, str, str], list[Row]] = {}
+        for row in self.rows:
+            groups.setdefault((row.source, row.noise, row.method), []).append(row)
+        lines = []
+        for (source, noise, method), rows in groups.items():
+            for name, low, high in (("all", 0.0, np.inf), *SHARES):
+                chosen = [row for row in rows if low <= row.visible < high]
+                start = self.after[method]
+                before = [by_key[start, *row.key] for row in chosen] if start is not None else None
+                head = {"source": source, "noise": noise, "method": method, "visible": name}
+                lines.append(head | figures(chosen, before))
+        return lines
+
+    def value(self) -> dict[str, Any]:
+        """What is written to a file, without the rows."""
+        times = {name: timing.value() for name, timing in self.times.items()}
+        return {
+            "settings": self.settings,
+            "versions": self.versions,
+            "after": self.after,
+            "seconds_per_object": times,
+            "summary": self.summary(),
+        }
+
+
+def figures(rows: Sequence[Row], before: Sequence[Row] | None = None) -> dict[str, Any]:
+    """Figures of some answers; with `before`, those for the same objects by the method they begin with, also the gain.
+
+    What was not answered, or is not finite, counts as an intersection over union of 0 and an infinite distance.
+    """
+    if not rows:
+        return {"objects": 0}
+    centres = [np.inf if row.centre is None else row.centre for row in rows]
+    median = float(np.median(centres))
+    answered = [row for row in rows if row.right is not None]
+    value: dict[str, Any] = {
+        "objects": len(rows),
+        "unanswered": sum(row.outcome == "nothing" for row in rows),
+        "not_finite": sum(row.outcome == "not finite" for row in rows),
+        "iou_mean": float(np.mean([row.iou for row in rows])),
+        "iou_median": float(np.median([row.iou for row in rows])),
+        "centre_median_mm": 1e3 * median if np.isfinite(median) else None,
+        "wrong_class": float(np.mean([not row.right for row in answered])) if answered else None,
+    }
+    if before is not None:
+        gains = np.array([row.iou - start.iou for row, start in zip(rows, before, strict=True)])
+        value |= {
+            "gain_mean": float(np.mean(gains)),
+            "gain_standard_error": float(np.std(gains) / np.sqrt(len(gains))),
+            "better": float(np.mean(gains > NOTABLE)),
+            "worse": float(np.mean(gains < -NOTABLE)),
+        }
+    return value
+
+
+def held_out_scenes(count: int, seed: int = 0) -> list[Scene]:
+    """Random scenes as in training, of a seed that training refuses.
+
+    Raises:
+      InputError: the numbers do not fit.
+    """
+    if count < 0:
+        raise InputError(f"bench recognition: --scenes {count} must be at least 0")
+    if not 0 <= seed < 2**31:
+        raise InputError(f"bench recognition: --seed {seed} must be from 0 to {2**31 - 1}")
+    key = jax.random.fold_in(jax.random.key(HELD_OUT_SEED), seed)
+    make = jax.jit(random_world)
+    return [Scene(f"{seed}-{i}", "held-out", make(jax.random.fold_in(key, i))) for i in range(count)]
+
+
+def scenes_of(scenarios: Sequence[Scenario]) -> list[Scene]:
+    """Scenes from scenario files.
+
+    Raises:
+      InputError: two have the same name, so that results could not be told apart.
+    """
+    names = [scenario.name for scenario in scenarios]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f'bench recognition: two scenarios have the name "{twice}"; rename one')
+    return [Scene(scenario.name, "files", from_scenario(scenario)) for scenario in scenarios]
+
+
+@functools.partial(jax.jit, static_argnames=("camera", "shelf", "noise", "stride"))
+def look(key: Key[Array, ""], camera: Camera, shelf: Shelf, world: World, noise: NoiseModel, stride: int) -> Look:
+    """The image of a scene with a sensor's noise.
+
+    Args:
+      key: PRNG key of the noise.
+      camera: of which `stride` is the distance of neighbouring rays in the full image, in pixels; static.
+      shelf, noise: static.
+      world: the scene.
+    """
+    depth, owner, alone = cast_world(camera, shelf, world)
+    points = noise(key, camera, depth)
+    pixels = jnp.sum(owner[..., None] == jnp.arange(TARGET).reshape(1, 1, -1), axis=(0, 1))
+    return Look(
+        Shown(points, true_labels(points, owner, shelf), measured_depth(camera, depth, points)),
+        pixels * stride**2,
+        pixels / jnp.maximum(alone[:TARGET], 1),
+    )
+
+
+def shipped_methods(camera: Camera, shelf: Shelf, weights: Weights | None = None) -> dict[str, Method]:
+    """The methods that are compared.
+
+    Args:
+      camera: of the images.
+      shelf: what stands on it is recognised.
+      weights: of the recognition network; the shipped ones if None.
+
+    Raises:
+      InputError: the shipped weights are missing or damaged.
+    """
+    weights = weights or shipped_weights("recognition")
+    network = cast(RecognitionNetwork, weights.network)
+
+    def told(key: Array, shown: Shown, _: Superquadrics) -> Superquadrics:
+        return recognise(key, network, weights.parameters, camera, shown.points, shown.labels, shelf)
+
+    def recovered(key: Array, shown: Shown, _: Superquadrics) -> Superquadrics:
+        points, labels = (np.asarray(a) for a in some_points(shown))
+        return ems.recover_scene(points, labels, TARGET)
+
+    def refiner(config: RefinementConfig) -> Callable[[Array, Shown, Superquadrics], Superquadrics]:
+        def refined(key: Array, shown: Shown, begin: Superquadrics) -> Superquadrics:
+            points, labels = shown.points.reshape(-1, 3), shown.labels.reshape(-1)
+            return refine(camera, shelf, begin, points, labels, shown.depth, config).scene
+
+        return refined
+
+    methods: dict[MethodName, Method] = {
+        "network": Method(told),
+        "network-refined": Method(refiner(RefinementConfig()), after="network"),
+        "ems": Method(recovered, slow=True),
+        "ems-refined": Method(refiner(RefinementConfig.rough()), after="ems", slow=True),
+    }
+    return cast(dict[str, Method], methods)
+
+
+@jax.jit
+def some_points(shown: Shown) -> tuple[Float[Array, "p 3"], Int[Array, " p"]]:
+    """`EMS_POINTS` points of every segment, spread evenly over it, and their labels; -1 where there are fewer."""
+    labels = shown.labels.reshape(-1).astype(jnp.int32)
+    slots = jnp.arange(TARGET)
+    index, weight = jax.vmap(lambda slot: select(labels, slot, EMS_POINTS))(slots)
+    own = jnp.where(weight > 0, slots[:, None], -1)
+    return shown.points.reshape(-1, 3)[index.reshape(-1)], own.reshape(-1)
+
+
+def chosen_methods(methods: Mapping[str, Method], names: Sequence[str]) -> dict[str, Method]:
+    """Some of the methods, with those that they begin with before them.
+
+    Raises:
+      InputError: there is none of a name.
+    """
+    chosen: dict[str, Method] = {}
+    for name in names:
+        if name not in methods:
+            raise InputError(f'bench recognition: method "{name}" is unknown; use {", ".join(methods)}')
+        start = methods[name].after
+        if start is not None:
+            chosen.setdefault(start, methods[start])
+        chosen.setdefault(name, methods[name])
+    return chosen
+
+
+class _Judged(flax.struct.PyTreeNode):
+    finite: jax.Array
+    iou: jax.Array
+    centre: jax.Array
+    right: jax.Array
+
+
+@jax.jit
+def _judge(world: World, answer: Superquadrics) -> _Judged:
+    truth = true_superquadrics(world)
+    parts = (answer.size, answer.exponents, answer.position, answer.rotation.reshape(TARGET, 9))
+    finite = jnp.stack([jnp.isfinite(part).all(axis=-1) for part in parts]).all(axis=0)
+    return _Judged(
+        finite=finite,
+        iou=intersection_over_union(sharpened(truth), answer),
+        centre=centre_error(truth, answer),
+        right=(answer.exponents[:, 1] > EDGE) == (world.kind[:TARGET] == CYLINDER),
+    )
+
+
+def _rows(scene: Scene, noise: str, method: str, image: Look, answer: Superquadrics) -> list[Row]:
+    judged, image, valid, answered = jax.device_get(
+        (_judge(scene.world, answer), image, scene.world.valid, answer.valid)
+    )
+    kind = np.asarray(scene.world.kind)
+    rows = []
+    for i in np.flatnonzero(valid[:TARGET] & (image.pixels >= PIXELS)):
+        outcome = "nothing" if not answered[i] else "answered" if judged.finite[i] else "not finite"
+        good = outcome == "answered"
+        rows.append(
+            Row(
+                source=scene.source,
+                scene=scene.name,
+                object=int(i),
+                shape="cylinder" if kind[i] == CYLINDER else "box",
+                noise=noise,
+                method=method,
+                pixels=int(image.pixels[i]),
+                visible=round(float(image.visible[i]), 4),
+                outcome=outcome,
+                iou=round(float(judged.iou[i]), 4) if good else 0.0,
+                centre=round(float(judged.centre[i]), 6) if good else None,
+                right=bool(judged.right[i]) if good else None,
+            )
+        )
+    return rows
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bench:
+    """A comparison of methods on scenes; everything that is needed to repeat any part of it.
+
+    Attributes:
+      scenes: what is recognised.
+      methods: by name, each after the one that it begins with.
+      noises: names of `NOISES`.
+      seed: of the noise and of the methods.
+      slow_scenes: on so many scenes, spread evenly over all, slow methods are measured too; None for all.
+      shelf: what the scenes stand on.
+    """
+
+    scenes: Sequence[Scene]
+    methods: Mapping[str, Method]
+    noises: Sequence[str] = ("clean", "gaussian")
+    seed: int = 0
+    slow_scenes: int | None = None
+    shelf: Shelf = dataclasses.field(default_factory=Shelf)
+
+    def __post_init__(self):
+        if not self.scenes:
+            raise InputError("bench recognition: there are no scenes; give --scenes, or scenario files")
+        if not self.noises or not self.methods:
+            raise InputError("bench recognition: give at least one noise and one method")
+        unknown = next((name for name in self.noises if name not in NOISES), None)
+        if unknown is not None:
+            raise InputError(f'bench recognition: noise "{unknown}" is unknown; use {", ".join(NOISES)}')
+
+        if self.slow_scenes is not None and self.slow_scenes < 1:
+            raise InputError(f"bench recognition: scenes for slow methods ({self.slow_scenes}) must be at least 1")
+
+    def methods_for(self, index: int) -> dict[str, Method]:
+        """The methods that are measured on a scene."""
+        total = len(self.scenes)
+        count = min(self.slow_scenes or total, total)
+        # The first scene is always among them.
+        everything = (index * count) % total < count
+        return {name: method for name, method in self.methods.items() if everything or not method.slow}
+
+    def image(self, index: int, noise: str) -> tuple[Key[Array, ""], Look]:
+        """A key for the methods, and the image of a scene; the same on every call."""
+        key = jax.random.fold_in(jax.random.key(self.seed), list(NOISES).index(noise))
+        sensing, answering = jax.random.split(jax.random.fold_in(key, index))
+        view = shelf_view(shelf=self.shelf)
+        return answering, look(sensing, view.camera, self.shelf, self.scenes[index].world, NOISES[noise], view.stride)
+
+    def answers(self, index: int, noise: str) -> tuple[Look, dict[str, Superquadrics], dict[str, float]]:
+        """The image of a scene, every method's answer, and how long it took with the one that it begins with [s]."""
+        key, image = self.image(index, noise)
+        jax.block_until_ready(image)
+        found: dict[str, Superquadrics] = {}
+        seconds: dict[str, float] = {}
+        for name, method in self.methods_for(index).items():
+            begin = found[method.after] if method.after is not None else _nothing()
+            start = time.perf_counter()
+            found[name] = jax.block_until_ready(method.answer(key, image.shown, begin))
+            seconds[name] = time.perf_counter() - start + seconds.get(method.after or "", 0.0)
+        return image, found, seconds
+
+    def run(self, watcher: Callable[[int], None] = lambda done: None) -> Measured:
+        """Recognise everything.
+
+        Args:
+          watcher: told after every image how many are done.
+        """
+        *_, first = self.answers(0, self.noises[0])
+        rows: list[Row] = []
+        seconds: dict[str, list[float]] = {name: [] for name in self.methods}
+        scene_seconds: dict[str, list[float]] = {name: [] for name in self.methods}
+        done = 0
+        for noise in self.noises:
+            for index, scene in enumerate(self.scenes):
+                image, found, spent = self.answers(index, noise)
+                objects = max(int(scene.world.valid[:TARGET].sum()), 1)
+                for name, answer in found.items():
+                    rows += _rows(scene, noise, name, image, answer)
+                    seconds[name].append(spent[name] / objects)
+                    scene_seconds[name].append(spent[name])
+                done += 1
+                watcher(done)
+        times = {
+            name: Time(max(first[name] - statistics.median(scene_seconds[name]), 0.0), tuple(spent))
+            for name, spent in seconds.items()
+        }
+        sources = [scene.source for scene in self.scenes]
+        settings = {
+            "held_out_scenes": sources.count("held-out"),
+            "scenario_files": sources.count("files"),
+            "noises": {name: _named(NOISES[name]) for name in self.noises},
+            "seed": self.seed,
+            "least_pixels": PIXELS,
+            "ems_points": EMS_POINTS,
+            "slow_scenes": self.slow_scenes,
+        }
+        after = {name: method.after for name, method in self.methods.items()}
+        return Measured(tuple(rows), after, times, settings, versions())
+
+
+def _nothing() -> Superquadrics:
+    ones, zeros = jnp.ones((TARGET, 3)), jnp.zeros((TARGET, 3))
+    turns = jnp.broadcast_to(jnp.eye(3), (TARGET, 3, 3))
+    return Superquadrics(ones, jnp.ones((TARGET, 2)), zeros, turns, jnp.zeros(TARGET, bool))
+
+
+def _named(noise: NoiseModel) -> str:
+    return getattr(noise, "__name__", repr(noise))
+
+
+def save_recognition(measured: Measured, path: PathLike) -> None:
+    """Write a comparison as JSON: the figures, and below them one line for every row, from which they follow.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    columns = [field.name for field in dataclasses.fields(Row)]
+    head = json.dumps(measured.value() | {"columns": columns}, indent=1, allow_nan=False)
+    lines = (json.dumps([getattr(row, name) for name in columns], allow_nan=False) for row in measured.rows)
+    text = head.removesuffix("\n}") + ',\n "rows": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n"
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def load_rows(path: PathLike) -> tuple[Row, ...]:
+    """The rows of a file that `save_recognition` wrote.
+
+    Raises:
+      InputError: it is none.
+    """
+    try:
+        with open(path, encoding="utf-8") as file:
+            value = json.load(file)
+        return tuple(Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"])
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: is no result of bench recognition") from None
+
+
+def worst(rows: Sequence[Row], method: str, count: int) -> list[Row]:
+    """The `count` answers of a method with the least intersection over union, the worst first.
+
+    Raises:
+      InputError: there are none.
+    """
+    own = sorted((row for row in rows if row.method == method), key=lambda row: row.iou)
+    if not own or count < 1:
+        raise InputError(
+            f"bench recognition: there are no {count} answers of {method} to draw; measure it, count from 1"
+        )
+    return own[:count]
+
+
+def worst_figure(bench: Bench, rows: Sequence[Row]) -> Figure:
+    """Answers beside the truth: for each a part of the depth image, and the segment's points from above.
+
+    Args:
+      bench: where the rows come from.
+      rows: one panel each.
+    """
+    index = {(scene.source, scene.name): i for i, scene in enumerate(bench.scenes)}
+    camera = shelf_view(shelf=bench.shelf).camera
+    columns = min(4, len(rows))
+    lines = -(-len(rows) // columns)
+    figure = Figure(figsize=(3.4 * columns, 4.9 * lines + 0.7), layout="constrained")
+    grid = figure.subfigures(lines, columns, squeeze=False)
+    for row, panel in zip(rows, grid.reshape(-1), strict=False):
+        i = index[row.source, row.scene]
+        image, found, _ = bench.answers(i, row.noise)
+        truth = sharpened(true_superquadrics(bench.scenes[i].world))
+        both = {"true": truth, "recognised": found[row.method]}
+        drawn = {name: _slot(scene, row.object) for name, scene in both.items()}
+        if row.outcome != "answered":
+            del drawn["recognised"]
+        _draw_panel(panel, row, image.shown, camera, drawn)
+    marks = figure.axes[1].get_legend_handles_labels()
+    figure.legend(*marks, loc="outside lower center", ncols=len(marks[0]), frameon=False, fontsize=9)
+    return figure
+
+
+def _slot(scene: Superquadrics, index: int) -> Superquadrics:
+    return jax.tree.map(lambda a: np.asarray(a)[index : index + 1], scene)
+
+
+STYLES = {"true": (drawing.GRASPABLE, "solid"), "recognised": (drawing.TARGET, (0, (4, 1.6)))}
+
+
+def _draw_panel(panel: Any, row: Row, shown: Shown, camera: Camera, drawn: Mapping[str, Superquadrics]) -> None:
+    """The camera's view and the view from above, for one object."""
+    depth, own = np.asarray(shown.depth), np.asarray(shown.labels) == row.object
+    panel.suptitle(
+        f"{row.scene}, object {row.object} ({row.shape})\n{row.noise}, {row.visible:.0%} visible: IoU {row.iou:.2f}",
+        fontsize=8.5, color=drawing.INK,
+    )  # fmt: skip
+    view, above = panel.subplots(2, 1, height_ratios=(1.25, 1.0))
+    in_view = {name: drawing.outlines_in_view(one, camera)[0] for name, one in drawn.items()}
+    from_above = {
+        name: 1e3 * outline[:, ::-1] for name, one in drawn.items() if (outline := drawing.outlines(one)[0]) is not None
+    }
+
+    rows, columns = np.nonzero(own)
+    corners = np.concatenate([np.stack([columns, rows], axis=1), *(o for o in in_view.values() if o is not None)])
+    low, high = corners.min(axis=0) - 6, corners.max(axis=0) + 6
+    middle, half = (low + high) / 2, max(*(high - low)) / 2
+    near = np.where(np.isfinite(depth), depth, np.nan)
+    part = near[own] if own.any() else near
+    view.imshow(near, cmap="gray", vmin=np.nanmin(part) - 0.15, vmax=np.nanmax(part) + 0.15, interpolation="nearest")
+    tint = np.zeros((*own.shape, 4))
+    tint[own] = (*drawing.rgb(drawing.ACTION), 0.35)
+    view.imshow(tint, interpolation="nearest")
+    view.set_xlim(middle[0] - half, middle[0] + half)
+    view.set_ylim(middle[1] + half, middle[1] - half)
+
+    points = 1e3 * np.asarray(shown.points)[own][:, :2]
+    above.scatter(points[:, 1], points[:, 0], s=1.5, color=drawing.ACTION, linewidths=0, label="the object's points")
+    for axes, outlines in ((view, in_view), (above, from_above)):
+        for name, outline in outlines.items():
+            if outline is not None:
+                colour, dashes = STYLES[name]
+                axes.plot(*np.concatenate([outline, outline[:1]]).T, color=colour, lw=1.6, linestyle=dashes, label=name)
+    # From above as the robot sees the shelf: +y to the left.
+    above.set_aspect("equal", adjustable="datalim")
+    above.invert_xaxis()
+    above.tick_params(labelsize=6.5, colors=drawing.MUTED)
+    above.set_xlabel("y [mm]", fontsize=7, color=drawing.MUTED)
+    above.set_ylabel("x [mm]", fontsize=7, color=drawing.MUTED)
+    view.set_xticks([])
+    view.set_yticks([])
