@@ -42,6 +42,8 @@ class PlannerOptions:
       sequences: sequences that are sampled for a decision; 30 by default.
       actions: which actions are used; both by default.
       criterion: what makes a target visible; "detector", the default, counts pixels as the detector does.
+      focus: share of the sampled actions that go to objects by how much they hide or are in the way, 0.7 by default;
+        0 is the paper's even draw.
       max_steps: actions in an episode; 10 by default.
       recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses; the others see
         a noisy depth image, "masks" with the true segmentation, "full" without.
@@ -58,6 +60,7 @@ class PlannerOptions:
         Literal["detector", "depth-mse", "depth-norm"] | None,
         tyro.conf.arg(metavar="{detector,depth-mse,depth-norm}"),
     ] = None
+    focus: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     max_steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     recognition: Recognition = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
@@ -71,7 +74,7 @@ class PlannerOptions:
         from mechsearch_jax.planner import PlannerConfig
 
         presets = {"paper": PlannerConfig.paper, "best": PlannerConfig.paper}
-        names = ("gamma", "horizon", "sequences", "actions", "criterion", "max_steps")
+        names = ("gamma", "horizon", "sequences", "actions", "criterion", "focus", "max_steps")
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return presets[self.preset](method=method, **given)
 

@@ -261,3 +261,18 @@ def existence(
     if views.collides is not None:
         possible &= ~jnp.any(views.collides, axis=-1)
     return exists & jnp.any(possible, axis=-1)
+
+
+def occluders(tables: ExistenceTables, views: ObjectViews) -> Bool[Array, "x n"]:
+    """Which objects hide a target at every candidate pose, judged by the one pixel in the middle of its image.
+
+    An approximation, for telling which objects matter; what is visible, `existence` says.
+    """
+    middle = tables.corner[:, 0] + jnp.array(tables.depth.shape[-2:])[None] // 2
+    nearest = jnp.min(tables.depth[:, 0], axis=(-1, -2))
+    pixel = middle[:, None] - views.corner[None]
+    size = jnp.array(views.depth.shape[-2:])
+    inside = jnp.all((pixel >= 0) & (pixel < size[None, None]), axis=-1)
+    row, column = jnp.moveaxis(jnp.clip(pixel, 0, size[None, None] - 1), -1, 0)
+    depth = views.depth[jnp.arange(views.depth.shape[0])[None], row, column]
+    return inside & (depth < nearest[:, None])

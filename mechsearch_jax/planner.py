@@ -46,6 +46,7 @@ from mechsearch_jax.existence import (
     existence_tables,
     no_views,
     object_views,
+    occluders,
 )
 from mechsearch_jax.graspability import (
     FoundGrasps,
@@ -57,6 +58,7 @@ from mechsearch_jax.graspability import (
     grasp_tables,
     graspability,
     no_hits,
+    pairs,
 )
 from mechsearch_jax.gripper import Gripper, arm_points
 from mechsearch_jax.kinematics import line_kinematics, line_poses, path_kinematics
@@ -68,6 +70,8 @@ from mechsearch_jax.transforms import compose, upright_pose
 CLEARANCES = (0.0, 0.004, 0.008, 0.012, 0.02)
 # Small enough that, at a pose, no number of hits outweighs one object of the cost proper.
 TIE_BREAK = 0.02
+# How much more an object matters that is in the way alone than one of two that are, one of two than one of three, ...
+ALONE = 4.0
 # On the approach to a found target: poses of the arm, and points on each of its capsules, that are tested.
 ARM_WAYPOINTS, ARM_POINTS = 6, 7
 # An object is not to be pushed to where its centre is nearer than this to the front edge [m].
@@ -91,6 +95,8 @@ class PlannerConfig:
       push_distances: how far pushes go [m].
       caution: what touching the target unseen would cost, in units of J: a sampled action is charged with J times the
         share of the possible poses at which it would do so.
+      focus: share of the draws that go to objects by how much they hide or are in the way; the others are even, as the
+        paper's all are. 0 to below 1.
       max_steps: T, actions in an episode.
     """
 
@@ -102,6 +108,7 @@ class PlannerConfig:
     criterion: Literal["detector", "depth-mse", "depth-norm"] = "detector"
     push_distances: tuple[float, ...] = (0.05, 0.10, 0.15)
     caution: float = 1.0
+    focus: float = 0.7
     max_steps: int = 10
 
     def __post_init__(self):
@@ -111,6 +118,8 @@ class PlannerConfig:
             raise InputError(f"gamma {self.gamma} is outside (0, 1]; the paper uses 0.9")
         if not 0.0 <= self.caution < math.inf:
             raise InputError(f"caution {self.caution} must be a number that is not negative; the default is 1")
+        if not 0.0 <= self.focus < 1.0:
+            raise InputError(f"focus {self.focus} is outside [0, 1); the default is 0.7, and 0 draws evenly")
         for name in ("horizon", "sequences", "max_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} {getattr(self, name)} must be at least 1")
@@ -120,7 +129,7 @@ class PlannerConfig:
 
     @classmethod
     def paper(cls, **changes) -> PlannerConfig:
-        """The paper's settings (appendix B.4 and B.5), with changes."""
+        """The paper's settings (appendix B.4 and B.5), with changes; it knows neither `caution` nor `focus`."""
         return cls(**changes)
 
 
@@ -454,11 +463,30 @@ def _options(problem, belief, space, node: _Node, moved: Array) -> Candidates:
     return candidates(space, problem.actions, node.scene, possible, node.options, moved)
 
 
-def _act(problem, belief, space, push_model, node: _Node, key: Array) -> tuple[dict[str, Any], Action, Array]:
+def _blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[Array, " n"]:
+    """Each object's share of what is in the way in those rows that count; the fewer share a row, the more it weighs."""
+    others = jnp.sum(in_the_way, axis=1, keepdims=True) - 1.0
+    weight = jnp.where(in_the_way & counts[:, None], ALONE**-others, 0.0)
+    total = jnp.sum(weight, axis=0)
+    return total / jnp.maximum(jnp.sum(total), 1e-12)
+
+
+def _weights(problem: Problem, belief: Belief, config: PlannerConfig, node: _Node) -> Float[Array, " n"]:
+    """How often each object is to be drawn: in part evenly, in part by what it hides and which grasps it blocks."""
+    pose, _, allowed, _ = pairs(problem.grasps, belief.grasps)
+    blocks = _blame(node.hits, allowed & _where_g_counts(belief, node.exists, config.method)[pose])
+    hides = _blame(occluders(problem.existence, node.views), node.exists & ~belief.found)
+    both = blocks + hides
+    share = both / jnp.maximum(jnp.sum(both), 1e-12)
+    return (1.0 - config.focus) / node.scene.capacity + config.focus * share
+
+
+def _act(problem, belief, config, space, push_model, node: _Node, key: Array) -> tuple[dict[str, Any], Action, Array]:
     """Sample an action and predict what it changes in a state; also the share of possible poses that it would touch."""
     possible = _possible_space(problem, belief, node.exists)
     available = node.available & node.alive
-    sample = sample_action(key, space, problem.actions, node.scene, possible, node.options, available)
+    weights = _weights(problem, belief, config, node)
+    sample = sample_action(key, space, problem.actions, node.scene, possible, node.options, available, weights)
     scene, acted = _predict(problem, space, push_model, node.scene, sample)
     acted &= node.alive
     action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
@@ -513,7 +541,7 @@ def plan(
     nodes = repeated(_root(problem, belief, scene, space))
     update = jax.vmap(functools.partial(_update, problem, belief, config))
     options_of = jax.vmap(functools.partial(_options, problem, belief, space))
-    act = jax.vmap(functools.partial(_act, problem, belief, space, push_model))
+    act = jax.vmap(functools.partial(_act, problem, belief, config, space, push_model))
     cost_of = jax.vmap(lambda node: _cost(problem, belief, node.exists, node.hits, config.method))
 
     def step(nodes, keys_and_time):

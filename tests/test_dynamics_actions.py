@@ -129,8 +129,8 @@ def test_footprints_of_objects_on_their_side():
 
 
 @pytest.fixture(scope="module")
-def sampled(problem):
-    """Many actions sampled in a shipped scene, whose target is still hidden."""
+def draw(problem):
+    """Samples many actions by the objects' weights in a shipped scene whose target is still hidden."""
     loaded = scenario.load_scenario(scenario.example_scenarios()["first-light"])
     objects = scenario.superquadrics(loaded.objects)
     config = PlannerConfig.paper()
@@ -140,16 +140,36 @@ def sampled(problem):
     space = planner.action_space(problem, config)
 
     @jax.jit
-    def draw(problem, belief, objects, keys):
+    def drawn(problem, belief, objects, weights, keys):
         possible = planner._possible_space(problem, belief, belief.exists)
         options = actions.candidates(space, problem.actions, objects, possible)
         sample = lambda key: actions.sample_action(  # noqa: E731
-            key, space, problem.actions, objects, possible, options, objects.valid
+            key, space, problem.actions, objects, possible, options, objects.valid, weights
         )
         return options, jax.vmap(sample)(keys)
 
-    options, samples = draw(problem, belief, objects, jax.random.split(jax.random.key(0), 200))
-    return objects, options, jax.tree.map(np.asarray, samples)
+    keys = jax.random.split(jax.random.key(0), 200)
+    draw = lambda weights: jax.tree.map(np.asarray, drawn(problem, belief, objects, weights, keys))  # noqa: E731
+    draw.objects = objects
+    return draw
+
+
+@pytest.fixture(scope="module")
+def sampled(draw):
+    """Many actions, every object with the same weight."""
+    return draw.objects, *draw(jnp.ones(draw.objects.capacity))
+
+
+def test_objects_are_drawn_by_their_weights(sampled, draw):
+    objects, _, even = sampled
+    first = np.arange(objects.capacity) == 0
+    weights = np.where(first, 4.0, 1.0)
+    _, samples = draw(jnp.float32(weights))
+    share, even_share = (np.mean(s.action.object == 0) for s in (samples, even))
+    assert 0.2 < even_share < 0.8
+    expected = 4 * even_share / (4 * even_share + 1 - even_share)
+    assert share == pytest.approx(expected, abs=4 * np.sqrt(0.25 / len(samples.risk)))
+    assert share > even_share + 0.1
 
 
 def test_both_kinds_of_action_are_offered(sampled):

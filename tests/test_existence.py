@@ -156,6 +156,24 @@ def test_looking_again_at_moved_objects_alone_gives_the_same_views(problem):
     np.testing.assert_allclose(update.depth, whole.depth, rtol=1e-5)
 
 
+def test_occluders_are_those_of_a_reference(problem):
+    objects = scenario.superquadrics(scenario.load_scenario(scenario.example_scenarios()["crowded-shelf"]).objects)
+    settings = problem.existence_config
+    tables, coarse = problem.existence, problem.camera.scaled(settings.downscale)
+    views = existence.object_views(tables, problem.camera, objects, None, settings)
+    told = np.asarray(existence.occluders(tables, views))
+    middle = np.asarray(tables.corner[:, 0]) + np.array(tables.depth.shape[-2:]) // 2
+    seen = (middle >= 0).all(axis=1) & (middle < (coarse.height, coarse.width)).all(axis=1)
+    nearest = np.asarray(tables.depth[:, 0]).min(axis=(-1, -2))
+    assert seen.mean() > 0.9
+    for k in np.flatnonzero(np.asarray(objects.valid)):
+        alone = jax.tree.map(lambda field, k=k: field[k : k + 1], objects)
+        hides = reference_superquadric_depth(coarse, alone)[tuple(middle[seen].T)] < nearest[seen]
+        assert np.mean(told[seen, k] == hides) > 0.98
+    assert not told[:, ~np.asarray(objects.valid)].any()
+    assert 0.1 < told.any(axis=1).mean() < 0.9
+
+
 def test_collisions_need_not_count(problem):
     one = scenario.load_scenario(scenario.example_scenarios()["crowded-shelf"])
     objects = scenario.superquadrics(one.objects)

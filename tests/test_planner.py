@@ -52,6 +52,35 @@ def test_prefix_values_are_equation_2():
     assert np.isinf(nothing)
 
 
+def test_what_is_in_the_way_alone_matters_most():
+    rng = np.random.default_rng(0)
+    rows, counts = rng.random((200, 6)) < 0.3, rng.random(200) < 0.7
+    rows[:, 4] = False
+    expected = np.zeros(6)
+    for row in rows[counts]:
+        expected[row] += planner.ALONE ** (1.0 - row.sum())
+    share = np.asarray(planner._blame(jnp.asarray(rows), jnp.asarray(counts)))
+    np.testing.assert_allclose(share, expected / expected.sum(), rtol=1e-5)
+    assert share[4] == 0
+    assert not np.asarray(planner._blame(jnp.asarray(rows), jnp.zeros(200, bool))).any()
+
+
+def test_draws_go_to_what_hides_the_target(decision, problem):
+    objects, belief, _ = decision
+    space = planner.action_space(problem, CONFIG)
+    root = planner._root(problem, belief, planner._with_target(problem, belief, objects), space)
+    weights_of = jax.jit(
+        lambda node: planner._weights(
+            problem, belief, CONFIG, planner._update(problem, belief, CONFIG, node, node.moved)
+        )
+    )
+    weights = np.asarray(weights_of(root))
+    valid = np.asarray(root.available)
+    assert weights.sum() == pytest.approx(1.0, abs=1e-5)
+    np.testing.assert_allclose(weights[~valid], (1.0 - CONFIG.focus) / len(weights), rtol=1e-5)
+    assert (weights[valid] > weights[~valid].max()).any()
+
+
 def test_a_decision_is_the_first_action_of_the_best_sequence(decision):
     _, belief, plan = decision
     values = np.asarray(plan.sequences.value)
@@ -139,6 +168,8 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"gamma": 1.5}, "gamma 1.5"),
         ({"horizon": 0}, "horizon 0 must be at least 1"),
         ({"sequences": 0}, "sequences 0"),
+        ({"focus": 1.0}, r"focus 1.0 is outside \[0, 1\)"),
+        ({"focus": -0.1}, "0 draws evenly"),
         ({"method": "guess"}, 'use "search-for-grasp" or "search-and-grasp"'),
         ({"actions": "throw"}, 'use "both", "push" or "pick-and-place"'),
         ({"criterion": "guess"}, 'criterion "guess" is unknown'),
