@@ -57,8 +57,6 @@ class ObjectGraspConfig:
       max_turn: largest angle between the approach and the side that is grasped [rad].
       min_turn: smaller ones are as good as none [rad].
       turn_gap: how much of the opening must be left when the approach is turned [m].
-      longest_turned: objects with a larger half-extent along the approach are grasped square only [m]: what is so long
-        and heavy slips out of fingers that have to turn it.
     """
 
     boxes: tuple[BoxGrasp, ...] = (
@@ -77,7 +75,6 @@ class ObjectGraspConfig:
     max_turn: float = math.radians(22)
     min_turn: float = math.radians(5)
     turn_gap: float = 0.004
-    longest_turned: float = 0.065
 
     def __post_init__(self):
         if not (self.boxes and self.round_drops and self.tilts):
@@ -140,7 +137,7 @@ def object_grasps(
     directions = np.linspace(-max_yaw, max_yaw, count) if count > 1 else np.zeros(1)
     yaw = jnp.where(is_round, jnp.float32(directions[way])[None], square - jnp.where(square < 0, -turn, turn))
     fits = (2 * width <= gripper.usable_opening) & (jnp.abs(yaw) <= max_yaw + 1e-3)
-    fits &= is_round | (share == 0.0)[None] | ((jnp.abs(turn) > config.min_turn) & (depth < config.longest_turned))
+    fits &= is_round | (share == 0.0)[None] | (jnp.abs(turn) > config.min_turn)
     front = jnp.where(is_round, depth, depth * jnp.cos(turn) + width * jnp.abs(jnp.sin(turn)))
 
     round_drop = np.asarray(config.round_drops, np.float32)[way % len(config.round_drops)]

@@ -113,15 +113,6 @@ def test_a_box_that_fills_the_hand_is_grasped_square_only():
     assert not fits[turned].any()
 
 
-def test_a_long_box_is_grasped_square_only():
-    way, _, _ = grasp_variants(CONFIG, WRISTS)
-    turned = np.array([box.turn != 0 and box.face == 0 for box in CONFIG.boxes])[way]
-    for length, expected in ((CONFIG.longest_turned - 0.001, True), (CONFIG.longest_turned + 0.001, False)):
-        _, _, fits = grasps_of((length, 0.015, 0.08), superquadric.BOX_EXPONENTS, np.radians(30))
-        assert fits[way == 0].all()
-        assert fits[turned].any() == expected
-
-
 @pytest.mark.parametrize("change", [{"turn": 1.5}, {"reach": 0.0}, {"drop": 0.0}, {"face": 4}])
 def test_impossible_ways_are_refused(change):
     with pytest.raises(InputError, match="face must be"):
