@@ -44,7 +44,7 @@ class MotionConfig:
       carry_steps: of an approach or a retreat with an object in the hand.
       leave_steps: of the way between the end of the retreat and the outside.
       transfer_steps: of the way, outside, to in front of where an object is placed.
-      open_steps: of opening the fingers.
+      open_steps: of opening the fingers; opened at once, they turn a narrow box that they leave one after the other.
       waypoints: number of poses on each stretch of a path, where inverse kinematics is solved.
     """
 
@@ -61,7 +61,7 @@ class MotionConfig:
     carry_steps: int = 325
     leave_steps: int = 150
     transfer_steps: int = 275
-    open_steps: int = 60
+    open_steps: int = 120
     waypoints: int = 31
 
     def __post_init__(self):
