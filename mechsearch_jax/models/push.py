@@ -161,16 +161,16 @@ def _slabs(width: Array, offset: Array, speed: Array) -> tuple[Array, Array]:
     return jnp.max(middle - half, axis=-1), jnp.min(middle + half, axis=-1)
 
 
-def _grazing(enters: Array, leaves: Array, overlap: Array) -> Array:
-    """A distance to a contact, at most `REACH`, and `REACH` where one passes by or is past it already."""
+def _grazing(enters: Array, leaves: Array, overlap: Array, longest: float = REACH) -> Array:
+    """A distance to a contact, at most `longest`, and `longest` where one passes by or is past it already."""
     share = jnp.clip(jnp.minimum(overlap, leaves) / GRAZE, 0.0, 1.0)
-    return share * jnp.clip(enters, -DEEPEST, REACH) + (1.0 - share) * REACH
+    return share * jnp.clip(enters, -DEEPEST, longest) + (1.0 - share) * longest
 
 
 def pusher_distance(
-    prints: Footprints, points: Float[Array, "p 3"], heading: Float[Array, "2"]
+    prints: Footprints, points: Float[Array, "p 3"], heading: Float[Array, "2"], longest: float = REACH
 ) -> tuple[Float[Array, "n p"], Bool[Array, "n p"]]:
-    """How far each point moves along a planar unit vector until it enters each footprint, at most `REACH` [m].
+    """How far each point moves along a planar unit vector until it enters each footprint, at most `longest` [m].
 
     Also whether it is at the height of the object; below 0 it is inside already.
     """
@@ -190,7 +190,7 @@ def pusher_distance(
     root = jnp.sqrt(jnp.maximum(product**2 - square * (_dot(p, p) - 1.0), 1e-9))
     disc = (-product - root) / square, (-product + root) / square
     enters, leaves = (jnp.where(prints.round[:, None], a, b) for a, b in zip(disc, flat, strict=True))
-    return _grazing(enters, leaves, widest - jnp.abs(lateral)), level
+    return _grazing(enters, leaves, widest - jnp.abs(lateral), longest), level
 
 
 def _pair_distance(prints: Footprints, heading: Array) -> tuple[Array, Array]:
