@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import importlib.resources
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -60,17 +61,29 @@ class LearnedPush:
         weights = _weights(self.path, self.digest)
         network = weights.network
         assert isinstance(network, PushNetwork)
-        geometry = push_geometry(shelf, scene, pusher, T_world_gripper, displacement, network.config.frame)
-        told = told_by(network, weights.parameters, geometry)
-        moves = scene.valid & (jax.nn.sigmoid(told.moves) > self.likely)
-        before = footprints(scene)
-        moved = rigid_motion(scene, before.position, before.position + told.shift, told.turn)
-        after = jax.tree.map(
-            lambda new, old: jnp.where(moves.reshape(-1, *[1] * (new.ndim - 1)), new, old), moved, scene
-        )
-        end = transform(T_world_gripper, pusher) + displacement[None]
-        return PushOutcome(
-            scene=after,
-            residual=unresolved(shelf, before, footprints(after), end),
-            topples=jnp.where(scene.valid, jax.nn.sigmoid(told.topples), 0.0),
-        )
+        return predicted(network, weights.parameters, self.likely, shelf, scene, pusher, T_world_gripper, displacement)
+
+
+def predicted(
+    network: PushNetwork,
+    parameters: Any,
+    likely: float,
+    shelf: Shelf,
+    scene: Superquadrics,
+    pusher: Array,
+    T_world_gripper: Array,
+    displacement: Array,
+) -> PushOutcome:
+    """What a network predicts of a push; see `LearnedPush` and `dynamics.PushModel` for the arguments."""
+    geometry = push_geometry(shelf, scene, pusher, T_world_gripper, displacement, network.config.frame)
+    told = told_by(network, parameters, geometry)
+    moves = scene.valid & (jax.nn.sigmoid(told.moves) > likely)
+    before = footprints(scene)
+    moved = rigid_motion(scene, before.position, before.position + told.shift, told.turn)
+    after = jax.tree.map(lambda new, old: jnp.where(moves.reshape(-1, *[1] * (new.ndim - 1)), new, old), moved, scene)
+    end = transform(T_world_gripper, pusher) + displacement[None]
+    return PushOutcome(
+        scene=after,
+        residual=unresolved(shelf, before, footprints(after), end),
+        topples=jnp.where(scene.valid, jax.nn.sigmoid(told.topples), 0.0),
+    )
