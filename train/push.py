@@ -126,6 +126,7 @@ class PushTask:
       origin: how the pushes were made.
       network: sizes of the network.
       shelf: the shelf.
+      pusher: surface of the gripper in its own frame [m].
       precision: type in which the network computes.
     """
 
@@ -134,13 +135,9 @@ class PushTask:
     origin: dict[str, Any] = dataclasses.field(default_factory=dict)
     network: PushConfig = dataclasses.field(default_factory=PushConfig)
     shelf: Shelf = dataclasses.field(default_factory=Shelf)
+    pusher: Array = dataclasses.field(default_factory=lambda: push_tables(PushesConfig()).pusher)
     precision: Any = jnp.float32
     name: str = NAME
-
-    @functools.cached_property
-    def pusher(self) -> Float[Array, "p 3"]:
-        """Surface of the gripper in its own frame [m]."""
-        return push_tables(PushesConfig()).pusher
 
     def geometry(self, pushes: Pushes) -> PushGeometry:
         """What the network is told of pushes."""
@@ -295,8 +292,8 @@ def model_scores(
     compared = jax.device_get(_compare(model, pushes, pusher, shelf or Shelf(), batch))
     truth = jax.device_get(push_truth(jax.tree.map(jnp.asarray, pushes)))
     length = np.linalg.norm(pushes.displacement, axis=1)
-    objects = pushes.before.valid[:, :-1].sum(axis=1)
-    sideways = np.abs(pushes.displacement[:, 0]) < 1e-3
+    objects = np.asarray(pushes.before.valid)[:, :-1].sum(axis=1)
+    sideways = np.abs(np.asarray(pushes.displacement)[:, 0]) < 1e-3
     groups: dict[str, np.ndarray] = {
         "all": np.ones(len(length), bool),
         "sideways": sideways,
@@ -319,7 +316,7 @@ def _summary(compared: _Compared, truth: PushTruth, pushes: Pushes, chosen: np.n
     def mean(value, where, unit):
         return round(float(value[where].mean() * unit), 3) if where.any() else None
 
-    precision = average_precision(compared.topples[here], truth.toppled[here])
+    precision = average_precision(np.asarray(compared.topples)[here], np.asarray(truth.toppled)[here])
     return {
         "pushes": int(chosen.sum()),
         "pushed_mm": mean(compared.shift_error, upright & pushed, 1e3),
