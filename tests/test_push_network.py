@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from mechsearch_jax import dynamics, superquadric, transforms
 from mechsearch_jax.actions import ActionConfig, action_tables
+from mechsearch_jax.envs.generator import separation
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.gripper import Gripper
@@ -26,7 +27,7 @@ from mechsearch_jax.superquadric import Superquadrics
 SHELF = Shelf()
 # Nothing is within reach of these walls.
 OPEN = Shelf(front=-50.0, back=50.0, right=-50.0, left=50.0)
-CONFIG = PushConfig(width=32, layers=2)
+CONFIG = PushConfig(width=16, layers=2)
 BOX, ROUND = superquadric.BOX_EXPONENTS, superquadric.CYLINDER_EXPONENTS
 
 
@@ -59,7 +60,7 @@ def cluttered(seed, count=5):
     rng = np.random.default_rng(seed)
     bodies = []
     for i in range(count):
-        round_one = bool(rng.random() < 0.5)
+        round_one = (i + seed) % 2 == 1
         half = rng.uniform((0.015, 0.015, 0.03), (0.06, 0.06, 0.1))
         half[1] = half[0] if round_one else half[1]
         x, y = (0.6, 0.0) if i == 0 else (rng.uniform(0.5, 0.75), rng.uniform(-0.05, 0.3))
@@ -124,7 +125,7 @@ def assert_same(a, b, valid=slice(None), shift=2e-5, other=2e-3):
 # --- symmetries ------------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 200), st.floats(-np.pi, np.pi), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 def test_turning_and_moving_everything_turns_and_moves_the_answer(seed, yaw, x, y):
     case = cluttered(seed)
@@ -260,15 +261,44 @@ def test_the_distance_to_contact_is_that_of_small_steps():
     assert level.any()
 
 
+def outline_of(prints, i, corners=180):
+    """A footprint's outline as a convex polygon in the world, in float64."""
+    angle = np.arange(corners) * 2 * np.pi / corners
+    unit = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
+    unit = np.stack([np.cos(angle), np.sin(angle)], axis=-1) if prints.round[i] else unit
+    c, s = np.cos(float(prints.yaw[i])), np.sin(float(prints.yaw[i]))
+    return (unit * np.asarray(prints.half[i], float)) @ np.array([[c, s], [-s, c]]) + np.asarray(prints.position[i])
+
+
+def test_the_distance_between_objects_is_that_of_small_steps():
+    scene, _, displacement = cluttered(9)
+    prints = dynamics.footprints(scene)
+    heading = np.asarray(displacement[:2], float) / np.linalg.norm(displacement[:2])
+    found, gap = jax.jit(push._pair_distance)(prints, jnp.float32(heading))
+    met = 0
+    for i in range(5):
+        for j in set(range(5)) - {i}:
+            a, b = outline_of(prints, i), outline_of(prints, j)
+            apart = separation(a, b)
+            # The polygon that stands for a cylinder is up to 2% wider.
+            assert gap[i, j] == pytest.approx(apart, abs=2e-3)
+            hits = np.array([separation(a + d * heading, b) < 0 for d in np.arange(0.0, REACH, 1e-3)])
+            # Where they only graze each other it is a matter of fractions of a millimetre.
+            if apart > 0 and hits.sum() > 20:
+                met += 1
+                assert found[i, j] == pytest.approx(1e-3 * np.argmax(hits), abs=4e-3)
+            elif apart > 0 and not hits.any():
+                side = np.array([-heading[1], heading[0]])
+                if max((b @ side).min() - (a @ side).max(), (a @ side).min() - (b @ side).max()) > 1e-3:
+                    assert found[i, j] == pytest.approx(REACH)
+    assert met >= 2
+
+
 def test_an_object_reaches_as_far_as_its_outline():
     scene, _, _ = cluttered(8)
     prints = dynamics.footprints(scene)
-    angle = np.linspace(0, 2 * np.pi, 4000)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     for i in range(5):
-        unit = circle if prints.round[i] else circle / np.abs(circle).max(axis=1, keepdims=True)
-        c, s = np.cos(float(prints.yaw[i])), np.sin(float(prints.yaw[i]))
-        outline = (unit * np.asarray(prints.half[i], float)) @ np.array([[c, s], [-s, c]])
+        outline = outline_of(prints, i, 4000) - np.asarray(prints.position[i])
         for direction in ([1.0, 0.0], [0.6, 0.8]):
             found = push.reach(prints, jnp.broadcast_to(jnp.float32(direction)[None], (5, 2)))[i]
             assert float(found) == pytest.approx((outline @ direction).max(), abs=2e-4)

@@ -200,13 +200,16 @@ def _pair_distance(prints: Footprints, heading: Array) -> tuple[Array, Array]:
     """
     n = prints.yaw.shape[0]
     fixed = jnp.broadcast_to(_fan(heading)[None], (n, DIRECTIONS))
-    own = jnp.concatenate([prints.yaw[:, None], prints.yaw[:, None] + np.float32(np.pi / 2)], axis=1)
+    # A round object has no sides of its own.
+    yaw = jnp.where(prints.round, fixed[:, 0], prints.yaw)[:, None]
+    own = jnp.concatenate([yaw, yaw + np.float32(np.pi / 2)], axis=1)
     own = jnp.broadcast_to(own[:, None], (n, n, 2))
     angles = jnp.concatenate([jnp.broadcast_to(fixed[:, None], (n, n, DIRECTIONS)), own, jnp.swapaxes(own, 0, 1)], -1)
     normal = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-    # `reach` wants the objects' axis last: of j along normal[i, j], then of i along normal[j, i], which are the same.
-    of_j = jnp.moveaxis(reach(prints, jnp.moveaxis(normal, 2, 0)), 0, -1)
-    width = of_j + jnp.swapaxes(of_j, 0, 1)
+    # `reach` wants the axis of the objects last: that of j, then that of i.
+    of_j = jnp.transpose(reach(prints, jnp.transpose(normal, (2, 0, 1, 3))), (1, 2, 0))
+    of_i = jnp.transpose(reach(prints, jnp.transpose(normal, (2, 1, 0, 3))), (2, 1, 0))
+    width = of_i + of_j
     offset = prints.position[:, None] - prints.position[None]
     side = _perpendicular(heading)
     lateral = _dot(offset, side[None, None])
