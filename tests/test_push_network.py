@@ -202,10 +202,9 @@ def test_the_order_of_the_objects_does_not_matter():
     assert_same(jax.tree.map(lambda a: a[order], told(scene, T, displacement)), shuffled, shift=1e-6, other=1e-5)
 
 
-@pytest.mark.parametrize("more", [1, 3])
-def test_absent_objects_change_nothing(more):
+def test_absent_objects_change_nothing():
     scene, T, displacement = cluttered(5)
-    padded = superquadric.pad(scene, 5 + more)
+    padded = superquadric.pad(scene, 8)
     # What an empty slot holds is nobody's business.
     padded = padded.replace(
         position=padded.position.at[5:].set(scene.position[0] + 0.01), size=padded.size.at[5:].set(0.05)
@@ -219,12 +218,13 @@ def test_neighbours_and_walls_matter_where_they_are_near():
     scene, T, displacement = cluttered(6)
     alone = told(scene.replace(valid=jnp.arange(5) == 0), T, displacement)
     assert np.abs(alone.shift[0] - told(scene, T, displacement).shift[0]).max() > 1e-4
-    answers = [
-        told(scene, T, displacement, shelf=dataclasses.replace(OPEN, back=0.8 + gap)).shift[0]
-        for gap in (0.0, 0.05, REACH + 0.1, REACH + 0.2)
-    ]
-    assert np.abs(answers[0] - answers[1]).max() > 1e-5
-    np.testing.assert_array_equal(answers[2], answers[3])
+    wall = dataclasses.replace(OPEN, back=0.8)
+    near, nearer, far, farther = (
+        told(*moved(0.0, x, 0.0, scene, T, displacement), shelf=wall).shift for x in (0.0, 0.05, -0.5, -0.6)
+    )
+    assert np.abs(near - nearer).max() > 1e-4
+    np.testing.assert_allclose(far, farther, atol=2e-5)
+    np.testing.assert_allclose(far, told(scene, T, displacement).shift, atol=2e-5)
 
 
 # --- what the network is told ----------------------------------------------------------------------------------------
@@ -280,8 +280,9 @@ def test_the_distance_between_objects_is_that_of_small_steps():
         for j in set(range(5)) - {i}:
             a, b = outline_of(prints, i), outline_of(prints, j)
             apart = separation(a, b)
-            # The polygon that stands for a cylinder is up to 2% wider.
-            assert gap[i, j] == pytest.approx(apart, abs=2e-3)
+            # It is measured along a few directions, which between round objects are up to 11 degrees off.
+            between = np.linalg.norm(a.mean(axis=0) - b.mean(axis=0))
+            assert apart - 0.02 * between - 1e-4 < gap[i, j] < apart + 1e-4
             hits = np.array([separation(a + d * heading, b) < 0 for d in np.arange(0.0, REACH, 1e-3)])
             # Where they only graze each other it is a matter of fractions of a millimetre.
             if apart > 0 and hits.sum() > 20:

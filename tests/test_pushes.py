@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax import dynamics, transforms
+from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.native_worlds import NativeWorlds
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
@@ -31,14 +32,18 @@ SCENES = SceneConfig(objects=(2, 5), lying=0.1, leaning=0.0, placements=8)
 DRAW_WORLD = functools.partial(random_world, config=SCENES)
 
 
-def simulated(seed, worlds, rounds):
+WORLDS = 8
+
+
+def simulated(seed, rounds):
+    # As many worlds everywhere, so that everything is compiled once.
     simulator = NativeWorlds(2, generator.push_simulation())
-    return generate_pushes(jax.random.key(seed), worlds, rounds, simulator, DRAW_WORLD)
+    return generate_pushes(jax.random.key(seed), WORLDS, rounds, simulator, DRAW_WORLD)
 
 
 @pytest.fixture(scope="module")
 def pushes():
-    return simulated(0, 10, 3)
+    return simulated(0, 4)
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +56,8 @@ def drawn():
         def one(key):
             scene, push = jax.random.split(key)
             world = DRAW_WORLD(scene)
+            # One world in eight is empty.
+            world = world.replace(valid=world.valid & (jax.random.bits(scene) % 8 > 0))
             return world, *draw_push(push, world, tables, CONFIG, SHELF)
 
         return jax.lax.map(one, keys, batch_size=32)
@@ -63,7 +70,7 @@ def drawn():
 
 def test_pushes_of_all_directions_and_lengths_are_found(drawn):
     (world, action, found), _ = drawn
-    assert found.mean() > 0.6
+    assert found[world.valid.any(axis=1)].mean() > 0.6
     assert (action.kind == found).all()
     assert world.valid[np.arange(192), action.object][found].all()
     assert (action.object[found] < TARGET).all()
@@ -78,9 +85,9 @@ def test_pushes_of_all_directions_and_lengths_are_found(drawn):
     assert (along[:, 2] == 0).all()
 
 
-def in_body(world, k, i, points):
-    """Which points are inside a true box or cylinder, in float64."""
-    rotation, half = world.rotation[k, i].astype(float), world.half_size[k, i].astype(float)
+def in_body(world, k, i, points, share=1.0):
+    """Which points are inside a true box or cylinder, or inside such a share of it, in float64."""
+    rotation, half = world.rotation[k, i].astype(float), share * world.half_size[k, i].astype(float)
     local = (points - world.position[k, i]) @ rotation
     flat = np.hypot(local[:, 0], local[:, 1]) < half[0]
     if world.kind[k, i] == BOX:
@@ -95,7 +102,8 @@ def test_the_gripper_starts_beside_the_object_and_inside_of_nothing(drawn):
     for k in np.flatnonzero(found)[:60]:
         T = action.T_world_gripper[k].astype(float)
         points = pusher @ T[:3, :3].T + T[:3, 3]
-        assert not any(in_body(world, k, i, points).any() for i in np.flatnonzero(world.valid[k]))
+        # Superquadrics, against which pushes are tested, lack 7% at the corners.
+        assert not any(in_body(world, k, i, points, 0.93).any() for i in np.flatnonzero(world.valid[k]))
         assert (points[points[:, 0] > SHELF.front, 2] > SHELF.board).all()
         # Moved on by little, it is in the object that it is to push.
         step = action.displacement[k] / np.linalg.norm(action.displacement[k])
@@ -106,13 +114,12 @@ def test_the_gripper_starts_beside_the_object_and_inside_of_nothing(drawn):
     assert np.median(gaps) == pytest.approx(0.5 * sum(CONFIG.gap), abs=4e-3)
 
 
-def test_where_there_is_nothing_to_push_nothing_is_drawn():
-    world = jax.jit(DRAW_WORLD)(jax.random.key(0))
-    world = world.replace(valid=jnp.zeros_like(world.valid))
-    draw = jax.jit(draw_push, static_argnames=("config", "shelf"))
-    action, found = draw(jax.random.key(0), world, push_tables(CONFIG), CONFIG, SHELF)
-    assert not found
-    assert action.kind == 0
+def test_where_there_is_nothing_to_push_nothing_is_drawn(drawn):
+    (world, action, found), _ = drawn
+    empty = ~world.valid.any(axis=1)
+    assert empty.sum() > 5
+    assert not found[empty].any()
+    assert (action.kind[empty] == ActionKind.NONE).all()
 
 
 # --- what becomes of it ----------------------------------------------------------------------------------------------
@@ -154,11 +161,12 @@ def test_pushes_that_follow_each_other_go_on_from_what_was(pushes):
     assert followed >= 3
 
 
-def test_the_same_key_gives_the_same_pushes():
-    one, again, other = simulated(3, 2, 2), simulated(3, 2, 2), simulated(4, 2, 2)
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert one.displacement.shape != other.displacement.shape or (one.displacement != other.displacement).any()
+def test_the_same_key_gives_the_same_pushes(pushes):
+    again, other = simulated(0, 1), simulated(4, 1)
+    first = len(again.object)
+    for a, b in zip(jax.tree.leaves(pushes), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a[:first], b)
+    assert not np.isin(other.displacement[:, 1], again.displacement[:, 1]).any()
 
 
 def upright_world(kind, rotation):
@@ -215,7 +223,7 @@ def test_a_world_is_simulated_as_its_scenario_is():
 
 
 def test_pushes_are_made_once_and_read_again(tmp_path):
-    generation = Generation(seed=1, pushes=3, worlds=2, rounds=2)
+    generation = Generation(seed=1, pushes=3, worlds=WORLDS, rounds=1)
     counts = []
     made = list(generator.portions(generation, tmp_path, lambda: NativeWorlds(2), DRAW_WORLD, CONFIG, counts.append))
 
@@ -325,6 +333,7 @@ def task_of(pushes: Pushes) -> PushTask:
     )
 
 
+@pytest.mark.slow
 def test_training_makes_the_loss_smaller(pushes, tmp_path):
     losses = []
     train(
@@ -334,6 +343,18 @@ def test_training_makes_the_loss_smaller(pushes, tmp_path):
         lambda progress, step, seconds, scalars: losses.append(scalars["loss"]),
     )
     assert losses[-1] < 0.8 * losses[0]
+
+
+@pytest.mark.slow
+def test_the_batch_simulator_pushes_as_the_native_one_does(pushes):
+    batch = generate_pushes(jax.random.key(0), WORLDS, 1, generator.engine(True), DRAW_WORLD)
+    lanes, native, mjx = np.intersect1d(
+        pushes.lane[: np.argmax(np.diff(pushes.lane) < 0) + 1], batch.lane, return_indices=True
+    )
+    assert len(lanes) > 4
+    np.testing.assert_allclose(pushes.T_world_gripper[native], batch.T_world_gripper[mjx], atol=1e-5)
+    gap = np.abs(pushes.after.position[native] - batch.after.position[mjx]).max(axis=-1)
+    assert np.median(gap[batch.before.valid[mjx]]) < 1e-3
 
 
 @pytest.mark.slow
