@@ -417,8 +417,9 @@ def test_damaged_weights_are_refused_in_one_line(weights, damage):
 
 def test_the_network_that_is_trained_is_small():
     scene, T, displacement = cluttered(0)
-    geometry = push_geometry(SHELF, scene, pusher(), T, displacement)
-    shapes = jax.eval_shape(lambda: PushNetwork().init(jax.random.key(0), geometry))
+    shapes = jax.eval_shape(
+        lambda: PushNetwork().init(jax.random.key(0), push_geometry(SHELF, scene, pusher(), T, displacement))
+    )
     assert sum(a.size for a in jax.tree.leaves(shapes)) < 250_000
 
 

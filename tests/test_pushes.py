@@ -60,9 +60,9 @@ def drawn():
             world = world.replace(valid=world.valid & (jax.random.bits(scene) % 8 > 0))
             return world, *draw_push(push, world, tables, CONFIG, SHELF)
 
-        return jax.lax.map(one, keys, batch_size=32)
+        return jax.lax.map(one, keys, batch_size=16)
 
-    return jax.device_get(draw(jax.random.split(jax.random.key(5), 192))), tables
+    return jax.device_get(draw(jax.random.split(jax.random.key(5), 128))), tables
 
 
 # --- what is drawn ---------------------------------------------------------------------------------------------------
@@ -72,7 +72,7 @@ def test_pushes_of_all_directions_and_lengths_are_found(drawn):
     (world, action, found), _ = drawn
     assert found[world.valid.any(axis=1)].mean() > 0.6
     assert (action.kind == found).all()
-    assert world.valid[np.arange(192), action.object][found].all()
+    assert world.valid[np.arange(128), action.object][found].all()
     assert (action.object[found] < TARGET).all()
     along = action.displacement[found]
     length = np.linalg.norm(along, axis=1)
@@ -80,7 +80,7 @@ def test_pushes_of_all_directions_and_lengths_are_found(drawn):
     assert length.max() > 0.16
     assert ((length >= CONFIG.lengths[0] - 1e-6) & (length <= CONFIG.lengths[1] + 1e-6)).all()
     sideways = np.abs(along[:, 0]) < 1e-6
-    assert min(np.sum(along[sideways, 1] > 0), np.sum(along[sideways, 1] < 0), np.sum(~sideways)) > 15
+    assert min(np.sum(along[sideways, 1] > 0), np.sum(along[sideways, 1] < 0), np.sum(~sideways)) > 10
     assert (along[:, 0] > -1e-6).all()
     assert (along[:, 2] == 0).all()
 
