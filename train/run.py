@@ -21,6 +21,8 @@ from mechsearch_jax.train.recognition import RecognitionTask
 from mechsearch_jax.train.segmentation import SegmentationTask
 
 TASKS: dict[str, Callable[[], Task]] = {"segmentation": SegmentationTask, "recognition": RecognitionTask}
+# Groups of scores that are printed.
+SHOWN = 8
 # Seconds between lines where the output is no terminal.
 _QUIET = 20.0
 
@@ -141,6 +143,8 @@ def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
         card = card | {"scores": task.scores(parameters, config.held_out)}
     task.save(out / f"{name}.npz", parameters, card)
     for what, scores in card["scores"].items():
-        console.print(f"{what}: {scores}", soft_wrap=True)
+        # Where there are many groups, the card has them.
+        shown = scores if len(scores) <= SHOWN else {"all": scores["all"]}
+        console.print(f"{what}: {shown}", soft_wrap=True)
     console.print(str(out / f"{name}.npz"), soft_wrap=True)
     return card
