@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool
 
 from mechsearch_jax.actions import Action
 from mechsearch_jax.envs.mjx_simulator import RETRIEVE, Failure, Outcomes
-from mechsearch_jax.envs.simulator import NativeSimulator
+from mechsearch_jax.envs.simulator import NativeSimulator, SimulatorConfig
 from mechsearch_jax.envs.world import BODIES, World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.scenario import Scenario
@@ -33,11 +33,13 @@ class NativeWorlds:
 
     engine = NativeSimulator.__name__
 
-    def __init__(self, threads: int | None = None):
+    def __init__(self, threads: int | None = None, config: SimulatorConfig | None = None):
         """Args:
         threads: how many worlds are simulated at the same time; one for each core if left out.
+        config: of every world's simulator.
         """
         self.world: World | None = None
+        self._config = config
         self._threads = threads or os.cpu_count() or 1
         self._simulators: list[NativeSimulator] = []
 
@@ -49,13 +51,29 @@ class NativeWorlds:
         """
         if not scenarios:
             raise InputError("NativeWorlds: no scenarios are given; reset it with one for each world")
-        self._simulators = [NativeSimulator() for _ in scenarios]
+        self._simulators = [NativeSimulator(config=self._config) for _ in scenarios]
         return self.replace(dict(enumerate(scenarios)))
 
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
         """Start episodes in some of the worlds; the others stay as they are."""
         for world, scenario in scenarios.items():
             self._simulators[world].reset(scenario)
+        return self._gather()
+
+    def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
+        """Take over the state of all worlds, or of some; see `MjxSimulator.load`.
+
+        Raises:
+          InputError: some worlds are to be kept, but there are not as many.
+        """
+        count = len(world.kind)
+        if only is None:
+            self._simulators = [NativeSimulator(config=self._config) for _ in range(count)]
+        elif len(self._simulators) != count or len(only) != count:
+            raise InputError(f"NativeWorlds: some of {count} worlds can be replaced only where there are as many")
+        host = jax.device_get(world)
+        for i in range(count) if only is None else np.flatnonzero(only):
+            self._simulators[i].load(jax.tree.map(lambda leaf, i=i: leaf[i], host))
         return self._gather()
 
     def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcomes:

@@ -25,7 +25,7 @@ from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs import motion
 from mechsearch_jax.envs.motion import MotionConfig, Reference
-from mechsearch_jax.envs.world import BODIES, TARGET, World, from_scenario, slots
+from mechsearch_jax.envs.world import BODIES, TARGET, World, bodies_of, from_scenario, slots
 from mechsearch_jax.kinematics import HOME
 from mechsearch_jax.scenario import Body, Scenario, rotation_matrix
 from mechsearch_jax.shelf import Shelf
@@ -147,11 +147,22 @@ class NativeSimulator:
         Raises:
           InputError: there are more objects than slots.
         """
-        self._bodies = slots(scenario)
-        self._model = models.with_bodies(self._blank, self._bodies)
-        self._data = models.initial_state(self._model, self._bodies)
-        self.world = from_scenario(scenario)
-        return self.world
+        return self._begin(slots(scenario), from_scenario(scenario))
+
+    def load(self, world: World) -> World:
+        """Start from a world, everything at rest and the robot at home.
+
+        Args:
+          world: fields without leading axes.
+        """
+        return self._begin(bodies_of(world), jax.tree.map(jnp.asarray, world))
+
+    def _begin(self, bodies: list[Body | None], world: World) -> World:
+        self._bodies = bodies
+        self._model = models.with_bodies(self._blank, bodies)
+        self._data = models.initial_state(self._model, bodies)
+        self.world = world
+        return world
 
     def settle(self) -> Outcome:
         """Let time pass, with the robot at home, until everything is at rest or the time for that is over."""

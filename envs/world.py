@@ -6,6 +6,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mechsearch_jax import superquadric
 from mechsearch_jax.errors import InputError
@@ -65,13 +66,33 @@ def from_scenario(scenario: Scenario) -> World:
     )
 
 
+def bodies_of(world: World) -> list[Body | None]:
+    """The bodies in a world's slots, None where a slot is empty.
+
+    Args:
+      world: fields without further leading axes.
+    """
+    host = jax.device_get(world)
+    quaternions = Rotation.from_matrix(np.where(host.valid[:, None, None], host.rotation, np.eye(3))).as_quat()
+    return [
+        Body(
+            "cylinder" if host.kind[i] == CYLINDER else "box",
+            *(tuple(float(v) for v in values) for values in (host.half_size[i], host.position[i])),  # pyright: ignore
+            tuple(float(v) for v in quaternions[i, [3, 0, 1, 2]]),  # pyright: ignore
+        )
+        if host.valid[i]
+        else None
+        for i in range(BODIES)
+    ]
+
+
+def superquadrics(world: World) -> Superquadrics:
+    """All bodies, the target last, as a recogniser that knows the truth would report them."""
+    exponents = jnp.array([superquadric.BOX_EXPONENTS, superquadric.CYLINDER_EXPONENTS])
+    return Superquadrics(world.half_size, exponents[world.kind], world.position, world.rotation, world.valid)
+
+
 def true_superquadrics(world: World) -> Superquadrics:
     """The surrounding objects, without the target, as a recogniser that knows the truth would report them."""
-    exponents = jnp.array([superquadric.BOX_EXPONENTS, superquadric.CYLINDER_EXPONENTS])
-    return Superquadrics(
-        size=world.half_size[..., :TARGET, :],
-        exponents=exponents[world.kind[..., :TARGET]],
-        position=world.position[..., :TARGET, :],
-        rotation=world.rotation[..., :TARGET, :, :],
-        valid=world.valid[..., :TARGET],
-    )
+    lead = world.valid.ndim - 1
+    return superquadrics(jax.tree.map(lambda leaf: leaf[(slice(None),) * lead + (slice(TARGET),)], world))

@@ -684,8 +684,69 @@ def _training_of(name: Literal["segmentation", "recognition"], batch: int, rate:
     return command
 
 
+def train_push(
+    *,
+    out: Path,
+    data: Path | None = None,
+    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 300_000,
+    worlds: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    rounds: int = 8,
+    frame: Literal["push", "world"] = "push",
+    width: int = 64,
+    layers: int = 3,
+    seed: int = 0,
+    steps: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None,
+    batch: int = 1024,
+    rate: float = 2e-3,
+    chunk: int = 50,
+    held_out: int = 20_000,
+) -> None:
+    """Simulate random pushes and train the push model on them; goes on where it was stopped.
+
+    Args:
+      out: folder for the checkpoint, the curves (scalars.jsonl), and in the end push.npz and its card push.json.
+      data: folder for the pushes, a kilobyte each; OUT/pushes if left out. What lies there is not simulated again.
+      pushes: at least so many are simulated; an eighth of them is held out.
+      worlds: simulated at once; 8192 on a GPU and 64 on a CPU if left out.
+      rounds: pushes that follow each other in a world before all are begun anew.
+      frame: "push" sees objects along the push; "world" is the baseline without symmetry.
+      width, layers: sizes of the network.
+      seed: of the weights, the scenes and the pushes.
+      steps: length in steps.
+      minutes: length in minutes instead, without simulation and scoring; 9 if neither is given.
+      batch: pushes in a step.
+      rate: highest learning rate.
+      chunk: steps that the device makes before it reports.
+      held_out: pushes, at most, for the scores at the end.
+    """
+    import jax
+
+    from mechsearch_jax.envs.pushes import Generation
+    from mechsearch_jax.models.push import PushConfig
+    from mechsearch_jax.results import check_writable
+    from mechsearch_jax.train.loop import TrainConfig
+    from mechsearch_jax.train.push import push_task
+    from mechsearch_jax.train.run import counting, run
+
+    if steps is None and minutes is None:
+        minutes = 9.0
+    config = TrainConfig(
+        seed=seed, steps=steps, minutes=minutes, batch=batch, rate=rate, chunk=chunk, held_out=held_out
+    )
+    network = PushConfig(width, layers, frame)
+    worlds = worlds or (64 if jax.default_backend() == "cpu" else 8192)
+    generation = Generation(seed, pushes, worlds, rounds)
+    check_writable(out)
+    folder = data or out / "pushes"
+    check_writable(folder)
+    with counting("pushes", pushes) as told:
+        task = push_task(generation, folder, network, told)
+    run(task, config, out)
+
+
 def train() -> None:
-    """Train the networks of perception: mechsearch train segmentation|recognition."""
+    """Train the networks: mechsearch train segmentation|recognition|push."""
 
 
 def scenarios() -> None:
@@ -712,6 +773,7 @@ GROUPS: dict[str, Commands] = {
     "train": {
         "segmentation": _training_of("segmentation", batch=32, rate=1e-3),
         "recognition": _training_of("recognition", batch=64, rate=1e-3),
+        "push": train_push,
     },
     "bench": {
         "existence": _timing_of("existence", "f"),

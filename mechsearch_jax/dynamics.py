@@ -243,6 +243,20 @@ def _resolve_walls(shelf, prints):
     return prints
 
 
+def unresolved(shelf: Shelf, before: Footprints, after: Footprints, points: Float[Array, "p 3"]) -> Float[Array, ""]:
+    """Deepest penetration after a push [m]: of the gripper, of walls, and of objects as far as it is new; at least 0.
+
+    Args:
+      shelf: walls.
+      before, after: the objects.
+      points: surface of the gripper where the push ends, in the world [m].
+    """
+    held = jnp.max(_pusher_depth(after, points)[0])
+    jammed = jnp.max(_pair_contacts(after)[0]) - jnp.maximum(jnp.max(_pair_contacts(before)[0]), 0.0)
+    wall = jnp.max(jnp.where(after.valid[:, None], jnp.max(_wall_depth(shelf, after)[0], axis=1), -1.0))
+    return jnp.maximum(jnp.maximum(jnp.maximum(held, jammed), wall), 0.0)
+
+
 @dataclasses.dataclass(frozen=True)
 class QuasiStatic:
     """An analytic `PushModel`: the gripper moves in small steps, and what it runs into gives way.
@@ -283,16 +297,14 @@ class QuasiStatic:
         after, stages = jax.lax.scan(step, before, points)
         # A gripper that cannot move what is jammed would pass through it, so the worst moment counts, not the last.
         held = jnp.max(jax.vmap(_pusher_depth)(stages, points)[0])
-        jammed = jnp.max(_pair_contacts(after)[0]) - jnp.maximum(jnp.max(_pair_contacts(before)[0]), 0.0)
-        wall = jnp.max(jnp.where(after.valid[:, None], jnp.max(_wall_depth(shelf, after)[0], axis=1), -1.0))
+        residual = jnp.maximum(held, unresolved(shelf, before, after, points[-1]))
         turn = after.yaw - before.yaw
         moved = (jnp.abs(turn) > 1e-3) | (jnp.max(jnp.abs(after.position - before.position), axis=-1) > 1e-4)
         moved_scene = rigid_motion(scene, before.position, after.position, turn)
         pick = lambda new, old: jnp.where(moved.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
-        residual = jnp.maximum(jnp.maximum(held, jammed), wall)
         scene = jax.tree.map(pick, moved_scene, scene)
         high = _touched_high(scene, after, start + displacement[None], heading, self.leverage)
-        return PushOutcome(scene, jnp.maximum(residual, 0.0), jnp.where(high, 1.0, 0.0))
+        return PushOutcome(scene, residual, jnp.where(high, 1.0, 0.0))
 
 
 def rigid_motion(

@@ -92,6 +92,11 @@ class Task(Protocol):
         """Of the network."""
         ...
 
+    @property
+    def origin(self) -> dict[str, Any]:
+        """Where the examples come from, for the card of the weights."""
+        ...
+
     def init(self, key: Key[Array, ""]) -> Any:
         """Fresh parameters of the network."""
         ...

@@ -39,6 +39,7 @@ from mechsearch_jax.train.scenes import (
     capture,
     is_known,
     noise_names,
+    origin,
     random_world,
     surface_points,
     visible_share,
@@ -184,6 +185,10 @@ class RecognitionTask:
     ragged: float = 0.25
     precision: Any = jnp.bfloat16
     name: str = "recognition"
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        return origin(self.scenes)
 
     def init(self, key: Key[Array, ""]) -> Any:
         segments = self.segments.points

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from mechsearch_jax.train.recognition import RecognitionTask
 from mechsearch_jax.train.segmentation import SegmentationTask
 
 TASKS: dict[str, Callable[[], Task]] = {"segmentation": SegmentationTask, "recognition": RecognitionTask}
+# Groups of scores that are printed.
+SHOWN = 8
 # Seconds between lines where the output is no terminal.
 _QUIET = 20.0
 
@@ -61,6 +64,38 @@ class ProgressLine:
             self._said = time.monotonic()
 
 
+@contextlib.contextmanager
+def counting(what: str, wanted: int) -> Iterator[Callable[[int], None]]:
+    """Shows how many of something there are, and the time left, to whoever calls what this gives with the number."""
+    console = Console(highlight=False)
+    start = said = time.monotonic()
+    first: int | None = None
+    bar = Progress(
+        TextColumn(what),
+        BarColumn(),
+        TextColumn("{task.completed} of {task.total}"),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+    def told(count: int) -> None:
+        nonlocal said, start, first
+        bar.update(task, completed=count)
+        now = time.monotonic()
+        if first is None:
+            # Until then programs were compiled, or files read.
+            first, start = count, now
+        elif not console.is_terminal and (now - said > _QUIET or count >= wanted):
+            left = (now - start) / max(count - first, 1) * max(wanted - count, 0)
+            console.print(f"{count} of {wanted} {what}, {left:.0f} s left")
+            said = now
+
+    with bar:
+        task = bar.add_task(what, total=wanted)
+        yield told
+
+
 def commit() -> str | None:
     """The commit that this code is at, None where it is in no checkout."""
     here = Path(__file__).resolve().parent
@@ -69,13 +104,6 @@ def commit() -> str | None:
     except (OSError, subprocess.CalledProcessError):
         return None
     return found.stdout.strip()
-
-
-def _data(task: Any) -> dict[str, Any]:
-    """What the examples are, for the card."""
-    scenes = dataclasses.asdict(task.scenes)
-    noises = [repr(n) if dataclasses.is_dataclass(n) else getattr(n, "__name__", str(n)) for n in task.scenes.noises]
-    return {"source": "random scenes, ray-cast as they were needed", **scenes, "noises": noises}
 
 
 def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
@@ -99,7 +127,7 @@ def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
         state = train(task, config, out, progress)
     parameters = jax.device_get(state.averaged)
     card = {
-        "data": _data(task),
+        "data": task.origin,
         "training": dataclasses.asdict(config),
         "steps": int(state.step),
         "seed": config.seed,
@@ -115,6 +143,8 @@ def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
         card = card | {"scores": task.scores(parameters, config.held_out)}
     task.save(out / f"{name}.npz", parameters, card)
     for what, scores in card["scores"].items():
-        console.print(f"{what}: {scores}", soft_wrap=True)
+        # Where there are many groups, the card has them.
+        shown = scores if len(scores) <= SHOWN else {"all": scores["all"]}
+        console.print(f"{what}: {shown}", soft_wrap=True)
     console.print(str(out / f"{name}.npz"), soft_wrap=True)
     return card

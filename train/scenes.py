@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import flax.struct
 import jax
@@ -75,6 +76,12 @@ class SceneConfig:
                 raise InputError(f"SceneConfig: {name} {getattr(self, name)} must be a range of positive numbers")
         if self.placements < 1 or not self.noises:
             raise InputError("SceneConfig: placements must be at least 1 and noises not empty")
+
+
+def origin(config: SceneConfig) -> dict[str, Any]:
+    """What examples from such scenes are, for the card of a network's weights."""
+    noises = [repr(n) if dataclasses.is_dataclass(n) else getattr(n, "__name__", str(n)) for n in config.noises]
+    return {"source": "random scenes, ray-cast as they were needed", **dataclasses.asdict(config), "noises": noises}
 
 
 class Footprint(flax.struct.PyTreeNode):

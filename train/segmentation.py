@@ -23,7 +23,7 @@ from mechsearch_jax.perception.labels import INSTANCES, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train.loop import HELD_OUT_SEED
-from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, random_world
+from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, origin, random_world
 
 # What a layer's loss counts against the next one's.
 _EARLIER = 0.5
@@ -114,6 +114,10 @@ class SegmentationTask:
     points: int = POINTS
     precision: Any = jnp.bfloat16
     name: str = "segmentation"
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        return origin(self.scenes)
 
     def init(self, key: Key[Array, ""]) -> Any:
         points = jnp.zeros((1, max(64, self.network.neighbours), 3))

@@ -23,9 +23,12 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.models.push import PushConfig, PushNetwork, push_geometry
 from mechsearch_jax.models.recognition import RecognitionConfig, RecognitionNetwork
 from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork
 from mechsearch_jax.perception.segments import SegmentConfig
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import empty
 
 FORMAT = "mechsearch-weights"
 VERSION = 1
@@ -38,12 +41,12 @@ class Architecture:
     Attributes:
       network: its class.
       config: the class of its configuration.
-      inputs: arrays of the shapes and types that it takes.
+      inputs: arrays of the shapes and types that it takes, or pytrees of such.
     """
 
     network: Any
     config: Any
-    inputs: tuple[jax.ShapeDtypeStruct, ...]
+    inputs: tuple[Any, ...]
 
     def shapes(self, config: Any) -> Any:
         """Its parameters' shapes."""
@@ -52,6 +55,9 @@ class Architecture:
 
 
 _CLOUD = SegmentConfig().points
+_PUSH = jax.eval_shape(
+    lambda: push_geometry(Shelf(), empty(2), jnp.zeros((1, 3)), jnp.zeros((4, 4)), jnp.zeros(3)),
+)
 ARCHITECTURES = {
     "segmentation": Architecture(
         SegmentationNetwork, SegmentationConfig, (jax.ShapeDtypeStruct((1, 64, 3), jnp.float32),)
@@ -65,6 +71,7 @@ ARCHITECTURES = {
             jax.ShapeDtypeStruct((1, 3), jnp.float32),
         ),
     ),
+    "push": Architecture(PushNetwork, PushConfig, (_PUSH,)),
 }
 
 
@@ -88,7 +95,7 @@ def save_weights(path: PathLike, name: str, config: Any, parameters: Any, card: 
 
     Args:
       path: of the archive, NAME.npz; the card goes beside it.
-      name: of the architecture, "segmentation" or "recognition".
+      name: of the architecture, one of `ARCHITECTURES`.
       config: of the network.
       parameters: Flax parameters; kept in half precision.
       card: how they were made and scored; numbers, texts, lists and dictionaries.

@@ -1,0 +1,89 @@
+"""The push model that was learnt from simulated pushes (paper section 4.3); a `dynamics.PushModel`."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from mechsearch_jax.dynamics import PushOutcome, footprints, rigid_motion, unresolved
+from mechsearch_jax.models.push import PushNetwork, push_geometry, told_by
+from mechsearch_jax.models.weights import Weights, load_weights
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.transforms import transform
+
+NAME = "push"
+
+
+@functools.cache
+def _weights(path: Path, digest: str) -> Weights:
+    """The network in a file whose card states this digest."""
+    # Called while a plan is traced, it still has to give numbers.
+    with jax.ensure_compile_time_eval():
+        return load_weights(path, NAME)
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnedPush:
+    """Predicts pushes with a trained network. Two are equal if their weights are.
+
+    Attributes:
+      path: of the weights; those that ship with the package if left out.
+      likely: an object is moved if it moves with a probability above this, and else left exactly where it is.
+      digest: of the weights, read from their card.
+
+    Raises:
+      InputError: the weights are missing or damaged.
+    """
+
+    path: Path | None = dataclasses.field(default=None, compare=False)
+    likely: float = 0.5
+    digest: str = dataclasses.field(default="", init=False)
+
+    def __post_init__(self):
+        path = self.path or Path(str(importlib.resources.files("mechsearch_jax") / "models" / f"{NAME}.npz"))
+        # What a frozen instance derives from its arguments can be set in no other way.
+        object.__setattr__(self, "path", path)
+        object.__setattr__(self, "digest", load_weights(path, NAME).card["sha256"])
+
+    def __call__(
+        self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array
+    ) -> PushOutcome:
+        """See `dynamics.PushModel`."""
+        assert self.path is not None
+        weights = _weights(self.path, self.digest)
+        network = weights.network
+        assert isinstance(network, PushNetwork)
+        return predicted(network, weights.parameters, self.likely, shelf, scene, pusher, T_world_gripper, displacement)
+
+
+def predicted(
+    network: PushNetwork,
+    parameters: Any,
+    likely: float,
+    shelf: Shelf,
+    scene: Superquadrics,
+    pusher: Array,
+    T_world_gripper: Array,
+    displacement: Array,
+) -> PushOutcome:
+    """What a network predicts of a push; see `LearnedPush` and `dynamics.PushModel` for the arguments."""
+    geometry = push_geometry(shelf, scene, pusher, T_world_gripper, displacement, network.config.frame)
+    told = told_by(network, parameters, geometry)
+    moves = scene.valid & (jax.nn.sigmoid(told.moves) > likely)
+    before = footprints(scene)
+    moved = rigid_motion(scene, before.position, before.position + told.shift, told.turn)
+    after = jax.tree.map(lambda new, old: jnp.where(moves.reshape(-1, *[1] * (new.ndim - 1)), new, old), moved, scene)
+    end = transform(T_world_gripper, pusher) + displacement[None]
+    return PushOutcome(
+        scene=after,
+        residual=unresolved(shelf, before, footprints(after), end),
+        topples=jnp.where(scene.valid, jax.nn.sigmoid(told.topples), 0.0),
+    )

@@ -1,0 +1,462 @@
+"""The network that predicts a push: how every object moves in the plane, whether it moves at all, whether it topples.
+
+Like SQPD-Net (S. Kim et al., "SE(2)-equivariant pushing dynamics models for tabletop object manipulations", 2022) it
+sees every object in a planar frame of its own and its neighbours from there. The frame has its origin in the object's
+centre and its first axis along the push, and an object is described by how far it reaches in a few directions: so a box
+turned by half a turn, or a cylinder turned at all, is the same to the network, and turning and moving everything turns
+and moves the answer. A push and its mirror image are both looked at and the answers averaged, so that what is symmetric
+stays symmetric. Walls are seen by how near they are, and not at all beyond `REACH`.
+
+`push_geometry` computes all that the network is told, and `PushNetwork` maps that to a `PushMotion`. As a baseline that
+is not equivariant, the same network can be told the same in the frame of the world.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal, cast
+
+import flax.linen as nn
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.dynamics import TOUCH, Footprints, footprints, turned
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.models.layers import FeedForward
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.transforms import transform
+
+# Directions, spread over half a turn, in which an object's reach is told; an even number.
+DIRECTIONS = 8
+# Contacts and walls farther away than this are all the same to the network [m]: no push is longer.
+REACH = 0.25
+# Over how much lateral overlap a contact comes into being: a graze is no contact [m].
+GRAZE = 1e-3
+# Deeper overlaps are all the same to the network [m].
+DEEPEST = 0.02
+# Points of the gripper that are looked at.
+POINTS = 192
+# How far behind the first point of contact others still count as touching, for two notions of a contact [m].
+SOFTNESS = (0.003, 0.015)
+# Objects that push each other on, one after the other, in the estimate of who is reached when.
+CHAIN = 4
+# Units of what the network is told and of what it says: lengths [m], angles [rad].
+_LENGTH, _SHIFT, _TURN = 0.1, 0.05, 0.3
+_OUTPUTS = 7
+# The inward normals of the back, right and left walls, and of the front edge, beyond which is nothing.
+_NORMALS = np.array([[-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], np.float32)
+_IS_EDGE = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
+_MIRROR = np.array([1.0, -1.0], np.float32)
+_MIRRORED_DIRECTIONS = (-np.arange(DIRECTIONS)) % DIRECTIONS
+
+
+@dataclasses.dataclass(frozen=True)
+class PushConfig:
+    """Sizes of the network, and what it is told the push in.
+
+    Attributes:
+      width: of what is known of an object.
+      layers: of messages between objects.
+      frame: "push" for each object's own frame along the push; "world" for the baseline without symmetry.
+    """
+
+    width: int = 64
+    layers: int = 3
+    frame: Literal["push", "world"] = "push"
+
+    def __post_init__(self):
+        if min(self.width, self.layers) < 1:
+            raise InputError("PushConfig: width and layers must be positive")
+        if self.frame not in ("push", "world"):
+            raise InputError(f'PushConfig: frame "{self.frame}" is unknown; use "push" or "world"')
+
+
+class PushGeometry(flax.struct.PyTreeNode):
+    """A push as the network is told it; every field may have leading axes. Vectors are planar, in the push's frame.
+
+    Attributes:
+      scalars: of each object, shape (N, S).
+      vectors: of each object, shape (N, V, 2).
+      extents: reach of each object from its centre in `DIRECTIONS` directions, shape (N, K).
+      pair_scalars, pair_vectors: of object j as seen from object i, shapes (N, N, S') and (N, N, V', 2).
+      wall_scalars, wall_vectors: of each wall as seen from each object, shapes (N, 4, S'') and (N, 4, 1, 2).
+      wall_near: 1 at the wall, 0 from `REACH` on, shape (N, 4).
+      carry: how far each object would be carried if nothing turned or slid off [m], shape (N,).
+      heading: unit vector of the push in the frame, shape (2,).
+      axis: first axis of the frame in the world, a planar unit vector, shape (2,).
+      round: which objects are round, shape (N,).
+      valid: which objects are there, shape (N,).
+    """
+
+    scalars: jax.Array
+    vectors: jax.Array
+    extents: jax.Array
+    pair_scalars: jax.Array
+    pair_vectors: jax.Array
+    wall_scalars: jax.Array
+    wall_vectors: jax.Array
+    wall_near: jax.Array
+    carry: jax.Array
+    heading: jax.Array
+    axis: jax.Array
+    round: jax.Array
+    valid: jax.Array
+
+
+class PushMotion(flax.struct.PyTreeNode):
+    """What the network says of each object; every field has the leading axes (..., N).
+
+    Attributes:
+      shift: planar motion of its centre in the world, if it moves [m], (..., N, 2).
+      turn: about the vertical, if it moves; 0 for a round object [rad].
+      moves: logit of the probability that it moves.
+      topples: logit of the probability that it falls over, or off the board.
+      log_scale: logarithms of the expected absolute errors of shift [m] and turn [rad], (..., N, 2).
+    """
+
+    shift: jax.Array
+    turn: jax.Array
+    moves: jax.Array
+    topples: jax.Array
+    log_scale: jax.Array
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+
+
+def _perpendicular(v: Array) -> Array:
+    return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
+
+
+def _norm(v: Array) -> Array:
+    """Length of planar vectors; 0, with a gradient of 0, where they vanish."""
+    square = _dot(v, v)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def _fan(axis: Array) -> Array:
+    """Angles of directions over half a turn, from a planar vector on [rad]."""
+    return jnp.arctan2(axis[1], axis[0]) + jnp.asarray(np.arange(DIRECTIONS) * np.pi / DIRECTIONS, jnp.float32)
+
+
+def reach(prints: Footprints, direction: Float[Array, "*other n 2"]) -> Float[Array, "*other n"]:
+    """How far footprints (N) reach from their centres along planar unit vectors [m]."""
+    lead = (1,) * (direction.ndim - 2)
+    yaw, half = prints.yaw.reshape(*lead, -1), prints.half.reshape(*lead, -1, 2)
+    along = _dot(direction, jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1))
+    across = _dot(direction, jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)], axis=-1))
+    parts = jnp.abs(jnp.stack([along, across], axis=-1)) * half
+    return jnp.where(prints.round.reshape(*lead, -1), _norm(parts), parts[..., 0] + parts[..., 1])
+
+
+def _slabs(width: Array, offset: Array, speed: Array) -> tuple[Array, Array]:
+    """When a point that is at `offset` and moves at `speed` enters and leaves all slabs |x| <= width along axis -1."""
+    safe = jnp.where(jnp.abs(speed) < 1e-5, 1e-5, speed)
+    middle, half = -offset / safe, width / jnp.abs(safe)
+    return jnp.max(middle - half, axis=-1), jnp.min(middle + half, axis=-1)
+
+
+def _grazing(enters: Array, leaves: Array, overlap: Array, longest: float = REACH) -> Array:
+    """A distance to a contact, at most `longest`, and `longest` where one passes by or is past it already."""
+    share = jnp.clip(jnp.minimum(overlap, leaves) / GRAZE, 0.0, 1.0)
+    return share * jnp.clip(enters, -DEEPEST, longest) + (1.0 - share) * longest
+
+
+def pusher_distance(
+    prints: Footprints, points: Float[Array, "p 3"], heading: Float[Array, "2"], longest: float = REACH
+) -> tuple[Float[Array, "n p"], Bool[Array, "n p"]]:
+    """How far each point moves along a planar unit vector until it enters each footprint, at most `longest` [m].
+
+    Also whether it is at the height of the object; below 0 it is inside already.
+    """
+    level = (points[None, :, 2] > prints.low[:, None] - TOUCH) & (points[None, :, 2] < prints.high[:, None] + TOUCH)
+    side = _perpendicular(heading)
+    from_centre = points[None, :, :2] - prints.position[:, None]
+    lateral = _dot(from_centre, side[None, None])
+    widest = reach(prints, jnp.broadcast_to(side[None], prints.position.shape))[:, None]
+    # What passes by is looked at as if it grazed the side, and then counts for nothing.
+    inside = jnp.clip(lateral, GRAZE / 4 - widest, widest - GRAZE / 4)
+    start = from_centre + (inside - lateral)[..., None] * side[None, None]
+    local = turned(-prints.yaw, start)
+    speed = turned(-prints.yaw, jnp.broadcast_to(heading[None], prints.position.shape))[:, None]
+    flat = _slabs(prints.half[:, None], local, speed)
+    p, d = local / prints.half[:, None], speed / prints.half[:, None]
+    square, product = _dot(d, d), _dot(p, d)
+    root = jnp.sqrt(jnp.maximum(product**2 - square * (_dot(p, p) - 1.0), 1e-9))
+    disc = (-product - root) / square, (-product + root) / square
+    enters, leaves = (jnp.where(prints.round[:, None], a, b) for a, b in zip(disc, flat, strict=True))
+    return _grazing(enters, leaves, widest - jnp.abs(lateral), longest), level
+
+
+def _pair_distance(prints: Footprints, heading: Array) -> tuple[Array, Array]:
+    """How far object i moves along the heading until it touches j, and the gap between them now; both (N, N) [m].
+
+    Exact for two boxes; a cylinder is taken as a polygon around it, up to 2% wider.
+    """
+    n = prints.yaw.shape[0]
+    fixed = jnp.broadcast_to(_fan(heading)[None], (n, DIRECTIONS))
+    # A round object has no sides of its own.
+    yaw = jnp.where(prints.round, fixed[:, 0], prints.yaw)[:, None]
+    own = jnp.concatenate([yaw, yaw + np.float32(np.pi / 2)], axis=1)
+    own = jnp.broadcast_to(own[:, None], (n, n, 2))
+    angles = jnp.concatenate([jnp.broadcast_to(fixed[:, None], (n, n, DIRECTIONS)), own, jnp.swapaxes(own, 0, 1)], -1)
+    normal = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+    # `reach` wants the axis of the objects last: that of j, then that of i.
+    of_j = jnp.transpose(reach(prints, jnp.transpose(normal, (2, 0, 1, 3))), (1, 2, 0))
+    of_i = jnp.transpose(reach(prints, jnp.transpose(normal, (2, 1, 0, 3))), (2, 1, 0))
+    width = of_i + of_j
+    offset = prints.position[:, None] - prints.position[None]
+    side = _perpendicular(heading)
+    lateral = _dot(offset, side[None, None])
+    across = reach(prints, jnp.broadcast_to(side[None], prints.position.shape))
+    widest = across[:, None] + across[None]
+    inside = jnp.clip(lateral, GRAZE / 4 - widest, widest - GRAZE / 4)
+    start = offset + (inside - lateral)[..., None] * side[None, None]
+    enters, leaves = _slabs(width, _dot(normal, start[:, :, None]), _dot(normal, heading[None, None, None]))
+    gap = jnp.max(jnp.abs(_dot(normal, offset[:, :, None])) - width, axis=-1)
+    return _grazing(enters, leaves, widest - jnp.abs(lateral)), gap
+
+
+def _soft_contact(distance: Array, level: Array, softness: float, values: Array) -> Array:
+    """Mean over the points of values (N, P, C) that are the first to touch, (N, C)."""
+    first = jnp.min(jnp.where(level, distance, REACH), axis=1, keepdims=True)
+    weight = jnp.where(level, jnp.exp(-(distance - first) / softness), 0.0)
+    weight = weight / jnp.maximum(jnp.sum(weight, axis=1, keepdims=True), 1e-6)
+    return jnp.sum(weight[..., None] * values, axis=1)
+
+
+def push_geometry(
+    shelf: Shelf,
+    scene: Superquadrics,
+    pusher: Float[Array, "p 3"],
+    T_world_gripper: Float[Array, "4 4"],
+    displacement: Float[Array, "3"],
+    frame: Literal["push", "world"] = "push",
+) -> PushGeometry:
+    """What the network is told of a push; see `dynamics.PushModel` for the arguments.
+
+    Args:
+      shelf: walls; one of which is farther than `REACH` from an object does not exist for it.
+      scene: the objects, fields (N, ...).
+      pusher: surface of the closed gripper in its own frame [m]; the first `POINTS` of it have to cover all of it.
+      T_world_gripper: where the push starts.
+      displacement: how the gripper moves [m]; what is vertical in it is neglected.
+      frame: see `PushConfig`.
+    """
+    prints = footprints(scene)
+    n = scene.capacity
+    length = _norm(displacement[:2])
+    heading = jnp.where(length > 1e-6, displacement[:2] / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0]))
+    axis = heading if frame == "push" else jnp.array([1.0, 0.0])
+    basis = jnp.stack([axis, _perpendicular(axis)])
+
+    def told(vectors):
+        """Planar vectors in the frame."""
+        along = basis.reshape(*[1] * (vectors.ndim - 1), 2, 2)
+        return jnp.stack([_dot(vectors, along[..., 0, :]), _dot(vectors, along[..., 1, :])], axis=-1)
+
+    def spread(vector):
+        return jnp.broadcast_to(vector[None], (n, *vector.shape))
+
+    points = transform(T_world_gripper, pusher[:POINTS])
+    distance, level = pusher_distance(prints, points, heading)
+    valid = prints.valid[:, None]
+    level &= valid
+    direct = jnp.min(jnp.where(level, distance, REACH), axis=1)
+    pair_distance, gap = _pair_distance(prints, heading)
+    other = ~jnp.eye(n, dtype=bool) & valid & valid.T
+    onward = jnp.where(other, jnp.maximum(pair_distance, 0.0), REACH)
+    reached = direct
+    for _ in range(CHAIN):
+        reached = jnp.minimum(reached, jnp.min(reached[:, None] + onward, axis=0))
+    carry = jnp.maximum(length - reached, 0.0)
+
+    touching = jnp.maximum(1.0 - direct / REACH, 0.0)[:, None]
+    where = points[None, :, :2] - prints.position[:, None] + distance[..., None] * heading[None, None]
+    height = jnp.broadcast_to(points[None, :, 2:], (*distance.shape, 1)) - prints.low[:, None, None]
+    contacts = [_soft_contact(distance, level, s, jnp.concatenate([where, height], -1)) * touching for s in SOFTNESS]
+    # The band that the gripper sweeps at the object's height.
+    across = _dot(points[None, :, :2] - prints.position[:, None], _perpendicular(heading)[None, None])
+    low = jnp.min(jnp.where(level, across, REACH), axis=1)
+    high = jnp.max(jnp.where(level, across, -REACH), axis=1)
+    level_at_all = jnp.any(level, axis=1)
+    middle = jnp.where(level_at_all, 0.5 * (low + high), 0.0)
+    breadth = jnp.where(level_at_all, 0.5 * (high - low), 0.0)
+
+    gripper = T_world_gripper[:2, 3]
+    approach, closing = T_world_gripper[:2, 2], T_world_gripper[:2, 1]
+    # The hand is the same after half a turn about its approach.
+    closing = told(closing[None])[0]
+    twice = jnp.stack([closing[0] ** 2 - closing[1] ** 2, 2.0 * closing[0] * closing[1]])
+    to_gripper = gripper[None] - prints.position
+    room = jnp.array([(shelf.front + shelf.back) / 2, (shelf.left + shelf.right) / 2])
+    place = prints.position - room[None] if frame == "world" else jnp.zeros((n, 2))
+    planar = jnp.stack(
+        [
+            to_gripper,
+            to_gripper + (length * heading)[None],
+            contacts[0][:, :2],
+            contacts[1][:, :2],
+            carry[:, None] * heading[None],
+            middle[:, None] * _perpendicular(heading)[None],
+            place,
+        ],
+        axis=1,
+    )
+    units = jnp.stack([spread(told(approach[None])[0]), spread(twice), spread(told(heading[None])[0])], axis=1)
+    tall = prints.high - prints.low
+    upright = jnp.max(jnp.abs(scene.rotation[:, 2, :]), axis=-1)
+    lengths = jnp.stack(
+        [
+            prints.low - shelf.board,
+            tall,
+            spread(length),
+            direct,
+            reached,
+            carry,
+            jnp.maximum(length - direct, 0.0),
+            contacts[0][:, 2],
+            contacts[1][:, 2],
+            breadth,
+            T_world_gripper[2, 3] - prints.low,
+        ],
+        axis=1,
+    )
+    plain = jnp.stack(
+        [
+            prints.round.astype(jnp.float32),
+            10.0 * (1.0 - upright),
+            spread(T_world_gripper[2, 2]),
+            touching[:, 0],
+            (reached < length).astype(jnp.float32),
+        ],
+        axis=1,
+    )
+    fan = _fan(axis)
+    rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
+    extents = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, n, 2))).T
+
+    offset = prints.position[None] - prints.position[:, None]
+    overlap = jnp.minimum(prints.high[:, None], prints.high[None]) - jnp.maximum(prints.low[:, None], prints.low[None])
+    onward = jnp.clip(pair_distance, -DEEPEST, REACH)
+    pair_lengths = jnp.stack([onward, onward.T, jnp.clip(gap, -DEEPEST, REACH), jnp.clip(overlap, -0.05, 0.2)], axis=-1)
+
+    normals = jnp.asarray(_NORMALS)
+    faces = jnp.array([-shelf.back, shelf.right, -shelf.left, shelf.front])
+    toward = reach(prints, jnp.broadcast_to(normals[:, None], (4, n, 2))).T
+    wall_gap = _dot(prints.position[:, None], normals[None]) - faces[None] - toward
+    wall_gap = jnp.clip(wall_gap, -0.05, REACH)
+    near = 1.0 - jnp.maximum(wall_gap, 0.0) / REACH
+    edge = jnp.broadcast_to(jnp.asarray(_IS_EDGE)[None], (n, 4))
+    return PushGeometry(
+        scalars=jnp.concatenate([lengths / _LENGTH, plain], axis=1),
+        vectors=jnp.concatenate([told(planar) / _LENGTH, units], axis=1),
+        extents=extents / _LENGTH,
+        pair_scalars=pair_lengths / _LENGTH,
+        pair_vectors=told(offset)[:, :, None] / _LENGTH,
+        wall_scalars=jnp.stack([wall_gap / _LENGTH, near, edge], axis=-1),
+        wall_vectors=jnp.broadcast_to(told(normals)[None, :, None], (n, 4, 1, 2)),
+        wall_near=near,
+        carry=carry,
+        heading=told(heading[None])[0],
+        axis=axis,
+        round=prints.round,
+        valid=prints.valid,
+    )
+
+
+def mirrored(geometry: PushGeometry) -> PushGeometry:
+    """The same push seen in a mirror along the frame's first axis."""
+    flip = {
+        name: getattr(geometry, name) * jnp.asarray(_MIRROR).reshape(*[1] * (getattr(geometry, name).ndim - 1), 2)
+        for name in ("vectors", "pair_vectors", "wall_vectors", "heading")
+    }
+    return geometry.replace(extents=geometry.extents[..., _MIRRORED_DIRECTIONS], **flip)
+
+
+def _flat(scalars: Array, vectors: Array) -> Array:
+    return jnp.concatenate([scalars, vectors.reshape(*vectors.shape[:-2], -1)], axis=-1)
+
+
+class Messages(nn.Module):
+    """The strongest message from the neighbours of each object, by what both are and how they stand; to be added."""
+
+    width: int
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Array, pairs: Array, other: Array) -> Array:
+        h = nn.LayerNorm()(x)
+        own = nn.Dense(self.width, dtype=self.dtype, name="own")(h)
+        theirs = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="theirs")(h)
+        pair = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="pair")(pairs)
+        message = nn.gelu(own[..., :, None, :] + theirs[..., None, :, :] + pair)
+        # `gelu` is never below -0.2, and who has no neighbours is told nothing.
+        strongest = jnp.max(jnp.where(other[..., None], message, -1.0), axis=-2)
+        strongest = jnp.where(jnp.any(other, axis=-1)[..., None], strongest, 0.0)
+        return nn.Dense(self.width, dtype=self.dtype, name="out")(strongest).astype(jnp.float32)
+
+
+class PushTrunk(nn.Module):
+    """From what is told of a push to numbers for each object, (..., N, 7); those of absent objects mean nothing."""
+
+    config: PushConfig
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, geometry: PushGeometry) -> Array:
+        width = self.config.width
+        objects = jnp.concatenate([_flat(geometry.scalars, geometry.vectors), geometry.extents], axis=-1)
+        pairs = _flat(geometry.pair_scalars, geometry.pair_vectors)
+        walls = _flat(geometry.wall_scalars, geometry.wall_vectors)
+        n = geometry.valid.shape[-1]
+        eye = jnp.eye(n, dtype=bool).reshape(*[1] * (geometry.valid.ndim - 1), n, n)
+        other = geometry.valid[..., None, :] & geometry.valid[..., :, None] & ~eye
+        x = nn.Dense(width, name="objects")(objects)
+        x = x + nn.Dense(width, name="bend")(nn.gelu(nn.Dense(2 * width, name="widen")(objects)))
+        # Nothing is said of a wall out of reach: its bias too fades with the distance.
+        met = nn.gelu(nn.Dense(width, name="walls")(walls)) * geometry.wall_near[..., None]
+        x = x + nn.Dense(width, use_bias=False, name="met")(jnp.sum(met, axis=-2))
+        for _ in range(self.config.layers):
+            x = x + Messages(width, self.dtype)(x, pairs, other)
+            x = x + FeedForward(width, growth=2, dtype=self.dtype)(x)
+        return nn.Dense(_OUTPUTS, name="outputs", kernel_init=nn.initializers.normal(1e-3))(nn.LayerNorm()(x))
+
+
+class PushNetwork(nn.Module):
+    """See the module's text. With the order of the objects, that of what is said of them changes, and nothing else."""
+
+    config: PushConfig = PushConfig()
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, geometry: PushGeometry) -> PushMotion:
+        trunk = PushTrunk(self.config, self.dtype, name="trunk")
+        if self.config.frame == "push":
+            both = trunk(jax.tree.map(lambda *images: jnp.stack(images), geometry, mirrored(geometry)))
+            # In the mirror, what goes to the left goes to the right, and turns are the other way round.
+            signs = jnp.array([1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0]).reshape(*[1] * (both.ndim - 2), -1)
+            outputs = 0.5 * (both[0] + signs * both[1])
+        else:
+            outputs = trunk(geometry)
+        x = geometry.axis[..., None, :]
+        y = _perpendicular(x)
+        planar = _SHIFT * outputs[..., :2] + geometry.carry[..., None] * geometry.heading[..., None, :]
+        return PushMotion(
+            shift=planar[..., :1] * x + planar[..., 1:] * y,
+            turn=jnp.where(geometry.round, 0.0, _TURN * outputs[..., 2]),
+            moves=outputs[..., 3],
+            topples=outputs[..., 4],
+            log_scale=jnp.clip(outputs[..., 5:], -4.0, 3.0)
+            + jnp.log(jnp.array([0.01, 0.05])).reshape(*[1] * (outputs.ndim - 1), 2),
+        )
+
+
+def told_by(network: PushNetwork, parameters: Any, geometry: PushGeometry) -> PushMotion:
+    """What the network with these parameters says of pushes."""
+    return cast(PushMotion, network.apply({"params": parameters}, geometry))

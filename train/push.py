@@ -1,0 +1,327 @@
+"""Training the push network (paper section 4.3): its task and loss, and its scores next to other push models."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, Key
+
+from mechsearch_jax.dynamics import PushModel, PushOutcome, QuasiStatic
+from mechsearch_jax.envs import pushes as generator
+from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, joined, portions, push_tables
+from mechsearch_jax.envs.world import CYLINDER, World, superquadrics
+from mechsearch_jax.learned_push import NAME, predicted
+from mechsearch_jax.models.push import PushConfig, PushGeometry, PushMotion, PushNetwork, push_geometry, told_by
+from mechsearch_jax.models.weights import save_weights
+from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.train.scenes import SceneConfig, random_world
+from mechsearch_jax.transforms import matmul
+
+# Every so many lanes of pushes one is never trained on.
+HELD_OUT_LANES = 8
+# What has moved less than this counts as still: objects settle by as much [m, rad].
+STILL, STILL_TURN = 1e-3, np.deg2rad(0.5)
+# A box is the same after half a turn [rad].
+HALF_TURN = np.pi
+# In the loss, errors are counted in these units [m, rad]: 1 cm is as bad as 10 degrees.
+_SHIFT, _TURN = 0.01, np.deg2rad(10.0)
+LOSS_WEIGHTS = {"shift": 1.0, "turn": 0.5, "still": 0.1, "moves": 0.5, "topples": 0.5, "scale": 0.02}
+# Distances of the paper's pushes [m], and how much others may differ to be scored with them.
+DISTANCES, WITHIN = (0.05, 0.10, 0.15), 0.025
+
+
+def push_scenes() -> SceneConfig:
+    """Scenes in which pushes begin: nothing leans, since nothing would hold it."""
+    return SceneConfig(objects=(1, 8), lying=0.03, leaning=0.0)
+
+
+class PushTruth(flax.struct.PyTreeNode):
+    """What became of the bodies; fields have the leading axes (..., 9).
+
+    Attributes:
+      shift: planar motion of the centre [m], (..., 9, 2).
+      turn: about the vertical [rad].
+      moved: whether it moved at all.
+      toppled: whether it fell over, or off the board; its shift and turn then mean nothing.
+      valid: whether it is there.
+    """
+
+    shift: jax.Array
+    turn: jax.Array
+    moved: jax.Array
+    toppled: jax.Array
+    valid: jax.Array
+
+
+def planar_turn(before: Float[Array, "*batch 3 3"], after: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch"]:
+    """The turn about the vertical [rad] that comes nearest to what leads from one rotation to another."""
+    R = matmul(after, jnp.swapaxes(before, -1, -2))
+    return jnp.arctan2(R[..., 1, 0] - R[..., 0, 1], R[..., 0, 0] + R[..., 1, 1])
+
+
+def push_truth(pushes: Pushes) -> PushTruth:
+    """What became of the bodies in pushes; those that settled by less than `STILL` have not moved."""
+    before, after = pushes.before, pushes.after
+    shift = (after.position - before.position)[..., :2]
+    turn = planar_turn(before.rotation, after.rotation)
+    stands = before.kind == CYLINDER
+    stands &= jnp.abs(before.rotation[..., 2, 2]) > 0.98
+    turn = jnp.where(stands, 0.0, turn)
+    far = (shift[..., 0] ** 2 + shift[..., 1] ** 2 > STILL**2) | (jnp.abs(turn) > STILL_TURN)
+    return PushTruth(shift, turn, before.valid & (far | pushes.toppled), pushes.toppled, before.valid)
+
+
+def turn_error(a: Float[Array, "*shape"], b: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Difference of two turns of a box [rad], at most a quarter turn."""
+    return a - b - HALF_TURN * jnp.round((a - b) / HALF_TURN)
+
+
+class PushExample(flax.struct.PyTreeNode):
+    """Pushes as the network is told them, and what became of them."""
+
+    geometry: PushGeometry
+    truth: PushTruth
+
+
+def example_loss(told: PushMotion, truth: PushTruth) -> dict[str, Float[Array, ""]]:
+    """The terms of the loss of a batch, each a mean over the objects that it is about."""
+    upright = truth.valid & ~truth.toppled
+
+    def mean(value, chosen):
+        return jnp.sum(jnp.where(chosen, value, 0.0)) / jnp.maximum(jnp.sum(chosen), 1)
+
+    gap = told.shift - truth.shift
+    shift = jnp.sqrt(gap[..., 0] ** 2 + gap[..., 1] ** 2 + 1e-10)
+    turn = jnp.abs(turn_error(told.turn, truth.turn))
+    errors = jax.lax.stop_gradient(jnp.stack([shift, turn], axis=-1))
+    scale = jnp.mean(errors / jnp.exp(told.log_scale) + told.log_scale, axis=-1)
+    moved, still = upright & truth.moved, upright & ~truth.moved
+    return {
+        "shift": mean(shift / _SHIFT, moved),
+        "turn": mean(turn / _TURN, moved),
+        "still": mean(shift / _SHIFT + turn / _TURN, still),
+        "moves": mean(optax.sigmoid_binary_cross_entropy(told.moves, truth.moved), truth.valid),
+        "topples": mean(optax.sigmoid_binary_cross_entropy(told.topples, truth.toppled), truth.valid),
+        "scale": mean(scale, moved),
+    }
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PushTask:
+    """A `loop.Task`.
+
+    Attributes:
+      pushes: to learn from, on the device.
+      held_out: to be scored on, of other scenes.
+      origin: how the pushes were made.
+      network: sizes of the network.
+      shelf: the shelf.
+      pusher: surface of the gripper in its own frame [m].
+      precision: type in which the network computes.
+    """
+
+    pushes: Pushes
+    held_out: Pushes
+    origin: dict[str, Any] = dataclasses.field(default_factory=dict)
+    network: PushConfig = dataclasses.field(default_factory=PushConfig)
+    shelf: Shelf = dataclasses.field(default_factory=Shelf)
+    pusher: Array = dataclasses.field(default_factory=lambda: push_tables(PushesConfig()).pusher)
+    precision: Any = jnp.float32
+    name: str = NAME
+
+    def geometry(self, pushes: Pushes) -> PushGeometry:
+        """What the network is told of pushes."""
+
+        def one(scene, T, displacement):
+            return push_geometry(self.shelf, scene, self.pusher, T, displacement, self.network.frame)
+
+        return jax.vmap(one)(superquadrics(pushes.before), pushes.T_world_gripper, pushes.displacement)
+
+    def init(self, key: Key[Array, ""]) -> Any:
+        first = jax.tree.map(lambda a: jnp.asarray(a[:1]), self.pushes)
+        return PushNetwork(self.network).init(key, self.geometry(first))["params"]
+
+    def sample(self, key: Key[Array, ""], batch: int) -> PushExample:
+        chosen = jax.random.randint(key, (batch,), 0, len(self.pushes.object))
+        pushes: Pushes = jax.tree.map(lambda a: jnp.asarray(a)[chosen], self.pushes)
+        return PushExample(self.geometry(pushes), push_truth(pushes))
+
+    def loss(self, parameters: Any, examples: PushExample) -> tuple[Float[Array, ""], dict[str, Any]]:
+        told = told_by(PushNetwork(self.network, self.precision), parameters, examples.geometry)
+        terms = example_loss(told, examples.truth)
+        loss = sum((weight * terms[name] for name, weight in LOSS_WEIGHTS.items()), jnp.zeros(()))
+        return loss, terms
+
+    def scores(self, parameters: Any, scenes: int) -> dict[str, Any]:
+        """Scores on so many held-out pushes, of the network and of what there is without one."""
+        held_out = jax.tree.map(lambda a: a[:scenes], self.held_out)
+        network = PushNetwork(self.network)
+        models: dict[str, PushModel] = {
+            "network": functools.partial(predicted, network, parameters, 0.5),
+            "quasi-static": QuasiStatic(),
+            "no motion": no_motion,
+        }
+        return {name: model_scores(model, held_out, self.pusher, self.shelf) for name, model in models.items()}
+
+    def save(self, path: Path, parameters: Any, card: dict[str, Any]) -> None:
+        save_weights(path, self.name, self.network, parameters, card)
+
+
+def push_task(
+    generation: Generation,
+    folder: Path,
+    network: PushConfig | None = None,
+    told: Callable[[int], None] = lambda pushes: None,
+) -> PushTask:
+    """The task of learning from pushes in a folder; those that are not there yet are simulated first.
+
+    Args:
+      generation: how many pushes.
+      folder: for the pushes.
+      network: sizes of the network.
+      told: is told how many pushes there are.
+
+    Raises:
+      InputError: what lies in the folder is damaged or was made otherwise, or the folder cannot be written.
+    """
+    scenes, config = push_scenes(), PushesConfig()
+    gpu = jax.default_backend() != "cpu"
+    parts = portions(
+        generation,
+        folder,
+        functools.partial(generator.engine, gpu),
+        functools.partial(random_world, config=scenes),
+        config,
+        told,
+    )
+    pushes = joined(list(parts))
+    held = pushes.lane % HELD_OUT_LANES == 0
+    origin = {
+        "source": "random pushes of the robot, simulated",
+        "engine": "MjxSimulator" if gpu else "NativeWorlds",
+        **dataclasses.asdict(generation),
+        "found": len(pushes.object),
+        "held_out": int(held.sum()),
+        "objects": scenes.objects,
+        "lengths": config.lengths,
+        "sideways": config.sideways,
+    }
+    return PushTask(
+        pushes=jax.tree.map(lambda a: jnp.asarray(a[~held]), pushes),
+        held_out=jax.tree.map(lambda a: a[held], pushes),
+        origin=origin,
+        network=network or PushConfig(),
+    )
+
+
+def no_motion(
+    shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array
+) -> PushOutcome:
+    """The `PushModel` that predicts nothing."""
+    return PushOutcome(scene, jnp.zeros(()), jnp.zeros(scene.capacity))
+
+
+class _Compared(flax.struct.PyTreeNode):
+    """Predictions next to the truth; fields have the leading axes (pushes, 9)."""
+
+    shift_error: jax.Array
+    turn_error: jax.Array
+    shift: jax.Array
+    topples: jax.Array
+
+
+@functools.partial(jax.jit, static_argnames=("model", "shelf", "batch"))
+def _compare(model: PushModel, pushes: Pushes, pusher: Array, shelf: Shelf, batch: int) -> _Compared:
+    def one(push: Pushes) -> _Compared:
+        before: World = push.before
+        scene = superquadrics(before)
+        told = model(shelf, scene, pusher, push.T_world_gripper, push.displacement)
+        truth = push_truth(push)
+        shift = (told.scene.position - scene.position)[..., :2]
+        gap = shift - truth.shift
+        turn = planar_turn(scene.rotation, told.scene.rotation)
+        return _Compared(
+            shift_error=jnp.sqrt(gap[..., 0] ** 2 + gap[..., 1] ** 2),
+            turn_error=jnp.abs(turn_error(turn, truth.turn)),
+            shift=jnp.sqrt(shift[..., 0] ** 2 + shift[..., 1] ** 2),
+            topples=told.topples,
+        )
+
+    return jax.lax.map(one, pushes, batch_size=batch)
+
+
+def average_precision(score: Float[np.ndarray, " n"], truth: Bool[np.ndarray, " n"]) -> float:
+    """Mean precision over the positives, in the order of falling scores; equal scores are one step. NaN without any."""
+    if not truth.any():
+        return float("nan")
+    order = np.argsort(-score, kind="stable")
+    hits = np.cumsum(truth[order])
+    last = np.append(np.diff(score[order]) != 0, True)
+    hits, seen = hits[last], np.flatnonzero(last) + 1
+    return float(np.sum(np.diff(hits, prepend=0) * hits / seen) / truth.sum())
+
+
+def model_scores(
+    model: PushModel, pushes: Pushes, pusher: Float[Array, "p 3"], shelf: Shelf | None = None, batch: int = 128
+) -> dict[str, Any]:
+    """How well a model predicts pushes: over all, by distance, by the number of objects, and by both.
+
+    Args:
+      model: jitted as a static argument.
+      pushes: on the host.
+      pusher: surface of the gripper in its own frame [m].
+      shelf: the shelf.
+      batch: pushes at once.
+
+    Returns:
+      For each group the number of `pushes`, mean errors of the pushed object (`pushed_mm`, `pushed_deg`, the latter of
+      boxes) and of others that moved (`other_mm`), the share of still objects that are predicted to move by less than
+      `STILL` (`still`), and the average precision of toppling (`topple_ap`). Objects that toppled count for the last
+      alone.
+    """
+    compared = jax.device_get(_compare(model, pushes, pusher, shelf or Shelf(), batch))
+    truth = jax.device_get(push_truth(jax.tree.map(jnp.asarray, pushes)))
+    length = np.linalg.norm(pushes.displacement, axis=1)
+    objects = np.asarray(pushes.before.valid)[:, :-1].sum(axis=1)
+    sideways = np.abs(np.asarray(pushes.displacement)[:, 0]) < 1e-3
+    groups: dict[str, np.ndarray] = {
+        "all": np.ones(len(length), bool),
+        "sideways": sideways,
+        "forward and diagonal": ~sideways,
+    }
+    near = {f"{100 * d:.0f} cm": np.abs(length - d) <= WITHIN for d in DISTANCES}
+    counts = {f"{n} objects": objects == n for n in range(1, pushes.before.valid.shape[1])}
+    groups |= near | counts
+    groups |= {f"{a}, {b}": x & y for a, x in near.items() for b, y in counts.items()}
+    return {name: _summary(compared, truth, pushes, chosen) for name, chosen in groups.items() if chosen.any()}
+
+
+def _summary(compared: _Compared, truth: PushTruth, pushes: Pushes, chosen: np.ndarray) -> dict[str, Any]:
+    here = chosen[:, None] & truth.valid
+    upright = here & ~truth.toppled
+    pushed = np.arange(truth.valid.shape[1])[None] == pushes.object[:, None]
+    boxes = pushes.before.kind != CYLINDER
+    still = upright & ~truth.moved
+
+    def mean(value, where, unit):
+        return round(float(value[where].mean() * unit), 3) if where.any() else None
+
+    precision = average_precision(np.asarray(compared.topples)[here], np.asarray(truth.toppled)[here])
+    return {
+        "pushes": int(chosen.sum()),
+        "pushed_mm": mean(compared.shift_error, upright & pushed, 1e3),
+        "pushed_deg": mean(compared.turn_error, upright & pushed & boxes, 180 / np.pi),
+        "other_mm": mean(compared.shift_error, upright & ~pushed & truth.moved, 1e3),
+        "still": mean((compared.shift < STILL).astype(float), still, 1.0),
+        "topple_ap": None if np.isnan(precision) else round(precision, 4),
+    }
