@@ -466,6 +466,10 @@ class Line:
 
     name: str = "line"
 
+    @property
+    def origin(self):
+        return {"source": "a straight line"}
+
     def init(self, key):
         return {"slope": jax.random.normal(key, (1, 1)), "offset": jnp.zeros(1)}
 
