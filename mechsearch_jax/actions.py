@@ -736,7 +736,7 @@ def sample_action(
     possible: PossibleSpace,
     options: Candidates,
     available: Bool[Array, " n"],
-    weights: Float[Array, " n"],
+    weights: Float[Array, " n"] | None = None,
 ) -> Sample:
     """Draw an action: an object and a kind (the multi-set of B.5) by the object's weight, then one of its ways evenly.
 
@@ -748,7 +748,7 @@ def sample_action(
       possible: where the target may be. An object's actions that enter it are drawn only if it has no others.
       options: of this scene.
       available: which objects may be moved.
-      weights: how often each object is drawn, positive; the paper's are equal.
+      weights: how often each object is drawn, positive; the paper's, and those left out, are equal.
     """
     config = space.config
     wrists = tables.q7.shape[1]
@@ -767,6 +767,7 @@ def sample_action(
             jnp.pad(options.push_enters.reshape(n, -1), ((0, 0), (0, width - b * d))),
         ]
     )
+    weights = jnp.ones(n) if weights is None else weights
     weight = jnp.tile(weights, 2)[:, None] * _weights(ways & ~enters, ways)
     choice, possible_at_all = _choose(key_choice, weight.reshape(-1))
     row, way = choice // width, choice % width
