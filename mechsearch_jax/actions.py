@@ -649,8 +649,8 @@ def _choose(key, weight):
     return jnp.argmax(logits + jax.random.gumbel(key, weight.shape)), jnp.any(weight > 0)
 
 
-def _weights(clean, dirty):
-    """Equal weight for every object that has an action, shared evenly among its clean ones, or the others in need."""
+def _shares(clean, dirty):
+    """One for every object that has an action, shared evenly among its clean ones, or the others in need."""
     usable = jnp.where(jnp.any(clean, axis=-1, keepdims=True), clean, dirty)
     return usable / jnp.maximum(jnp.sum(usable, axis=-1, keepdims=True), 1)
 
@@ -768,7 +768,7 @@ def sample_action(
         ]
     )
     weights = jnp.ones(n) if weights is None else weights
-    weight = jnp.tile(weights, 2)[:, None] * _weights(ways & ~enters, ways)
+    weight = jnp.tile(weights, 2)[:, None] * _shares(ways & ~enters, ways)
     choice, possible_at_all = _choose(key_choice, weight.reshape(-1))
     row, way = choice // width, choice % width
     is_grasp = row < n

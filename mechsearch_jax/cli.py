@@ -37,7 +37,7 @@ class PlannerOptions:
 
     Attributes:
       preset: where settings come from that are not given; "best" stands for the best known ones, which so far are
-        those of the paper: nothing that was measured beats them.
+        the same as "paper".
       gamma: discount of later actions, above 0 and at most 1; the paper's is 0.9.
       horizon: actions in a sequence; the paper's is 3.
       sequences: sequences that are sampled for a decision; 30 by default.

@@ -471,7 +471,7 @@ def _blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[A
     return total / jnp.maximum(jnp.sum(total), 1e-12)
 
 
-def _weights(problem: Problem, belief: Belief, config: PlannerConfig, node: _Node) -> Float[Array, " n"]:
+def _object_weights(problem: Problem, belief: Belief, config: PlannerConfig, node: _Node) -> Float[Array, " n"]:
     """How often each object is to be drawn: in part evenly, in part by what it hides and which grasps it blocks."""
     pose, _, allowed, _ = pairs(problem.grasps, belief.grasps)
     blocks = _blame(node.hits, allowed & _where_g_counts(belief, node.exists, config.method)[pose])
@@ -485,7 +485,7 @@ def _act(problem, belief, config, space, push_model, node: _Node, key: Array) ->
     """Sample an action and predict what it changes in a state; also the share of possible poses that it would touch."""
     possible = _possible_space(problem, belief, node.exists)
     available = node.available & node.alive
-    weights = _weights(problem, belief, config, node)
+    weights = _object_weights(problem, belief, config, node)
     sample = sample_action(key, space, problem.actions, node.scene, possible, node.options, available, weights)
     scene, acted = _predict(problem, space, push_model, node.scene, sample)
     acted &= node.alive

@@ -70,7 +70,7 @@ def test_draws_go_to_what_hides_the_target(decision, problem):
     space = planner.action_space(problem, CONFIG)
     root = planner._root(problem, belief, planner._with_target(problem, belief, objects), space)
     weights_of = jax.jit(
-        lambda node: planner._weights(
+        lambda node: planner._object_weights(
             problem, belief, CONFIG, planner._update(problem, belief, CONFIG, node, node.moved)
         )
     )
