@@ -76,6 +76,7 @@ class ExistenceTables(flax.struct.PyTreeNode):
       T_world_target: the places where the target is tried, shape (X, S, 4, 4).
       depth: the target's depth in a window at each place, infinite around it, shape (X, S, h, w) [m].
       corner: first row and column of that window in the coarse image, shape (X, S, 2).
+      nearest: the least depth of the target at the first place, shape (X,) [m].
       cloud: surface of the drawn-in target in its own frame as rows of coordinates, shape (3, P) [m].
       radius: radius of a sphere that holds the target [m].
     """
@@ -83,6 +84,7 @@ class ExistenceTables(flax.struct.PyTreeNode):
     T_world_target: jax.Array
     depth: jax.Array
     corner: jax.Array
+    nearest: jax.Array
     cloud: jax.Array
     radius: jax.Array
 
@@ -136,7 +138,8 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     eroded = jnp.asarray(half - config.erosion)
     sample = jax.jit(superquadric.sample_surface, static_argnames="count")
     cloud = sample(eroded, jnp.array(target.exponents), count=config.points)
-    return ExistenceTables(T, depth, corner, cloud.T, jnp.float32(np.linalg.norm(half)))
+    nearest = jnp.min(depth[:, 0], axis=(-1, -2))
+    return ExistenceTables(T, depth, corner, nearest, cloud.T, jnp.float32(np.linalg.norm(half)))
 
 
 def no_views(capacity: int, config: ExistenceConfig) -> ObjectViews:
@@ -269,10 +272,9 @@ def occluders(tables: ExistenceTables, views: ObjectViews) -> Bool[Array, "x n"]
     An approximation, for telling which objects matter; what is visible, `existence` says.
     """
     middle = tables.corner[:, 0] + jnp.array(tables.depth.shape[-2:])[None] // 2
-    nearest = jnp.min(tables.depth[:, 0], axis=(-1, -2))
     pixel = middle[:, None] - views.corner[None]
     size = jnp.array(views.depth.shape[-2:])
     inside = jnp.all((pixel >= 0) & (pixel < size[None, None]), axis=-1)
     row, column = jnp.moveaxis(jnp.clip(pixel, 0, size[None, None] - 1), -1, 0)
     depth = views.depth[jnp.arange(views.depth.shape[0])[None], row, column]
-    return inside & (depth < nearest[:, None])
+    return inside & (depth < tables.nearest[:, None])
