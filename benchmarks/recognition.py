@@ -7,7 +7,6 @@ by volumetric intersection over union and by their centres. Generated scenes com
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 import statistics
 import time
@@ -22,66 +21,29 @@ from jaxtyping import Array, Float, Int, Key
 from matplotlib.figure import Figure
 
 from mechsearch_jax.benchmarks import ems
+from mechsearch_jax.benchmarks.images import NOISES, PIXELS, Look, Scene, Shown, look, named, save_rows
 from mechsearch_jax.camera import Camera
-from mechsearch_jax.envs.recognisers import measured_depth, true_labels
-from mechsearch_jax.envs.world import CYLINDER, TARGET, World, from_scenario, true_superquadrics
+from mechsearch_jax.envs.world import CYLINDER, TARGET, World, true_superquadrics
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.files import PathLike
 from mechsearch_jax.models.recognition import RecognitionNetwork
 from mechsearch_jax.models.weights import Weights, shipped_weights
 from mechsearch_jax.perception.cloud import shelf_view
-from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
 from mechsearch_jax.perception.recognition import recognise
 from mechsearch_jax.perception.refinement import RefinementConfig, refine, select
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
 from mechsearch_jax.results import versions
-from mechsearch_jax.scenario import Scenario
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.train.loop import HELD_OUT_SEED
-from mechsearch_jax.train.scenes import cast_world, random_world
 from mechsearch_jax.viz import drawing
 
 MethodName = Literal["network", "network-refined", "ems", "ems-refined"]
-NoiseName = Literal["clean", "gaussian", "time-of-flight"]
-NOISES: Mapping[str, NoiseModel] = {"clean": no_noise, "gaussian": RandomDirection(), "time-of-flight": TimeOfFlight()}
-# Objects that show fewer pixels of the full image do not count.
-PIXELS = 100
 # Visible shares by which figures are broken down: name, from, to below.
 SHARES = (("below 30%", 0.0, 0.3), ("30 to 60%", 0.3, 0.6), ("60% and more", 0.6, np.inf))
 # A change of the intersection over union that is called better or worse.
 NOTABLE = 0.02
 # Points of a segment that the classical method is given; it is slow, and more do not make it better.
 EMS_POINTS = 250
-
-
-class Shown(flax.struct.PyTreeNode):
-    """What methods see of a scene.
-
-    Attributes:
-      points: as measured, in the world [m], shape (h, w, 3); NaN where nothing was.
-      labels: the true masks, as `envs.recognisers.true_labels` has them, shape (h, w).
-      depth: of the points along the camera's axis [m], shape (h, w); infinite where nothing is, NaN where nothing was
-        measured.
-    """
-
-    points: jax.Array
-    labels: jax.Array
-    depth: jax.Array
-
-
-class Look(flax.struct.PyTreeNode):
-    """An image of a scene, and how much of its objects it shows.
-
-    Attributes:
-      shown: the image.
-      pixels: of the full image that show each object, int32, shape (8,).
-      visible: that number over the one that there would be if the object stood alone, shape (8,).
-    """
-
-    shown: Shown
-    pixels: jax.Array
-    visible: jax.Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,21 +60,6 @@ class Method:
     answer: Callable[[Key[Array, ""], Shown, Superquadrics], Superquadrics]
     after: str | None = None
     slow: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class Scene:
-    """A scene to recognise.
-
-    Attributes:
-      name: of the scenario, or of a generated scene.
-      source: "held-out" if generated, else "files".
-      world: where everything stands.
-    """
-
-    name: str
-    source: str
-    world: World
 
 
 @dataclasses.dataclass(frozen=True)
@@ -247,54 +194,6 @@ def figures(rows: Sequence[Row], before: Sequence[Row] | None = None) -> dict[st
             "worse": float(np.mean(gains < -NOTABLE)),
         }
     return value
-
-
-def held_out_scenes(count: int, seed: int = 0) -> list[Scene]:
-    """Random scenes as in training, of a seed that training refuses.
-
-    Raises:
-      InputError: the numbers do not fit.
-    """
-    if count < 0:
-        raise InputError(f"bench recognition: --scenes {count} must be at least 0")
-    if not 0 <= seed < 2**31:
-        raise InputError(f"bench recognition: --seed {seed} must be from 0 to {2**31 - 1}")
-    key = jax.random.fold_in(jax.random.key(HELD_OUT_SEED), seed)
-    make = jax.jit(random_world)
-    return [Scene(f"{seed}-{i}", "held-out", make(jax.random.fold_in(key, i))) for i in range(count)]
-
-
-def scenes_of(scenarios: Sequence[Scenario]) -> list[Scene]:
-    """Scenes from scenario files.
-
-    Raises:
-      InputError: two have the same name, so that results could not be told apart.
-    """
-    names = [scenario.name for scenario in scenarios]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f'bench recognition: two scenarios have the name "{twice}"; rename one')
-    return [Scene(scenario.name, "files", from_scenario(scenario)) for scenario in scenarios]
-
-
-@functools.partial(jax.jit, static_argnames=("camera", "shelf", "noise", "stride"))
-def look(key: Key[Array, ""], camera: Camera, shelf: Shelf, world: World, noise: NoiseModel, stride: int) -> Look:
-    """The image of a scene with a sensor's noise.
-
-    Args:
-      key: PRNG key of the noise.
-      camera: of which `stride` is the distance of neighbouring rays in the full image, in pixels; static.
-      shelf, noise: static.
-      world: the scene.
-    """
-    depth, owner, alone = cast_world(camera, shelf, world)
-    points = noise(key, camera, depth)
-    pixels = jnp.sum(owner[..., None] == jnp.arange(TARGET).reshape(1, 1, -1), axis=(0, 1))
-    return Look(
-        Shown(points, true_labels(points, owner, shelf), measured_depth(camera, depth, points)),
-        pixels * stride**2,
-        pixels / jnp.maximum(alone[:TARGET], 1),
-    )
 
 
 def shipped_methods(camera: Camera, shelf: Shelf, weights: Weights | None = None) -> dict[str, Method]:
@@ -498,7 +397,7 @@ class Bench:
         settings = {
             "held_out_scenes": sources.count("held-out"),
             "scenario_files": sources.count("files"),
-            "noises": {name: _named(NOISES[name]) for name in self.noises},
+            "noises": {name: named(NOISES[name]) for name in self.noises},
             "seed": self.seed,
             "least_pixels": PIXELS,
             "ems_points": EMS_POINTS,
@@ -514,22 +413,13 @@ def _nothing() -> Superquadrics:
     return Superquadrics(ones, jnp.ones((TARGET, 2)), zeros, turns, jnp.zeros(TARGET, bool))
 
 
-def _named(noise: NoiseModel) -> str:
-    return getattr(noise, "__name__", repr(noise))
-
-
 def save_recognition(measured: Measured, path: PathLike) -> None:
-    """Write a comparison as JSON: the figures, and below them one line for every row, from which they follow.
+    """Write a comparison as JSON.
 
     Raises:
       InputError: the file cannot be written.
     """
-    columns = [field.name for field in dataclasses.fields(Row)]
-    head = json.dumps(measured.value() | {"columns": columns}, indent=1, allow_nan=False)
-    lines = (json.dumps([getattr(row, name) for name in columns], allow_nan=False) for row in measured.rows)
-    text = head.removesuffix("\n}") + ',\n "rows": [\n  ' + ",\n  ".join(lines) + "\n ]\n}\n"
-    with replacing(path) as file:
-        file.write(text.encode())
+    save_rows(measured.value(), measured.rows, path)
 
 
 def load_rows(path: PathLike) -> tuple[Row, ...]:

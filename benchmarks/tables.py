@@ -9,6 +9,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from mechsearch_jax.benchmarks import segmentation
 from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
 from mechsearch_jax.benchmarks.recognition import SHARES, Measured
@@ -131,10 +132,12 @@ def recognition_tables(measured: Measured) -> Group:
     return Group(*tables.values(), Text(explanation, style="dim"))
 
 
+def _plain_table(title: str) -> Table:
+    return Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left")
+
+
 def _recognition_table(title: str) -> Table:
-    table = Table(
-        box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left"
-    )
+    table = _plain_table(title)
     table.add_column("method", no_wrap=True, min_width=15)
     for name in ("objects", "IoU", "<30%", "30-60%", "≥60%", "mm", "wrong", "lost", "gain"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -157,6 +160,35 @@ def recognition_times_table(measured: Measured) -> Table:
         f"all objects of a scene at once, with the method it begins with; {measured.versions['device']}; {packages}"
     )
     return table
+
+
+def segmentation_tables(measured: segmentation.Measured) -> Group:
+    """How well objects are told apart: a table for every source of scenes and noise, by number of objects."""
+    tables: dict[tuple[str, str], Table] = {}
+    for line in measured.summary():
+        key = line["source"], line["noise"]
+        if key not in tables:
+            tables[key] = _plain_table(f"{key[0]} scenes, {key[1]}")
+            for name in ("objects", "scenes", "counted", "IoU", "missed", "visible", "IoU of all visible"):
+                tables[key].add_column(name, justify="right", no_wrap=True)
+        mean = line["iou_mean"]
+        tables[key].add_row(
+            "all" if line["objects"] is None else str(line["objects"]),
+            str(line["scenes"]),
+            str(line["counted"]),
+            "-" if mean is None else f"{mean:.3f}",
+            str(line["missed"]),
+            str(line["visible"]),
+            f"{line['iou_mean_visible']:.3f}",
+            style="bold" if line["objects"] is None else None,
+        )
+    value = measured.value()
+    explanation = (
+        "IoU: mean over the objects of at least 100 pixels. missed: those below 0.5. visible: with a pixel or more. "
+        f"{1e3 * value['median_seconds']:.0f} ms an image, compiled in {value['compile_seconds']:.0f} s; "
+        f"{measured.versions['device']}."
+    )
+    return Group(*tables.values(), Text(explanation, style="dim"))
 
 
 class EpisodeProgress:

@@ -594,7 +594,7 @@ def bench_recognition(
     import jax
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import recognition
+    from mechsearch_jax.benchmarks import images, recognition
     from mechsearch_jax.benchmarks.tables import recognition_tables, recognition_times_table
     from mechsearch_jax.perception.cloud import shelf_view
     from mechsearch_jax.results import check_writable
@@ -607,12 +607,12 @@ def bench_recognition(
     for file in (out, picture):
         if file is not None:
             check_writable(file.parent)
-    given = recognition.scenes_of([load_scenario(file) for file in find_scenarios(scenarios)] if scenarios else [])
+    given = images.scenes_of([load_scenario(file) for file in find_scenarios(scenarios)] if scenarios else [])
     console = Console(highlight=False)
     with console.status("making scenes") as status:
         methods = recognition.shipped_methods(shelf_view().camera, Shelf())
         bench = recognition.Bench(
-            [*recognition.held_out_scenes(scenes, seed), *given],
+            [*images.held_out_scenes(scenes, seed), *given],
             recognition.chosen_methods(methods, method),
             tuple(dict.fromkeys(noise)),
             seed,
@@ -633,6 +633,60 @@ def bench_recognition(
             save_figure(recognition.worst_figure(bench, rows), picture)
     console.print(recognition_tables(measured))
     console.print(recognition_times_table(measured))
+
+
+def bench_segmentation(
+    scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")] = (),
+    /,
+    *,
+    scenes: int = 100,
+    seed: int = 0,
+    noise: tuple[Literal["clean", "gaussian", "time-of-flight"], ...] = ("clean", "gaussian"),
+    out: JsonFile = None,
+    picture: JsonFile = None,
+    worst: int = 6,
+) -> None:
+    """Measure how well the objects of depth images are told apart, against their true masks.
+
+    Args:
+      scenarios: scenario files, folders of them, or names of shipped ones, beside the generated scenes.
+      scenes: how many are generated, with a seed that training cannot have; may be 0 if there are scenarios.
+      seed: of the generated scenes and of the noise.
+      noise: of the depth image, one or more; "gaussian" is the paper's, 1 mm.
+      out: JSON file for the figures and for every object's row.
+      picture: PNG file for the worst images, the true masks above those found.
+      worst: how many of them.
+    """
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import images, segmentation
+    from mechsearch_jax.benchmarks.tables import segmentation_tables
+    from mechsearch_jax.results import check_writable
+    from mechsearch_jax.scenario import load_scenario
+    from mechsearch_jax.viz.drawing import save_figure
+
+    if worst < 1:
+        raise InputError(f"bench segmentation: --worst {worst} must be at least 1")
+    for file in (out, picture):
+        if file is not None:
+            check_writable(file.parent)
+    given = images.scenes_of([load_scenario(file) for file in find_scenarios(scenarios)] if scenarios else [])
+    console = Console(highlight=False)
+    with console.status("making scenes") as status:
+        everything = [*images.held_out_scenes(scenes, seed), *given]
+        bench = segmentation.Bench(everything, tuple(dict.fromkeys(noise)), seed)
+        # A compilation that was read from disk would not tell how long compiling takes.
+        jax.config.update("jax_enable_compilation_cache", False)
+        total = len(bench.scenes) * len(bench.noises)
+        status.update("compiling")
+        measured = bench.run(lambda done: status.update(f"segmenting {done}/{total}"))
+        if out is not None:
+            segmentation.save_segmentation(measured, out)
+        if picture is not None:
+            status.update("drawing")
+            save_figure(segmentation.worst_figure(bench, measured.rows, worst), picture)
+    console.print(segmentation_tables(measured))
 
 
 def _training_of(name: Literal["segmentation", "recognition"], batch: int, rate: float) -> Callable[..., None]:
@@ -754,7 +808,7 @@ def scenarios() -> None:
 
 
 def bench() -> None:
-    """Measure the parts: mechsearch bench existence|graspability|plan|simulate|inside|roofline|agreement|recognition"""
+    """Measure the parts: existence|graspability|plan|simulate|inside|roofline|agreement|recognition|segmentation."""
 
 
 Commands = dict[str, Callable[..., None]]
@@ -784,6 +838,7 @@ GROUPS: dict[str, Commands] = {
         "roofline": bench_roofline,
         "agreement": bench_agreement,
         "recognition": bench_recognition,
+        "segmentation": bench_segmentation,
     },
 }
 

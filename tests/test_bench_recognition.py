@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks import recognition, tables
+from mechsearch_jax.benchmarks import images, recognition, tables
 from mechsearch_jax.benchmarks.recognition import Bench, Method, Row
 from mechsearch_jax.envs.world import true_superquadrics
 from mechsearch_jax.errors import InputError
@@ -20,7 +20,7 @@ from mechsearch_jax.scenario import example_scenarios, load_scenario
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.viz.drawing import save_figure
 
-SCENE = recognition.scenes_of([load_scenario(example_scenarios()["first-light"])])[0]
+SCENE = images.scenes_of([load_scenario(example_scenarios()["first-light"])])[0]
 TRUTH = sharpened(true_superquadrics(SCENE.world))
 ROW = Row("files", "a", 0, "box", "clean", "network", 500, 0.5, "answered", 0.9, 0.001, True)
 
@@ -173,14 +173,14 @@ def test_the_picture_shows_the_worst_answers(bench, measured, tmp_path):
 
 
 def test_held_out_scenes_are_reproducible_and_their_seeds_checked():
-    first, again, other = (recognition.held_out_scenes(2, seed) for seed in (0, 0, 1))
+    first, again, other = (images.held_out_scenes(2, seed) for seed in (0, 0, 1))
     for a, b, c in zip(first, again, other, strict=True):
         assert a.name == b.name != c.name
         np.testing.assert_array_equal(a.world.position, b.world.position)
         assert not np.array_equal(a.world.position, c.world.position)
     for count, seed in ((-1, 0), (1, -1), (1, 2**31)):
-        with pytest.raises(InputError, match="bench recognition: --"):
-            recognition.held_out_scenes(count, seed)
+        with pytest.raises(InputError, match=r"--(scenes|seed) -?[0-9]+ must be"):
+            images.held_out_scenes(count, seed)
 
 
 def test_methods_bring_along_what_they_begin_with():
@@ -218,7 +218,7 @@ def test_slow_methods_are_measured_on_scenes_spread_over_all(slow_scenes, expect
 def test_two_scenarios_of_one_name_are_refused():
     scenario = load_scenario(example_scenarios()["first-light"])
     with pytest.raises(InputError, match="two scenarios have the name"):
-        recognition.scenes_of([scenario, scenario])
+        images.scenes_of([scenario, scenario])
 
 
 @pytest.mark.slow
@@ -226,9 +226,9 @@ def test_refinement_improves_on_the_network_whatever_the_noise():
     """On scenes of a seed that nothing was tuned on; what is hardly visible must not get worse either."""
     methods = recognition.shipped_methods(shelf_view().camera, Shelf())
     chosen = recognition.chosen_methods(methods, ["network-refined"])
-    measured = Bench(recognition.held_out_scenes(12, 7), chosen, tuple(recognition.NOISES)).run()
+    measured = Bench(images.held_out_scenes(12, 7), chosen, tuple(images.NOISES)).run()
     lines = {(line["noise"], line["visible"]): line for line in measured.summary() if "gain_mean" in line}
-    for noise in recognition.NOISES:
+    for noise in images.NOISES:
         assert lines[noise, "all"]["objects"] > 40
         assert lines[noise, "all"]["gain_mean"] > 0
         for name, *_ in recognition.SHARES:
