@@ -1,4 +1,4 @@
-"""Training of the segmentation network: its examples, its Hungarian-matched loss and its held-out scores."""
+"""Training of the segmentation network: its examples, its matched loss and its held-out scores."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
-from optax.assignment import hungarian_algorithm
 
+from mechsearch_jax.assignment import assign
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork, told_by
 from mechsearch_jax.models.weights import save_weights
@@ -52,7 +52,7 @@ class Example(flax.struct.PyTreeNode):
 
 
 def match(logits: Float[Array, "p classes"], labels: Int[Array, " p"]) -> Int[Array, " classes"]:
-    """Which of the network's instances each label is matched with, by the Hungarian method.
+    """Which of the network's instances each label is matched with, at the least cost in total.
 
     The cost of a pair is what both terms of `segmentation_loss` would be for it. Labels that no point has are matched
     with what is left over. The last entry stands for OTHER, which matches itself.
@@ -63,9 +63,7 @@ def match(logits: Float[Array, "p classes"], labels: Int[Array, " p"]) -> Int[Ar
     likelihood = -jnp.matmul(member.T, log_probability, precision="highest") / jnp.maximum(count, 1.0)[:, None]
     cost = likelihood + 2.0 * dice(jnp.exp(log_probability), member).T
     cost = jnp.where(count[:, None] > 0, cost, 0.0)
-    rows, columns = hungarian_algorithm(jax.lax.stop_gradient(cost))
-    instance = jnp.zeros(INSTANCES, jnp.int32).at[rows].set(columns.astype(jnp.int32))
-    return jnp.append(instance, INSTANCES)
+    return jnp.append(assign(jax.lax.stop_gradient(cost)), INSTANCES)
 
 
 def dice(probability: Float[Array, "p a"], member: Float[Array, "p b"]) -> Float[Array, "a b"]:
@@ -179,8 +177,7 @@ def instance_overlaps(
     shared = jnp.matmul(own.T, other, precision="highest")
     union = jnp.sum(own, axis=0)[:, None] + jnp.sum(other, axis=0)[None] - shared
     overlap = shared / jnp.maximum(union, 1.0)
-    rows, columns = hungarian_algorithm(-overlap)
-    return jnp.zeros(INSTANCES).at[rows].set(overlap[rows, columns]), jnp.sum(own, axis=0) > 0
+    return overlap[instances, assign(-overlap)], jnp.sum(own, axis=0) > 0
 
 
 @functools.partial(jax.jit, static_argnames=("task", "batch"))
