@@ -237,19 +237,23 @@ def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: 
     low = jnp.array([shelf.spawn_x[0], shelf.spawn_y[0]])
     high = jnp.array([shelf.spawn_x[1], shelf.spawn_y[1]])
 
-    def place(placed, slot_key_shape):
-        slot, key, shape = slot_key_shape
-        footprints, present = placed
+    tries = config.placements
+
+    def candidates_of(slot, key, shape):
         draws, turns, pick, touch = jax.random.split(key, 4)
-        tries = config.placements
         centre = low[None] + (high - low)[None] * jax.random.uniform(draws, (tries, 2))
         yaw = jax.random.uniform(turns, (tries,), minval=-jnp.pi, maxval=jnp.pi)
         candidates = Footprint(
             centre, jnp.broadcast_to(shape.half, (tries, 2)), yaw, jnp.broadcast_to(shape.radius, (tries,))
         )
         neighbour = jax.random.randint(pick, (tries,), 0, jnp.maximum(slot, 1)) % BODIES
+        return candidates, neighbour, jax.random.bernoulli(touch, config.touching)
+
+    def place(placed, one_body):
+        footprints, present = placed
+        slot, wanted, (candidates, neighbour, touch) = one_body
         beside = jax.vmap(_slide)(candidates, jax.tree.map(lambda a: a[neighbour], footprints))
-        touches = jax.random.bernoulli(touch, config.touching) & present[neighbour]
+        touches = touch & present[neighbour]
         candidates = candidates.replace(centre=jnp.where(touches[:, None], beside.centre, candidates.centre))
         gaps = jax.vmap(lambda one: jax.vmap(lambda other: gap(one, other))(footprints))(candidates)
         clear = jnp.all((gaps > 0.0) | ~present[None, :], axis=1)
@@ -257,11 +261,13 @@ def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: 
         best = jnp.argmax(fits)
         one = jax.tree.map(lambda a: a[best], candidates)
         footprints = jax.tree.map(lambda a, b: a.at[slot].set(b), footprints, one)
-        return (footprints, present.at[slot].set(fits[best] & wanted[slot])), None
+        return (footprints, present.at[slot].set(fits[best] & wanted)), None
 
     nowhere = Footprint(jnp.zeros((BODIES, 2)), jnp.zeros((BODIES, 2)), jnp.zeros(BODIES), jnp.zeros(BODIES))
+    # What is drawn is drawn for all bodies at once: only where they stand depends on those before.
+    drawn = jax.vmap(candidates_of)(jnp.arange(BODIES), jax.random.split(keys[4], BODIES), shapes)
     (footprints, present), _ = jax.lax.scan(
-        place, (nowhere, jnp.zeros(BODIES, bool)), (jnp.arange(BODIES), jax.random.split(keys[4], BODIES), shapes)
+        place, (nowhere, jnp.zeros(BODIES, bool)), (jnp.arange(BODIES), wanted, drawn)
     )
     position = jnp.concatenate([footprints.centre, (shelf.board + shapes.height)[:, None]], axis=1)
     return World(
