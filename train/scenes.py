@@ -24,6 +24,8 @@ from mechsearch_jax.transforms import matmul, yaw_rotation
 
 # Steps of `_slide`; each shortens the gap to at most about a third.
 _SLIDES = 8
+# What an object must show of itself in the full image to be worth scoring.
+PIXELS = 100
 _TARGETS = np.array([(0.02, 0.02, 0.05), (0.015, 0.02, 0.05)])
 _KNOWN = np.array(
     [(BOX, *half) for w, d, h in BOXES for half in ((w / 2, d / 2, h / 2), (d / 2, w / 2, h / 2))]
@@ -383,6 +385,6 @@ def surface_points(
     return jnp.where(kind == CYLINDER, can, box) * half_size[None]
 
 
-def worth_seeing(seen: Capture, view: View, pixels: int) -> Bool[Array, " objects"]:
+def worth_seeing(seen: Capture, view: View, pixels: int = PIXELS) -> Bool[Array, " objects"]:
     """Which objects show at least so many pixels of the full image."""
     return seen.pixels * view.stride**2 >= pixels
