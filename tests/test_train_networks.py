@@ -82,6 +82,13 @@ def test_nearest_neighbours_are_the_nearest_and_of_equals_the_first(way, count):
     assert np.array_equal(find(jnp.asarray(clouds)), expected)
 
 
+def test_who_is_nearest_has_no_slope_but_where_it_is_has():
+    points = jax.random.uniform(jax.random.key(0), (20, 3))
+    slope = jax.jit(jax.grad(lambda x: jnp.sum(x[nearest_neighbours(x, 3)])))(points)
+    counts = np.bincount(np.asarray(nearest_neighbours(points, 3)).reshape(-1), minlength=20)
+    assert np.array_equal(slope, np.repeat(counts[:, None], 3, axis=1))
+
+
 @pytest.mark.parametrize("count", [1, 5, 7])
 def test_the_strongest_neighbour_and_its_gradient_are_those_of_plain_differentiation(count):
     keys = jax.random.split(jax.random.key(3), 5)

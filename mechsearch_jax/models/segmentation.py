@@ -75,7 +75,8 @@ def nearest_neighbours(points: Float[Array, "p 3"], count: int) -> Int[Array, "p
     Nearer ones come first, and of equally near ones that of the lower index, on every platform.
     """
     passes, sort = (functools.partial(of, count=count) for of in (_neighbours_by_passes, _neighbours_by_sorting))
-    return jax.lax.platform_dependent(points, cuda=passes, rocm=passes, default=sort)
+    # Indices have no slope, and a general reduction knows no derivative.
+    return jax.lax.platform_dependent(jax.lax.stop_gradient(points), cuda=passes, rocm=passes, default=sort)
 
 
 def _neighbours_by_sorting(points: Array, count: int) -> Array:
