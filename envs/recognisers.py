@@ -14,8 +14,8 @@ from typing import Literal, Protocol, cast, get_args
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
-from optax.assignment import hungarian_algorithm
 
+from mechsearch_jax.assignment import assign
 from mechsearch_jax.camera import Camera, project
 from mechsearch_jax.envs.episode import Recogniser, Recognition, Snapshot, oracle
 from mechsearch_jax.envs.observation import observe
@@ -109,10 +109,10 @@ def numbered(found: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "
     own = (found.reshape(-1)[:, None] == segments[None]).astype(jnp.float32)
     truth = (masks.reshape(-1)[:, None] == segments[None]).astype(jnp.float32)
     shared = jnp.matmul(own.T, truth)
-    # With nothing shared, a segment still gets one of the slots of objects that nobody sees.
-    slots = shared[:, :TARGET]
-    rows, columns = hungarian_algorithm(-slots)
-    name = jnp.full(INSTANCES, OTHER, jnp.int32).at[rows].set(columns.astype(jnp.int32))
+    # With nothing shared, a segment still gets one of the slots of objects that nobody sees. One finds none.
+    slots = jnp.where(segments[None] < TARGET, shared, 0.0)
+    slot = assign(-slots)
+    name = jnp.where(slot < TARGET, slot, OTHER)
     return jnp.where(found >= 0, name[jnp.maximum(found, 0)], found).astype(jnp.int8)
 
 

@@ -15,12 +15,13 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.envs.world import BOX, CYLINDER
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.models import recognition as model
+from mechsearch_jax.models import segmentation as layers
 from mechsearch_jax.models.recognition import BASE_ROTATIONS, HYPOTHESES, IS_CYLINDER, RecognitionConfig
 from mechsearch_jax.models.segmentation import (
     SegmentationConfig,
     SegmentationNetwork,
     nearest_neighbours,
-    strongest_response,
+    strongest_neighbour,
 )
 from mechsearch_jax.models.weights import load_weights, save_weights
 from mechsearch_jax.perception import segments as clouds
@@ -28,7 +29,7 @@ from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
 from mechsearch_jax.perception.segments import CLEAR, CONTEXT, HIDDEN_EDGE, INNER, OUTLINE, segment_clouds
 from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.train import recognition, scenes, segmentation
+from mechsearch_jax.train import loop, recognition, scenes, segmentation
 from mechsearch_jax.train.loop import (
     CHECKPOINT,
     SCALARS,
@@ -64,33 +65,72 @@ def test_segmentation_follows_the_order_of_the_points():
     assert np.std(told.logits[-1]) > 1e-2
 
 
-def test_nearest_neighbours_are_the_nearest():
-    points = np.random.default_rng(0).random((60, 3)).astype(np.float32)
-    found = np.asarray(nearest_neighbours(jnp.asarray(points), 5))
-    distance = np.linalg.norm(points[:, None].astype(float) - points[None], axis=-1)
-    assert np.array_equal(found, np.argsort(distance, axis=1)[:, :5])
+# The CPU takes the one, a GPU the other.
+WAYS = {"here": nearest_neighbours, "sorting": layers._neighbours_by_sorting, "passes": layers._neighbours_by_passes}
 
 
-def test_the_strongest_response_and_its_gradient_are_those_of_plain_differentiation():
-    keys = jax.random.split(jax.random.key(3), 4)
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("count", [1, 5, 20])
+def test_nearest_neighbours_are_the_nearest_and_of_equals_the_first(way, count):
+    rng = np.random.default_rng(0)
+    # On a grid distances are exact, and most of them equal; many points are twice there.
+    clouds = np.stack([rng.random((60, 3)), rng.integers(0, 4, (60, 3)) / 8]).astype(np.float32)
+    find = jax.vmap(functools.partial(WAYS[way], count=count))
+    distance = np.linalg.norm(clouds[:, :, None].astype(float) - clouds[:, None], axis=-1)
+    expected = np.argsort(distance, axis=2, kind="stable")[..., :count]
+    assert np.array_equal(jax.jit(find)(clouds), expected)
+    assert np.array_equal(find(jnp.asarray(clouds)), expected)
+
+
+def test_who_is_nearest_has_no_slope_but_where_it_is_has():
+    points = jax.random.uniform(jax.random.key(0), (20, 3))
+    slope = jax.jit(jax.grad(lambda x: jnp.sum(x[nearest_neighbours(x, 3)])))(points)
+    counts = np.bincount(np.asarray(nearest_neighbours(points, 3)).reshape(-1), minlength=20)
+    assert np.array_equal(slope, np.repeat(counts[:, None], 3, axis=1))
+
+
+@pytest.mark.parametrize("count", [1, 5, 7])
+def test_the_strongest_neighbour_and_its_gradient_are_those_of_plain_differentiation(count):
+    keys = jax.random.split(jax.random.key(3), 5)
     features = jax.random.normal(keys[0], (30, 8))
-    rest = jax.random.normal(keys[1], (30, 5, 8))
-    # Some points are the neighbour of many, others of none.
-    neighbours = jax.random.randint(keys[2], (30, 5), 0, 11)
-    weight = jax.random.normal(keys[3], (30, 8))
+    offsets = jax.random.normal(keys[1], (30, count, 3))
+    place = jax.random.normal(keys[2], (3, 8))
+    # Some points are the neighbour of many, others of none; one is a neighbour twice.
+    neighbours = jax.random.randint(keys[3], (30, count), 0, 11)
+    weight = jax.random.normal(keys[4], (30, 8))
 
-    def plain(features, rest):
-        return jnp.sum(weight * jnp.max(jax.nn.gelu(features[neighbours] + rest), axis=1))
+    def plain(features, offsets, place):
+        response = features[neighbours] + jnp.matmul(offsets, place, precision="highest")
+        return jnp.sum(weight * jnp.sin(jnp.max(response, axis=1)))
 
-    def ours(features, rest):
-        return jnp.sum(weight * strongest_response(features, rest, neighbours))
+    def ours(features, offsets, place):
+        return jnp.sum(weight * jnp.sin(strongest_neighbour(features, offsets, place, neighbours)))
 
-    expected, slopes = jax.jit(jax.value_and_grad(plain, argnums=(0, 1)))(features, rest)
-    told, ours_slopes = jax.jit(jax.value_and_grad(ours, argnums=(0, 1)))(features, rest)
-    assert told == pytest.approx(float(expected), rel=1e-6)
+    arguments = (features, offsets, place)
+    expected, slopes = jax.jit(jax.value_and_grad(plain, argnums=(0, 1, 2)))(*arguments)
+    told, ours_slopes = jax.jit(jax.value_and_grad(ours, argnums=(0, 1, 2)))(*arguments)
+    assert told == pytest.approx(float(expected), rel=1e-5)
     for a, b in zip(ours_slopes, slopes, strict=True):
         assert np.allclose(a, b, atol=1e-5)
         assert np.abs(b).max() > 0.1
+
+
+def test_the_strongest_neighbour_takes_features_of_16_bits():
+    keys = jax.random.split(jax.random.key(4), 3)
+    features = jax.random.normal(keys[0], (40, 8), jnp.bfloat16)
+    offsets, place = jax.random.normal(keys[1], (40, 300, 3)), jnp.ones((3, 8), jnp.bfloat16)
+    neighbours = jax.random.randint(keys[2], (40, 300), 0, 40)
+    told = jax.jit(strongest_neighbour)(features, offsets, place, neighbours)
+    exact = np.asarray(features, float)[neighbours] + np.asarray(offsets, float).sum(axis=-1, keepdims=True)
+    assert told.dtype == jnp.float32
+    assert np.allclose(told, exact.max(axis=1), atol=1e-5)
+    slopes = jax.jit(jax.grad(lambda *a: jnp.sum(strongest_neighbour(*a, neighbours)), argnums=(0, 1, 2)))(
+        features, offsets, place
+    )
+    assert [a.dtype for a in slopes] == [jnp.bfloat16, jnp.float32, jnp.bfloat16]
+    counts = np.zeros((40, 8))
+    np.add.at(counts, (np.take_along_axis(np.asarray(neighbours), exact.argmax(axis=1), axis=1), np.arange(8)), 1)
+    assert np.allclose(np.asarray(slopes[0], float), counts)
 
 
 def numpy_segmentation_loss(logits, labels):
@@ -152,6 +192,21 @@ def test_overlap_of_instances_counts_points():
     found = jnp.asarray(np.repeat([3, 5, OTHER], [70, 20, 10]), jnp.int8)
     overlap, present = segmentation.instance_overlaps(found, labels)
     assert np.allclose(overlap[present], [60 / 70, 20 / 40])
+
+
+def test_held_out_scores_tell_apart_what_shows_enough():
+    task = segmentation.SegmentationTask(network=SEGMENTATION, points=256, precision=jnp.float32)
+    scored = segmentation.held_out_scores(task, parameters("segmentation"), 8, batch=8)
+    examples = jax.jit(task.sample, static_argnums=1)(jax.random.fold_in(jax.random.key(loop.HELD_OUT_SEED), 0), 8)
+    labels, worth = np.asarray(examples.labels), np.asarray(examples.worth)
+    seen = np.stack([[(own == slot).any() for slot in range(8)] for own in labels])
+    assert worth.any(axis=1).all()
+    assert sum(group["scenes"] for group in scored.values()) == 8
+    assert sum(group["all"]["objects"] for group in scored.values()) == seen.sum()
+    assert sum(group["100 pixels and more"]["objects"] for group in scored.values()) == (seen & worth).sum()
+    for group in scored.values():
+        for part in ("all", "100 pixels and more"):
+            assert 0.0 < group[part]["iou_raw"] < 0.9
 
 
 def test_clean_up_removes_specks_and_dissolves_small_segments():

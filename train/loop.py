@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import serialization
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key
 
 from mechsearch_jax.errors import InputError
@@ -143,10 +144,12 @@ def learning_rate(progress: float, config: TrainConfig) -> float:
 
 
 def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
-    """AdamW but for the learning rate; only matrices decay."""
+    """AdamW but for the learning rate; only matrices decay.
+
+    Moments are of all parameters in one vector: a network has so many small ones that launches for each would count.
+    """
     return optax.chain(
-        optax.clip_by_global_norm(config.clip),
-        optax.scale_by_adam(b1=0.9, b2=0.99),
+        optax.flatten(optax.chain(optax.clip_by_global_norm(config.clip), optax.scale_by_adam(b1=0.9, b2=0.99))),
         optax.add_decayed_weights(config.decay, mask=lambda tree: jax.tree.map(lambda a: a.ndim > 1, tree)),
     )
 
@@ -170,7 +173,7 @@ def make_steps(task: Task, config: TrainConfig) -> Callable[[TrainState, Float[A
         examples = task.sample(key, config.batch)
         (loss, scalars), gradient = jax.value_and_grad(task.loss, has_aux=True)(state.parameters, examples)
         # One bad step must not spoil all that was learnt: a gradient that is not finite is left out.
-        norm = optax.global_norm(gradient)
+        norm = jnp.linalg.norm(ravel_pytree(gradient)[0])
         sound = jnp.isfinite(norm) & jnp.isfinite(loss)
         gradient = jax.tree.map(lambda g: jnp.where(sound, g, 0.0), gradient)
         updates, moments = optimiser.update(gradient, state.optimiser, state.parameters)

@@ -34,6 +34,7 @@ from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import (
+    PIXELS,
     Capture,
     SceneConfig,
     capture,
@@ -55,8 +56,6 @@ _UNIT = 0.01
 _OVERLAP = np.deg2rad(6.0)
 # Exponents that stand for an edge that is sharp, and for a round.
 _SHARP, _ROUND = 0.06, 1.0
-# Objects that show fewer pixels of the full image are not scored, nor taught below a quarter of that.
-PIXELS = 100
 
 
 def _cube_symmetries() -> np.ndarray:
@@ -216,6 +215,7 @@ class RecognitionTask:
             rotation=matmul(R_segment_world, objects.rotation),
             surface=rotate(R_segment_world[:, None], surface - origin[:, None]),
         )
+        # Taught is also what shows too little to be scored, but not what shows next to nothing.
         taught = segments.valid & objects.valid & worth_seeing(seen, self.view, PIXELS // 4)
         return world, seen, Example(segments, truth, taught.astype(jnp.float32))
 
@@ -325,7 +325,7 @@ def _score_batch(task: RecognitionTask, parameters: Any, key: Array, batch: int)
         centre=centre_error(truth, found),
         cylinder=(found.exponents[..., 1] > 0.5) == (worlds.kind[:, :TARGET] == CYLINDER),
         share=jax.vmap(visible_share)(seen),
-        counted=truth.valid & jax.vmap(lambda s: worth_seeing(s, task.view, PIXELS))(seen),
+        counted=truth.valid & jax.vmap(lambda s: worth_seeing(s, task.view))(seen),
         known=jax.vmap(is_known)(worlds)[:, :TARGET],
         sensor=jnp.broadcast_to(seen.sensor[:, None], (batch, TARGET)),
     )

@@ -24,6 +24,8 @@ from mechsearch_jax.transforms import matmul, yaw_rotation
 
 # Steps of `_slide`; each shortens the gap to at most about a third.
 _SLIDES = 8
+# What an object must show of itself in the full image to be worth scoring.
+PIXELS = 100
 _TARGETS = np.array([(0.02, 0.02, 0.05), (0.015, 0.02, 0.05)])
 _KNOWN = np.array(
     [(BOX, *half) for w, d, h in BOXES for half in ((w / 2, d / 2, h / 2), (d / 2, w / 2, h / 2))]
@@ -237,19 +239,23 @@ def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: 
     low = jnp.array([shelf.spawn_x[0], shelf.spawn_y[0]])
     high = jnp.array([shelf.spawn_x[1], shelf.spawn_y[1]])
 
-    def place(placed, slot_key_shape):
-        slot, key, shape = slot_key_shape
-        footprints, present = placed
+    tries = config.placements
+
+    def candidates_of(slot, key, shape):
         draws, turns, pick, touch = jax.random.split(key, 4)
-        tries = config.placements
         centre = low[None] + (high - low)[None] * jax.random.uniform(draws, (tries, 2))
         yaw = jax.random.uniform(turns, (tries,), minval=-jnp.pi, maxval=jnp.pi)
         candidates = Footprint(
             centre, jnp.broadcast_to(shape.half, (tries, 2)), yaw, jnp.broadcast_to(shape.radius, (tries,))
         )
         neighbour = jax.random.randint(pick, (tries,), 0, jnp.maximum(slot, 1)) % BODIES
+        return candidates, neighbour, jax.random.bernoulli(touch, config.touching)
+
+    def place(placed, one_body):
+        footprints, present = placed
+        slot, wanted, (candidates, neighbour, touch) = one_body
         beside = jax.vmap(_slide)(candidates, jax.tree.map(lambda a: a[neighbour], footprints))
-        touches = jax.random.bernoulli(touch, config.touching) & present[neighbour]
+        touches = touch & present[neighbour]
         candidates = candidates.replace(centre=jnp.where(touches[:, None], beside.centre, candidates.centre))
         gaps = jax.vmap(lambda one: jax.vmap(lambda other: gap(one, other))(footprints))(candidates)
         clear = jnp.all((gaps > 0.0) | ~present[None, :], axis=1)
@@ -257,11 +263,13 @@ def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: 
         best = jnp.argmax(fits)
         one = jax.tree.map(lambda a: a[best], candidates)
         footprints = jax.tree.map(lambda a, b: a.at[slot].set(b), footprints, one)
-        return (footprints, present.at[slot].set(fits[best] & wanted[slot])), None
+        return (footprints, present.at[slot].set(fits[best] & wanted)), None
 
     nowhere = Footprint(jnp.zeros((BODIES, 2)), jnp.zeros((BODIES, 2)), jnp.zeros(BODIES), jnp.zeros(BODIES))
+    # What is drawn is drawn for all bodies at once: only where they stand depends on those before.
+    drawn = jax.vmap(candidates_of)(jnp.arange(BODIES), jax.random.split(keys[4], BODIES), shapes)
     (footprints, present), _ = jax.lax.scan(
-        place, (nowhere, jnp.zeros(BODIES, bool)), (jnp.arange(BODIES), jax.random.split(keys[4], BODIES), shapes)
+        place, (nowhere, jnp.zeros(BODIES, bool)), (jnp.arange(BODIES), wanted, drawn)
     )
     position = jnp.concatenate([footprints.centre, (shelf.board + shapes.height)[:, None]], axis=1)
     return World(
@@ -377,6 +385,6 @@ def surface_points(
     return jnp.where(kind == CYLINDER, can, box) * half_size[None]
 
 
-def worth_seeing(seen: Capture, view: View, pixels: int) -> Bool[Array, " objects"]:
+def worth_seeing(seen: Capture, view: View, pixels: int = PIXELS) -> Bool[Array, " objects"]:
     """Which objects show at least so many pixels of the full image."""
     return seen.pixels * view.stride**2 >= pixels

@@ -1,4 +1,4 @@
-"""Training of the segmentation network: its examples, its Hungarian-matched loss and its held-out scores."""
+"""Training of the segmentation network: its examples, its matched loss and its held-out scores."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
-from optax.assignment import hungarian_algorithm
 
+from mechsearch_jax.assignment import assign
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork, told_by
 from mechsearch_jax.models.weights import save_weights
@@ -23,7 +23,7 @@ from mechsearch_jax.perception.labels import INSTANCES, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train.loop import HELD_OUT_SEED
-from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, origin, random_world
+from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, origin, random_world, worth_seeing
 
 # What a layer's loss counts against the next one's.
 _EARLIER = 0.5
@@ -40,6 +40,7 @@ class Example(flax.struct.PyTreeNode):
       centres: centre of each point's object [m], (P, 3).
       weight: 1, or 0 where the camera sees no object.
       objects: how many objects there are, seen or not.
+      worth: which objects show at least 100 pixels of the full image, (8,).
       sensor: which noise the points have.
     """
 
@@ -48,11 +49,12 @@ class Example(flax.struct.PyTreeNode):
     centres: jax.Array
     weight: jax.Array
     objects: jax.Array
+    worth: jax.Array
     sensor: jax.Array
 
 
 def match(logits: Float[Array, "p classes"], labels: Int[Array, " p"]) -> Int[Array, " classes"]:
-    """Which of the network's instances each label is matched with, by the Hungarian method.
+    """Which of the network's instances each label is matched with, at the least cost in total.
 
     The cost of a pair is what both terms of `segmentation_loss` would be for it. Labels that no point has are matched
     with what is left over. The last entry stands for OTHER, which matches itself.
@@ -63,9 +65,7 @@ def match(logits: Float[Array, "p classes"], labels: Int[Array, " p"]) -> Int[Ar
     likelihood = -jnp.matmul(member.T, log_probability, precision="highest") / jnp.maximum(count, 1.0)[:, None]
     cost = likelihood + 2.0 * dice(jnp.exp(log_probability), member).T
     cost = jnp.where(count[:, None] > 0, cost, 0.0)
-    rows, columns = hungarian_algorithm(jax.lax.stop_gradient(cost))
-    instance = jnp.zeros(INSTANCES, jnp.int32).at[rows].set(columns.astype(jnp.int32))
-    return jnp.append(instance, INSTANCES)
+    return jnp.append(assign(jax.lax.stop_gradient(cost)), INSTANCES)
 
 
 def dice(probability: Float[Array, "p a"], member: Float[Array, "p b"]) -> Float[Array, "a b"]:
@@ -139,7 +139,15 @@ class SegmentationTask:
         label = jnp.where(cloud.valid, labels[cloud.pixel], OTHER)
         centres = world.position[jnp.clip(label, 0, TARGET - 1)]
         weight = cloud.valid[0].astype(jnp.float32)
-        return Example(cloud.points, label, centres, weight, jnp.sum(world.valid[:TARGET]), seen.sensor)
+        return Example(
+            points=cloud.points,
+            labels=label,
+            centres=centres,
+            weight=weight,
+            objects=jnp.sum(world.valid[:TARGET]),
+            worth=worth_seeing(seen, self.view),
+            sensor=seen.sensor,
+        )
 
     def sample(self, key: Key[Array, ""], batch: int) -> Example:
         return jax.vmap(self.scene)(jax.random.split(key, batch))
@@ -179,8 +187,7 @@ def instance_overlaps(
     shared = jnp.matmul(own.T, other, precision="highest")
     union = jnp.sum(own, axis=0)[:, None] + jnp.sum(other, axis=0)[None] - shared
     overlap = shared / jnp.maximum(union, 1.0)
-    rows, columns = hungarian_algorithm(-overlap)
-    return jnp.zeros(INSTANCES).at[rows].set(overlap[rows, columns]), jnp.sum(own, axis=0) > 0
+    return overlap[instances, assign(-overlap)], jnp.sum(own, axis=0) > 0
 
 
 @functools.partial(jax.jit, static_argnames=("task", "batch"))
@@ -190,25 +197,40 @@ def _score_batch(task: SegmentationTask, parameters: Any, key: Array, batch: int
     raw = labels_of(told.logits[-1].reshape(-1, INSTANCES + 1)).reshape(batch, -1)
     valid = jnp.broadcast_to(examples.weight[:, None] > 0, raw.shape)
     clean = jax.vmap(clean_up)(examples.points, raw, valid)
-    overlaps = [jax.vmap(instance_overlaps)(found, examples.labels) for found in (raw, clean)]
-    return overlaps, examples.objects, examples.sensor
+    raw, present = jax.vmap(instance_overlaps)(raw, examples.labels)
+    clean, _ = jax.vmap(instance_overlaps)(clean, examples.labels)
+    # The target is none of the instances that there are.
+    worth = present & jnp.pad(examples.worth, ((0, 0), (0, INSTANCES - examples.worth.shape[1])))
+    return raw, clean, present, worth, examples.objects, examples.sensor
 
 
 def held_out_scores(task: SegmentationTask, parameters: Any, scenes: int, batch: int = 32) -> dict[str, Any]:
     """Mean instance IoU on scenes of seeds that are never trained on, before and after the clean-up, by the number of
-    objects in a scene and for every kind of noise, with shapes as in training."""
+    objects in a scene and for every kind of noise, with shapes as in training.
+
+    It is that of all objects of which the cloud has a point, and apart of those with at least 100 pixels of the full
+    image.
+    """
     key = jax.random.key(HELD_OUT_SEED)
     parts = [_score_batch(task, parameters, jax.random.fold_in(key, i), batch) for i in range(-(-scenes // batch))]
-    overlaps, objects, sensors = jax.tree.map(lambda *a: np.concatenate([np.asarray(x) for x in a]), *parts)
+    raw, clean, present, worth, objects, sensors = jax.tree.map(
+        lambda *a: np.concatenate([np.asarray(x) for x in a]), *parts
+    )
+
+    def summary(counted):
+        if not counted.any():
+            return {"objects": 0}
+        means = {"iou_raw": np.mean(raw[counted]), "iou_clean": np.mean(clean[counted])}
+        return {"objects": int(counted.sum()), **{name: round(float(mean), 4) for name, mean in means.items()}}
+
     result: dict[str, Any] = {}
     for sensor, noise in enumerate(noise_names(task.scenes)):
         for count in range(1, TARGET + 1):
             chosen = (objects == count) & (sensors == sensor)
-            found = {
-                name: round(float(np.mean(overlap[chosen][present[chosen]])), 4)
-                for name, (overlap, present) in zip(("iou_raw", "iou_clean"), overlaps, strict=True)
-                if present[chosen].any()
-            }
-            if found:
-                result[f"{count} objects, {noise}"] = {"scenes": int(chosen.sum()), **found}
+            if present[chosen].any():
+                result[f"{count} objects, {noise}"] = {
+                    "scenes": int(chosen.sum()),
+                    "all": summary(present & chosen[:, None]),
+                    "100 pixels and more": summary(worth & chosen[:, None]),
+                }
     return result

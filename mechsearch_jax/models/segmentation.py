@@ -10,6 +10,7 @@ DGCNN's, the neighbours are those in space in every layer: they are found once.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, cast
 
 import flax.linen as nn
@@ -24,6 +25,8 @@ from mechsearch_jax.perception.labels import INSTANCES
 
 # The middle of the shelf's space [m]: where the network's frame has its origin.
 MIDDLE = (0.6, 0.1, 0.5)
+# Neighbours that `strongest_neighbour` goes through in one piece, between which the largest so far is in memory.
+_UNROLLED = 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,52 +70,119 @@ class SegmentationOutput(flax.struct.PyTreeNode):
 
 
 def nearest_neighbours(points: Float[Array, "p 3"], count: int) -> Int[Array, "p count"]:
-    """Indices of the `count` nearest points of each point, itself among them, by Euclidean distance."""
-    square = sum((points[:, None, i] - points[None, :, i]) ** 2 for i in range(3))
-    return jax.lax.top_k(-square, count)[1]
+    """Indices of the `count` nearest points of each point, itself among them, by Euclidean distance.
+
+    Nearer ones come first, and of equally near ones that of the lower index, on every platform.
+    """
+    passes, sort = (functools.partial(of, count=count) for of in (_neighbours_by_passes, _neighbours_by_sorting))
+    # Indices have no slope, and a general reduction knows no derivative.
+    return jax.lax.platform_dependent(jax.lax.stop_gradient(points), cuda=passes, rocm=passes, default=sort)
 
 
-def _activated(features: Array, rest: Array, neighbours: Array) -> Array:
-    return nn.gelu(features[neighbours] + rest)
+def _neighbours_by_sorting(points: Array, count: int) -> Array:
+    return jax.lax.top_k(-_squares(points), count)[1]
+
+
+def _neighbours_by_passes(points: Array, count: int) -> Array:
+    """One pass over all pairs for each neighbour, which finds the next after the last.
+
+    On a GPU `top_k` sorts whole rows where `count` is above 16. A pass is a reduction into which the distances are
+    fused: they are never in memory.
+    """
+    number = jnp.broadcast_to(jnp.arange(len(points), dtype=jnp.int32)[None], (len(points), len(points)))
+    beyond = (jnp.float32(jnp.inf), jnp.int32(len(points)))
+
+    def nearer(a, b):
+        first = (a[0] < b[0]) | ((a[0] == b[0]) & (a[1] < b[1]))
+        return jnp.where(first, a[0], b[0]), jnp.where(first, a[1], b[1])
+
+    def following(last, _):
+        square = _squares(points)
+        done = (square < last[0][:, None]) | ((square == last[0][:, None]) & (number <= last[1][:, None]))
+        found = jax.lax.reduce((jnp.where(done, jnp.inf, square), number), beyond, nearer, (1,))
+        return found, found[1]
+
+    none = (jnp.full(len(points), -1.0), jnp.full(len(points), -1, jnp.int32))
+    return jax.lax.scan(following, none, length=count)[1].T
+
+
+def _squares(points: Array) -> Array:
+    return sum(((points[:, None, i] - points[None, :, i]) ** 2 for i in range(3)), jnp.zeros((), points.dtype))
 
 
 @jax.custom_vjp
-def strongest_response(
-    features: Float[Array, "p width"], rest: Float[Array, "p count width"], neighbours: Int[Array, "p count"]
+def strongest_neighbour(
+    features: Float[Array, "p width"],
+    offsets: Float[Array, "p count 3"],
+    place: Float[Array, "3 width"],
+    neighbours: Int[Array, "p count"],
 ) -> Float[Array, "p width"]:
-    """Largest activation over a point's neighbours, for each channel: gelu of a neighbour's features and of `rest`.
+    """For each channel the largest, over a point's neighbours, of their features and of where they are.
 
-    Its gradient reaches one neighbour for each channel. Left to itself, differentiation would add a zero to all others
-    too, at random places in memory: `count` times as many additions, which would take most of a training step.
+    Plainly `max(features[neighbours] + offsets @ place, axis=1)`. But that is `count` times as large as all else in
+    the network, so it is gone through neighbour by neighbour; and the gradient reaches one neighbour for each channel,
+    while differentiation, left to itself, would add a zero to all others too, at random places in memory.
+
+    Args:
+      features: of the points.
+      offsets: of each point's neighbours.
+      place: what an offset counts in each channel.
+      neighbours: of each point, their indices.
     """
-    return jnp.max(_activated(features, rest, neighbours), axis=-2)
+    return _strongest(features, offsets, place, neighbours)[0]
 
 
-def _strongest_forward(features, rest, neighbours):
-    activated = _activated(features, rest, neighbours)
-    winner = jnp.argmax(activated, axis=-2)
-    return jnp.max(activated, axis=-2), (features, rest, neighbours, winner)
+def _strongest(features, offsets, place, neighbours):
+    """The largest in float32, and the number of the neighbour that it is of."""
+    place = place.astype(jnp.float32)
+    count = neighbours.shape[1]
+    number = jnp.arange(count, dtype=jnp.uint8 if count <= 256 else jnp.int32)
+
+    def stronger(best, neighbour):
+        largest, winner = best
+        index, offset, number = neighbour
+        # Products so thin cost less as sums, which are fused with what is around them.
+        where = sum(offset[:, i, None] * place[None, i] for i in range(3))
+        response = features[index].astype(jnp.float32) + where
+        return (jnp.maximum(largest, response), jnp.where(response > largest, number, winner)), None
+
+    none = (jnp.full(features.shape, -jnp.inf, jnp.float32), jnp.zeros(features.shape, number.dtype))
+    each = (neighbours.T, jnp.moveaxis(offsets, 1, 0).astype(jnp.float32), number)
+    return jax.lax.scan(stronger, none, each, unroll=_UNROLLED)[0]
+
+
+def _strongest_forward(features, offsets, place, neighbours):
+    best, winner = _strongest(features, offsets, place, neighbours)
+    return best, (features, offsets, place, neighbours, winner)
 
 
 def _strongest_backward(kept, slope):
-    features, rest, neighbours, winner = kept
-    channels = jnp.arange(features.shape[1])[None]
-    who = jnp.take_along_axis(neighbours, winner, axis=1)
-    before = features[who, channels] + jnp.take_along_axis(rest, winner[:, None], axis=1)[:, 0]
-    _, through = jax.vjp(nn.gelu, before)
-    (slope,) = through(slope.astype(before.dtype))
+    features, offsets, place, neighbours, winner = kept
+    index = winner.astype(jnp.int32)
+    who = jnp.take_along_axis(neighbours, index, axis=1)
     # Sums of many terms lose what is small in 16 bits, and a GPU adds these in memory far more slowly.
-    exact = slope.astype(jnp.float32)
-    to_features = jnp.zeros(features.shape, jnp.float32).at[who, channels].add(exact).astype(features.dtype)
-    wins = jnp.arange(rest.shape[1])[None, :, None] == winner[:, None]
-    return to_features, jnp.where(wins, slope[:, None], 0).astype(rest.dtype), None
+    to_features = jnp.zeros(features.shape, jnp.float32).at[who, jnp.arange(features.shape[1])[None]].add(slope)
+    to_place = [jnp.sum(slope * jnp.take_along_axis(offsets[..., i], index, axis=1), axis=0) for i in range(3)]
+    # Nothing of this is computed where, as in training, nobody asks for the gradient of the offsets.
+    wins = winner[:, None] == jnp.arange(neighbours.shape[1], dtype=winner.dtype)[None, :, None]
+    to_offsets = jnp.where(wins, slope[:, None], 0.0) @ place.T
+    return (
+        to_features.astype(features.dtype),
+        to_offsets.astype(offsets.dtype),
+        jnp.stack(to_place).astype(place.dtype),
+        None,
+    )
 
 
-strongest_response.defvjp(_strongest_forward, _strongest_backward)
+strongest_neighbour.defvjp(_strongest_forward, _strongest_backward)
 
 
 class EdgeConvolution(nn.Module):
-    """The strongest response to a point's neighbours, by what they are and where; to be added to its input."""
+    """The strongest response to a point's neighbours, by what they are and where; to be added to its input.
+
+    The strongest is taken before the activation, unlike DGCNN's: for an activation that never falls it is the same,
+    and nothing has to be kept of the other neighbours.
+    """
 
     width: int
     dtype: Any = jnp.float32
@@ -122,9 +192,11 @@ class EdgeConvolution(nn.Module):
         h = nn.LayerNorm()(x)
         own = nn.Dense(self.width, dtype=self.dtype, name="own")(h)
         other = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="other")(h)
-        place = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="place")(offsets)
-        strongest = jax.vmap(strongest_response)(other, own[..., None, :] + place, neighbours)
-        return nn.Dense(self.width, dtype=self.dtype, name="out")(strongest).astype(jnp.float32)
+        # What the layer says of the axes is its matrix.
+        place = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="place")(jnp.eye(3))
+        strongest = jax.vmap(strongest_neighbour, in_axes=(0, 0, None, 0))(other, offsets, place, neighbours)
+        response = nn.gelu(own + strongest.astype(self.dtype))
+        return nn.Dense(self.width, dtype=self.dtype, name="out")(response).astype(jnp.float32)
 
 
 class SegmentationNetwork(nn.Module):
