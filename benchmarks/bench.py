@@ -1,4 +1,4 @@
-"""How long f, g, a decision and simulation take, on scenes that the generator made.
+"""How long perception, f, g, a decision and simulation take, on scenes that the generator made.
 
 Compilation is timed apart from the steady state.
 """
@@ -19,10 +19,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax import planner
+from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs import motion
 from mechsearch_jax.envs.episode import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator, commands
+from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.world import World, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import existence, object_views
@@ -31,11 +33,12 @@ from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, 
 from mechsearch_jax.planner import Belief, PlannerConfig, Problem
 from mechsearch_jax.results import versions
 from mechsearch_jax.scenario import MAX_OBJECTS
+from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.transforms import make
 
 # What a call does many of; how many is in `Timing.shapes`.
-COUNTED = ("evaluations", "operations", "bytes")
+COUNTED = ("evaluations", "operations", "bytes", "recognitions")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +46,7 @@ class Timing:
     """How long one function takes.
 
     Attributes:
-      subject: "existence", "graspability", "plan", "simulate", or a part of `roofline.bench_inside`.
+      subject: "existence", "graspability", "plan", "perceive", "simulate", or a part of `roofline.bench_inside`.
       objects: number of objects in the scenes.
       shapes: sizes that the time depends on; for "simulate" also what was seen of overflows and divergence.
       compile_seconds: of tracing and compiling [s]; honest only if compilations are not kept on disk.
@@ -189,6 +192,41 @@ def bench(
         calls = [(problem, *several)]
     compile_seconds, seconds = measure(function, calls, repeats)
     return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions())
+
+
+def bench_perceive(
+    recognition: RecognitionName, objects: int, batch: int = 1, scenes: int = 5, repeats: int = 20
+) -> Timing:
+    """Time what makes superquadrics of noisy depth images: cloud, segments, network and refinement.
+
+    The images are ray-cast in the same computation, because that is how the planner's simulated camera comes to them.
+
+    Args:
+      recognition: "masks" or "full".
+      objects: number of objects in a scene, all of which are recognised at once.
+      batch, scenes, repeats: as in `bench`.
+
+    Raises:
+      InputError: the oracle recognises nothing, the number of objects does not fit, or the weights are damaged.
+    """
+    if recognition == "oracle":
+        raise InputError("bench perceive: the oracle recognises nothing; give --recognition masks or full")
+    generator = ScenarioGenerator()
+    see = recogniser(recognition, generator.target)
+    camera, shelf = Camera(), Shelf()
+    worlds = [from_scenario(generator.generate(seed, objects)) for seed in range(scenes)]
+    states = [(jax.random.key(seed), world) for seed, world in enumerate(worlds)]
+
+    def perceive(key: Array, world: World) -> Superquadrics:
+        return see(key, Snapshot(camera, shelf, world)).scene
+
+    function, calls = perceive, states
+    if batch > 1:
+        function = jax.vmap(perceive)
+        calls = [jax.tree.map(lambda *leaves: jnp.stack([leaves[i % scenes] for i in range(batch)]), *states)]
+    compile_seconds, seconds = measure(function, calls, repeats)
+    shapes = {"scenes": scenes, "batch": batch, "recognitions": batch * objects}
+    return Timing(f"perceive: {recognition}", objects, shapes, compile_seconds, tuple(seconds), versions())
 
 
 def crowded_worlds(worlds: int, scenes: int = 8, seed: int = 0) -> World:

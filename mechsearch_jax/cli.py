@@ -447,6 +447,41 @@ def _timing_of(subject: Literal["existence", "graspability", "plan"], what: str)
     return command
 
 
+def bench_perceive(
+    *,
+    objects: int = 8,
+    batch: int = 1,
+    repeats: int = 10,
+    recognition: Literal["masks", "full"] = "full",
+    out: JsonFile = None,
+) -> None:
+    """Time recognising all objects of a scene from its noisy depth image: compilation, median and spread.
+
+    Args:
+      objects: number of objects in a scene.
+      batch: how many scenes at once.
+      repeats: number of timed calls.
+      recognition: "masks" is told which pixels are whose, "full" finds out.
+      out: JSON file for the result.
+    """
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import bench as benches
+    from mechsearch_jax.benchmarks.tables import timing_table
+
+    for name, value in {"repeats": repeats, "batch": batch}.items():
+        if value < 1:
+            raise InputError(f"bench perceive: --{name} {value} must be at least 1")
+    jax.config.update("jax_enable_compilation_cache", False)
+    console = Console(highlight=False)
+    with console.status("timing perceive"):
+        timing = benches.bench_perceive(recognition, objects, batch=batch, repeats=repeats)
+    console.print(timing_table(timing))
+    if out is not None:
+        benches.save_timing(timing, out)
+
+
 def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, out: JsonFile = None) -> None:
     """Time the batch simulator with 8 objects, the arm sweeping through them: steps per second of all worlds together.
 
@@ -808,7 +843,7 @@ def scenarios() -> None:
 
 
 def bench() -> None:
-    """Measure the parts: existence|graspability|plan|simulate|inside|roofline|agreement|recognition|segmentation."""
+    """Measure the parts, one command each."""
 
 
 Commands = dict[str, Callable[..., None]]
@@ -833,6 +868,7 @@ GROUPS: dict[str, Commands] = {
         "existence": _timing_of("existence", "f"),
         "graspability": _timing_of("graspability", "g where f = 1"),
         "plan": _timing_of("plan", "a whole decision"),
+        "perceive": bench_perceive,
         "simulate": bench_simulate,
         "inside": bench_inside,
         "roofline": bench_roofline,

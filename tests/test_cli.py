@@ -97,6 +97,7 @@ WRONG = {
     "nothing to recognise": (["bench", "recognition", "--scenes", "0"], "there are no scenes"),
     "unknown noise": (["bench", "recognition", "--noise", "fog"], "'fog'"),
     "unknown seed": (["bench", "recognition", "--seed", "-1"], "--seed -1 must be from 0"),
+    "no images": (["bench", "perceive", "--batch", "0"], "--batch 0 must be at least 1"),
     "nothing to segment": (["bench", "segmentation", "--scenes", "0"], "there are no scenes"),
     "no picture of segments": (["bench", "segmentation", "--worst", "0"], "--worst 0 must be at least 1"),
     "no picture": (["bench", "recognition", "--worst", "0"], "--worst 0 must be at least 1"),
