@@ -19,6 +19,8 @@ from mechsearch_jax.viz import drawing
 
 _WIDTH = 4.6
 _CAPTION, _GAP, _LEGEND = 0.52, 0.16, 0.55
+# Width of a letter of the heading, in units of the size of its type.
+_LETTER = 0.6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,7 +82,7 @@ def filmstrip(
         _GAP / width + offset / width,
         1 - 0.3 / height,
         heading,
-        fontsize=13,
+        fontsize=min(13.0, 72.0 * (width - offset - 2 * _GAP) / (_LETTER * max(len(heading), 1))),
         color=drawing.INK,
         weight="bold",
         va="center",
