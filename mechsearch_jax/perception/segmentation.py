@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.masked import masked_vmap
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 
 
@@ -82,14 +83,13 @@ def clean_up(
     return jnp.where(lost & near, own[source], own).astype(jnp.int8)
 
 
-@functools.partial(jax.jit, static_argnames=("reach", "rows"))
+@functools.partial(jax.jit, static_argnames="reach")
 def spread_labels(
     points: Float[Array, "h w 3"],
     candidates: Bool[Array, "h w"],
     cloud: Float[Array, "p 3"],
     labels: Int[Array, " p"],
     reach: float = 0.015,
-    rows: int = 4,
 ) -> Int[Array, "h w"]:
     """Labels of an image's pixels from those of a cloud drawn from it: each takes that of the nearest cloud point.
 
@@ -99,20 +99,20 @@ def spread_labels(
       cloud: [m].
       labels: of the cloud's points; OTHER points count as any.
       reach: a pixel with no cloud point so near becomes OTHER [m]; static.
-      rows: how many rows are done at once, which bounds the memory; static.
 
     Returns:
       Labels as `perception.labels` has them, int8.
     """
-    height, width, _ = points.shape
     measured = jnp.isfinite(points).all(axis=-1)
-    clean = jnp.where(measured[..., None], points, 0.0)
-    padded = jnp.pad(clean, ((0, -height % rows), (0, 0), (0, 0))).reshape(-1, rows * width, 3)
+    pixels = jnp.where(measured[..., None], points, 0.0).reshape(-1, 3)
 
-    def nearest(block):
-        square = _squares(block, cloud)
-        best = jnp.argmin(square, axis=1)
-        return jnp.where(jnp.take_along_axis(square, best[:, None], axis=1)[:, 0] < reach**2, labels[best], OTHER)
+    def nearest(_, image, i):
+        pixels, cloud, labels = image
+        square = _squares(pixels[i][None], cloud[...])[0]
+        best = jnp.argmin(square)
+        return jnp.where(square[best] < reach**2, labels[best], OTHER).astype(jnp.int8)
 
-    found = jax.lax.map(nearest, padded).reshape(-1, width)[:height]
+    # The shelf itself is most of an image.
+    wanted = (measured & candidates).reshape(-1)
+    found = masked_vmap(nearest, wanted, None, (pixels, cloud, labels)).reshape(measured.shape)
     return jnp.where(~measured, MISSING, jnp.where(candidates, found, FREE)).astype(jnp.int8)
