@@ -57,19 +57,19 @@ _PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
 class Poses(flax.struct.PyTreeNode):
-    """Where bodies are, with any leading axes.
+    """Where bodies are, with any leading axes; on the host arrays of NumPy.
 
     Attributes:
       position: [m], shape (..., 9, 3).
       rotation: `R_world_body`, shape (..., 9, 3, 3).
     """
 
-    position: jax.Array
-    rotation: jax.Array
+    position: Any
+    rotation: Any
 
 
 class Simulated(flax.struct.PyTreeNode):
-    """What became of a push, with any leading axes.
+    """What became of a push, with any leading axes; on the host arrays of NumPy.
 
     Attributes:
       before: where the bodies were when it began.
@@ -79,7 +79,7 @@ class Simulated(flax.struct.PyTreeNode):
 
     before: Poses
     after: Poses
-    failed: jax.Array
+    failed: Any
 
 
 def _poses(world: World) -> Poses:
@@ -259,7 +259,7 @@ def _simulate(
     lead = active.shape
     world, reference = jax.tree.map(lambda a: a.reshape(-1, *a.shape[len(lead) :]), (world, reference))
     flat = _Rollouts(_blank(shelf, config.motion.timestep), config, threads).push(world, reference, active.reshape(-1))
-    return jax.tree.map(lambda a: a.reshape(*lead, *a.shape[1:]), flat)
+    return jax.tree.map(lambda a: a.reshape((*lead, *a.shape[1:])), flat)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -311,7 +311,7 @@ class _Rollouts:
             rest = np.where(loose[:, None], rest, begin)
             each = [built[i] for i in scene]
             states = rest[scene]
-            robot = reference.start[rows][:, [*range(ARM + 1), ARM]].astype(float)
+            robot = np.asarray(reference.start, float)[rows][:, [*range(ARM + 1), ARM]]
             robot[:, ARM:] = np.maximum(robot[:, ARM:], 0.0)
             _set_robot(states, robot, self.blank.nq)
             told_arm = np.stack([controls(jax.tree.map(lambda a, row=row: a[row], reference)) for row in rows])
@@ -367,7 +367,7 @@ class _Rollouts:
         moving = np.arange(len(states))
         for _ in range(config.settle_steps // config.settle_block):
             told = np.repeat(robot[moving, None], config.settle_block, axis=1)
-            trajectory = self._trajectory(pool, [each[i] for i in moving], states[moving], told)
+            trajectory = self._trajectory(pool, [each[i] for i in moving.tolist()], states[moving], told)
             broke[moving] |= self._stopped(states[moving], trajectory)
             states[moving] = trajectory[:, -1]
             first = 1 + nq + ROBOT
@@ -381,13 +381,14 @@ class _Rollouts:
 
 def _sound(world: World, reference: Reference) -> Bool[np.ndarray, " n"]:
     """Where there is a scene and a motion: numbers that are finite, and rotations that are none of mirrors."""
-    here = world.valid
-    fine = np.isfinite(reference.q).all(axis=(1, 2)) & np.isfinite(reference.velocity).all(axis=(1, 2))
+    here = np.asarray(world.valid)
+    numbers = [np.asarray(a).reshape(len(here), -1) for a in (reference.q, reference.velocity)]
     for leaf in (world.half_size, world.position, world.rotation):
-        each = np.isfinite(leaf).reshape(*here.shape, -1).all(axis=-1)
-        fine &= (each | ~here).all(axis=1)
+        each = np.asarray(leaf).reshape(*here.shape, -1)
+        numbers.append(np.where(here[..., None], each, 0.0).reshape(len(here), -1))
+    fine = np.asarray(np.isfinite(np.concatenate(numbers, axis=1)).all(axis=1))
     known = np.where((here & fine[:, None])[..., None, None], world.rotation, np.eye(3, dtype=np.float32))
-    return fine & (np.linalg.det(known) > 0.5).all(axis=1)
+    return fine & np.asarray((np.linalg.det(known) > 0.5).all(axis=1))
 
 
 def _state_of(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
