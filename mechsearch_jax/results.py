@@ -317,7 +317,7 @@ def identity(row: Row) -> tuple[Any, ...]:
 def _options(row: Row) -> dict[str, Any]:
     """Every option of a row that is known."""
     known = {name: getattr(row, name) for name in OPTIONS}
-    return known if row.configuration is None else {**EARLIER, **json.loads(row.configuration), **known}
+    return {**EARLIER, **json.loads(row.configuration or "{}"), **known}
 
 
 def label_variants(rows: Sequence[Row]) -> list[str]:
