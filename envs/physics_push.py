@@ -231,7 +231,7 @@ def _batched(shelf: Shelf, config: MjxConfig) -> Callable[[World, Action], Simul
         return Simulated(_poses(world), _poses(after), failed)
 
     @simulate.def_vmap
-    def _(size: int, batched: tuple[World, Action], world: World, action: Action) -> tuple[Simulated, Simulated]:
+    def _(size: int, batched: Sequence[Any], world: World, action: Action) -> tuple[Simulated, Simulated]:
         full = jax.tree.map(
             lambda a, has: a if has else jnp.broadcast_to(a, (size, *a.shape)), (world, action), tuple(batched)
         )

@@ -287,3 +287,17 @@ def test_a_decision_simulates_once(problem, monkeypatch):
     assert np.isfinite(plans[0].value)
     with pytest.raises(InputError, match="needs a simulator"):
         planner.plan(jax.random.key(0), problem, belief, objects, dataclasses.replace(config, sequences=5))
+
+
+@pytest.mark.slow
+def test_a_decision_simulates_all_its_pushes_in_the_batch_simulator(problem):
+    config = PlannerConfig(sequences=2, horizon=2, actions="push", push_model="physics")
+    objects = jax.tree.map(lambda a: a[:8], SCENE)
+    belief = planner.observe_belief(
+        problem, planner.initial_belief(problem), objects, jnp.array(False), jnp.zeros(3), config
+    )
+    plan = planner.plan(jax.random.key(0), problem, belief, objects, config, MjxPhysics())
+    native = planner.plan(jax.random.key(0), problem, belief, objects, config, NativePhysics())
+    assert (plan.sequences.actions.kind[:, 0] == native.sequences.actions.kind[:, 0]).all()
+    assert np.isfinite(plan.value)
+    np.testing.assert_allclose(plan.value, native.value, rtol=0.1)
