@@ -24,6 +24,7 @@ from mechsearch_jax.envs import motion
 from mechsearch_jax.envs.episode import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator, commands
+from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.world import World, from_scenario
 from mechsearch_jax.errors import InputError
@@ -163,7 +164,7 @@ def bench(
       repeats: number of timed calls.
 
     Raises:
-      InputError: the number of objects does not fit.
+      InputError: the number of objects does not fit, or the push model cannot be used.
     """
     generator = ScenarioGenerator()
     problem = planner.build_problem(target=generator.target)
@@ -176,10 +177,11 @@ def bench(
         states.append((jax.random.key(seed), belief, scene))
     poses = [int(belief.exists.sum()) for _, belief, _ in states]
     shapes = {"poses": problem.poses.shape[0], "capacity": states[0][2].capacity, "scenes": scenes, "batch": batch}
+    models = push_models(config.push_model)
     functions: dict[str, Callable[..., Any]] = {
         "existence": lambda problem, key, belief, scene: f_of(problem, scene),
         "graspability": lambda problem, key, belief, scene: g_of(problem, belief, scene),
-        "plan": lambda problem, key, belief, scene: planner.plan(key, problem, belief, scene, config),
+        "plan": lambda problem, key, belief, scene: planner.plan(key, problem, belief, scene, config, *models),
     }
     if subject == "graspability":
         shapes["median_possible_poses"] = int(statistics.median(poses))

@@ -40,6 +40,7 @@ from mechsearch_jax.envs.episode import (
     true_target_pose,
 )
 from mechsearch_jax.envs.mjx_simulator import RETRIEVE, Outcomes, Overflow
+from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.planner import Belief, GraspChoice, PlannerConfig, Problem
 from mechsearch_jax.results import Episode
@@ -139,8 +140,10 @@ def _grasp(
 def _decide(problem: Problem, minds: _Minds, keys: Array, rows: Int[Array, " n"], config: PlannerConfig) -> Choice:
     """Plan in the slots `rows`."""
 
+    models = push_models(config.push_model)
+
     def one(key, mind):
-        return chosen(planner.plan(key, problem, mind.belief, mind.scene, config))
+        return chosen(planner.plan(key, problem, mind.belief, mind.scene, config, *models))
 
     mind = _some(minds, rows)
     active = (rows < keys.shape[0])[:, None]
@@ -213,6 +216,9 @@ def run_episodes(
       recognition: what the records call it.
       at_once: how many slots look or decide in one computation.
       busy: told of every stage, with the number of slots in it.
+
+    Raises:
+      InputError: the push model that `config` names cannot be used.
     """
     queue = enumerate(starts)
     first = [pair for _, pair in zip(range(slots), queue, strict=False)]

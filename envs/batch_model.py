@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.world import BODIES, CYLINDER
@@ -38,53 +38,56 @@ class BodyFields(flax.struct.PyTreeNode):
 
 def body_fields(
     blank: mujoco.MjModel,
-    kind: Int[np.ndarray, "worlds 9"],
-    half_size: Float[np.ndarray, "worlds 9 3"],
-    valid: Bool[np.ndarray, "worlds 9"],
+    kind: Int[Array, "worlds 9"],
+    half_size: Float[Array, "worlds 9 3"],
+    valid: Bool[Array, "worlds 9"],
 ) -> BodyFields:
-    """The fields of a model whose slots hold the bodies of each world, float32.
+    """The fields of a model whose slots hold the bodies of each world, float32; traceable.
 
     Args:
       blank: the compiled model with empty slots.
       kind, half_size, valid: of the bodies, as in a `World`.
     """
     worlds = len(kind)
-    half_size = np.asarray(half_size, float)
     cylinder = kind == CYLINDER
-    mass, inertia = models.masses_and_inertias(cylinder, half_size)
-    mass = np.where(valid, mass, models.EMPTY_MASS)
-    inertia = np.where(valid[..., None], inertia, models.EMPTY_INERTIA)
+    mass, inertia = models.masses_and_inertias(cylinder, half_size, jnp)
+    mass = jnp.where(valid, mass, models.EMPTY_MASS)
+    inertia = jnp.where(valid[..., None], inertia, models.EMPTY_INERTIA)
 
-    fields = {
-        name: np.broadcast_to(getattr(blank, name), (worlds, *getattr(blank, name).shape)).astype(np.float32)
-        for name in BodyFields.__dataclass_fields__
-    }
+    fields = {}
+    for name in BodyFields.__dataclass_fields__:
+        value = jnp.asarray(getattr(blank, name), jnp.float32)
+        fields[name] = jnp.broadcast_to(value, (worlds, *value.shape))
+
+    def put(name: str, where: np.ndarray | int, value: Array) -> None:
+        fields[name] = fields[name].at[:, where].set(value.astype(jnp.float32))
+
     body = np.array([blank.body(f"body{i}").id for i in range(BODIES)])
-    fields["body_mass"][:, body] = mass
-    fields["body_inertia"][:, body] = inertia
-    fields["body_gravcomp"][:, body] = ~valid
+    put("body_mass", body, mass)
+    put("body_inertia", body, inertia)
+    put("body_gravcomp", body, ~valid)
     # A free body is all of its subtree; the world's subtree is everything.
-    fields["body_subtreemass"][:, body] = mass
+    put("body_subtreemass", body, mass)
     robot = blank.body_mass.sum() - blank.body_mass[body].sum()
-    fields["body_subtreemass"][:, 0] = robot + mass.sum(axis=1)
+    put("body_subtreemass", 0, robot + mass.sum(axis=1))
 
     # The inverse of a free body's mass matrix is diagonal; its turns share the mean, as in mj_setConst.
-    inverse = np.stack([1 / mass, (1 / inertia).mean(axis=-1)], axis=-1)
-    fields["body_invweight0"][:, body] = inverse
+    inverse = jnp.stack([1 / mass, (1 / inertia).mean(axis=-1)], axis=-1)
+    put("body_invweight0", body, inverse)
     dof = np.concatenate([np.arange(6) + blank.joint(f"body{i}").dofadr[0] for i in range(BODIES)])
-    fields["dof_invweight0"][:, dof] = np.repeat(inverse, 3, axis=-1).reshape(worlds, -1)
+    put("dof_invweight0", dof, jnp.repeat(inverse, 3, axis=-1).reshape(worlds, -1))
 
     for shape in ("box", "cylinder"):
         geom = np.array([blank.geom(f"{shape}{i}").id for i in range(BODIES)])
         used = valid & (cylinder == (shape == "cylinder"))
-        half = np.where(used[..., None], half_size - models.MARGIN, models.TINY)
+        half = jnp.where(used[..., None], half_size - models.MARGIN, models.TINY)
+        x, y, z = half[..., 0], half[..., 1], half[..., 2]
         if shape == "box":
-            size, radius = half, np.linalg.norm(half, axis=-1)
+            size, radius = half, jnp.sqrt(x**2 + y**2 + z**2)
         else:
-            size = np.stack([half[..., 0], half[..., 2], np.zeros_like(half[..., 0])], axis=-1)
-            radius = np.hypot(half[..., 0], half[..., 2])
-        fields["geom_size"][:, geom] = size
-        fields["geom_rbound"][:, geom] = radius
-        fields["geom_aabb"][:, geom] = np.concatenate([np.zeros_like(half), half], axis=-1)
+            size, radius = jnp.stack([x, z, jnp.zeros_like(x)], axis=-1), jnp.sqrt(x**2 + z**2)
+        put("geom_size", geom, size)
+        put("geom_rbound", geom, radius)
+        put("geom_aabb", geom, jnp.concatenate([jnp.zeros_like(half), half], axis=-1))
     fields["geom_aabb"] = fields["geom_aabb"].reshape(worlds, -1, 2, 3)
-    return BodyFields(**{name: jnp.asarray(value) for name, value in fields.items()})
+    return BodyFields(**fields)

@@ -25,6 +25,7 @@ from mechsearch_jax import planner, results
 from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs.observation import Observation, is_found, observe
+from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.simulator import Outcome, Retrieval
 from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
 from mechsearch_jax.planner import Belief, GraspChoice, Plan, PlannerConfig, Problem
@@ -207,8 +208,12 @@ def run_episode(
       recogniser: what the planner sees the world through.
       recognition: what the record calls it.
       watcher: told of every step.
+
+    Raises:
+      InputError: the push model that `config` names cannot be used.
     """
     planner_key, environment_key = jax.random.split(jax.random.key(seed))
+    models = push_models(config.push_model)
     watcher = watcher or _Blind()
     world = simulator.reset(scenario)
     belief = planner.initial_belief(problem)
@@ -234,7 +239,8 @@ def run_episode(
         if grasp is None and trouble is None and not log.last:
             with clock("plan"):
                 key = jax.random.fold_in(planner_key, log.index)
-                decision = jax.block_until_ready(planner.plan(key, problem, belief, seen.scene, config))
+                decision = planner.plan(key, problem, belief, seen.scene, config, *models)
+                jax.block_until_ready(decision)
             choice = chosen(decision)
             trouble = distrust(choice)
 

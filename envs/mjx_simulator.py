@@ -38,8 +38,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.camera import Camera
@@ -287,6 +287,7 @@ class MjxSimulator:
         self._empty = jnp.asarray(np.concatenate([self._home(), *self._parked()]), jnp.float32)
         self._fields: BodyFields | None = None
         self._data: Any = None
+        self._start = jax.jit(self._begin_state)
         self._execute = jax.jit(self._simulate, donate_argnums=1)
         self._rollout = jax.jit(self._follow, donate_argnums=1)
 
@@ -330,15 +331,8 @@ class MjxSimulator:
         count = len(world.kind)
         if only is not None and (self.world is None or len(self.world.kind) != count or len(only) != count):
             raise InputError(f"MjxSimulator: some of {count} worlds can be replaced only where there are as many")
-        host = jax.tree.map(np.asarray, world)
-        fields = body_fields(self._blank, host.kind, host.half_size, host.valid)
-        quaternion = Rotation.from_matrix(host.rotation.reshape(-1, 3, 3)).as_quat()[:, [3, 0, 1, 2]]
-        poses = np.concatenate([host.position, quaternion.reshape(count, BODIES, 4)], axis=-1)
-        parked = np.asarray(self._empty[ROBOT:]).reshape(1, BODIES, 7)
-        poses = np.where(host.valid[..., None], poses, parked).reshape(count, -1)
-        robot = np.broadcast_to(self._empty[:ROBOT], (count, ROBOT))
-        qpos, ctrl = jnp.asarray(np.concatenate([robot, poses], axis=1), jnp.float32), jnp.asarray(robot)
-        fields, world = jax.tree.map(jnp.asarray, (fields, world))
+        world = jax.tree.map(jnp.asarray, world)
+        fields, qpos, ctrl = self._start(world)
         if only is None:
             if self._data is None or self._data.qpos.shape[0] != count:
                 self._data = self._make_data(count)
@@ -357,6 +351,23 @@ class MjxSimulator:
         )
         self._fields, self.world = fields, world
         return world
+
+    def simulate(self, world: World, actions: Action) -> tuple[World, Outcomes]:
+        """What actions would make of worlds: `load` and `execute` without memory, to be traced.
+
+        This simulator's own worlds stay as they are.
+
+        Args:
+          world, actions: fields with a leading axis for the worlds.
+
+        Returns:
+          The worlds afterwards, and what came of the actions.
+        """
+        count = len(world.kind)
+        fields, qpos, ctrl = self._start(world)
+        data = self._make_data(count).replace(qpos=qpos, ctrl=ctrl)
+        _, world, outcomes = self._simulate(fields, data, world, actions, jnp.ones(count, bool))
+        return world, outcomes
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcomes:
         """Let time pass, with the robot where it is, until everything is at rest or the time for that is over.
@@ -449,11 +460,26 @@ class MjxSimulator:
     def _parked() -> list[np.ndarray]:
         return [np.array([*models.parking_place(i), 1.0, 0.0, 0.0, 0.0]) for i in range(BODIES)]
 
+    def _begin_state(self, world: World) -> tuple[BodyFields, Array, Array]:
+        """The fields of the model, the configuration and the commands of worlds at rest with the robot at home."""
+        count = len(world.kind)
+        fields = body_fields(self._blank, world.kind, world.half_size, world.valid)
+        upright = jnp.where(world.valid[..., None, None], world.rotation, jnp.eye(3)[None, None])
+        quaternion = Rotation.from_matrix(upright.reshape(-1, 3, 3)).as_quat()[:, np.array([3, 0, 1, 2])]
+        poses = jnp.concatenate([world.position, quaternion.reshape(count, BODIES, 4)], axis=-1)
+        parked = self._empty[ROBOT:].reshape(1, BODIES, 7)
+        poses = jnp.where(world.valid[..., None], poses, parked).reshape(count, -1)
+        robot = jnp.broadcast_to(self._empty[:ROBOT], (count, ROBOT))
+        return fields, jnp.concatenate([robot, poses], axis=1), robot
+
     def _make_data(self, worlds: int) -> Any:
         capacity = self.config.contacts * worlds
-        one = self._mjx.make_data(self._blank, impl="warp", naconmax=capacity, njmax=self.config.rows)
-        # MJX ties it to a device, and with it all results; what was compiled for free arrays would not serve for those.
-        one = jax.device_get(one)
+        # Within a plan that is traced, it still has to give numbers.
+        with jax.ensure_compile_time_eval():
+            one = self._mjx.make_data(self._blank, impl="warp", naconmax=capacity, njmax=self.config.rows)
+            # MJX ties it to a device, and with it all results; what was compiled for free arrays would not serve for
+            # those.
+            one = jax.device_get(one)
         return jax.jit(jax.vmap(lambda _, data: data, in_axes=(0, None)))(jnp.arange(worlds), one)
 
     def _step(self, fields: BodyFields, data: Any) -> Any:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -279,21 +280,22 @@ def compile_model(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> mujo
 
 
 def masses_and_inertias(
-    cylinder: Bool[np.ndarray, "*batch"], half_size: Float[np.ndarray, "*batch 3"]
-) -> tuple[Float[np.ndarray, "*batch"], Float[np.ndarray, "*batch 3"]]:
+    cylinder: Bool[Any, "*batch"], half_size: Float[Any, "*batch 3"], library: Any = np
+) -> tuple[Float[Any, "*batch"], Float[Any, "*batch 3"]]:
     """Masses [kg] and principal moments of inertia [kg m2] of solid bodies, along their own axes.
 
     Args:
       cylinder: which are cylinders; the others are boxes.
       half_size: half-extents [m].
+      library: NumPy or `jax.numpy`, whichever the arrays are of.
     """
     square = half_size**2
-    volume = 8 * np.prod(half_size, axis=-1) * np.where(cylinder, np.pi / 4, 1.0)
-    mass = volume * np.where(cylinder, CYLINDER_DENSITY, BOX_DENSITY)
+    volume = 8 * library.prod(half_size, axis=-1) * library.where(cylinder, np.pi / 4, 1.0)
+    mass = volume * library.where(cylinder, CYLINDER_DENSITY, BOX_DENSITY)
     box = (square.sum(axis=-1, keepdims=True) - square) / 3
     across = square[..., 0] / 4 + square[..., 2] / 3
-    rod = np.stack([across, across, square[..., 0] / 2], axis=-1)
-    return np.asarray(mass), mass[..., None] * np.where(cylinder[..., None], rod, box)
+    rod = library.stack([across, across, square[..., 0] / 2], axis=-1)
+    return library.asarray(mass), mass[..., None] * library.where(cylinder[..., None], rod, box)
 
 
 def mass_and_inertia(body: Body) -> tuple[float, Float[np.ndarray, " 3"]]:

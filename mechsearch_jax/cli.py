@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Method = Literal["search-for-grasp", "search-and-grasp"]
 Actions = Literal["both", "push", "pick-and-place"]
 Recognition = Literal["oracle", "masks", "full"]
+PushModel = Literal["quasi-static", "learned", "physics"]
 TargetShape = Literal["cylinder", "box"]
 
 
@@ -45,6 +46,8 @@ class PlannerOptions:
       criterion: what makes a target visible; "detector", the default, counts pixels as the detector does.
       focus: share of the sampled actions that go to objects by how much they hide or are in the way, 0.7 by default;
         0 is the paper's even draw.
+      push_model: what predicts pushes: "quasi-static" by geometry, "learned" by a network, "physics" by simulating
+        them, on a CPU only those that come first.
       max_steps: actions in an episode; 10 by default.
       recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses; the others see
         a noisy depth image, "masks" with the true segmentation, "full" without.
@@ -62,6 +65,7 @@ class PlannerOptions:
         tyro.conf.arg(metavar="{detector,depth-mse,depth-norm}"),
     ] = None
     focus: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    push_model: Annotated[PushModel | None, tyro.conf.arg(metavar="{quasi-static,learned,physics}")] = None
     max_steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     recognition: Recognition = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
@@ -70,14 +74,18 @@ class PlannerOptions:
         """The planner's configuration: the preset's, with what is given in its place.
 
         Raises:
-          InputError: an option is impossible.
+          InputError: an option is impossible, or the push model cannot be used.
         """
+        from mechsearch_jax.envs.push_models import push_models
         from mechsearch_jax.planner import PlannerConfig
 
         presets = {"paper": PlannerConfig.paper, "best": PlannerConfig.paper}
-        names = ("gamma", "horizon", "sequences", "actions", "criterion", "focus", "max_steps")
+        names = ("gamma", "horizon", "sequences", "actions", "criterion", "focus", "push_model", "max_steps")
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return presets[self.preset](method=method, **given)
+        config = presets[self.preset](method=method, **given)
+        # Missing weights are to be told of now, not by every episode.
+        push_models(config.push_model)
+        return config
 
     def engine(self) -> str:
         """The class of the simulator that runs many episodes.

@@ -46,9 +46,9 @@ class PushModel(Protocol):
     """Predicts a push; interchangeable (DESIGN.md section 5)."""
 
     def __call__(
-        self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array
+        self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
     ) -> PushOutcome:
-        """Predict a push.
+        """Predict a push; one of no length changes nothing.
 
         Args:
           shelf: walls; static.
@@ -56,6 +56,7 @@ class PushModel(Protocol):
           pusher: surface of the closed gripper in its own frame, shape (P, 3) [m].
           T_world_gripper: where the push starts, shape (4, 4).
           displacement: how the gripper moves, shape (3,) [m].
+          q7: angle of joint 7, which tells the arm's configuration [rad]; models that only know the gripper ignore it.
         """
         ...
 
@@ -278,7 +279,7 @@ class QuasiStatic:
     leverage: tuple[float, float] = LEVERAGE
 
     def __call__(
-        self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array
+        self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
     ) -> PushOutcome:
         """See `PushModel`."""
         start = transform(T_world_gripper, pusher)

@@ -54,14 +54,15 @@ class LearnedPush:
         object.__setattr__(self, "digest", load_weights(path, NAME).card["sha256"])
 
     def __call__(
-        self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array
+        self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
     ) -> PushOutcome:
         """See `dynamics.PushModel`."""
         assert self.path is not None
         weights = _weights(self.path, self.digest)
         network = weights.network
         assert isinstance(network, PushNetwork)
-        return predicted(network, weights.parameters, self.likely, shelf, scene, pusher, T_world_gripper, displacement)
+        predict = functools.partial(predicted, network, weights.parameters, self.likely)
+        return predict(shelf, scene, pusher, T_world_gripper, displacement, q7)
 
 
 def predicted(
@@ -73,6 +74,7 @@ def predicted(
     pusher: Array,
     T_world_gripper: Array,
     displacement: Array,
+    q7: Array,
 ) -> PushOutcome:
     """What a network predicts of a push; see `LearnedPush` and `dynamics.PushModel` for the arguments."""
     geometry = push_geometry(shelf, scene, pusher, T_world_gripper, displacement, network.config.frame)

@@ -36,7 +36,7 @@ from mechsearch_jax.actions import (
     widen,
 )
 from mechsearch_jax.camera import Camera
-from mechsearch_jax.dynamics import PushModel, QuasiStatic, changed, pick_and_place
+from mechsearch_jax.dynamics import PushModel, changed, pick_and_place
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import (
     ExistenceConfig,
@@ -62,6 +62,7 @@ from mechsearch_jax.graspability import (
 )
 from mechsearch_jax.gripper import Gripper, arm_points
 from mechsearch_jax.kinematics import line_kinematics, line_poses, path_kinematics
+from mechsearch_jax.push_models import PushModelName, check_name, own_push_model
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics, gauge, to_object_frame
 from mechsearch_jax.target import Target
@@ -95,6 +96,10 @@ class PlannerConfig:
       push_distances: how far pushes go [m].
       caution: what touching the target unseen would cost, in units of J: a sampled action is charged with J times the
         share of the possible poses at which it would do so.
+      topple_charge: what an object that falls over would cost, in units of J: a sampled push is charged with J times
+        the number of objects that are expected to. `ActionConfig.topple` says which pushes are ruled out altogether.
+      push_model: what predicts pushes; see `push_models.own_push_model`, and `envs.push_models` for "physics", which
+        needs a simulator.
       focus: share of the draws that go to objects by how much they hide or are in the way; the others are even, as the
         paper's all are. 0 to below 1.
       max_steps: T, actions in an episode.
@@ -108,6 +113,8 @@ class PlannerConfig:
     criterion: Literal["detector", "depth-mse", "depth-norm"] = "detector"
     push_distances: tuple[float, ...] = (0.05, 0.10, 0.15)
     caution: float = 1.0
+    topple_charge: float = 0.5
+    push_model: PushModelName = "quasi-static"
     focus: float = 0.7
     max_steps: int = 10
 
@@ -118,18 +125,23 @@ class PlannerConfig:
             raise InputError(f"gamma {self.gamma} is outside (0, 1]; the paper uses 0.9")
         if not 0.0 <= self.caution < math.inf:
             raise InputError(f"caution {self.caution} must be a number that is not negative; the default is 1")
+        if not 0.0 <= self.topple_charge < math.inf:
+            raise InputError(
+                f"topple_charge {self.topple_charge} must be a number that is not negative; 0 is the paper's"
+            )
         if not 0.0 <= self.focus < 1.0:
             raise InputError(f"focus {self.focus} is outside [0, 1); the default is 0.7, and 0 draws evenly")
         for name in ("horizon", "sequences", "max_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} {getattr(self, name)} must be at least 1")
-        # Both check what they are given.
+        # All three check what they are given.
+        check_name(self.push_model)
         ActionConfig(kinds=self.actions, push_distances=self.push_distances)
         ExistenceConfig(criterion=self.criterion)
 
     @classmethod
     def paper(cls, **changes) -> PlannerConfig:
-        """The paper's settings (appendix B.4 and B.5), with changes; it knows neither `caution` nor `focus`."""
+        """The paper's settings (appendix B.4 and B.5), with changes; it has no `caution`, `focus`, `topple_charge`."""
         return cls(**changes)
 
 
@@ -414,20 +426,24 @@ def action_space(problem: Problem, config: PlannerConfig) -> ActionSpace:
 
 
 def _predict(problem: Problem, space: ActionSpace, push_model: PushModel, scene: Superquadrics, sample: Sample):
-    """S of equation 4, and whether the action can be executed as predicted."""
+    """S of equation 4, whether the action can be executed as predicted, and how many objects are expected to topple."""
     action = sample.action
-    pushed = push_model(problem.shelf, scene, problem.actions.pusher, action.T_world_gripper, action.displacement)
-    placed = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
     is_push = action.kind == ActionKind.PUSH
+    # A model that simulates has less to do where nothing is pushed.
+    way = jnp.where(is_push, action.displacement, 0.0)
+    pushed = push_model(problem.shelf, scene, problem.actions.pusher, action.T_world_gripper, way, action.q7)
+    placed = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
     moved = changed(scene, pushed.scene)
     still = scene.valid & ~moved & is_push
-    spoiled = (pushed.residual > space.config.jam) | jnp.any(pushed.topples > space.config.topple) | moved[-1]
+    # So that what is not a number spoils a push, too.
+    holds = (pushed.residual <= space.config.jam) & jnp.all(pushed.topples <= space.config.topple)
+    spoiled = ~holds | moved[-1]
     spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < problem.shelf.front + EDGE))
     spoiled |= push_hits_others(space, problem.actions, scene, action, sample.wrist, still)
     possible = (action.kind != ActionKind.NONE) & ~(is_push & spoiled) & followable(space, action)
     after = jax.tree.map(lambda a, b: jnp.where(is_push, a, b), pushed.scene, placed)
     after = jax.tree.map(lambda new, old: jnp.where(possible, new, old), after, scene)
-    return after, possible
+    return after, possible, jnp.where(is_push, jnp.sum(pushed.topples), 0.0)
 
 
 def _root(problem: Problem, belief: Belief, scene: Superquadrics, space: ActionSpace) -> _Node:
@@ -482,12 +498,12 @@ def _object_weights(problem: Problem, belief: Belief, config: PlannerConfig, nod
 
 
 def _act(problem, belief, config, space, push_model, node: _Node, key: Array) -> tuple[dict[str, Any], Action, Array]:
-    """Sample an action and predict what it changes in a state; also the share of possible poses that it would touch."""
+    """Sample an action and predict what it changes in a state; also what it may cost beside, as a share of J."""
     possible = _possible_space(problem, belief, node.exists)
     available = node.available & node.alive
     weights = _object_weights(problem, belief, config, node)
     sample = sample_action(key, space, problem.actions, node.scene, possible, node.options, available, weights)
-    scene, acted = _predict(problem, space, push_model, node.scene, sample)
+    scene, acted, topples = _predict(problem, space, push_model, node.scene, sample)
     acted &= node.alive
     action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
     changes = {
@@ -496,7 +512,19 @@ def _act(problem, belief, config, space, push_model, node: _Node, key: Array) ->
         "available": node.available & (jnp.arange(scene.capacity) != action.object),
         "alive": acted,
     }
-    return changes, action, sample.risk
+    return changes, action, config.caution * sample.risk + config.topple_charge * topples
+
+
+def _either(first: Bool[Array, ""], model: PushModel, later: PushModel) -> PushModel:
+    """The first model where `first` is set, else the other; the other is not run, as long as `first` is not batched."""
+    if model == later:
+        return model
+
+    def chosen(shelf, scene, pusher, T_world_gripper, displacement, q7):
+        branches = (functools.partial(model, shelf), functools.partial(later, shelf))
+        return jax.lax.cond(first, *branches, scene, pusher, T_world_gripper, displacement, q7)
+
+    return chosen
 
 
 def _prefix_values(
@@ -511,7 +539,7 @@ def _prefix_values(
     return jnp.min(values), jnp.argmin(values) + 1
 
 
-@functools.partial(jax.jit, static_argnames=("config", "push_model"))
+@functools.partial(jax.jit, static_argnames=("config", "push_model", "later_push_model"))
 def plan(
     key: Array,
     problem: Problem,
@@ -519,6 +547,7 @@ def plan(
     scene: Superquadrics,
     config: PlannerConfig,
     push_model: PushModel | None = None,
+    later_push_model: PushModel | None = None,
 ) -> Plan:
     """Decide on the next action by sampling sequences and keeping the first action of the best (B.4).
 
@@ -528,12 +557,17 @@ def plan(
       belief: what is known of the target, after the latest observation.
       scene: the objects as recognised, fields (N, ...).
       config: static.
-      push_model: predicts pushes; static; `dynamics.QuasiStatic()` if left out.
+      push_model: predicts pushes; static; the one that `config` names if left out.
+      later_push_model: predicts those that are not the first action of a sequence; static; `push_model` if left out.
 
     Returns:
       The decision and everything that was considered. The same arguments give the same decision, also under `vmap`.
+
+    Raises:
+      InputError: the push model is left out, and the one that `config` names needs a simulator or has no weights.
     """
-    push_model = push_model or QuasiStatic()
+    push_model = push_model or own_push_model(config.push_model)
+    later_push_model = later_push_model or push_model
     space = action_space(problem, config)
     scene = _with_target(problem, belief, scene)
     count, horizon = config.sequences, config.horizon
@@ -541,7 +575,6 @@ def plan(
     nodes = repeated(_root(problem, belief, scene, space))
     update = jax.vmap(functools.partial(_update, problem, belief, config))
     options_of = jax.vmap(functools.partial(_options, problem, belief, space))
-    act = jax.vmap(functools.partial(_act, problem, belief, config, space, push_model))
     cost_of = jax.vmap(lambda node: _cost(problem, belief, node.exists, node.hits, config.method))
 
     def step(nodes, keys_and_time):
@@ -555,22 +588,24 @@ def plan(
 
         def go_on():
             options = shared(options_of(nodes, moved))
-            changes, actions, risk = act(nodes.replace(options=options), keys)
-            return changes | {"options": options}, actions, risk
+            predicts = _either(first, push_model, later_push_model)
+            act = functools.partial(_act, problem, belief, config, space, predicts)
+            changes, actions, price = jax.vmap(act)(nodes.replace(options=options), keys)
+            return changes | {"options": options}, actions, price
 
         def stay():
             changes = {name: getattr(nodes, name) for name in ("scene", "moved", "available", "alive", "options")}
             return changes, repeated(no_action()), jnp.zeros(count)
 
         # After the last action only the cost counts. What the actions do not change does not pass through the branches.
-        changes, actions, risk = jax.lax.cond(time < horizon, go_on, stay)
-        return nodes.replace(**changes), (actions, cost_of(nodes), risk, jnp.any(nodes.views.overflow))
+        changes, actions, price = jax.lax.cond(time < horizon, go_on, stay)
+        return nodes.replace(**changes), (actions, cost_of(nodes), price, jnp.any(nodes.views.overflow))
 
     keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
-    _, (actions, cost, risk, overflow) = jax.lax.scan(step, nodes, (keys, jnp.arange(horizon + 1)))
-    actions, risk = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, risk))
+    _, (actions, cost, price, overflow) = jax.lax.scan(step, nodes, (keys, jnp.arange(horizon + 1)))
+    actions, price = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, price))
     cost, now = jnp.swapaxes(cost, 0, 1), cost[0, 0]
-    charge = config.caution * risk * cost[:, :-1]
+    charge = price * cost[:, :-1]
     value, length = jax.vmap(lambda c, h, k: _prefix_values(c, h, k != ActionKind.NONE, config.gamma))(
         cost, charge, actions.kind
     )

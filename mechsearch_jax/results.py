@@ -160,7 +160,7 @@ def save_episode(episode: Episode, path: PathLike) -> None:
 
 
 def load_episode(path: PathLike) -> Episode:
-    """Read `episode.json`.
+    """Read `episode.json`; options that it does not know yet have the values of `EARLIER`.
 
     Raises:
       InputError: the file cannot be read or is not the record of an episode.
@@ -176,7 +176,7 @@ def load_episode(path: PathLike) -> Episode:
             Step(**{**step, "action": None if step["action"] is None else ActionRecord(**step["action"])})
             for step in value["steps"]
         )
-        return Episode(**{**value, "steps": steps})
+        return Episode(**{**value, "steps": steps, "config": {**EARLIER, **value["config"]}})
     except (TypeError, KeyError) as error:
         raise InputError(f"{path}: is not the record of an episode ({error})") from error
 
@@ -295,6 +295,10 @@ _CODE = b"mechsearch_code"
 _FIRST_COLUMNS = SCHEMA.names[:-1]
 
 
+# What options that files of earlier versions do not hold were then.
+EARLIER: Mapping[str, Any] = {"push_model": "quasi-static", "topple_charge": 0.0}
+
+
 def configuration(options: Mapping[str, Any]) -> str:
     """An episode's options, as `Episode.config` holds them, in one text that is the same for the same options.
 
@@ -306,13 +310,14 @@ def configuration(options: Mapping[str, Any]) -> str:
 
 def identity(row: Row) -> tuple[Any, ...]:
     """What tells the rows of a table apart: the scenario, every option and the seed."""
-    return row.scenario, *(getattr(row, name) for name in OPTIONS), row.seed, row.configuration
+    known = None if row.configuration is None else configuration({**EARLIER, **json.loads(row.configuration)})
+    return row.scenario, *(getattr(row, name) for name in OPTIONS), row.seed, known
 
 
 def _options(row: Row) -> dict[str, Any]:
     """Every option of a row that is known."""
     known = {name: getattr(row, name) for name in OPTIONS}
-    return known if row.configuration is None else {**json.loads(row.configuration), **known}
+    return {**EARLIER, **json.loads(row.configuration or "{}"), **known}
 
 
 def label_variants(rows: Sequence[Row]) -> list[str]:

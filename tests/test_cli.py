@@ -64,6 +64,7 @@ WRONG = {
     "unknown option": (["search", "good.json", "--out", "out", "--speed", "3"], "--speed"),
     "unknown choice": (["search", "good.json", "--out", "out", "--actions", "fly"], "'fly'"),
     "no number": (["search", "good.json", "--out", "out", "--gamma", "high"], "--gamma"),
+    "unknown push model": (["search", "good.json", "--out", "out", "--push-model", "guess"], "'guess'"),
     "impossible gamma": (["search", "good.json", "--out", "out", "--gamma", "1.5"], "gamma 1.5 is outside (0, 1]"),
     "impossible horizon": (["inspect", "good.json", "--out", "out", "--horizon", "0"], "horizon 0 must be at least 1"),
     "no output": (["search", "good.json"], "--out"),

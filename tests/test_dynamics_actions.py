@@ -16,6 +16,7 @@ from mechsearch_jax.shelf import Shelf
 
 SHELF = Shelf()
 PUSH = jax.jit(dynamics.QuasiStatic(), static_argnums=0)
+Q7 = jnp.zeros(())
 
 
 def on_board(*bodies):
@@ -53,7 +54,7 @@ def yaw_of(rotation):
 def test_a_push_through_the_centre_moves_by_the_distance_less_the_gap(shape):
     scene = on_board((*shape, 0.6, 0.1, 0.0))
     pusher, T = finger_at(0.6, 0.1 - 0.03 - 0.01 - 0.01)
-    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]))
+    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7)
     np.testing.assert_allclose(after.scene.position[0, :2], [0.6, 0.1 + 0.09], atol=2e-3)
     np.testing.assert_allclose(yaw_of(np.asarray(after.scene.rotation[0])), 0.0, atol=0.04)
     assert float(after.residual) < 1e-3
@@ -62,7 +63,7 @@ def test_a_push_through_the_centre_moves_by_the_distance_less_the_gap(shape):
 def test_a_push_off_the_centre_turns_a_box_the_right_way():
     scene = on_board((*BOX, 0.6, 0.1, 0.0))
     pusher, T = finger_at(0.58, 0.05)
-    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.08, 0.0]))
+    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.08, 0.0]), Q7)
     assert yaw_of(np.asarray(after.scene.rotation[0])) < -0.05
     assert 0.01 < float(after.scene.position[0, 1]) - 0.1 < 0.07
 
@@ -74,7 +75,7 @@ def test_pushing_mirrored_scenes_gives_mirrored_results():
     results = []
     for scene, side in ((left, 1.0), (right, -1.0)):
         pusher, T = finger_at(0.59, middle + side * 0.01)
-        results.append(PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, side * 0.1, 0.0])).scene)
+        results.append(PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, side * 0.1, 0.0]), Q7).scene)
     np.testing.assert_allclose(results[0].position[:2, 0], results[1].position[:2, 0], atol=2e-4)
     np.testing.assert_allclose(results[0].position[:2, 1] - middle, middle - results[1].position[:2, 1], atol=2e-4)
 
@@ -82,7 +83,7 @@ def test_pushing_mirrored_scenes_gives_mirrored_results():
 def test_a_pushed_object_pushes_its_neighbour_and_nothing_else_moves():
     scene = on_board((*BOX, 0.6, 0.1, 0.0), (*BOX, 0.6, 0.18, 0.0), (*BOX, 0.72, -0.2, 0.0))
     pusher, T = finger_at(0.6, 0.05)
-    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0])).scene
+    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7).scene
     moved = np.asarray(dynamics.changed(scene, after))
     assert moved.tolist() == [True, True] + [False] * 6
     assert float(after.position[1, 1] - after.position[0, 1]) >= 0.06 - 2e-3
@@ -91,14 +92,14 @@ def test_a_pushed_object_pushes_its_neighbour_and_nothing_else_moves():
 def test_an_object_against_the_wall_is_jammed():
     scene = on_board((*BOX, 0.6, SHELF.left - 0.03, 0.0))
     pusher, T = finger_at(0.6, SHELF.left - 0.08)
-    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]))
+    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7)
     assert float(after.residual) > ActionConfig().jam
 
 
 def test_a_push_that_misses_moves_nothing():
     scene = on_board((*BOX, 0.6, 0.1, 0.0))
     pusher, T = finger_at(0.5, 0.05)
-    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0])).scene
+    after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7).scene
     assert not np.any(dynamics.changed(scene, after))
 
 

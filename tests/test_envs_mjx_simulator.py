@@ -66,7 +66,7 @@ def native_of(start, action):
 def test_the_fields_of_every_world_are_those_that_mujoco_computes():
     blank = model.compile_model(Shelf(), Camera())
     scenes = [scene(BOX, BOTTLE), scene(), scene(*[BOTTLE] * 8, target=standing("box", (0.015, 0.02, 0.05), 0.6, 0.1))]
-    worlds = jax.tree.map(lambda *leaves: np.stack(leaves), *[from_scenario(s) for s in scenes])
+    worlds = stack(*[from_scenario(s) for s in scenes])
     found = body_fields(blank, worlds.kind, worlds.half_size, worlds.valid)
     for i, start in enumerate(scenes):
         compiled = model.with_bodies(blank, slots(start))

@@ -116,7 +116,14 @@ def test_rows_of_other_options_stay(tmp_path, files, command):
 
 @pytest.mark.parametrize(
     "other",
-    [{"criterion": "depth-mse"}, {"max_steps": 5}, {"caution": 0.5}, {"push_distances": (0.1,)}],
+    [
+        {"criterion": "depth-mse"},
+        {"max_steps": 5},
+        {"caution": 0.5},
+        {"push_distances": (0.1,)},
+        {"push_model": "physics"},
+        {"topple_charge": 0.0},
+    ],
     ids=lambda other: next(iter(other)),
 )
 def test_every_option_tells_rows_apart(tmp_path, files, command, other):

@@ -1,5 +1,7 @@
 """The planner: equation 2, decisions that repeat, no retracing, and the rules of the two methods."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 from mechsearch_jax import masked, planner, scenario, superquadric
 from mechsearch_jax.actions import ActionKind
+from mechsearch_jax.dynamics import QuasiStatic, changed
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PlannerConfig
 
@@ -154,6 +157,85 @@ def test_a_decision_is_the_same_in_the_blocks_of_a_gpu(decision, problem, monkey
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), plan, again)
 
 
+@dataclasses.dataclass(frozen=True)
+class Shaky:
+    """The quasi-static model, which fears that everything it moves may topple, or does not know what becomes of it."""
+
+    chance: float | jax.Array
+    residual: float | jax.Array
+
+    def __call__(self, shelf, scene, pusher, T_world_gripper, displacement, q7):
+        told = QuasiStatic()(shelf, scene, pusher, T_world_gripper, displacement, q7)
+        feared = jnp.where(changed(scene, told.scene), self.chance, 0.0)
+        return told.replace(topples=jnp.maximum(told.topples, feared), residual=told.residual + self.residual)
+
+
+# The first is executed nevertheless.
+CHANCES = jnp.float32([0.4, 0.6, np.nan, 0.0, 0.0])
+RESIDUALS = jnp.float32([0.0, 0.0, 0.0, np.nan, np.inf])
+
+
+@pytest.fixture(scope="module")
+def drawn(decision, problem):
+    """What is drawn first in many sequences, what models say of it, and what is charged for it."""
+    objects, belief, _ = decision
+    space = planner.action_space(problem, CONFIG)
+    free, dear = (dataclasses.replace(CONFIG, topple_charge=charge) for charge in (0.0, 2.0))
+
+    @jax.jit
+    def draw(keys):
+        root = planner._root(problem, belief, planner._with_target(problem, belief, objects), space)
+        root = planner._update(problem, belief, CONFIG, root, root.moved)
+        root = root.replace(options=planner._options(problem, belief, space, root, root.moved))
+        possible = planner._possible_space(problem, belief, root.exists)
+        weights = planner._object_weights(problem, belief, CONFIG, root)
+
+        def one(key):
+            sample = planner.sample_action(
+                key, space, problem.actions, root.scene, possible, root.options, root.available, weights
+            )
+            predict = lambda *shaky: planner._predict(problem, space, Shaky(*shaky), root.scene, sample)[1:]  # noqa: E731
+            told = planner._predict(problem, space, QuasiStatic(), root.scene, sample)[1:]
+            shaky = jax.vmap(predict)(CHANCES, RESIDUALS)
+            act = [planner._act(problem, belief, c, space, Shaky(0.4, 0.0), root, key)[2] for c in (free, dear)]
+            return sample, told, shaky, act
+
+        return jax.vmap(one)(keys)
+
+    return jax.device_get(draw(jax.random.split(jax.random.key(0), 30)))
+
+
+def test_what_may_topple_is_charged_for(drawn):
+    sample, (sure, nothing), (possible, topples), (free, dear) = drawn
+    possible, topples = possible[:, 0], topples[:, 0]
+    pushes = sure & (sample.action.kind == ActionKind.PUSH)
+    picks = sure & (sample.action.kind == ActionKind.PICK_AND_PLACE)
+    assert pushes.any()
+    assert picks.any()
+    np.testing.assert_array_equal(possible, sure)
+    assert (nothing[sure] == 0).all()
+    # Every push moves one object at least.
+    assert (topples[pushes] > 0.39).all()
+    assert (topples[picks] == 0).all()
+    np.testing.assert_allclose(free[sure], (CONFIG.caution * sample.risk)[sure], rtol=1e-6)
+    np.testing.assert_allclose(dear[sure], (CONFIG.caution * sample.risk + 2.0 * topples)[sure], rtol=1e-6)
+
+
+def test_what_is_dear_is_not_chosen():
+    # A push that would make J half of what it is, and a pick that takes off a quarter.
+    cost = jnp.float32([[20.0, 10.0], [20.0, 15.0]])
+    for price, best in ((0.0, 0), (0.5 * 0.4, 0), (2.0 * 0.4, 1)):
+        charge = jnp.float32([[price * 20.0], [0.0]])
+        value = [planner._prefix_values(c, h, jnp.array([True]), 0.9)[0] for c, h in zip(cost, charge, strict=True)]
+        assert int(np.argmin(value)) == best
+
+
+def test_a_push_that_likely_topples_something_or_is_not_understood_is_ruled_out(drawn):
+    sample, _, (possible, _), _ = drawn
+    for row in range(1, 5):
+        assert set(sample.action.kind[possible[:, row]].tolist()) == {ActionKind.PICK_AND_PLACE}
+
+
 def test_an_empty_shelf_leaves_nothing_to_do(problem):
     empty = superquadric.empty(8)
     plan = planner.plan(jax.random.key(0), problem, look(problem, empty), empty, CONFIG)
@@ -170,6 +252,9 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"sequences": 0}, "sequences 0"),
         ({"focus": 1.0}, r"focus 1.0 is outside \[0, 1\)"),
         ({"focus": -0.1}, "0 draws evenly"),
+        ({"topple_charge": -0.5}, "topple_charge -0.5 must be a number that is not negative"),
+        ({"topple_charge": float("nan")}, "topple_charge nan"),
+        ({"push_model": "guess"}, 'push model "guess" is unknown; use quasi-static, learned, physics'),
         ({"method": "guess"}, 'use "search-for-grasp" or "search-and-grasp"'),
         ({"actions": "throw"}, 'use "both", "push" or "pick-and-place"'),
         ({"criterion": "guess"}, 'criterion "guess" is unknown'),

@@ -368,7 +368,7 @@ def test_what_does_not_move_stays_exactly_where_it_is(weights):
     expected = told(scene, T, displacement, shelf=SHELF)
     probability = np.sort(jax.nn.sigmoid(expected.moves))
     model = LearnedPush(weights, likely=float(probability[1:3].mean()))
-    outcome = jax.jit(model, static_argnums=0)(SHELF, scene, pusher(), T, displacement)
+    outcome = jax.jit(model, static_argnums=0)(SHELF, scene, pusher(), T, displacement, jnp.zeros(()))
     same = np.asarray(~dynamics.changed(scene, outcome.scene))
     assert same.sum() == 2
     np.testing.assert_allclose(
@@ -382,7 +382,7 @@ def test_a_pushed_object_that_is_told_to_turn_turns_by_that():
     scene, T, displacement = cluttered(3)
     expected = told(scene, T, displacement, shelf=SHELF)
     outcome = jax.jit(functools.partial(predicted, PushNetwork(CONFIG), parameters(), 0.0), static_argnums=0)(
-        SHELF, scene, pusher(), T, displacement
+        SHELF, scene, pusher(), T, displacement, jnp.zeros(())
     )
     change = transforms.matmul(outcome.scene.rotation, jnp.swapaxes(scene.rotation, -1, -2))
     np.testing.assert_allclose(np.arctan2(change[:, 1, 0], change[:, 0, 0]), expected.turn, atol=1e-5)

@@ -301,7 +301,7 @@ def test_a_model_that_knows_the_outcome_scores_best(pushes):
     after = pushes.after
 
     # The model recognises a push by where the gripper starts.
-    def oracle(shelf, scene, pusher, T, displacement):
+    def oracle(shelf, scene, pusher, T, displacement, q7):
         row = jnp.argmin(jnp.sum((jnp.asarray(pushes.T_world_gripper)[:, :3, 3] - T[None, :3, 3]) ** 2, axis=1))
         known = scene.replace(
             position=jnp.asarray(after.position)[row],

@@ -23,7 +23,7 @@ STEPS = (
     Step(40, False, False, 52.0, results.record_action(PUSH), 31.0, 33.0, 24, None, {"plan": 0.5}),
     Step(17, True, True, 33.0, None, None, None, 0, "the object slipped", {"plan": 0.25}),
 )
-EPISODE = Episode("two-things", 2, {"gamma": 0.9}, {"jax": "1.2.3"}, STEPS, 1, 1, True, None)
+EPISODE = Episode("two-things", 2, {**results.EARLIER, "gamma": 0.9}, {"jax": "1.2.3"}, STEPS, 1, 1, True, None)
 ROW = Row(
     scenario="two-things",
     objects=2,
@@ -77,6 +77,13 @@ def test_what_is_no_episode_is_one_line(tmp_path, text):
         results.load_episode(tmp_path / "episode.json")
     assert str(tmp_path / "episode.json") in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_an_episode_without_a_push_model_was_planned_with_the_first_one(tmp_path):
+    known = {"push_model": "physics", "topple_charge": 0.25}
+    for config in ({"gamma": 0.9}, {"gamma": 0.9, **known}):
+        results.save_episode(dataclasses.replace(EPISODE, config=config), tmp_path / "episode.json")
+        assert results.load_episode(tmp_path / "episode.json").config == {**results.EARLIER, **config}
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
@@ -168,6 +175,22 @@ def test_options_that_differ_tell_rows_apart():
     ]
     assert results.label_variants(rows[1:2]) == ["search-for-grasp"]
     assert [rates.episodes for rates in results.summarise(rows)] == [1] * 6
+
+
+def test_rows_without_a_push_model_were_planned_with_the_first_one(tmp_path):
+    old, new, other = (
+        dataclasses.replace(ROW, configuration=results.configuration({"gamma": 0.9, **more}))
+        for more in ({}, {"push_model": "quasi-static", "topple_charge": 0.0}, {"push_model": "physics"})
+    )
+    results.write_rows([old, new, other], tmp_path / "rows.parquet")
+    old, new, other = results.read_rows(tmp_path / "rows.parquet")
+    assert results.identity(old) == results.identity(new) != results.identity(other)
+    labels = results.label_variants([old, new, other])
+    assert labels == [
+        "search-for-grasp, push model quasi-static",
+        "search-for-grasp, push model quasi-static",
+        "search-for-grasp, push model physics",
+    ]
 
 
 def test_confidence_intervals_are_wilsons():

@@ -1,0 +1,45 @@
+"""Push models by name, those that need a simulator too, as `planner.plan` takes them."""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import jax
+
+from mechsearch_jax.dynamics import PushModel
+from mechsearch_jax.envs.physics_push import MjxPhysics, NativePhysics
+from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.push_models import own_push_model
+
+
+class PushModels(NamedTuple):
+    """What predicts pushes in a plan; the last two arguments of `planner.plan`.
+
+    Attributes:
+      first: predicts those that are the first action of a sequence.
+      later: predicts the others.
+    """
+
+    first: PushModel
+    later: PushModel
+
+
+@functools.cache
+def push_models(name: str) -> PushModels:
+    """The push models of a name; the same objects for the same name, so that nothing is compiled twice.
+
+    "physics" simulates every push on a GPU. On a CPU that would take too long: the first action of every sequence is
+    simulated there, and the others are predicted by the model that is used where none is named.
+
+    Args:
+      name: "quasi-static", "learned" or "physics".
+
+    Raises:
+      InputError: there is none of that name, its weights are missing or damaged, or Warp cannot be imported.
+    """
+    if name != "physics":
+        return PushModels(own_push_model(name), own_push_model(name))
+    if jax.default_backend() == "cpu":
+        return PushModels(NativePhysics(), own_push_model(PlannerConfig().push_model))
+    return PushModels(MjxPhysics(), MjxPhysics())
