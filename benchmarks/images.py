@@ -26,8 +26,6 @@ from mechsearch_jax.train.scenes import cast_world, random_world
 
 NoiseName = Literal["clean", "gaussian", "time-of-flight"]
 NOISES: Mapping[str, NoiseModel] = {"clean": no_noise, "gaussian": RandomDirection(), "time-of-flight": TimeOfFlight()}
-# Objects that show fewer pixels of the full image do not count.
-PIXELS = 100
 
 
 class Shown(flax.struct.PyTreeNode):

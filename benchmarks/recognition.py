@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int, Key
 from matplotlib.figure import Figure
 
 from mechsearch_jax.benchmarks import ems
-from mechsearch_jax.benchmarks.images import NOISES, PIXELS, Look, Scene, Shown, look, named, save_rows
+from mechsearch_jax.benchmarks.images import NOISES, Look, Scene, Shown, look, named, save_rows
 from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs.world import CYLINDER, TARGET, World, true_superquadrics
 from mechsearch_jax.errors import InputError
@@ -35,6 +35,7 @@ from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_ov
 from mechsearch_jax.results import versions
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.train.scenes import PIXELS
 from mechsearch_jax.viz import drawing
 
 MethodName = Literal["network", "network-refined", "ems", "ems-refined"]

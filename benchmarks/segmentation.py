@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from mechsearch_jax.benchmarks.images import NOISES, PIXELS, Look, Scene, look, named, save_rows
+from mechsearch_jax.benchmarks.images import NOISES, Look, Scene, look, named, save_rows
 from mechsearch_jax.envs.recognisers import Labeller, Segmenter
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
@@ -26,6 +26,7 @@ from mechsearch_jax.models.weights import shipped_weights
 from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.results import versions
 from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.train.scenes import PIXELS
 from mechsearch_jax.viz import drawing
 
 # Colours of up to eight objects, told apart with red-green blindness too.
