@@ -166,6 +166,7 @@ class NativeSimulator:
 
     def settle(self) -> Outcome:
         """Let time pass, with the robot at home, until everything is at rest or the time for that is over."""
+        self._go_home()
         recorder = _Recorder(self._data, self.config.trace_every)
         settled = self._come_to_rest(recorder)
         return self._finish(recorder, settled, None)

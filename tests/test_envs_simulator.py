@@ -131,6 +131,7 @@ def test_reset_keeps_the_scenario_exactly_and_rest_does_not_move_it(sim):
     np.testing.assert_allclose(before.position, world.from_scenario(start).position)
     outcome = sim.settle()
     assert outcome.settled
+    np.testing.assert_allclose(sim._data.qpos[: len(HOME)], HOME, atol=1e-3)
     assert not outcome.fallen.any()
     assert np.abs(np.asarray(sim.world.position - before.position)).max() < 5e-4
     again = sim.scenario("again")
