@@ -18,6 +18,7 @@ from mechsearch_jax.envs.recognisers import measured_depth, true_labels
 from mechsearch_jax.envs.world import TARGET, World, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
 from mechsearch_jax.scenario import Scenario
 from mechsearch_jax.shelf import Shelf
@@ -118,6 +119,22 @@ def look(key: Key[Array, ""], camera: Camera, shelf: Shelf, world: World, noise:
         pixels * stride**2,
         pixels / jnp.maximum(alone[:TARGET], 1),
     )
+
+
+def image_of(scenes: Sequence[Scene], index: int, noise: str, seed: int, shelf: Shelf) -> tuple[Key[Array, ""], Look]:
+    """A key for what is measured, and the image of a scene; the same on every call.
+
+    Args:
+      scenes: of which one is looked at.
+      index: which.
+      noise: name of the sensor.
+      seed: of the noise and the key.
+      shelf: what the scenes stand on.
+    """
+    key = jax.random.fold_in(jax.random.key(seed), list(NOISES).index(noise))
+    sensing, rest = jax.random.split(jax.random.fold_in(key, index))
+    view = shelf_view(shelf=shelf)
+    return rest, look(sensing, view.camera, shelf, scenes[index].world, NOISES[noise], view.stride)
 
 
 def named(noise: NoiseModel) -> str:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int, Key
 from matplotlib.figure import Figure
 
 from mechsearch_jax.benchmarks import ems
-from mechsearch_jax.benchmarks.images import NOISES, Look, Scene, Shown, look, named, save_rows
+from mechsearch_jax.benchmarks.images import NOISES, Look, Scene, Shown, image_of, named, save_rows
 from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs.world import CYLINDER, TARGET, World, true_superquadrics
 from mechsearch_jax.errors import InputError
@@ -351,10 +351,7 @@ class Bench:
 
     def image(self, index: int, noise: str) -> tuple[Key[Array, ""], Look]:
         """A key for the methods, and the image of a scene; the same on every call."""
-        key = jax.random.fold_in(jax.random.key(self.seed), list(NOISES).index(noise))
-        sensing, answering = jax.random.split(jax.random.fold_in(key, index))
-        view = shelf_view(shelf=self.shelf)
-        return answering, look(sensing, view.camera, self.shelf, self.scenes[index].world, NOISES[noise], view.stride)
+        return image_of(self.scenes, index, noise, self.seed, self.shelf)
 
     def answers(self, index: int, noise: str) -> tuple[Look, dict[str, Superquadrics], dict[str, float]]:
         """The image of a scene, every method's answer, and how long it took with the one that it begins with [s]."""

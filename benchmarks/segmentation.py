@@ -17,13 +17,12 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from mechsearch_jax.benchmarks.images import NOISES, Look, Scene, look, named, save_rows
+from mechsearch_jax.benchmarks.images import NOISES, Look, Scene, image_of, named, save_rows
 from mechsearch_jax.envs.recognisers import Labeller, Segmenter
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.models.weights import shipped_weights
-from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.results import versions
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train.scenes import PIXELS
@@ -178,13 +177,10 @@ class Bench:
         return jax.jit(label)
 
     def _label(self, label: Callable[..., Any], index: int, noise: str) -> tuple[Look, np.ndarray, float]:
-        key = jax.random.fold_in(jax.random.key(self.seed), list(NOISES).index(noise))
-        sensing, drawing_points = jax.random.split(jax.random.fold_in(key, index))
-        view = shelf_view(shelf=self.shelf)
-        image = look(sensing, view.camera, self.shelf, self.scenes[index].world, NOISES[noise], view.stride)
+        key, image = image_of(self.scenes, index, noise, self.seed, self.shelf)
         jax.block_until_ready(image)
         start = time.perf_counter()
-        found = jax.block_until_ready(label(drawing_points, image))
+        found = jax.block_until_ready(label(key, image))
         return image, np.asarray(found), time.perf_counter() - start
 
 
