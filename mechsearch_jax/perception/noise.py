@@ -108,7 +108,7 @@ def _incidence(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h
     The neighbours to the right and below span one, those to the left and above another; the one that is met more
     squarely counts, because at an edge the other leads across it. 1 where there is neither.
     """
-    # As one kernel with what the points are made from, at each neighbour anew, this takes a GPU's compiler minutes.
+    # Else a GPU's compiler makes the points anew at each neighbour, within one very large kernel.
     points = jax.lax.optimization_barrier(points)
     ray = points - jnp.array(camera.position).reshape(1, 1, 3)
 
