@@ -47,6 +47,8 @@ CHAIN = 4
 # Units of what the network is told and of what it says: lengths [m], angles [rad].
 _LENGTH, _SHIFT, _TURN = 0.1, 0.05, 0.3
 _OUTPUTS = 7
+# Weaker than any neighbour.
+_NOBODY = -1e9
 # The inward normals of the back, right and left walls, and of the front edge, beyond which is nothing.
 _NORMALS = np.array([[-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], np.float32)
 _IS_EDGE = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
@@ -395,11 +397,11 @@ class Messages(nn.Module):
         own = nn.Dense(self.width, dtype=self.dtype, name="own")(h)
         theirs = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="theirs")(h)
         pair = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="pair")(pairs)
-        message = nn.gelu(own[..., :, None, :] + theirs[..., None, :, :] + pair)
-        # `gelu` is never below -0.2, and who has no neighbours is told nothing.
-        strongest = jnp.max(jnp.where(other[..., None], message, -1.0), axis=-2)
-        strongest = jnp.where(jnp.any(other, axis=-1)[..., None], strongest, 0.0)
-        return nn.Dense(self.width, dtype=self.dtype, name="out")(strongest).astype(jnp.float32)
+        # What an object is itself does not change which neighbour is the strongest.
+        strongest = jnp.max(jnp.where(other[..., None], theirs[..., None, :, :] + pair, _NOBODY), axis=-2)
+        alone = ~jnp.any(other, axis=-1)[..., None]
+        message = jnp.where(alone, 0.0, nn.gelu(own + jnp.where(alone, 0.0, strongest)))
+        return nn.Dense(self.width, dtype=self.dtype, name="out")(message).astype(jnp.float32)
 
 
 class PushTrunk(nn.Module):
