@@ -97,6 +97,7 @@ class Pushes(flax.struct.PyTreeNode):
       object: which of them was to be pushed, int32.
       T_world_gripper: where the gripper started, shape (n, 4, 4).
       displacement: how it moved [m], shape (n, 3).
+      q7: angle of joint 7 [rad], shape (n,).
       toppled: which bodies fell over, or off the board, shape (n, 9).
       fallen: which fell off the board, shape (n, 9).
       lane: pushes of different lanes are of different scenes, int32.
@@ -107,6 +108,7 @@ class Pushes(flax.struct.PyTreeNode):
     object: jax.Array
     T_world_gripper: jax.Array
     displacement: jax.Array
+    q7: jax.Array
     toppled: jax.Array
     fallen: jax.Array
     lane: jax.Array
@@ -321,6 +323,7 @@ def generate_pushes(
             object=action.object,
             T_world_gripper=action.T_world_gripper,
             displacement=action.displacement,
+            q7=action.q7,
             toppled=over,
             fallen=fallen,
             lane=jnp.arange(worlds, dtype=jnp.int32),
@@ -439,7 +442,7 @@ def portions(
             save_pushes(path, part, identity)
         count += len(part.object)
         if not len(part.object):
-            raise InputError(f"train push: no push was possible in {generation.worlds} worlds; give more --worlds")
+            raise InputError(f"no push was possible in {generation.worlds} worlds; give more --worlds")
         told(count)
         number += 1
         yield part

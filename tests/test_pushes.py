@@ -139,6 +139,12 @@ def test_objects_are_displaced_along_the_push(pushes):
     assert np.median((along / np.maximum(length - 0.01, 0.01))[upright]) == pytest.approx(1.0, abs=0.35)
 
 
+def test_the_wrist_that_a_push_was_made_with_is_kept(pushes):
+    assert pushes.q7.shape == (len(pushes.object),)
+    assert np.isin(pushes.q7, push_tables(CONFIG).q7[1]).all()
+    assert len(np.unique(pushes.q7)) > 1
+
+
 def test_objects_that_are_far_from_the_push_stay(pushes):
     truth = push_truth(jax.tree.map(jnp.asarray, pushes))
     assert 0.1 < truth.moved[truth.valid].mean() < 0.9

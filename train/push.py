@@ -17,8 +17,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 from mechsearch_jax.dynamics import PushModel, PushOutcome, QuasiStatic
 from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, joined, portions, push_tables
-from mechsearch_jax.envs.world import CYLINDER, World, superquadrics
+from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, Worlds, joined, portions, push_tables
+from mechsearch_jax.envs.world import CYLINDER, superquadrics
 from mechsearch_jax.learned_push import NAME, predicted
 from mechsearch_jax.models.push import PushConfig, PushGeometry, PushMotion, PushNetwork, push_geometry, told_by
 from mechsearch_jax.models.weights import save_weights
@@ -177,6 +177,17 @@ class PushTask:
         save_weights(path, self.name, self.network, parameters, card)
 
 
+def random_pushes(
+    generation: Generation,
+    folder: Path,
+    make_simulator: Callable[[], Worlds],
+    told: Callable[[int], None] = lambda pushes: None,
+) -> Pushes:
+    """Pushes as the network learns from; see `envs.pushes.portions` for the arguments and errors."""
+    draw_world = functools.partial(random_world, config=push_scenes())
+    return joined(list(portions(generation, folder, make_simulator, draw_world, PushesConfig(), told)))
+
+
 def push_task(
     generation: Generation,
     folder: Path,
@@ -196,15 +207,7 @@ def push_task(
     """
     scenes, config = push_scenes(), PushesConfig()
     gpu = jax.default_backend() != "cpu"
-    parts = portions(
-        generation,
-        folder,
-        functools.partial(generator.engine, gpu),
-        functools.partial(random_world, config=scenes),
-        config,
-        told,
-    )
-    pushes = joined(list(parts))
+    pushes = random_pushes(generation, folder, functools.partial(generator.engine, gpu), told)
     held = pushes.lane % HELD_OUT_LANES == 0
     origin = {
         "source": "random pushes of the robot, simulated",
@@ -231,34 +234,46 @@ def no_motion(
     return PushOutcome(scene, jnp.zeros(()), jnp.zeros(scene.capacity))
 
 
-class _Compared(flax.struct.PyTreeNode):
-    """Predictions next to the truth; fields have the leading axes (pushes, 9)."""
+@functools.partial(jax.jit, static_argnames=("model", "shelf"))
+def _predict(model: PushModel, pushes: Pushes, pusher: Array, shelf: Shelf) -> PushOutcome:
+    def one(push: Pushes) -> PushOutcome:
+        return model(shelf, superquadrics(push.before), pusher, push.T_world_gripper, push.displacement, push.q7)
 
-    shift_error: jax.Array
-    turn_error: jax.Array
-    shift: jax.Array
-    topples: jax.Array
+    return jax.vmap(one)(pushes)
 
 
-@functools.partial(jax.jit, static_argnames=("model", "shelf", "batch"))
-def _compare(model: PushModel, pushes: Pushes, pusher: Array, shelf: Shelf, batch: int) -> _Compared:
-    def one(push: Pushes) -> _Compared:
-        before: World = push.before
-        scene = superquadrics(before)
-        # Pushes do not keep the angle of joint 7: no model that is compared here moves an arm.
-        told = model(shelf, scene, pusher, push.T_world_gripper, push.displacement, jnp.float32(jnp.nan))
-        truth = push_truth(push)
-        shift = (told.scene.position - scene.position)[..., :2]
-        gap = shift - truth.shift
-        turn = planar_turn(scene.rotation, told.scene.rotation)
-        return _Compared(
-            shift_error=jnp.sqrt(gap[..., 0] ** 2 + gap[..., 1] ** 2),
-            turn_error=jnp.abs(turn_error(turn, truth.turn)),
-            shift=jnp.sqrt(shift[..., 0] ** 2 + shift[..., 1] ** 2),
-            topples=told.topples,
-        )
+def predictions(
+    model: PushModel,
+    pushes: Pushes,
+    pusher: Float[Array, "p 3"],
+    shelf: Shelf | None = None,
+    batch: int = 128,
+    told: Callable[[int], None] = lambda pushes: None,
+) -> PushOutcome:
+    """What a model predicts of pushes.
 
-    return jax.lax.map(one, pushes, batch_size=batch)
+    Args:
+      model: jitted as a static argument.
+      pushes: on the host.
+      pusher: surface of the gripper in its own frame [m].
+      shelf: the shelf.
+      batch: pushes at once.
+      told: is told how many are predicted.
+
+    Returns:
+      Fields with a leading axis for the pushes, on the host.
+    """
+    count = len(pushes.object)
+    batch = min(batch, count)
+    parts = []
+    for start in range(0, count, batch):
+        # The last batch begins earlier than where the one before it ended, so that all have one size.
+        first = min(start, count - batch)
+        some = jax.tree.map(lambda a, first=first: a[first : first + batch], pushes)
+        outcome = jax.device_get(_predict(model, some, pusher, shelf or Shelf()))
+        parts.append(jax.tree.map(lambda a, skip=start - first: a[skip:], outcome))
+        told(min(start + batch, count))
+    return jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
 
 def average_precision(score: Float[np.ndarray, " n"], truth: Bool[np.ndarray, " n"]) -> float:
@@ -275,14 +290,39 @@ def average_precision(score: Float[np.ndarray, " n"], truth: Bool[np.ndarray, " 
 def model_scores(
     model: PushModel, pushes: Pushes, pusher: Float[Array, "p 3"], shelf: Shelf | None = None, batch: int = 128
 ) -> dict[str, Any]:
-    """How well a model predicts pushes: over all, by distance, by the number of objects, and by both.
+    """How well a model predicts pushes: the `outcome_scores` of its `predictions`; see there."""
+    return outcome_scores(predictions(model, pushes, pusher, shelf, batch), pushes)
+
+
+class _Compared(flax.struct.PyTreeNode):
+    """Predictions next to the truth; fields have the leading axes (pushes, 9)."""
+
+    shift_error: jax.Array
+    turn_error: jax.Array
+    shift: jax.Array
+    topples: jax.Array
+
+
+@jax.jit
+def _compare(told: PushOutcome, pushes: Pushes, truth: PushTruth) -> _Compared:
+    before = pushes.before
+    shift = (told.scene.position - before.position)[..., :2]
+    gap = shift - truth.shift
+    turn = planar_turn(before.rotation, told.scene.rotation)
+    return _Compared(
+        shift_error=jnp.sqrt(gap[..., 0] ** 2 + gap[..., 1] ** 2),
+        turn_error=jnp.abs(turn_error(turn, truth.turn)),
+        shift=jnp.sqrt(shift[..., 0] ** 2 + shift[..., 1] ** 2),
+        topples=told.topples,
+    )
+
+
+def outcome_scores(told: PushOutcome, pushes: Pushes) -> dict[str, Any]:
+    """How well outcomes were predicted: over all, by distance, by the number of objects, and by both.
 
     Args:
-      model: jitted as a static argument.
+      told: what was predicted of each push, with all nine bodies of a world in its scene.
       pushes: on the host.
-      pusher: surface of the gripper in its own frame [m].
-      shelf: the shelf.
-      batch: pushes at once.
 
     Returns:
       For each group the number of `pushes`, mean errors of the pushed object (`pushed_mm`, `pushed_deg`, the latter of
@@ -290,8 +330,8 @@ def model_scores(
       `STILL` (`still`), and the average precision of toppling (`topple_ap`). Objects that toppled count for the last
       alone.
     """
-    compared = jax.device_get(_compare(model, pushes, pusher, shelf or Shelf(), batch))
-    truth = jax.device_get(push_truth(jax.tree.map(jnp.asarray, pushes)))
+    truth = push_truth(jax.tree.map(jnp.asarray, pushes))
+    compared, truth = jax.device_get((_compare(told, pushes, truth), truth))
     length = np.linalg.norm(pushes.displacement, axis=1)
     objects = np.asarray(pushes.before.valid)[:, :-1].sum(axis=1)
     sideways = np.abs(np.asarray(pushes.displacement)[:, 0]) < 1e-3
