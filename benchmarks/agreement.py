@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.metadata
-import json
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -26,8 +25,9 @@ from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
 from mechsearch_jax.envs.simulator import NativeSimulator, Outcome
 from mechsearch_jax.envs.world import CYLINDER, World, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.planner import PlannerConfig, Problem
-from mechsearch_jax.results import ACTION_NAMES, PathLike, replacing, versions
+from mechsearch_jax.results import ACTION_NAMES, versions
 from mechsearch_jax.scenario import MAX_OBJECTS, Scenario
 
 # What counts as the same final pose [m, degrees].
@@ -144,9 +144,7 @@ def save_agreement(agreement: Agreement, path: PathLike) -> None:
     Raises:
       InputError: the file cannot be written.
     """
-    value = {"summary": agreement.summary(), **dataclasses.asdict(agreement)}
-    with replacing(path) as file:
-        file.write((json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+    save_json({"summary": agreement.summary(), **dataclasses.asdict(agreement)}, path)
 
 
 def generated_scenes(count: int, seed: int = 0) -> list[Scenario]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -29,7 +28,7 @@ from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.world import World, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import existence, object_views
-from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation
 from mechsearch_jax.planner import Belief, PlannerConfig, Problem
 from mechsearch_jax.results import versions
@@ -89,18 +88,13 @@ class Timing:
         return value if self.rate is None else {**value, f"{self.unit}_per_second": self.rate}
 
 
-def _save(value: dict[str, Any], path: PathLike) -> None:
-    with replacing(path) as file:
-        file.write((json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
-
-
 def save_timing(timing: Timing, path: PathLike) -> None:
     """Write a timing as JSON, with its median.
 
     Raises:
       InputError: the file cannot be written.
     """
-    _save(timing.value(), path)
+    save_json(timing.value(), path)
 
 
 def save_timings(timings: Sequence[Timing], path: PathLike) -> None:
@@ -109,7 +103,7 @@ def save_timings(timings: Sequence[Timing], path: PathLike) -> None:
     Raises:
       InputError: the file cannot be written.
     """
-    _save({"timings": [timing.value() for timing in timings]}, path)
+    save_json({"timings": [timing.value() for timing in timings]}, path)
 
 
 def measure(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repeats: int) -> tuple[float, list[float]]:

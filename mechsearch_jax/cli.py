@@ -23,6 +23,7 @@ import tyro
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from mechsearch_jax.benchmarks.bench import Timing
     from mechsearch_jax.planner import PlannerConfig
 
 Method = Literal["search-for-grasp", "search-and-grasp"]
@@ -130,6 +131,17 @@ Options = Annotated[PlannerOptions, tyro.conf.arg(name="")]
 Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER ...")]
 
 JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
+
+
+def at_least_one(command: str, **options: int | None) -> None:
+    """Refuse counts below 1; None stands for what is not given.
+
+    Raises:
+      InputError: one is.
+    """
+    for name, value in options.items():
+        if value is not None and value < 1:
+            raise InputError(f"{command}: --{name.replace('_', '-')} {value} must be at least 1")
 
 
 def find_scenario(name: str) -> Path:
@@ -312,9 +324,7 @@ def evaluate(
     from mechsearch_jax.benchmarks.tables import EpisodeProgress, rates_table
     from mechsearch_jax.cache import keep_compilations
 
-    for name, value in {"workers": workers, "batch": batch}.items():
-        if value is not None and value < 1:
-            raise InputError(f"evaluate: --{name} {value} must be at least 1")
+    at_least_one("evaluate", workers=workers, batch=batch)
     if workers is not None and batch is not None:
         raise InputError("evaluate: give either --workers or --batch, not both")
     if workers is not None and options.simulator == "mjx":
@@ -380,8 +390,7 @@ def generate(*, objects: int, out: Path, count: int = 1, target: TargetShape = "
     from mechsearch_jax.scenario import save_scenario
     from mechsearch_jax.target import Target
 
-    if count < 1:
-        raise InputError(f"scenarios generate: --count {count} must be at least 1")
+    at_least_one("scenarios generate", count=count)
     check_writable(out)
     keep_compilations()
     generator = ScenarioGenerator(Target.box() if target == "box" else Target.cylinder())
@@ -412,6 +421,31 @@ def check(scenarios: Scenarios, /) -> None:
         raise SystemExit(2)
 
 
+def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing]) -> None:
+    """Measure, print and write a timing.
+
+    Raises:
+      InputError: the file cannot be written, or what `measure` raises.
+    """
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.bench import save_timing
+    from mechsearch_jax.benchmarks.tables import timing_table
+    from mechsearch_jax.results import check_writable
+
+    if out is not None:
+        check_writable(out.parent)
+    # A compilation that was read from disk would not tell how long compiling takes.
+    jax.config.update("jax_enable_compilation_cache", False)
+    console = Console(highlight=False)
+    with console.status(f"timing {subject}"):
+        timing = measure()
+    console.print(timing_table(timing))
+    if out is not None:
+        save_timing(timing, out)
+
+
 def _timing_of(subject: Literal["existence", "graspability", "plan"], what: str) -> Callable[..., None]:
     """The command that times one part of the planner."""
 
@@ -423,24 +457,11 @@ def _timing_of(subject: Literal["existence", "graspability", "plan"], what: str)
         out: JsonFile = None,
         options: Options = PlannerOptions(),
     ) -> None:
-        import jax
-        from rich.console import Console
+        from mechsearch_jax.benchmarks.bench import bench
 
-        from mechsearch_jax.benchmarks.bench import bench, save_timing
-        from mechsearch_jax.benchmarks.tables import timing_table
-
-        for name, value in {"repeats": repeats, "batch": batch}.items():
-            if value < 1:
-                raise InputError(f"bench: --{name} {value} must be at least 1")
+        at_least_one(f"bench {subject}", repeats=repeats, batch=batch)
         config = options.config("search-for-grasp")
-        # A compilation that was read from disk would not tell how long compiling takes.
-        jax.config.update("jax_enable_compilation_cache", False)
-        console = Console(highlight=False)
-        with console.status(f"timing {subject}"):
-            timing = bench(subject, objects, config, batch=batch, repeats=repeats)
-        console.print(timing_table(timing))
-        if out is not None:
-            save_timing(timing, out)
+        _print_timing(subject, out, lambda: bench(subject, objects, config, batch=batch, repeats=repeats))
 
     command.__name__ = subject
     command.__doc__ = f"""Time {what}: compilation, median and spread.
@@ -472,22 +493,10 @@ def bench_perceive(
       recognition: "masks" is told which pixels are whose, "full" finds out.
       out: JSON file for the result.
     """
-    import jax
-    from rich.console import Console
-
     from mechsearch_jax.benchmarks import bench as benches
-    from mechsearch_jax.benchmarks.tables import timing_table
 
-    for name, value in {"repeats": repeats, "batch": batch}.items():
-        if value < 1:
-            raise InputError(f"bench perceive: --{name} {value} must be at least 1")
-    jax.config.update("jax_enable_compilation_cache", False)
-    console = Console(highlight=False)
-    with console.status("timing perceive"):
-        timing = benches.bench_perceive(recognition, objects, batch=batch, repeats=repeats)
-    console.print(timing_table(timing))
-    if out is not None:
-        benches.save_timing(timing, out)
+    at_least_one("bench perceive", repeats=repeats, batch=batch)
+    _print_timing("perceive", out, lambda: benches.bench_perceive(recognition, objects, batch, repeats=repeats))
 
 
 def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, out: JsonFile = None) -> None:
@@ -499,19 +508,9 @@ def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, ou
       repeats: number of timed calls.
       out: JSON file for the result.
     """
-    import jax
-    from rich.console import Console
-
     from mechsearch_jax.benchmarks import bench as benches
-    from mechsearch_jax.benchmarks.tables import timing_table
 
-    jax.config.update("jax_enable_compilation_cache", False)
-    console = Console(highlight=False)
-    with console.status("timing simulate"):
-        timing = benches.bench_simulate(worlds, steps, repeats)
-    console.print(timing_table(timing))
-    if out is not None:
-        benches.save_timing(timing, out)
+    _print_timing("simulate", out, lambda: benches.bench_simulate(worlds, steps, repeats))
 
 
 def bench_inside(
@@ -583,9 +582,7 @@ def bench_agreement(
     from mechsearch_jax.envs.mjx_simulator import import_mjx
     from mechsearch_jax.scenario import load_scenario
 
-    for name, value in {"actions": actions, "scenes": scenes}.items():
-        if value < 1:
-            raise InputError(f"bench agreement: --{name} {value} must be at least 1")
+    at_least_one("bench agreement", actions=actions, scenes=scenes)
     files = find_scenarios(scenarios) if scenarios else []
     import_mjx()
     keep_compilations()
@@ -645,8 +642,7 @@ def bench_recognition(
     from mechsearch_jax.shelf import Shelf
     from mechsearch_jax.viz.drawing import save_figure
 
-    if worst < 1:
-        raise InputError(f"bench recognition: --worst {worst} must be at least 1")
+    at_least_one("bench recognition", worst=worst)
     for file in (out, picture):
         if file is not None:
             check_writable(file.parent)
@@ -709,8 +705,7 @@ def bench_segmentation(
     from mechsearch_jax.scenario import load_scenario
     from mechsearch_jax.viz.drawing import save_figure
 
-    if worst < 1:
-        raise InputError(f"bench segmentation: --worst {worst} must be at least 1")
+    at_least_one("bench segmentation", worst=worst)
     for file in (out, picture):
         if file is not None:
             check_writable(file.parent)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from mechsearch_jax.errors import InputError
 
@@ -34,3 +35,13 @@ def replacing(path: PathLike) -> Iterator[IO[bytes]]:
             raise
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def save_json(value: dict[str, Any], path: PathLike) -> None:
+    """Write numbers, texts, lists and dictionaries as JSON; there may be no NaN among them.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    with replacing(path) as file:
+        file.write((json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
