@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from rich.console import Console, Group
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from mechsearch_jax.benchmarks import segmentation
+from mechsearch_jax.benchmarks import push, segmentation
 from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
 from mechsearch_jax.benchmarks.recognition import SHARES, Measured
@@ -51,6 +52,7 @@ def timing_table(timing: Timing) -> Table:
     table.add_row("spread", f"{1e3 * fastest:.1f} to {1e3 * slowest:.1f} ms in {len(timing.seconds)} calls")
     if timing.rate is not None:
         table.add_row("rate", f"{timing.rate:,.0f} {timing.unit}/s")
+        table.add_row("for each", f"{1e3 / timing.rate:,.3g} ms")
     table.add_row("device", timing.versions["device"])
     table.add_row("versions", ", ".join(f"{k} {v}" for k, v in timing.versions.items() if k != "device"))
     return table
@@ -189,6 +191,42 @@ def segmentation_tables(measured: segmentation.Measured) -> Group:
         f"{measured.versions['device']}."
     )
     return Group(*tables.values(), Text(explanation, style="dim"))
+
+
+def push_scores_tables(measured: push.Measured) -> Group:
+    """How well pushes are predicted: a row for every model, and for the best by distance and by number of objects."""
+    everything = {name: groups["all"] for name, groups in measured.scores.items()}
+    title = f"{measured.settings['pushes']} pushes in scenes that no training has seen"
+    tables = [_push_scores_table(title, "model", everything)]
+    groups = measured.scores[measured.best]
+    for what, ending in (("distance", " cm"), ("objects", " objects")):
+        chosen = {name.removesuffix(" objects"): line for name, line in groups.items() if _is_plain(name, ending)}
+        if chosen:
+            tables.append(_push_scores_table(f"{measured.best}, by {what}", what, chosen))
+    explanation = (
+        "pushed: mean errors of the pushed object's place and, if it is a box, of its turn. other: of the place of "
+        "others that moved. still: share of what stays that is predicted to stay within 1 mm. topple AP: average "
+        "precision of what falls over, which counts for nothing else. distance: within 2.5 cm. "
+        f"{measured.versions['device']}."
+    )
+    return Group(*tables, Text(explanation, style="dim"))
+
+
+def _is_plain(group: str, ending: str) -> bool:
+    """Whether a group is of one kind only, not of distance and objects both."""
+    return group.endswith(ending) and "," not in group
+
+
+def _push_scores_table(title: str, first: str, lines: Mapping[str, Mapping[str, Any]]) -> Table:
+    table = _plain_table(title)
+    table.add_column(first, no_wrap=True, min_width=12)
+    for name in ("pushes", "pushed mm", "pushed deg", "other mm", "still", "topple AP"):
+        table.add_column(name, justify="right", no_wrap=True)
+    digits = {"pushed_mm": 2, "pushed_deg": 2, "other_mm": 2, "still": 3, "topple_ap": 3}
+    for name, line in lines.items():
+        cells = ("-" if line[key] is None else f"{line[key]:.{n}f}" for key, n in digits.items())
+        table.add_row(name, str(line["pushes"]), *cells)
+    return table
 
 
 class EpisodeProgress:

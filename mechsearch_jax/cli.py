@@ -131,6 +131,7 @@ Options = Annotated[PlannerOptions, tyro.conf.arg(name="")]
 Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER ...")]
 
 JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
+WeightsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")]
 
 
 def at_least_one(command: str, **options: int | None) -> None:
@@ -727,6 +728,65 @@ def bench_segmentation(
     console.print(segmentation_tables(measured))
 
 
+def bench_push(
+    *,
+    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 2000,
+    seed: int = 0,
+    models: tuple[Literal["no motion", "quasi-static", "learned", "physics", "nudged"], ...] = (
+        "no motion",
+        "quasi-static",
+        "learned",
+        "physics",
+        "nudged",
+    ),
+    weights: WeightsFile = None,
+    worlds: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    data: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None,
+    out: JsonFile = None,
+) -> None:
+    """Simulate random pushes in scenes that no training has seen, and compare push models with what became of them.
+
+    Args:
+      pushes: at least so many.
+      seed: of the scenes and the pushes, of those that training cannot have.
+      models: what is compared, one or more; "no motion" predicts nothing, and "nudged" is the same simulation again
+        from a hundredth of a millimetre elsewhere: how far it differs from itself.
+      weights: of the learned model; those that ship if not given.
+      worlds: simulated at once; 512 on a GPU and 64 on a CPU if left out.
+      data: folder for the pushes, so that a killed run goes on and another need not simulate them again; they are not
+        kept if left out.
+      out: JSON file for the scores, in groups by distance and number of objects.
+    """
+    import tempfile
+
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import push
+    from mechsearch_jax.benchmarks.tables import push_scores_tables
+    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.results import check_writable
+    from mechsearch_jax.train.run import counting
+
+    worlds = (64 if jax.default_backend() == "cpu" else 512) if worlds is None else worlds
+    bench = push.Bench(push.held_out_generation(pushes, worlds, seed), models, weights)
+    for folder in (data, None if out is None else out.parent):
+        if folder is not None:
+            check_writable(folder)
+    keep_compilations()
+    with contextlib.ExitStack() as stack:
+        folder = data or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        with counting("pushes", pushes) as told:
+            made = bench.pushes(folder, told)
+    console = Console(highlight=False)
+    with console.status("predicting") as status:
+        total = len(made.object)
+        measured = bench.run(made, lambda name, done: status.update(f"{name}: {done}/{total}"))
+        if out is not None:
+            push.save_push_scores(measured, out)
+    console.print(push_scores_tables(measured))
+
+
 def _training_of(name: Literal["segmentation", "recognition"], batch: int, rate: float) -> Callable[..., None]:
     """The command that trains one network of perception."""
     default_batch, default_rate = batch, rate
@@ -878,6 +938,7 @@ GROUPS: dict[str, Commands] = {
         "agreement": bench_agreement,
         "recognition": bench_recognition,
         "segmentation": bench_segmentation,
+        "push": bench_push,
     },
 }
 
