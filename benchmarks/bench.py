@@ -1,4 +1,4 @@
-"""How long perception, f, g, a decision and simulation take, on scenes that the generator made.
+"""How long perception, f, g, predicted pushes, a decision and simulation take, on scenes that the generator made.
 
 Compilation is timed apart from the steady state.
 """
@@ -10,6 +10,7 @@ import functools
 import statistics
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
@@ -18,27 +19,34 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax import planner
+from mechsearch_jax.actions import Action
+from mechsearch_jax.benchmarks.push import named_model, weights_of
 from mechsearch_jax.camera import Camera
+from mechsearch_jax.dynamics import PushOutcome
 from mechsearch_jax.envs import motion
 from mechsearch_jax.envs.episode import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator, commands
 from mechsearch_jax.envs.push_models import push_models
+from mechsearch_jax.envs.pushes import PushesConfig, draw_push, push_tables
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
-from mechsearch_jax.envs.world import World, from_scenario
+from mechsearch_jax.envs.world import TARGET, World, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation
 from mechsearch_jax.planner import Belief, PlannerConfig, Problem
+from mechsearch_jax.push_models import PushModelName
 from mechsearch_jax.results import versions
 from mechsearch_jax.scenario import MAX_OBJECTS
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.train.push import push_scenes
+from mechsearch_jax.train.scenes import random_world
 from mechsearch_jax.transforms import make
 
 # What a call does many of; how many is in `Timing.shapes`.
-COUNTED = ("evaluations", "operations", "bytes", "recognitions")
+COUNTED = ("evaluations", "operations", "bytes", "recognitions", "predictions")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,12 +54,13 @@ class Timing:
     """How long one function takes.
 
     Attributes:
-      subject: "existence", "graspability", "plan", "perceive", "simulate", or a part of `roofline.bench_inside`.
+      subject: "existence", "graspability", "plan", "perceive: ..." and "predict: ..." with what does it, "simulate", or
+        a part of `roofline.bench_inside`.
       objects: number of objects in the scenes.
       shapes: sizes that the time depends on; for "simulate" also what was seen of overflows and divergence.
       compile_seconds: of tracing and compiling [s]; honest only if compilations are not kept on disk.
       seconds: of every call afterwards, results awaited [s].
-      versions: as `results.versions` returns them.
+      versions: as `results.versions` returns them; with "weights", the SHA-256 of those of a learned push model.
     """
 
     subject: str
@@ -223,6 +232,78 @@ def bench_perceive(
     compile_seconds, seconds = measure(function, calls, repeats)
     shapes = {"scenes": scenes, "batch": batch, "recognitions": batch * objects}
     return Timing(f"perceive: {recognition}", objects, shapes, compile_seconds, tuple(seconds), versions())
+
+
+def drawn_pushes(count: int, objects: int, seed: int = 0, tries: int = 100) -> tuple[World, Action]:
+    """Random pushes that the arm can make, as the push model is trained on, each in a random scene of its own.
+
+    Args:
+      count: how many.
+      objects: in each scene. One with room for fewer, or in which no push is possible, is drawn anew.
+      seed: of the scenes and the pushes.
+      tries: after so many times `count` scenes it is given up.
+
+    Returns:
+      The scenes and the pushes, with a leading axis.
+
+    Raises:
+      InputError: the number of objects does not fit, or too few pushes are found.
+    """
+    if not 1 <= objects <= MAX_OBJECTS:
+        raise InputError(f"bench predict: --objects {objects} is not between 1 and {MAX_OBJECTS}")
+    scenes, config, shelf = dataclasses.replace(push_scenes(), objects=(objects, objects)), PushesConfig(), Shelf()
+    tables = push_tables(config)
+
+    def draw(key: Array) -> tuple[World, Action, Array]:
+        scene_key, push_key = jax.random.split(key)
+        world = random_world(scene_key, scenes, shelf)
+        action, found = draw_push(push_key, world, tables, config, shelf)
+        return world, action, found & (jnp.sum(world.valid[:TARGET]) == objects)
+
+    several = jax.jit(lambda keys: jax.lax.map(draw, keys, batch_size=min(count, 64)))
+    parts, have = [], 0
+    for i in range(tries):
+        world, action, real = jax.device_get(
+            several(jax.random.split(jax.random.fold_in(jax.random.key(seed), i), count))
+        )
+        parts.append(jax.tree.map(lambda a, real=real: a[real], (world, action)))
+        have += int(real.sum())
+        if have >= count:
+            return jax.tree.map(lambda *a: jnp.asarray(np.concatenate(a)[:count]), *parts)
+    raise InputError(f"bench predict: only {have} of {count} pushes were possible with {objects} objects; take fewer")
+
+
+def bench_predict(
+    push_model: PushModelName, objects: int, batch: int = 30, repeats: int = 20, weights: Path | None = None
+) -> Timing:
+    """Time a push model on random pushes, each in a scene of its own, all in one call.
+
+    Args:
+      push_model: its name.
+      objects: number of objects in a scene.
+      batch: pushes in a call; a decision predicts as many at once as it samples sequences.
+      repeats: number of timed calls.
+      weights: of the learned model; the shipped ones if None.
+
+    Raises:
+      InputError: the number of objects does not fit, or the model cannot be used.
+    """
+    model = named_model(push_model, weights)
+    world, action = drawn_pushes(batch, objects)
+    shelf, pusher = Shelf(), push_tables(PushesConfig()).pusher
+
+    def predict(pusher: Array, scene: Superquadrics, action: Action) -> PushOutcome:
+        return model(shelf, scene, pusher, action.T_world_gripper, action.displacement, action.q7)
+
+    # As in a decision, the target is none of the objects.
+    scene = true_superquadrics(world)
+    compile_seconds, seconds = measure(jax.vmap(predict, in_axes=(None, 0, 0)), [(pusher, scene, action)], repeats)
+    about = weights_of(model)
+    shapes = {"predictions": batch, "capacity": TARGET}
+    if about is not None:
+        shapes["parameters"] = about["parameters"]
+    told = versions() if about is None else {**versions(), "weights": about["sha256"]}
+    return Timing(f"predict: {push_model}", objects, shapes, compile_seconds, tuple(seconds), told)
 
 
 def crowded_worlds(worlds: int, scenes: int = 8, seed: int = 0) -> World:

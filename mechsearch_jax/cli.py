@@ -500,6 +500,33 @@ def bench_perceive(
     _print_timing("perceive", out, lambda: benches.bench_perceive(recognition, objects, batch, repeats=repeats))
 
 
+def bench_predict(
+    *,
+    push_model: PushModel = "quasi-static",
+    weights: WeightsFile = None,
+    objects: int = 8,
+    batch: int = 30,
+    repeats: int = 20,
+    out: JsonFile = None,
+) -> None:
+    """Time predicting random pushes, all at once, each in a scene of its own: compilation, median and spread.
+
+    Args:
+      push_model: what predicts them; "physics" simulates every one.
+      weights: of the learned model; those that ship if not given.
+      objects: number of objects in a scene.
+      batch: pushes predicted at once; a decision predicts 30.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
+    from mechsearch_jax.benchmarks import bench as benches
+
+    at_least_one("bench predict", repeats=repeats, batch=batch)
+    if weights is not None and push_model != "learned":
+        raise InputError(f"bench predict: --weights is for --push-model learned, not for {push_model}")
+    _print_timing("predict", out, lambda: benches.bench_predict(push_model, objects, batch, repeats, weights))
+
+
 def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, out: JsonFile = None) -> None:
     """Time the batch simulator with 8 objects, the arm sweeping through them: steps per second of all worlds together.
 
@@ -931,6 +958,7 @@ GROUPS: dict[str, Commands] = {
         "existence": _timing_of("existence", "f"),
         "graspability": _timing_of("graspability", "g where f = 1"),
         "plan": _timing_of("plan", "a whole decision"),
+        "predict": bench_predict,
         "perceive": bench_perceive,
         "simulate": bench_simulate,
         "inside": bench_inside,

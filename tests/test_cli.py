@@ -108,6 +108,22 @@ WRONG = {
         "--worst-of network-refined is not among the methods",
     ),
     "file in a file": (["bench", "recognition", "--out", "good.json/a.json"], "good.json: cannot be written to"),
+    "no pushes": (["bench", "push", "--pushes", "0"], "bench push: --pushes 0 must be at least 1"),
+    "unknown seed of pushes": (["bench", "push", "--seed", "-1"], "bench push: --seed -1 must be from 0"),
+    "unknown model": (["bench", "push", "--models", "guess"], "guess"),
+    "weights of nothing": (
+        ["bench", "push", "--models", "quasi-static", "--weights", "push.npz"],
+        '--weights is for the model "learned"',
+    ),
+    "no weights": (["bench", "push", "--weights", "none.npz"], "none.json: cannot be read"),
+    "pushes in a file": (["bench", "push", "--models", "no motion", "--data", "good.json"], "cannot be written to"),
+    "nothing to predict": (["bench", "predict", "--batch", "0"], "bench predict: --batch 0 must be at least 1"),
+    "too many objects to push": (["bench", "predict", "--objects", "9"], "--objects 9 is not between 1 and 8"),
+    "weights of no network": (["bench", "predict", "--weights", "push.npz"], "--weights is for --push-model learned"),
+    "no weights to time": (
+        ["bench", "predict", "--push-model", "learned", "--weights", "none.npz"],
+        "none.json: cannot be read",
+    ),
     "nothing to agree on": (["bench", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
     "file for a folder": (["search", "good.json", "--out", "good.json"], "good.json: cannot be written to"),
 }
