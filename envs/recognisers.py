@@ -32,7 +32,7 @@ from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
 from mechsearch_jax.perception.target_pose import target_pose
 from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.target import Target
 
 RecognitionName = Literal["oracle", "masks", "full"]
@@ -118,7 +118,7 @@ def numbered(found: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImageRecogniser:
-    """The `Recogniser` that sees a depth image.
+    """The `Recogniser` that sees a depth image. What it recognises has the edges of `superquadric.standard_edges`.
 
     Attributes:
       target: its known shape.
@@ -160,7 +160,7 @@ def _recognise(
     index, count = draw(choosing, (masks == TARGET).reshape(-1), TARGET_POINTS)
     seen = jnp.broadcast_to(count > 0, TARGET_POINTS)
     pose = target_pose(recogniser.target, shelf, jnp.array(camera.position), points.reshape(-1, 3)[index], seen)
-    return refined.scene, pose
+    return standard_edges(refined.scene), pose
 
 
 def measured_depth(camera: Camera, depth: Float[Array, "h w"], points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:

@@ -68,6 +68,15 @@ def pad(superquadrics: Superquadrics, capacity: int) -> Superquadrics:
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b[:missing]]), superquadrics, empty(capacity))
 
 
+def standard_edges(superquadrics: Superquadrics) -> Superquadrics:
+    """The same superquadrics with edges no sharper than those of `BOX_EXPONENTS`, which the paper plans with.
+
+    What fits an image best has nearly the sharp edges of a real box. It hides more and is hit more than the rounded box
+    of the same size that stands for it in plans: with it, f and g would depend on how an object came to be known.
+    """
+    return superquadrics.replace(exponents=jnp.maximum(superquadrics.exponents, BOX_EXPONENTS[0]))
+
+
 def _power(base: Array, exponent: Array) -> Array:
     """`base ** exponent` for `base >= 0`, with a zero gradient instead of NaN where `base` is 0."""
     positive = base > 0
