@@ -20,6 +20,11 @@ from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.transforms import transform
 
 NAME = "push"
+# An object is moved if it is predicted to move with a probability above this: of those that stay, 1 in 100 then moves.
+LIKELY = 0.8
+# The hand gives way and ends short of where it was sent: of what pushes really come to, 1 in 20 overlaps with the hand
+# where it was sent, or with another object's footprint, by about this [m].
+SLACK = 0.02
 
 
 @functools.cache
@@ -37,6 +42,7 @@ class LearnedPush:
     Attributes:
       path: of the weights; those that ship with the package if left out.
       likely: an object is moved if it moves with a probability above this, and else left exactly where it is.
+      slack: overlaps up to this are none, since objects that really are pushed end up that near [m].
       digest: of the weights, read from their card.
 
     Raises:
@@ -44,7 +50,8 @@ class LearnedPush:
     """
 
     path: Path | None = dataclasses.field(default=None, compare=False)
-    likely: float = 0.5
+    likely: float = LIKELY
+    slack: float = SLACK
     digest: str = dataclasses.field(default="", init=False)
 
     def __post_init__(self):
@@ -61,7 +68,7 @@ class LearnedPush:
         weights = _weights(self.path, self.digest)
         network = weights.network
         assert isinstance(network, PushNetwork)
-        predict = functools.partial(predicted, network, weights.parameters, self.likely)
+        predict = functools.partial(predicted, network, weights.parameters, self.likely, self.slack)
         return predict(shelf, scene, pusher, T_world_gripper, displacement, q7)
 
 
@@ -69,6 +76,7 @@ def predicted(
     network: PushNetwork,
     parameters: Any,
     likely: float,
+    slack: float,
     shelf: Shelf,
     scene: Superquadrics,
     pusher: Array,
@@ -86,6 +94,6 @@ def predicted(
     end = transform(T_world_gripper, pusher) + displacement[None]
     return PushOutcome(
         scene=after,
-        residual=unresolved(shelf, before, footprints(after), end),
+        residual=jnp.maximum(unresolved(shelf, before, footprints(after), end) - slack, 0.0),
         topples=jnp.where(scene.valid, jax.nn.sigmoid(told.topples), 0.0),
     )

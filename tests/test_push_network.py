@@ -381,12 +381,47 @@ def test_what_does_not_move_stays_exactly_where_it_is(weights):
 def test_a_pushed_object_that_is_told_to_turn_turns_by_that():
     scene, T, displacement = cluttered(3)
     expected = told(scene, T, displacement, shelf=SHELF)
-    outcome = jax.jit(functools.partial(predicted, PushNetwork(CONFIG), parameters(), 0.0), static_argnums=0)(
+    outcome = jax.jit(functools.partial(predicted, PushNetwork(CONFIG), parameters(), 0.0, 0.0), static_argnums=0)(
         SHELF, scene, pusher(), T, displacement, jnp.zeros(())
     )
     change = transforms.matmul(outcome.scene.rotation, jnp.swapaxes(scene.rotation, -1, -2))
     np.testing.assert_allclose(np.arctan2(change[:, 1, 0], change[:, 0, 0]), expected.turn, atol=1e-5)
     np.testing.assert_allclose(outcome.scene.position[:, 2], scene.position[:, 2], atol=1e-7)
+
+
+def test_small_overlaps_count_for_nothing(weights):
+    scene, T, _ = cluttered(2)
+    # Weights that nobody trained leave the objects where the gripper goes.
+    displacement = jnp.float32([0.0, 0.12, 0.0])
+
+    def residual(slack):
+        model = LearnedPush(weights, slack=slack)
+        return float(jax.jit(model, static_argnums=0)(SHELF, scene, pusher(), T, displacement, jnp.zeros(())).residual)
+
+    whole = residual(0.0)
+    assert whole > 0.01
+    assert residual(0.01) == pytest.approx(whole - 0.01, abs=1e-6)
+    assert residual(1.0) == 0.0
+
+
+def test_the_weights_that_ship_push_as_one_expects():
+    model = LearnedPush()
+    body = (0.03, 0.04, 0.06), BOX
+    scene = standing((*body, 0.6, 0.0, 0.0), (*body, 0.6, 0.08, 0.0), (*body, 0.6, 0.4, 0.0))
+    T = gripper_at(0.63, -0.16)
+    push = jax.jit(model, static_argnums=0)
+    outcome = push(SHELF, scene, pusher(), T, jnp.float32([0.0, 0.1, 0.0]), jnp.zeros(()))
+    shift = np.asarray(outcome.scene.position - scene.position)
+    # The second is met by the first, which is where it was to begin with; nothing comes near the third.
+    assert 0.06 < shift[0, 1] < 0.11
+    assert 0.05 < shift[1, 1] < 0.11
+    assert (shift[2] == 0).all()
+    assert np.abs(shift[:, 0]).max() < 0.02
+    assert (outcome.topples < 0.5).all()
+    # At its upper edge, a slender object falls over instead.
+    slender = standing(((0.02, 0.02, 0.11), BOX, 0.6, 0.0, 0.0))
+    high = push(SHELF, slender, pusher(), gripper_at(0.62, -0.14, z=0.18), jnp.float32([0.0, 0.1, 0.0]), jnp.zeros(()))
+    assert float(high.topples[0]) > 0.5
 
 
 def test_models_of_the_same_weights_are_the_same_to_jit(weights, tmp_path):

@@ -19,7 +19,7 @@ from mechsearch_jax.dynamics import PushModel, PushOutcome, QuasiStatic
 from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, Worlds, joined, portions, push_tables
 from mechsearch_jax.envs.world import CYLINDER, superquadrics
-from mechsearch_jax.learned_push import NAME, predicted
+from mechsearch_jax.learned_push import LIKELY, NAME, SLACK, predicted
 from mechsearch_jax.models.push import PushConfig, PushGeometry, PushMotion, PushNetwork, push_geometry, told_by
 from mechsearch_jax.models.weights import save_weights
 from mechsearch_jax.shelf import Shelf
@@ -167,7 +167,7 @@ class PushTask:
         held_out = jax.tree.map(lambda a: a[:scenes], self.held_out)
         network = PushNetwork(self.network)
         models: dict[str, PushModel] = {
-            "network": functools.partial(predicted, network, parameters, 0.5),
+            "network": functools.partial(predicted, network, parameters, LIKELY, SLACK),
             "quasi-static": QuasiStatic(),
             "no motion": no_motion,
         }
