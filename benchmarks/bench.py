@@ -60,7 +60,8 @@ class Timing:
       shapes: sizes that the time depends on; for "simulate" also what was seen of overflows and divergence.
       compile_seconds: of tracing and compiling [s]; honest only if compilations are not kept on disk.
       seconds: of every call afterwards, results awaited [s].
-      versions: as `results.versions` returns them; with "weights", the SHA-256 of those of a learned push model.
+      versions: as `results.versions` returns them; for "plan" also the "push model", for "predict: learned" also
+        "weights", their SHA-256.
     """
 
     subject: str
@@ -196,7 +197,9 @@ def bench(
         several = jax.tree.map(lambda *leaves: jnp.stack([leaves[i % scenes] for i in range(batch)]), *states)
         calls = [(problem, *several)]
     compile_seconds, seconds = measure(function, calls, repeats)
-    return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions())
+    # f and g predict no push.
+    told = {"push model": config.push_model} if subject == "plan" else {}
+    return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions() | told)
 
 
 def bench_perceive(

@@ -117,18 +117,20 @@ class Bench:
       generation: of the pushes; see `held_out_generation`.
       rows: what is compared, of `ROWS`.
       weights: of the learned model; the shipped ones if None.
-      make_simulator: simulates the pushes; on a GPU if there is one, if left out.
+      make_simulator: simulates the pushes; `envs.pushes.engine` if left out.
     """
 
     generation: Generation
     rows: Sequence[str] = ROWS
     weights: Path | None = None
-    make_simulator: Callable[[], Worlds] = lambda: generator.engine(jax.default_backend() != "cpu")
+    make_simulator: Callable[[], Worlds] | None = None
 
     def __post_init__(self):
         unknown = next((name for name in self.rows if name not in ROWS), None)
-        if unknown is not None or not self.rows:
-            raise InputError(f'bench push: model "{unknown or ""}" is unknown; use {", ".join(ROWS)}')
+        if not self.rows:
+            raise InputError(f"bench push: give at least one of --models {', '.join(ROWS)}")
+        if unknown is not None:
+            raise InputError(f'bench push: model "{unknown}" is unknown; use {", ".join(ROWS)}')
         if self.weights is not None and "learned" not in self.rows:
             raise InputError('bench push: --weights is for the model "learned"; add it to --models or leave it out')
         # What cannot be used is to be told of before anything is simulated.
@@ -139,10 +141,15 @@ class Bench:
         """What predicts: the rows without "nudged"."""
         return {name: named_model(name, self.weights) for name in dict.fromkeys(self.rows) if name != "nudged"}
 
+    @property
+    def gpu(self) -> bool:
+        """Whether the pushes are simulated on a GPU: where there is one."""
+        return jax.default_backend() != "cpu"
+
     @functools.cached_property
     def simulator(self) -> Worlds:
         """What simulates the pushes."""
-        return self.make_simulator()
+        return (self.make_simulator or functools.partial(generator.engine, self.gpu))()
 
     def pushes(self, folder: Path, told: Callable[[int], None] = lambda pushes: None) -> Pushes:
         """The pushes; those that lie in a folder already are read, the others simulated and put there.
@@ -155,7 +162,7 @@ class Bench:
           InputError: what lies in the folder is damaged or was made otherwise, it cannot be written, no push was
             possible, or Warp cannot be imported.
         """
-        return random_pushes(self.generation, folder, lambda: self.simulator, told)
+        return random_pushes(self.generation, folder, self.gpu, told, lambda: self.simulator)
 
     def run(self, pushes: Pushes, told: Callable[[str, int], None] = lambda row, pushes: None) -> Measured:
         """Compare predictions with what the simulation made of pushes.
@@ -178,7 +185,7 @@ class Bench:
         settings = {
             "pushes": len(pushes.object),
             "generation": dataclasses.asdict(self.generation),
-            "simulator": type(self.simulator).__name__,
+            "simulator": generator.engine_name(self.gpu),
             "objects": scenes.objects,
             "lengths": config.lengths,
             "sideways": config.sideways,

@@ -204,6 +204,7 @@ def push_scores_tables(measured: push.Measured) -> Group:
         if chosen:
             tables.append(_push_scores_table(f"{measured.best}, by {what}", what, chosen))
     explanation = (
+        "failed: how many pushes a simulation could not carry out; they count as predicted to move nothing. "
         "pushed: mean errors of the pushed object's place and, if it is a box, of its turn. other: of the place of "
         "others that moved. still: share of what stays that is predicted to stay within 1 mm. topple AP: average "
         "precision of what falls over, which counts for nothing else. distance: within 2.5 cm. "
@@ -220,12 +221,12 @@ def _is_plain(group: str, ending: str) -> bool:
 def _push_scores_table(title: str, first: str, lines: Mapping[str, Mapping[str, Any]]) -> Table:
     table = _plain_table(title)
     table.add_column(first, no_wrap=True, min_width=12)
-    for name in ("pushes", "pushed mm", "pushed deg", "other mm", "still", "topple AP"):
+    for name in ("pushes", "failed", "pushed mm", "pushed deg", "other mm", "still", "topple AP"):
         table.add_column(name, justify="right", no_wrap=True)
     digits = {"pushed_mm": 2, "pushed_deg": 2, "other_mm": 2, "still": 3, "topple_ap": 3}
     for name, line in lines.items():
         cells = ("-" if line[key] is None else f"{line[key]:.{n}f}" for key, n in digits.items())
-        table.add_row(name, str(line["pushes"]), *cells)
+        table.add_row(name, str(line["pushes"]), str(line["failed"]), *cells)
     return table
 
 

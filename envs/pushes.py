@@ -366,7 +366,8 @@ def load_pushes(path: Path, identity: str) -> Pushes:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); choose another --data") from None
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile):
-        raise InputError(f"{path}: holds no pushes; remove it or choose another --data") from None
+        complaint = "is damaged, or was written by another version; remove it or choose another --data"
+        raise InputError(f"{path}: {complaint}") from None
     if found != identity:
         raise InputError(f"{path}: was made otherwise ({found}); repeat that or choose another --data")
     return pushes
@@ -401,6 +402,7 @@ def portions(
     folder: Path,
     make_simulator: Callable[[], Worlds],
     draw_world: Callable[[Array], World],
+    source: str = "",
     config: PushesConfig | None = None,
     told: Callable[[int], None] = lambda pushes: None,
 ) -> Iterator[Pushes]:
@@ -410,7 +412,8 @@ def portions(
       generation: how many.
       folder: for one file for each portion.
       make_simulator: called if anything has to be simulated.
-      draw_world: see `generate_pushes`; part of what makes the pushes, but not checked against what lies there.
+      draw_world: see `generate_pushes`.
+      source: names the simulator and the scenes; what lies in the folder must have been made with the same.
       config: which pushes.
       told: is told how many pushes there are.
 
@@ -422,7 +425,7 @@ def portions(
     count = number = 0
     while count < generation.pushes:
         path = folder / f"pushes-{number:03d}.npz"
-        identity = repr((generation.seed, generation.worlds, generation.rounds, number, config))
+        identity = repr((generation.seed, generation.worlds, generation.rounds, number, config, source))
         if path.exists():
             part = load_pushes(path, identity)
         else:
@@ -446,6 +449,11 @@ def portions(
         told(count)
         number += 1
         yield part
+
+
+def engine_name(gpu: bool) -> str:
+    """The name of what `engine` returns."""
+    return "MjxSimulator" if gpu else "NativeWorlds"
 
 
 def engine(gpu: bool, threads: int | None = None) -> Worlds:

@@ -914,7 +914,7 @@ def train_push(
         seed=seed, steps=steps, minutes=minutes, batch=batch, rate=rate, chunk=chunk, held_out=held_out
     )
     network = PushConfig(width, layers, frame)
-    worlds = worlds or (64 if jax.default_backend() == "cpu" else 8192)
+    worlds = (64 if jax.default_backend() == "cpu" else 8192) if worlds is None else worlds
     generation = Generation(seed, pushes, worlds, rounds)
     check_writable(out)
     folder = data or out / "pushes"

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from mechsearch_jax.dynamics import PushOutcome, footprints, rigid_motion, unresolved
+from mechsearch_jax.errors import InputError
 from mechsearch_jax.models.push import PushNetwork, push_geometry, told_by
 from mechsearch_jax.models.weights import Weights, load_weights
 from mechsearch_jax.shelf import Shelf
@@ -22,8 +23,8 @@ from mechsearch_jax.transforms import transform
 NAME = "push"
 # An object is moved if it is predicted to move with a probability above this: of those that stay, 1 in 100 then moves.
 LIKELY = 0.8
-# The hand gives way and ends short of where it was sent: of what pushes really come to, 1 in 20 overlaps with the hand
-# where it was sent, or with another object's footprint, by about this [m].
+# The hand gives way and ends short of where it was sent: what simulated pushes come to overlaps in 1 of 20 cases by
+# about this with the hand where it was sent or with a neighbour [m]. Next to a wall, predictions are as far off.
 SLACK = 0.02
 
 
@@ -42,11 +43,12 @@ class LearnedPush:
     Attributes:
       path: of the weights; those that ship with the package if left out.
       likely: an object is moved if it moves with a probability above this, and else left exactly where it is.
-      slack: overlaps up to this are none, since objects that really are pushed end up that near [m].
+      slack: so much overlap, with the hand, a wall or another object, is taken off the residual [m]: what a push really
+        comes to overlaps with the hand where it was sent, too.
       digest: of the weights, read from their card.
 
     Raises:
-      InputError: the weights are missing or damaged.
+      InputError: the weights are missing or damaged, or a number is out of range.
     """
 
     path: Path | None = dataclasses.field(default=None, compare=False)
@@ -55,6 +57,10 @@ class LearnedPush:
     digest: str = dataclasses.field(default="", init=False)
 
     def __post_init__(self):
+        if not 0.0 <= self.likely <= 1.0 or not self.slack >= 0.0:
+            raise InputError(
+                f"LearnedPush: likely {self.likely} must be from 0 to 1, and slack {self.slack} m must not be negative"
+            )
         path = self.path or Path(str(importlib.resources.files("mechsearch_jax") / "models" / f"{NAME}.npz"))
         # What a frozen instance derives from its arguments can be set in no other way.
         object.__setattr__(self, "path", path)

@@ -22,6 +22,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.models.push import PushConfig, PushNetwork
 from mechsearch_jax.models.weights import ARCHITECTURES, save_weights
 from mechsearch_jax.train.loop import TrainConfig
+from mechsearch_jax.train.push import outcome_scores
 
 CONFIG = PushConfig(width=8, layers=1)
 GENERATION = held_out_generation(pushes=5, worlds=8, rounds=1)
@@ -117,8 +118,8 @@ def test_a_push_that_is_simulated_again_ends_the_same(pushes):
     assert count >= GENERATION.pushes
     seen = []
     # The last batch is not full.
-    again = repeated(pushes, simulator(), 3, seen.append)
-    assert seen == [*range(3, count, 3), count]
+    again = repeated(pushes, simulator(), count - 1, seen.append)
+    assert seen == [count - 1, count]
     valid = pushes.before.valid
     np.testing.assert_array_equal(again.scene.position[valid], pushes.after.position[valid])
     np.testing.assert_array_equal(again.scene.rotation[valid], pushes.after.rotation[valid])
@@ -132,9 +133,18 @@ def test_a_push_that_the_arm_cannot_make_again_moves_nothing(pushes):
     away[0, :3, 3] += 3.0
     again = repeated(first.replace(T_world_gripper=away), simulator(), 2)
     np.testing.assert_array_equal(again.residual, [np.inf, 0.0])
+    assert outcome_scores(again, first)["all"]["failed"] == 1
     np.testing.assert_array_equal(again.scene.position[0], first.before.position[0])
     valid = first.before.valid[1]
     np.testing.assert_array_equal(again.scene.position[1][valid], first.after.position[1][valid])
+
+
+def test_predictions_that_are_no_numbers_are_refused(pushes):
+    first = jax.tree.map(lambda a: a[:2], pushes)
+    told = repeated(first, simulator(), 2)
+    spoilt = told.replace(topples=np.where(first.before.valid, np.nan, told.topples))
+    with pytest.raises(InputError, match="not finite numbers"):
+        outcome_scores(spoilt, first)
 
 
 # --- what comes of it ------------------------------------------------------------------------------------------------
@@ -171,7 +181,15 @@ def test_scores_are_written_with_how_they_came_about(measured, weights, tmp_path
     assert "commit" in value
 
 
-LINE = {"pushes": 4, "pushed_mm": 12.345, "pushed_deg": None, "other_mm": 6.0, "still": 0.5, "topple_ap": 0.25}
+LINE = {
+    "pushes": 4,
+    "failed": 0,
+    "pushed_mm": 12.345,
+    "pushed_deg": None,
+    "other_mm": 6.0,
+    "still": 0.5,
+    "topple_ap": 0.25,
+}
 SCORES = {
     "no motion": {"all": LINE | {"pushed_mm": None}},
     "quasi-static": {
@@ -197,9 +215,9 @@ def test_the_tables_show_every_model_and_the_groups_of_the_best():
     models, distances, objects, _ = group.renderables
     numbers = ["-", "6.00", "0.500", "0.250"]
     assert rows_of(models) == [
-        ["no motion", "4", "-", *numbers],
-        ["quasi-static", "4", "12.35", *numbers],
-        ["nudged", "4", "1.00", *numbers],
+        ["no motion", "4", "0", "-", *numbers],
+        ["quasi-static", "4", "0", "12.35", *numbers],
+        ["nudged", "4", "0", "1.00", *numbers],
     ]
     assert [row[:2] for row in rows_of(distances)] == [["10 cm", "3"]]
     assert [row[:2] for row in rows_of(objects)] == [["1", "1"], ["8", "2"]]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import scenario
+from mechsearch_jax import scenario, superquadric
 from mechsearch_jax.camera import Camera, back_project
 from mechsearch_jax.envs.episode import Snapshot, oracle, target_of
 from mechsearch_jax.envs.observation import observe
@@ -50,6 +50,8 @@ def test_true_masks_and_noisy_depth_give_the_shapes(world, seen):
     assert overlap[both].mean() > 0.85
     assert not np.asarray(seen.scene.valid & ~truth.valid).any()
     assert not seen.found
+    # As the oracle has them, whatever fits the image best.
+    np.testing.assert_array_equal(seen.scene.exponents[both, 0], np.float32(superquadric.BOX_EXPONENTS[0]))
 
 
 def test_the_same_key_gives_the_same_and_another_key_other_noise(world, masks, seen):

@@ -404,6 +404,12 @@ def test_small_overlaps_count_for_nothing(weights):
     assert residual(1.0) == 0.0
 
 
+@pytest.mark.parametrize("wrong", [{"likely": 1.5}, {"likely": float("nan")}, {"slack": -0.01}])
+def test_impossible_thresholds_are_refused(weights, wrong):
+    with pytest.raises(InputError, match=r"LearnedPush: likely .* slack"):
+        LearnedPush(weights, **wrong)
+
+
 def test_the_weights_that_ship_push_as_one_expects():
     model = LearnedPush()
     body = (0.03, 0.04, 0.06), BOX

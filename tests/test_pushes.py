@@ -231,21 +231,26 @@ def test_a_world_is_simulated_as_its_scenario_is():
 def test_pushes_are_made_once_and_read_again(tmp_path):
     generation = Generation(seed=1, pushes=3, worlds=WORLDS, rounds=1)
     counts = []
-    made = list(generator.portions(generation, tmp_path, lambda: NativeWorlds(2), DRAW_WORLD, CONFIG, counts.append))
+    made = list(
+        generator.portions(generation, tmp_path, lambda: NativeWorlds(2), DRAW_WORLD, "here", CONFIG, counts.append)
+    )
 
     def simulate():
         raise AssertionError("all there is lies there already")
 
-    read = list(generator.portions(generation, tmp_path, simulate, DRAW_WORLD, CONFIG))
+    where = tmp_path, simulate, DRAW_WORLD, "here", CONFIG
+    read = list(generator.portions(generation, *where))
     assert counts[-1] == sum(len(part.object) for part in made) >= 3
     for a, b in zip(jax.tree.leaves(made), jax.tree.leaves(read), strict=True):
         np.testing.assert_array_equal(a, b)
     # Another portion would be needed now: scenes of one seed are none of another's.
     with pytest.raises(InputError, match="made otherwise"):
-        list(generator.portions(dataclasses.replace(generation, seed=2), tmp_path, simulate, DRAW_WORLD, CONFIG))
+        list(generator.portions(dataclasses.replace(generation, seed=2), *where))
+    with pytest.raises(InputError, match="made otherwise"):
+        list(generator.portions(generation, tmp_path, simulate, DRAW_WORLD, "elsewhere", CONFIG))
     (tmp_path / "pushes-000.npz").write_bytes(b"PK nothing of the kind")
-    with pytest.raises(InputError, match="no pushes") as refused:
-        list(generator.portions(generation, tmp_path, simulate, DRAW_WORLD, CONFIG))
+    with pytest.raises(InputError, match="is damaged") as refused:
+        list(generator.portions(generation, *where))
     assert "\n" not in str(refused.value)
 
 

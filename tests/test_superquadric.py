@@ -139,6 +139,15 @@ def test_eager_jit_and_vmap_agree():
         np.testing.assert_allclose(jax.vmap(function)(size, e, points), eager, rtol=2e-5)
 
 
+def test_edges_are_as_rounded_as_in_plans():
+    scene = random_scene(np.random.default_rng(4), 3)
+    exponents = jnp.float32([[0.03, 0.03], [0.03, 1.0], [0.5, 0.3]])
+    rounded = superquadric.standard_edges(scene.replace(exponents=exponents))
+    np.testing.assert_array_equal(rounded.exponents, np.float32([[0.2, 0.2], [0.2, 1.0], [0.5, 0.3]]))
+    for name in ("size", "position", "rotation", "valid"):
+        np.testing.assert_array_equal(getattr(rounded, name), getattr(scene, name))
+
+
 def test_padding_keeps_the_objects_and_refuses_too_many():
     scene = random_scene(np.random.default_rng(2), 3)
     padded = superquadric.pad(scene, 5)

@@ -19,6 +19,7 @@ from mechsearch_jax.dynamics import PushModel, PushOutcome, QuasiStatic
 from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, Worlds, joined, portions, push_tables
 from mechsearch_jax.envs.world import CYLINDER, superquadrics
+from mechsearch_jax.errors import InputError
 from mechsearch_jax.learned_push import LIKELY, NAME, SLACK, predicted
 from mechsearch_jax.models.push import PushConfig, PushGeometry, PushMotion, PushNetwork, push_geometry, told_by
 from mechsearch_jax.models.weights import save_weights
@@ -174,18 +175,23 @@ class PushTask:
         return {name: model_scores(model, held_out, self.pusher, self.shelf) for name, model in models.items()}
 
     def save(self, path: Path, parameters: Any, card: dict[str, Any]) -> None:
+        card = card | {"scored_with": {"likely": LIKELY, "slack": SLACK}}
         save_weights(path, self.name, self.network, parameters, card)
 
 
 def random_pushes(
     generation: Generation,
     folder: Path,
-    make_simulator: Callable[[], Worlds],
+    gpu: bool,
     told: Callable[[int], None] = lambda pushes: None,
+    make_simulator: Callable[[], Worlds] | None = None,
 ) -> Pushes:
-    """Pushes as the network learns from; see `envs.pushes.portions` for the arguments and errors."""
-    draw_world = functools.partial(random_world, config=push_scenes())
-    return joined(list(portions(generation, folder, make_simulator, draw_world, PushesConfig(), told)))
+    """Pushes as the network learns from, simulated on a GPU or not; see `envs.pushes.portions` for the rest."""
+    scenes = push_scenes()
+    draw_world = functools.partial(random_world, config=scenes)
+    simulate = make_simulator or functools.partial(generator.engine, gpu)
+    source = f"{generator.engine_name(gpu)}, {scenes}"
+    return joined(list(portions(generation, folder, simulate, draw_world, source, PushesConfig(), told)))
 
 
 def push_task(
@@ -203,15 +209,18 @@ def push_task(
       told: is told how many pushes there are.
 
     Raises:
-      InputError: what lies in the folder is damaged or was made otherwise, or the folder cannot be written.
+      InputError: what lies in the folder is damaged or was made otherwise, the folder cannot be written, or there are
+        too few pushes to hold some out.
     """
     scenes, config = push_scenes(), PushesConfig()
     gpu = jax.default_backend() != "cpu"
-    pushes = random_pushes(generation, folder, functools.partial(generator.engine, gpu), told)
+    pushes = random_pushes(generation, folder, gpu, told)
     held = pushes.lane % HELD_OUT_LANES == 0
+    if held.all() or not held.any():
+        raise InputError("train push: too few pushes to hold some out; give more --pushes or --worlds")
     origin = {
         "source": "random pushes of the robot, simulated",
-        "engine": "MjxSimulator" if gpu else "NativeWorlds",
+        "engine": generator.engine_name(gpu),
         **dataclasses.asdict(generation),
         "found": len(pushes.object),
         "held_out": int(held.sum()),
@@ -325,13 +334,21 @@ def outcome_scores(told: PushOutcome, pushes: Pushes) -> dict[str, Any]:
       pushes: on the host.
 
     Returns:
-      For each group the number of `pushes`, mean errors of the pushed object (`pushed_mm`, `pushed_deg`, the latter of
-      boxes) and of others that moved (`other_mm`), the share of still objects that are predicted to move by less than
-      `STILL` (`still`), and the average precision of toppling (`topple_ap`). Objects that toppled count for the last
-      alone.
+      For each group the number of `pushes` and of those that the model `failed` at (an infinite residual; what it says
+      of them counts all the same), mean errors of the pushed object (`pushed_mm`, `pushed_deg`, the latter of boxes)
+      and of others that moved (`other_mm`), the share of still objects that are predicted to move by less than `STILL`
+      (`still`), and the average precision of toppling (`topple_ap`). Objects that toppled count for the last alone.
+
+    Raises:
+      InputError: what was predicted is no number.
     """
+    valid = np.asarray(pushes.before.valid)
+    numbers = told.scene.position, told.scene.rotation, told.topples
+    if not all(np.isfinite(np.asarray(a)[valid]).all() for a in numbers):
+        raise InputError("predictions of pushes are not finite numbers; the model's weights may be damaged")
     truth = push_truth(jax.tree.map(jnp.asarray, pushes))
     compared, truth = jax.device_get((_compare(told, pushes, truth), truth))
+    failed = np.isinf(np.asarray(told.residual))
     length = np.linalg.norm(pushes.displacement, axis=1)
     objects = np.asarray(pushes.before.valid)[:, :-1].sum(axis=1)
     sideways = np.abs(np.asarray(pushes.displacement)[:, 0]) < 1e-3
@@ -344,10 +361,12 @@ def outcome_scores(told: PushOutcome, pushes: Pushes) -> dict[str, Any]:
     counts = {f"{n} objects": objects == n for n in range(1, pushes.before.valid.shape[1])}
     groups |= near | counts
     groups |= {f"{a}, {b}": x & y for a, x in near.items() for b, y in counts.items()}
-    return {name: _summary(compared, truth, pushes, chosen) for name, chosen in groups.items() if chosen.any()}
+    return {name: _summary(compared, truth, failed, pushes, chosen) for name, chosen in groups.items() if chosen.any()}
 
 
-def _summary(compared: _Compared, truth: PushTruth, pushes: Pushes, chosen: np.ndarray) -> dict[str, Any]:
+def _summary(
+    compared: _Compared, truth: PushTruth, failed: np.ndarray, pushes: Pushes, chosen: np.ndarray
+) -> dict[str, Any]:
     here = chosen[:, None] & truth.valid
     upright = here & ~truth.toppled
     pushed = np.arange(truth.valid.shape[1])[None] == pushes.object[:, None]
@@ -360,6 +379,7 @@ def _summary(compared: _Compared, truth: PushTruth, pushes: Pushes, chosen: np.n
     precision = average_precision(np.asarray(compared.topples)[here], np.asarray(truth.toppled)[here])
     return {
         "pushes": int(chosen.sum()),
+        "failed": int(failed[chosen].sum()),
         "pushed_mm": mean(compared.shift_error, upright & pushed, 1e3),
         "pushed_deg": mean(compared.turn_error, upright & pushed & boxes, 180 / np.pi),
         "other_mm": mean(compared.shift_error, upright & ~pushed & truth.moved, 1e3),

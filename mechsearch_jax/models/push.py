@@ -386,7 +386,7 @@ def _flat(scalars: Array, vectors: Array) -> Array:
 
 
 class Messages(nn.Module):
-    """The strongest message from the neighbours of each object, by what both are and how they stand; to be added."""
+    """A message from the strongest neighbour of each object, by what both are and how they stand; to be added."""
 
     width: int
     dtype: Any = jnp.float32
@@ -397,7 +397,8 @@ class Messages(nn.Module):
         own = nn.Dense(self.width, dtype=self.dtype, name="own")(h)
         theirs = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="theirs")(h)
         pair = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="pair")(pairs)
-        # What an object is itself does not change which neighbour is the strongest.
+        # What an object is itself does not change which neighbour is the strongest, in each channel by itself. The
+        # inner `where` keeps `gelu` and its gradient from `_NOBODY`.
         strongest = jnp.max(jnp.where(other[..., None], theirs[..., None, :, :] + pair, _NOBODY), axis=-2)
         alone = ~jnp.any(other, axis=-1)[..., None]
         message = jnp.where(alone, 0.0, nn.gelu(own + jnp.where(alone, 0.0, strongest)))
