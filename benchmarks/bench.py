@@ -284,7 +284,7 @@ def bench_predict(
     Args:
       push_model: its name.
       objects: number of objects in a scene.
-      batch: pushes in a call; a decision predicts as many at once as it samples sequences.
+      batch: pushes in a call; a step of a decision predicts one for each sampled sequence.
       repeats: number of timed calls.
       weights: of the learned model; the shipped ones if None.
 

@@ -515,7 +515,7 @@ def bench_predict(
       push_model: what predicts them; "physics" simulates every one.
       weights: of the learned model; those that ship if not given.
       objects: number of objects in a scene.
-      batch: pushes predicted at once; a decision predicts 30.
+      batch: pushes predicted at once; each step of a decision predicts 30.
       repeats: number of timed calls.
       out: JSON file for the result.
     """
@@ -559,7 +559,10 @@ def bench_inside(
     from mechsearch_jax.benchmarks import roofline
     from mechsearch_jax.benchmarks.bench import save_timings
     from mechsearch_jax.benchmarks.tables import timings_table
+    from mechsearch_jax.results import check_writable
 
+    if out is not None:
+        check_writable(out.parent)
     jax.config.update("jax_enable_compilation_cache", False)
     console = Console(highlight=False)
     with console.status("timing inside"):
@@ -608,10 +611,13 @@ def bench_agreement(
     from mechsearch_jax.benchmarks.tables import agreement_table
     from mechsearch_jax.cache import keep_compilations
     from mechsearch_jax.envs.mjx_simulator import import_mjx
+    from mechsearch_jax.results import check_writable
     from mechsearch_jax.scenario import load_scenario
 
     at_least_one("bench agreement", actions=actions, scenes=scenes)
     files = find_scenarios(scenarios) if scenarios else []
+    if out is not None:
+        check_writable(out.parent)
     import_mjx()
     keep_compilations()
     console = Console(highlight=False)
