@@ -873,7 +873,7 @@ def train_push(
     *,
     out: Path,
     data: Path | None = None,
-    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 300_000,
+    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 800_000,
     worlds: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     rounds: int = 8,
     frame: Literal["push", "world"] = "push",
@@ -899,7 +899,7 @@ def train_push(
       width, layers: sizes of the network.
       seed: of the weights, the scenes and the pushes.
       steps: length in steps.
-      minutes: length in minutes instead, without simulation and scoring; 9 if neither is given.
+      minutes: length in minutes instead, without simulation and scoring; 5 if neither is given.
       batch: pushes in a step.
       rate: highest learning rate.
       chunk: steps that the device makes before it reports.
@@ -915,11 +915,11 @@ def train_push(
     from mechsearch_jax.train.run import counting, run
 
     if steps is None and minutes is None:
-        minutes = 9.0
+        minutes = 5.0
     config = TrainConfig(
         seed=seed, steps=steps, minutes=minutes, batch=batch, rate=rate, chunk=chunk, held_out=held_out
     )
-    network = PushConfig(width, layers, frame)
+    network = PushConfig(width=width, layers=layers, frame=frame)
     worlds = (64 if jax.default_backend() == "cpu" else 8192) if worlds is None else worlds
     generation = Generation(seed, pushes, worlds, rounds)
     check_writable(out)

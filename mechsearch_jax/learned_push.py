@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mechsearch_jax.dynamics import PushOutcome, footprints, rigid_motion, unresolved
+from mechsearch_jax.dynamics import PushOutcome, rigid_motion, unresolved
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models.push import PushNetwork, push_geometry, told_by
+from mechsearch_jax.models.push import PushNetwork, push_start, told_by
 from mechsearch_jax.models.weights import Weights, load_weights
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
@@ -91,15 +91,19 @@ def predicted(
     q7: Array,
 ) -> PushOutcome:
     """What a network predicts of a push; see `LearnedPush` and `dynamics.PushModel` for the arguments."""
-    geometry = push_geometry(shelf, scene, pusher, T_world_gripper, displacement, network.config.frame)
-    told = told_by(network, parameters, geometry)
+    start = push_start(shelf, scene, pusher, T_world_gripper, displacement)
+    told = told_by(network, parameters, start)
     moves = scene.valid & (jax.nn.sigmoid(told.moves) > likely)
-    before = footprints(scene)
-    moved = rigid_motion(scene, before.position, before.position + told.shift, told.turn)
+    before = start.prints
+    prints = before.replace(
+        position=before.position + jnp.where(moves[:, None], told.shift, 0.0),
+        yaw=before.yaw + jnp.where(moves, told.turn, 0.0),
+    )
+    moved = rigid_motion(scene, before.position, prints.position, told.turn)
     after = jax.tree.map(lambda new, old: jnp.where(moves.reshape(-1, *[1] * (new.ndim - 1)), new, old), moved, scene)
     end = transform(T_world_gripper, pusher) + displacement[None]
     return PushOutcome(
         scene=after,
-        residual=jnp.maximum(unresolved(shelf, before, footprints(after), end) - slack, 0.0),
+        residual=jnp.maximum(unresolved(shelf, before, prints, end) - slack, 0.0),
         topples=jnp.where(scene.valid, jax.nn.sigmoid(told.topples), 0.0),
     )

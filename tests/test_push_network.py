@@ -19,7 +19,7 @@ from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.gripper import Gripper
 from mechsearch_jax.learned_push import LearnedPush, predicted
 from mechsearch_jax.models import push
-from mechsearch_jax.models.push import REACH, PushConfig, PushNetwork, push_geometry
+from mechsearch_jax.models.push import REACH, PushConfig, PushNetwork, push_geometry, push_start
 from mechsearch_jax.models.weights import save_weights
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
@@ -70,23 +70,19 @@ def cluttered(seed, count=5):
     return standing(*bodies), T, jnp.float32([length * np.cos(angle), length * np.sin(angle), 0.0])
 
 
-GEOMETRY = jax.jit(push_geometry, static_argnames=("shelf", "frame"))
-
-
 @functools.cache
 def parameters(config=CONFIG):
     """Of a network that has much to say."""
     scene, T, displacement = cluttered(0)
-    fresh = jax.jit(PushNetwork(config).init)(jax.random.key(3), GEOMETRY(SHELF, scene, pusher(), T, displacement))
-    fresh = fresh["params"]
+    start = push_start(SHELF, scene, pusher(), T, displacement)
+    fresh = jax.jit(PushNetwork(config).init)(jax.random.key(3), start)["params"]
     fresh["trunk"]["outputs"]["kernel"] = fresh["trunk"]["outputs"]["kernel"] * 500.0
     return fresh
 
 
 @functools.partial(jax.jit, static_argnames=("shelf", "config"))
 def answer(weights, points, scene, T, displacement, shelf, config):
-    geometry = push_geometry(shelf, scene, points, T, displacement, config.frame)
-    return push.told_by(PushNetwork(config), weights, geometry)
+    return push.told_by(PushNetwork(config), weights, push_start(shelf, scene, points, T, displacement))
 
 
 def told(scene, T, displacement, shelf=OPEN, config=CONFIG, points=None):
@@ -311,7 +307,8 @@ def test_an_object_is_reached_through_another():
         (*shape, 0.6, 0.0, 0.0), (*shape, 0.6, 0.07, 0.0), (*shape, 0.7, 0.07, 0.0), (*shape, 0.6, -0.3, 0.0)
     )
     # One point, 4 cm before the first: which is 3 cm before the second; the third is beside and the fourth behind.
-    geometry = GEOMETRY(OPEN, scene, jnp.zeros((1, 3)), gripper_at(0.6, -0.06), jnp.float32([0.0, 0.1, 0.0]))
+    start = push_start(OPEN, scene, jnp.zeros((1, 3)), gripper_at(0.6, -0.06), jnp.float32([0.0, 0.1, 0.0]))
+    geometry = jax.jit(push_geometry)(start)
     np.testing.assert_allclose(geometry.carry, [0.06, 0.03, 0.0, 0.0], atol=1e-6)
 
 
@@ -343,8 +340,8 @@ def test_gradients_are_finite_also_where_things_touch_or_nothing_moves():
     @jax.jit
     @functools.partial(jax.grad, argnums=(0, 1, 2, 3))
     def gradient(position, T, displacement, weights):
-        geometry = push_geometry(SHELF, aligned.replace(position=position), points, T, displacement)
-        found = push.told_by(PushNetwork(CONFIG), weights, geometry)
+        start = push_start(SHELF, aligned.replace(position=position), points, T, displacement)
+        found = push.told_by(PushNetwork(CONFIG), weights, start)
         return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(found))
 
     for y, length in ((0.0, 0.1), (0.1, 0.1), (0.0, 0.0)):
@@ -459,7 +456,7 @@ def test_damaged_weights_are_refused_in_one_line(weights, damage):
 def test_the_network_that_is_trained_is_small():
     scene, T, displacement = cluttered(0)
     shapes = jax.eval_shape(
-        lambda: PushNetwork().init(jax.random.key(0), push_geometry(SHELF, scene, pusher(), T, displacement))
+        lambda: PushNetwork().init(jax.random.key(0), push_start(SHELF, scene, pusher(), T, displacement))
     )
     assert sum(a.size for a in jax.tree.leaves(shapes)) < 250_000
 

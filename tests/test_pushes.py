@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax import dynamics, transforms
 from mechsearch_jax.actions import ActionKind
+from mechsearch_jax.benchmarks.push import repeated
 from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.native_worlds import NativeWorlds
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
 from mechsearch_jax.envs.world import BOX, CYLINDER, TARGET, World, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models.push import PushConfig
+from mechsearch_jax.models.push import NORMALS, PushConfig, reach
 from mechsearch_jax.scenario import Body, Scenario
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train import push as training
@@ -308,6 +309,46 @@ def test_the_truth_costs_nothing_but_its_scale(pushes):
     assert terms["moves"] > 10
 
 
+def test_what_is_left_out_of_a_push_had_no_part_in_it(pushes):
+    task, on_device = task_of(pushes), jax.tree.map(jnp.asarray, pushes)
+    start, truth = task.start(on_device), push_truth(on_device)
+    count = len(pushes.object)
+    varied, kept = jax.jit(jax.vmap(training.varied))(jax.random.split(jax.random.key(0), count), start, truth)
+    np.testing.assert_array_equal(varied.prints.valid, kept.valid)
+    left_out = np.asarray(truth.valid & ~kept.valid)
+    assert left_out.sum() > 5
+    assert not np.any(left_out & np.asarray(truth.moved))
+    # Without them, the same comes of the push, but for what a nudge would change too.
+    some = np.flatnonzero(left_out.any(axis=1))
+    fewer = jax.tree.map(lambda a: a[some], pushes)
+    fewer = fewer.replace(before=fewer.before.replace(valid=np.asarray(kept.valid)[some]))
+    again = repeated(fewer, NativeWorlds(2, generator.push_simulation()), WORLDS)
+    there = np.asarray(kept.valid & truth.moved & ~truth.toppled)[some]
+    gap = np.linalg.norm((again.scene.position - pushes.after.position[some])[..., :2], axis=-1)[there]
+    assert np.median(gap) < 5e-4
+    assert np.mean(gap < 5e-3) > 0.85
+
+
+def test_walls_are_set_elsewhere_only_where_nothing_meets_them(pushes):
+    task, on_device = task_of(pushes), jax.tree.map(jnp.asarray, pushes)
+    start, truth = task.start(on_device), push_truth(on_device)
+    count = len(pushes.object)
+    varied, kept = jax.jit(jax.vmap(training.varied))(jax.random.split(jax.random.key(1), count), start, truth)
+    moved = np.asarray(varied.faces - start.faces)
+    assert (moved > 0).any()
+    assert (moved < 0).any()
+    for push, wall in zip(*np.nonzero(moved), strict=True):
+        valid = np.asarray(kept.valid)[push]
+        assert not np.asarray(truth.toppled)[push][valid].any()
+        normal, face = NORMALS[wall], np.asarray(varied.faces)[push, wall]
+        for world in (pushes.before, pushes.after):
+            prints = dynamics.footprints(superquadrics(jax.tree.map(lambda a, push=push: a[push], world)))
+            toward = reach(prints, jnp.broadcast_to(-jnp.asarray(normal)[None], prints.position.shape))
+            inside = np.asarray(prints.position) @ normal - np.asarray(toward) - face
+            # Those that lean end with other footprints than they began with.
+            assert (inside[valid & (np.asarray(start.tilt)[push] < 1e-3)] > 0).all()
+
+
 def test_a_model_that_knows_the_outcome_scores_best(pushes):
     after = pushes.after
 
@@ -386,6 +427,6 @@ def test_the_command_simulates_trains_scores_and_writes_weights(tmp_path, capsys
     tables = push_tables(CONFIG)
     T = transforms.upright_pose(jnp.float32([0.6, 0.0, 0.0]), 0.45)
     outcome = jax.jit(model, static_argnums=0)(
-        SHELF, superquadrics(world), tables.pusher, T, jnp.float32([0.0, 0.1, 0.0])
+        SHELF, superquadrics(world), tables.pusher, T, jnp.float32([0.0, 0.1, 0.0]), jnp.zeros(())
     )
     assert np.isfinite(outcome.scene.position).all()

@@ -21,11 +21,21 @@ from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, Worlds,
 from mechsearch_jax.envs.world import CYLINDER, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.learned_push import LIKELY, NAME, SLACK, predicted
-from mechsearch_jax.models.push import PushConfig, PushGeometry, PushMotion, PushNetwork, push_geometry, told_by
+from mechsearch_jax.models.push import (
+    NORMALS,
+    REACH,
+    PushConfig,
+    PushMotion,
+    PushNetwork,
+    PushStart,
+    push_start,
+    pusher_distance,
+    told_by,
+)
 from mechsearch_jax.models.weights import save_weights
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.train.scenes import SceneConfig, random_world
+from mechsearch_jax.train.scenes import SceneConfig, origin, random_world
 from mechsearch_jax.transforms import matmul
 
 # Every so many lanes of pushes one is never trained on.
@@ -87,10 +97,54 @@ def turn_error(a: Float[Array, "*shape"], b: Float[Array, "*shape"]) -> Float[Ar
     return a - b - HALF_TURN * jnp.round((a - b) / HALF_TURN)
 
 
+# Nothing that stays farther than this from all that moves has a part in it [m].
+CLEAR = 0.005
+# How often something that has no part in a push is taken away, or a wall set elsewhere, and how far outwards [m].
+VARIED, OUTWARDS = 0.5, 0.2
+
+
+def varied(key: Key[Array, ""], start: PushStart, truth: PushTruth) -> tuple[PushStart, PushTruth]:
+    """The same push, with the same outcome, less some objects that had no part in it, and with other distant walls.
+
+    An approximation: objects are taken to move on straight lines, in circles around their footprints.
+
+    Args:
+      key: PRNG key.
+      start: of a push of objects (N, ...).
+      truth: what became of them, fields (N, ...).
+    """
+    prints = start.prints
+    length = jnp.sqrt(jnp.sum(start.displacement**2))
+    heading = start.displacement / jnp.maximum(length, 1e-6)
+    radius = jnp.sqrt(jnp.sum(prints.half**2, axis=-1))
+    # What falls over comes to lie beside its footprint.
+    radius = radius + jnp.where(truth.toppled, prints.high - prints.low, 0.0)
+    shift = jnp.where(truth.moved[:, None], truth.shift, 0.0)
+    offset = prints.position[None] - prints.position[:, None]
+    along = jnp.sum(offset * shift[:, None], axis=-1) / jnp.maximum(jnp.sum(shift**2, axis=-1), 1e-9)[:, None]
+    nearest = offset - jnp.clip(along, 0.0, 1.0)[..., None] * shift[:, None]
+    clearance = jnp.sqrt(jnp.sum(nearest**2, axis=-1)) - radius[:, None] - radius[None]
+    clear = jnp.all((clearance > CLEAR) | ~(truth.moved & truth.valid)[:, None], axis=0)
+    distance, level = pusher_distance(prints, start.points, heading)
+    clear &= jnp.min(jnp.where(level, distance, REACH), axis=1) > length + CLEAR
+    keys = jax.random.split(key, 4)
+    valid = truth.valid & ~(clear & ~truth.moved & jax.random.bernoulli(keys[0], VARIED, clear.shape))
+
+    ends = jnp.stack([prints.position, prints.position + shift])
+    inside = jnp.sum(ends[:, :, None] * jnp.asarray(NORMALS)[None, None], axis=-1) - radius[None, :, None]
+    room = jnp.min(jnp.where(valid[None, :, None], inside, jnp.inf), axis=(0, 1)) - start.faces - 2 * CLEAR
+    far = (room > 0) & ~jnp.any(truth.toppled & truth.valid)
+    inwards = jax.random.bernoulli(keys[1], 0.5, room.shape)
+    moved = jax.random.uniform(keys[2], room.shape) * jnp.where(inwards, jnp.minimum(room, REACH), -OUTWARDS)
+    moved = jnp.where(far & jax.random.bernoulli(keys[3], VARIED, room.shape), moved, 0.0)
+    start = start.replace(prints=prints.replace(valid=valid), faces=start.faces + moved)
+    return start, truth.replace(valid=valid)
+
+
 class PushExample(flax.struct.PyTreeNode):
     """Pushes as the network is told them, and what became of them."""
 
-    geometry: PushGeometry
+    start: PushStart
     truth: PushTruth
 
 
@@ -140,25 +194,28 @@ class PushTask:
     precision: Any = jnp.float32
     name: str = NAME
 
-    def geometry(self, pushes: Pushes) -> PushGeometry:
+    def start(self, pushes: Pushes) -> PushStart:
         """What the network is told of pushes."""
 
         def one(scene, T, displacement):
-            return push_geometry(self.shelf, scene, self.pusher, T, displacement, self.network.frame)
+            return push_start(self.shelf, scene, self.pusher, T, displacement)
 
         return jax.vmap(one)(superquadrics(pushes.before), pushes.T_world_gripper, pushes.displacement)
 
     def init(self, key: Key[Array, ""]) -> Any:
-        first = jax.tree.map(lambda a: jnp.asarray(a[:1]), self.pushes)
-        return PushNetwork(self.network).init(key, self.geometry(first))["params"]
+        first = self.start(jax.tree.map(lambda a: jnp.asarray(a[:1]), self.pushes))
+        return PushNetwork(self.network).init(key, jax.tree.map(lambda a: a[0], first))["params"]
 
     def sample(self, key: Key[Array, ""], batch: int) -> PushExample:
+        key, vary_key = jax.random.split(key)
         chosen = jax.random.randint(key, (batch,), 0, len(self.pushes.object))
         pushes: Pushes = jax.tree.map(lambda a: jnp.asarray(a)[chosen], self.pushes)
-        return PushExample(self.geometry(pushes), push_truth(pushes))
+        start, truth = self.start(pushes), push_truth(pushes)
+        return PushExample(*jax.vmap(varied)(jax.random.split(vary_key, batch), start, truth))
 
     def loss(self, parameters: Any, examples: PushExample) -> tuple[Float[Array, ""], dict[str, Any]]:
-        told = told_by(PushNetwork(self.network, self.precision), parameters, examples.geometry)
+        network = PushNetwork(self.network, self.precision)
+        told = jax.vmap(functools.partial(told_by, network, parameters))(examples.start)
         terms = example_loss(told, examples.truth)
         loss = sum((weight * terms[name] for name, weight in LOSS_WEIGHTS.items()), jnp.zeros(()))
         return loss, terms
@@ -190,7 +247,7 @@ def random_pushes(
     scenes = push_scenes()
     draw_world = functools.partial(random_world, config=scenes)
     simulate = make_simulator or functools.partial(generator.engine, gpu)
-    source = f"{generator.engine_name(gpu)}, {scenes}"
+    source = repr((generator.engine_name(gpu), generator.push_simulation(), origin(scenes)))
     return joined(list(portions(generation, folder, simulate, draw_world, source, PushesConfig(), told)))
 
 
@@ -218,7 +275,7 @@ def push_task(
     held = pushes.lane % HELD_OUT_LANES == 0
     if held.all() or not held.any():
         raise InputError("train push: too few pushes to hold some out; give more --pushes or --worlds")
-    origin = {
+    made = {
         "source": "random pushes of the robot, simulated",
         "engine": generator.engine_name(gpu),
         **dataclasses.asdict(generation),
@@ -231,7 +288,7 @@ def push_task(
     return PushTask(
         pushes=jax.tree.map(lambda a: jnp.asarray(a[~held]), pushes),
         held_out=jax.tree.map(lambda a: a[held], pushes),
-        origin=origin,
+        origin=made,
         network=network or PushConfig(),
     )
 

@@ -14,6 +14,7 @@ is not equivariant, the same network can be told the same in the frame of the wo
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, Literal, cast
 
 import flax.linen as nn
@@ -50,7 +51,7 @@ _OUTPUTS = 7
 # Weaker than any neighbour.
 _NOBODY = -1e9
 # The inward normals of the back, right and left walls, and of the front edge, beyond which is nothing.
-_NORMALS = np.array([[-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], np.float32)
+NORMALS = np.array([[-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], np.float32)
 _IS_EDGE = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
 _MIRROR = np.array([1.0, -1.0], np.float32)
 _MIRRORED_DIRECTIONS = (-np.arange(DIRECTIONS)) % DIRECTIONS
@@ -71,14 +72,14 @@ class PushConfig:
     frame: Literal["push", "world"] = "push"
 
     def __post_init__(self):
-        if min(self.width, self.layers) < 1:
-            raise InputError("PushConfig: width and layers must be positive")
+        if self.width < 2 or self.layers < 1:
+            raise InputError("PushConfig: width must be at least 2 and layers at least 1")
         if self.frame not in ("push", "world"):
             raise InputError(f'PushConfig: frame "{self.frame}" is unknown; use "push" or "world"')
 
 
 class PushGeometry(flax.struct.PyTreeNode):
-    """A push as the network is told it; every field may have leading axes. Vectors are planar, in the push's frame.
+    """A push as the network is told it. Vectors are planar, in the push's frame.
 
     Attributes:
       scalars: of each object, shape (N, S).
@@ -110,14 +111,14 @@ class PushGeometry(flax.struct.PyTreeNode):
 
 
 class PushMotion(flax.struct.PyTreeNode):
-    """What the network says of each object; every field has the leading axes (..., N).
+    """What the network says of each object; every field has the leading axis (N,).
 
     Attributes:
-      shift: planar motion of its centre in the world, if it moves [m], (..., N, 2).
+      shift: planar motion of its centre in the world, if it moves [m], (N, 2).
       turn: about the vertical, if it moves; 0 for a round object [rad].
       moves: logit of the probability that it moves.
       topples: logit of the probability that it falls over, or off the board.
-      log_scale: logarithms of the expected absolute errors of shift [m] and turn [rad], (..., N, 2).
+      log_scale: logarithms of the expected absolute errors of shift [m] and turn [rad], (N, 2).
     """
 
     shift: jax.Array
@@ -201,46 +202,82 @@ def _pair_distance(prints: Footprints, heading: Array) -> tuple[Array, Array]:
     Exact for two boxes; a cylinder is taken as a polygon around it, up to 2% wider.
     """
     n = prints.yaw.shape[0]
-    fixed = jnp.broadcast_to(_fan(heading)[None], (n, DIRECTIONS))
+    fan = _fan(heading)
+    rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
     # A round object has no sides of its own.
-    yaw = jnp.where(prints.round, fixed[:, 0], prints.yaw)[:, None]
-    own = jnp.concatenate([yaw, yaw + np.float32(np.pi / 2)], axis=1)
-    own = jnp.broadcast_to(own[:, None], (n, n, 2))
-    angles = jnp.concatenate([jnp.broadcast_to(fixed[:, None], (n, n, DIRECTIONS)), own, jnp.swapaxes(own, 0, 1)], -1)
-    normal = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-    # `reach` wants the axis of the objects last: that of j, then that of i.
-    of_j = jnp.transpose(reach(prints, jnp.transpose(normal, (2, 0, 1, 3))), (1, 2, 0))
-    of_i = jnp.transpose(reach(prints, jnp.transpose(normal, (2, 1, 0, 3))), (2, 1, 0))
-    width = of_i + of_j
+    axis = jnp.stack([jnp.cos(prints.yaw), jnp.sin(prints.yaw)], axis=-1)
+    axis = jnp.where(prints.round[:, None], heading[None], axis)
+    sides = jnp.stack([axis, _perpendicular(axis)], axis=1)
+    # How far all objects reach along the rays, (K, N), and along each other's sides: [k, s, m] is m along those of k.
+    along_rays = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, n, 2)))
+    along_sides = reach(prints, jnp.broadcast_to(sides[:, :, None], (n, 2, n, 2)))
+    own = jnp.diagonal(along_sides, axis1=0, axis2=2).T
     offset = prints.position[:, None] - prints.position[None]
-    side = _perpendicular(heading)
-    lateral = _dot(offset, side[None, None])
-    across = reach(prints, jnp.broadcast_to(side[None], prints.position.shape))
+    lateral = _dot(offset, _perpendicular(heading)[None, None])
+    across = reach(prints, jnp.broadcast_to(_perpendicular(heading)[None], prints.position.shape))
     widest = across[:, None] + across[None]
     inside = jnp.clip(lateral, GRAZE / 4 - widest, widest - GRAZE / 4)
-    start = offset + (inside - lateral)[..., None] * side[None, None]
-    enters, leaves = _slabs(width, _dot(normal, start[:, :, None]), _dot(normal, heading[None, None, None]))
-    gap = jnp.max(jnp.abs(_dot(normal, offset[:, :, None])) - width, axis=-1)
-    return _grazing(enters, leaves, widest - jnp.abs(lateral)), gap
+    start = offset + (inside - lateral)[..., None] * _perpendicular(heading)[None, None]
+
+    def slabs(width, speed, normal):
+        """Entering, leaving and the gap along normals; all broadcast to (..., N, N) with the normals first."""
+        safe = jnp.where(jnp.abs(speed) < 1e-5, 1e-5, speed)
+        middle, half = -_dot(normal, start[None]) / safe, width / jnp.abs(safe)
+        gap = jnp.abs(_dot(normal, offset[None])) - width
+        return tuple(jnp.max(a, axis=0) for a in (middle - half, -(middle + half), gap))
+
+    onward = _dot(rays, heading[None])
+    width, normal = jnp.moveaxis(own[:, :, None] + along_sides, 1, 0), jnp.moveaxis(sides, 1, 0)
+    speed = _dot(normal, heading[None, None])
+    parts = (
+        slabs(along_rays[:, :, None] + along_rays[:, None], onward[:, None, None], rays[:, None, None]),
+        slabs(width, speed[:, :, None], normal[:, :, None]),
+        slabs(jnp.swapaxes(width, 1, 2), speed[:, None], normal[:, None]),
+    )
+    enters, stays, gap = (functools.reduce(jnp.maximum, a) for a in zip(*parts, strict=True))
+    return _grazing(enters, -stays, widest - jnp.abs(lateral)), gap
 
 
 def _soft_contact(distance: Array, level: Array, softness: float, values: Array) -> Array:
     """Mean over the points of values (N, P, C) that are the first to touch, (N, C)."""
     first = jnp.min(jnp.where(level, distance, REACH), axis=1, keepdims=True)
-    weight = jnp.where(level, jnp.exp(-(distance - first) / softness), 0.0)
+    # What is not level may be reached long before; the inner `where` keeps it from overflowing.
+    weight = jnp.where(level, jnp.exp((first - jnp.where(level, distance, first)) / softness), 0.0)
     weight = weight / jnp.maximum(jnp.sum(weight, axis=1, keepdims=True), 1e-6)
     return jnp.sum(weight[..., None] * values, axis=1)
 
 
-def push_geometry(
+class PushStart(flax.struct.PyTreeNode):
+    """A push as it begins.
+
+    Attributes:
+      prints: footprints of the objects, fields (N, ...).
+      tilt: how far each object leans, 0 if a face of it is level, shape (N,).
+      points: surface of the gripper in the world [m], shape (P, 3).
+      T_world_gripper: its pose, shape (4, 4).
+      displacement: how the gripper moves in the plane [m], shape (2,).
+      faces: where the inner faces of the back, right and left walls are along their inward normals, and the front edge
+        [m], shape (4,).
+      board: height of the shelf's board [m].
+    """
+
+    prints: Footprints
+    tilt: jax.Array
+    points: jax.Array
+    T_world_gripper: jax.Array
+    displacement: jax.Array
+    faces: jax.Array
+    board: jax.Array
+
+
+def push_start(
     shelf: Shelf,
     scene: Superquadrics,
     pusher: Float[Array, "p 3"],
     T_world_gripper: Float[Array, "4 4"],
     displacement: Float[Array, "3"],
-    frame: Literal["push", "world"] = "push",
-) -> PushGeometry:
-    """What the network is told of a push; see `dynamics.PushModel` for the arguments.
+) -> PushStart:
+    """The start of a push; see `dynamics.PushModel` for the arguments.
 
     Args:
       shelf: walls; one of which is farther than `REACH` from an object does not exist for it.
@@ -248,12 +285,29 @@ def push_geometry(
       pusher: surface of the closed gripper in its own frame [m]; the first `POINTS` of it have to cover all of it.
       T_world_gripper: where the push starts.
       displacement: how the gripper moves [m]; what is vertical in it is neglected.
+    """
+    return PushStart(
+        prints=footprints(scene),
+        tilt=10.0 * (1.0 - jnp.max(jnp.abs(scene.rotation[:, 2, :]), axis=-1)),
+        points=transform(T_world_gripper, pusher[:POINTS]),
+        T_world_gripper=T_world_gripper,
+        displacement=displacement[:2],
+        faces=jnp.array([-shelf.back, shelf.right, -shelf.left, shelf.front]),
+        board=jnp.float32(shelf.board),
+    )
+
+
+def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") -> PushGeometry:
+    """What the network is told of a push.
+
+    Args:
+      start: see there.
       frame: see `PushConfig`.
     """
-    prints = footprints(scene)
-    n = scene.capacity
-    length = _norm(displacement[:2])
-    heading = jnp.where(length > 1e-6, displacement[:2] / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0]))
+    prints, points, T_world_gripper = start.prints, start.points, start.T_world_gripper
+    n = prints.yaw.shape[0]
+    length = _norm(start.displacement)
+    heading = jnp.where(length > 1e-6, start.displacement / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0]))
     axis = heading if frame == "push" else jnp.array([1.0, 0.0])
     basis = jnp.stack([axis, _perpendicular(axis)])
 
@@ -265,7 +319,6 @@ def push_geometry(
     def spread(vector):
         return jnp.broadcast_to(vector[None], (n, *vector.shape))
 
-    points = transform(T_world_gripper, pusher[:POINTS])
     distance, level = pusher_distance(prints, points, heading)
     valid = prints.valid[:, None]
     level &= valid
@@ -296,7 +349,8 @@ def push_geometry(
     closing = told(closing[None])[0]
     twice = jnp.stack([closing[0] ** 2 - closing[1] ** 2, 2.0 * closing[0] * closing[1]])
     to_gripper = gripper[None] - prints.position
-    room = jnp.array([(shelf.front + shelf.back) / 2, (shelf.left + shelf.right) / 2])
+    faces = start.faces
+    room = 0.5 * jnp.stack([faces[3] - faces[0], faces[1] - faces[2]])
     place = prints.position - room[None] if frame == "world" else jnp.zeros((n, 2))
     planar = jnp.stack(
         [
@@ -312,10 +366,9 @@ def push_geometry(
     )
     units = jnp.stack([spread(told(approach[None])[0]), spread(twice), spread(told(heading[None])[0])], axis=1)
     tall = prints.high - prints.low
-    upright = jnp.max(jnp.abs(scene.rotation[:, 2, :]), axis=-1)
     lengths = jnp.stack(
         [
-            prints.low - shelf.board,
+            prints.low - start.board,
             tall,
             spread(length),
             direct,
@@ -332,7 +385,7 @@ def push_geometry(
     plain = jnp.stack(
         [
             prints.round.astype(jnp.float32),
-            10.0 * (1.0 - upright),
+            start.tilt,
             spread(T_world_gripper[2, 2]),
             touching[:, 0],
             (reached < length).astype(jnp.float32),
@@ -348,8 +401,7 @@ def push_geometry(
     onward = jnp.clip(pair_distance, -DEEPEST, REACH)
     pair_lengths = jnp.stack([onward, onward.T, jnp.clip(gap, -DEEPEST, REACH), jnp.clip(overlap, -0.05, 0.2)], axis=-1)
 
-    normals = jnp.asarray(_NORMALS)
-    faces = jnp.array([-shelf.back, shelf.right, -shelf.left, shelf.front])
+    normals = jnp.asarray(NORMALS)
     toward = reach(prints, jnp.broadcast_to(normals[:, None], (4, n, 2))).T
     wall_gap = _dot(prints.position[:, None], normals[None]) - faces[None] - toward
     wall_gap = jnp.clip(wall_gap, -0.05, REACH)
@@ -423,7 +475,7 @@ class PushTrunk(nn.Module):
         x = nn.Dense(width, name="objects")(objects)
         x = x + nn.Dense(width, name="bend")(nn.gelu(nn.Dense(2 * width, name="widen")(objects)))
         # Nothing is said of a wall out of reach: its bias too fades with the distance.
-        met = nn.gelu(nn.Dense(width, name="walls")(walls)) * geometry.wall_near[..., None]
+        met = nn.gelu(nn.Dense(width // 2, name="walls")(walls)) * geometry.wall_near[..., None]
         x = x + nn.Dense(width, use_bias=False, name="met")(jnp.sum(met, axis=-2))
         for _ in range(self.config.layers):
             x = x + Messages(width, self.dtype)(x, pairs, other)
@@ -438,28 +490,27 @@ class PushNetwork(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, geometry: PushGeometry) -> PushMotion:
+    def __call__(self, start: PushStart) -> PushMotion:
         trunk = PushTrunk(self.config, self.dtype, name="trunk")
+        geometry = push_geometry(start, self.config.frame)
         if self.config.frame == "push":
             both = trunk(jax.tree.map(lambda *images: jnp.stack(images), geometry, mirrored(geometry)))
             # In the mirror, what goes to the left goes to the right, and turns are the other way round.
-            signs = jnp.array([1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0]).reshape(*[1] * (both.ndim - 2), -1)
-            outputs = 0.5 * (both[0] + signs * both[1])
+            signs = jnp.array([1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+            outputs = 0.5 * (both[0] + signs[None] * both[1])
         else:
             outputs = trunk(geometry)
-        x = geometry.axis[..., None, :]
-        y = _perpendicular(x)
-        planar = _SHIFT * outputs[..., :2] + geometry.carry[..., None] * geometry.heading[..., None, :]
+        x, y = geometry.axis[None], _perpendicular(geometry.axis)[None]
+        planar = _SHIFT * outputs[:, :2] + geometry.carry[:, None] * geometry.heading[None]
         return PushMotion(
-            shift=planar[..., :1] * x + planar[..., 1:] * y,
-            turn=jnp.where(geometry.round, 0.0, _TURN * outputs[..., 2]),
-            moves=outputs[..., 3],
-            topples=outputs[..., 4],
-            log_scale=jnp.clip(outputs[..., 5:], -4.0, 3.0)
-            + jnp.log(jnp.array([0.01, 0.05])).reshape(*[1] * (outputs.ndim - 1), 2),
+            shift=planar[:, :1] * x + planar[:, 1:] * y,
+            turn=jnp.where(geometry.round, 0.0, _TURN * outputs[:, 2]),
+            moves=outputs[:, 3],
+            topples=outputs[:, 4],
+            log_scale=jnp.clip(outputs[:, 5:], -4.0, 3.0) + jnp.log(jnp.array([0.01, 0.05]))[None],
         )
 
 
-def told_by(network: PushNetwork, parameters: Any, geometry: PushGeometry) -> PushMotion:
-    """What the network with these parameters says of pushes."""
-    return cast(PushMotion, network.apply({"params": parameters}, geometry))
+def told_by(network: PushNetwork, parameters: Any, start: PushStart) -> PushMotion:
+    """What the network with these parameters says of a push."""
+    return cast(PushMotion, network.apply({"params": parameters}, start))

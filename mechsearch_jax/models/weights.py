@@ -23,7 +23,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
-from mechsearch_jax.models.push import PushConfig, PushNetwork, push_geometry
+from mechsearch_jax.models.push import PushConfig, PushNetwork, push_start
 from mechsearch_jax.models.recognition import RecognitionConfig, RecognitionNetwork
 from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork
 from mechsearch_jax.perception.segments import SegmentConfig
@@ -56,7 +56,7 @@ class Architecture:
 
 _CLOUD = SegmentConfig().points
 _PUSH = jax.eval_shape(
-    lambda: push_geometry(Shelf(), empty(2), jnp.zeros((1, 3)), jnp.zeros((4, 4)), jnp.zeros(3)),
+    lambda: push_start(Shelf(), empty(2), jnp.zeros((1, 3)), jnp.zeros((4, 4)), jnp.zeros(3)),
 )
 ARCHITECTURES = {
     "segmentation": Architecture(
