@@ -119,6 +119,8 @@ class ActionConfig:
       placements: how many places are tried for a picked object, and how many of those are tested for collision.
       place_yaw: largest angle by which a picked object is turned [rad].
       clearance: distance to keep from neighbours when placing [m].
+      give: an object may brush others this deep on its way out [m]: those that touch each other are recognised as
+        overlapping as often as not, and would lock each other in.
       jam: deepest unresolved penetration of a predicted push that is still executed [m].
       cloud_points: points on the swept gripper.
       pusher_points: points on the hand and fingers.
@@ -139,6 +141,7 @@ class ActionConfig:
     placements: tuple[int, int] = (32, 4)
     place_yaw: float = math.radians(30)
     clearance: float = 0.005
+    give: float = 0.003
     jam: float = 0.006
     cloud_points: int = 1024
     pusher_points: int = 384
@@ -147,6 +150,8 @@ class ActionConfig:
     def __post_init__(self):
         if self.kinds not in ("both", "push", "pick-and-place"):
             raise InputError(f'actions "{self.kinds}" are unknown; use "both", "push" or "pick-and-place"')
+        if not self.give >= 0.0:
+            raise InputError(f"ActionConfig: give {self.give} m must not be negative")
         if not self.push_distances or not all(0.0 < d <= LONGEST_PUSH for d in self.push_distances):
             raise InputError(
                 f"push_distances {self.push_distances} must be one or more lengths above 0 and at most {LONGEST_PUSH} m"
@@ -543,7 +548,9 @@ def candidates(
     grasped = jnp.asarray(owner[grasps])
     held = jax.vmap(functools.partial(in_hand, scene))(grasped, flat[grasps])
     distance = space.gripper.approach
-    by_object = _object_hits(flat[grasps], grasped, held, scene, clouds, distance, mask[grasps] & ~by_hand)
+    slim = scene.replace(size=jnp.maximum(scene.size - config.give, 0.5 * scene.size))
+    brushing = _object_cloud(slim, config.object_points)
+    by_object = _object_hits(flat[grasps], grasped, held, scene, brushing, distance, mask[grasps] & ~by_hand)
     grasp_hits = (by_hand | by_object).reshape(n, a, n)
     if previous is not None:
         grasp_hits = jnp.where(concerns[:, None, :], grasp_hits, previous.grasp_hits)
