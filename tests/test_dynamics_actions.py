@@ -155,6 +155,18 @@ def draw(problem):
     return draw
 
 
+@pytest.mark.parametrize(("deep", "locked"), [(-0.0005, False), (0.001, False), (0.012, True)])
+def test_neighbours_that_are_recognised_as_overlapping_do_not_lock_each_other_in(problem, deep, locked):
+    body = ((0.032, 0.032, 0.06), ROUND[1])
+    pair = on_board((*body, 0.6, 0.05, 0.0), (*body, 0.6, 0.114 - deep, 0.0))
+    space = planner.action_space(problem, PlannerConfig.paper())
+    belief = planner.initial_belief(problem)
+    nowhere = planner._possible_space(problem, belief, jnp.zeros_like(belief.exists))
+    options = jax.jit(actions.candidates, static_argnums=0)(space, problem.actions, pair, nowhere)
+    assert options.grasp_reached[0].any()
+    assert actions.free_ways(options)[0][0].any() != locked
+
+
 @pytest.fixture(scope="module")
 def sampled(draw):
     """Many actions, every object with the same weight."""
@@ -231,5 +243,7 @@ def test_settings_that_make_no_sense_are_refused():
         ActionConfig(kinds="throw")
     with pytest.raises(InputError, match="push_distances"):
         ActionConfig(push_distances=())
+    with pytest.raises(InputError, match="give"):
+        ActionConfig(give=-0.001)
     with pytest.raises(InputError, match="give as many each"):
         actions.action_tables(planner.Gripper(), (0.0,), dataclasses.replace(ActionConfig()))
