@@ -317,7 +317,8 @@ def generate_pushes(
         fallen = outcomes.fallen & before.valid
         over = fell_over(before, after) | fallen
         sound = np.asarray(possible & (outcomes.failure == int(Failure.NONE)) & (outcomes.overflow == 0))
-        lost = np.asarray(jnp.any(fallen, axis=1)) | ~sound
+        # What is stopped in its fall would go on falling in the next push.
+        lost = np.asarray(jnp.any(fallen, axis=1) | ~outcomes.settled) | ~sound
         chance = np.where(np.asarray(jnp.any(over, axis=1)), config.renewed_toppled, config.renewed)
         renew = lost | (np.asarray(jax.random.uniform(renew_key, (worlds,))) < chance)
         pushes = Pushes(
@@ -400,6 +401,14 @@ class Generation:
             raise InputError(f"train push: --seed {self.seed} must not be negative")
 
 
+def _drawn_from(config: PushesConfig) -> dict[str, Any]:
+    """The settings on which pushes depend; of those of a planner's actions, most concern others."""
+    pushing = ("push_wrists", "push_tilt", "push_depths", "push_height", "push_leverage")
+    pushing += ("cloud_points", "pusher_points")
+    settings = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    return settings | {"actions": {name: getattr(config.actions, name) for name in pushing}}
+
+
 def portions(
     generation: Generation,
     folder: Path,
@@ -428,7 +437,7 @@ def portions(
     count = number = 0
     while count < generation.pushes:
         path = folder / f"pushes-{number:03d}.npz"
-        identity = repr((generation.seed, generation.worlds, generation.rounds, number, config, source))
+        identity = repr((generation.seed, generation.worlds, generation.rounds, number, _drawn_from(config), source))
         if path.exists():
             part = load_pushes(path, identity)
         else:

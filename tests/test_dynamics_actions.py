@@ -155,7 +155,7 @@ def draw(problem):
     return draw
 
 
-@pytest.mark.parametrize(("deep", "locked"), [(-0.0005, False), (0.001, False), (0.012, True)])
+@pytest.mark.parametrize(("deep", "locked"), [(-0.0005, False), (0.002, False), (0.004, True)])
 def test_neighbours_that_are_recognised_as_overlapping_do_not_lock_each_other_in(problem, deep, locked):
     body = ((0.032, 0.032, 0.06), ROUND[1])
     pair = on_board((*body, 0.6, 0.05, 0.0), (*body, 0.6, 0.114 - deep, 0.0))

@@ -22,6 +22,7 @@ from mechsearch_jax.envs.world import CYLINDER, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.learned_push import LIKELY, NAME, SLACK, predicted
 from mechsearch_jax.models.push import (
+    CHAIN,
     NORMALS,
     REACH,
     PushConfig,
@@ -99,6 +100,8 @@ def turn_error(a: Float[Array, "*shape"], b: Float[Array, "*shape"]) -> Float[Ar
 
 # Nothing that stays farther than this from all that moves has a part in it [m].
 CLEAR = 0.005
+# Of a body whose tilt (see `PushStart`) is above this, no face is level; others may hold it.
+LEANS = 0.01
 # How often something that has no part in a push is taken away, or a wall set elsewhere, and how far outwards [m].
 VARIED, OUTWARDS = 0.5, 0.2
 
@@ -106,7 +109,8 @@ VARIED, OUTWARDS = 0.5, 0.2
 def varied(key: Key[Array, ""], start: PushStart, truth: PushTruth) -> tuple[PushStart, PushTruth]:
     """The same push, with the same outcome, less some objects that had no part in it, and with other distant walls.
 
-    An approximation: objects are taken to move on straight lines, in circles around their footprints.
+    An approximation: objects are taken to move on straight lines, in circles around their footprints, and the hand as
+    the points of it that the network is told of.
 
     Args:
       key: PRNG key.
@@ -127,12 +131,24 @@ def varied(key: Key[Array, ""], start: PushStart, truth: PushTruth) -> tuple[Pus
     clear = jnp.all((clearance > CLEAR) | ~(truth.moved & truth.valid)[:, None], axis=0)
     distance, level = pusher_distance(prints, start.points, heading)
     clear &= jnp.min(jnp.where(level, distance, REACH), axis=1) > length + CLEAR
+    # What holds something in place has a part in it, too, and so has what holds that.
+    gap = jnp.sqrt(jnp.sum(offset**2, axis=-1)) - radius[:, None] - radius[None]
+    beside = (gap <= CLEAR) & truth.valid[:, None]
+    clear &= ~jnp.any(beside & (start.tilt > LEANS)[:, None] & ~jnp.eye(len(clear), dtype=bool), axis=0)
+    for _ in range(CHAIN):
+        clear &= ~jnp.any(beside & ~clear[:, None], axis=0)
     keys = jax.random.split(key, 4)
     valid = truth.valid & ~(clear & ~truth.moved & jax.random.bernoulli(keys[0], VARIED, clear.shape))
 
+    normals = jnp.asarray(NORMALS)
     ends = jnp.stack([prints.position, prints.position + shift])
-    inside = jnp.sum(ends[:, :, None] * jnp.asarray(NORMALS)[None, None], axis=-1) - radius[None, :, None]
-    room = jnp.min(jnp.where(valid[None, :, None], inside, jnp.inf), axis=(0, 1)) - start.faces - 2 * CLEAR
+    inside = jnp.sum(ends[:, :, None] * normals[None, None], axis=-1) - radius[None, :, None]
+    hand = jnp.stack([start.points[:, :2], start.points[:, :2] + start.displacement[None]])
+    hand = jnp.min(jnp.sum(hand[:, :, None] * normals[None, None], axis=-1), axis=(0, 1))
+    # The arm reaches over the front edge.
+    hand = jnp.where(normals[:, 0] > 0, jnp.inf, hand)
+    room = jnp.min(jnp.where(valid[None, :, None], inside, jnp.inf), axis=(0, 1))
+    room = jnp.minimum(room, hand) - start.faces - 2 * CLEAR
     far = (room > 0) & ~jnp.any(truth.toppled & truth.valid)
     inwards = jax.random.bernoulli(keys[1], 0.5, room.shape)
     moved = jax.random.uniform(keys[2], room.shape) * jnp.where(inwards, jnp.minimum(room, REACH), -OUTWARDS)
@@ -195,7 +211,7 @@ class PushTask:
     name: str = NAME
 
     def start(self, pushes: Pushes) -> PushStart:
-        """What the network is told of pushes."""
+        """How pushes begin."""
 
         def one(scene, T, displacement):
             return push_start(self.shelf, scene, self.pusher, T, displacement)

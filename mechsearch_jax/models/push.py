@@ -7,8 +7,8 @@ turned by half a turn, or a cylinder turned at all, is the same to the network, 
 and moves the answer. A push and its mirror image are both looked at and the answers averaged, so that what is symmetric
 stays symmetric. Walls are seen by how near they are, and not at all beyond `REACH`.
 
-`push_geometry` computes all that the network is told, and `PushNetwork` maps that to a `PushMotion`. As a baseline that
-is not equivariant, the same network can be told the same in the frame of the world.
+`push_geometry` computes from a `PushStart` all that the network is told, and `PushNetwork` maps a `PushStart` to a
+`PushMotion`. As a baseline that is not equivariant, the same network can be told the same in the frame of the world.
 """
 
 from __future__ import annotations
@@ -80,6 +80,8 @@ class PushConfig:
 
 class PushGeometry(flax.struct.PyTreeNode):
     """A push as the network is told it. Vectors are planar, in the push's frame.
+
+    Within the network, a push and its mirror image lie along a leading axis of every field.
 
     Attributes:
       scalars: of each object, shape (N, S).
@@ -220,7 +222,7 @@ def _pair_distance(prints: Footprints, heading: Array) -> tuple[Array, Array]:
     start = offset + (inside - lateral)[..., None] * _perpendicular(heading)[None, None]
 
     def slabs(width, speed, normal):
-        """Entering, leaving and the gap along normals; all broadcast to (..., N, N) with the normals first."""
+        """When it enters, minus when it leaves, and the gap, over normals along the first axis of (..., N, N)."""
         safe = jnp.where(jnp.abs(speed) < 1e-5, 1e-5, speed)
         middle, half = -_dot(normal, start[None]) / safe, width / jnp.abs(safe)
         gap = jnp.abs(_dot(normal, offset[None])) - width
@@ -234,8 +236,8 @@ def _pair_distance(prints: Footprints, heading: Array) -> tuple[Array, Array]:
         slabs(width, speed[:, :, None], normal[:, :, None]),
         slabs(jnp.swapaxes(width, 1, 2), speed[:, None], normal[:, None]),
     )
-    enters, stays, gap = (functools.reduce(jnp.maximum, a) for a in zip(*parts, strict=True))
-    return _grazing(enters, -stays, widest - jnp.abs(lateral)), gap
+    enters, minus_leaves, gap = (functools.reduce(jnp.maximum, a) for a in zip(*parts, strict=True))
+    return _grazing(enters, -minus_leaves, widest - jnp.abs(lateral)), gap
 
 
 def _soft_contact(distance: Array, level: Array, softness: float, values: Array) -> Array:
@@ -252,7 +254,7 @@ class PushStart(flax.struct.PyTreeNode):
 
     Attributes:
       prints: footprints of the objects, fields (N, ...).
-      tilt: how far each object leans, 0 if a face of it is level, shape (N,).
+      tilt: 10 (1 - cos) of the angle by which each object leans, 0 if a face of it is level, shape (N,).
       points: surface of the gripper in the world [m], shape (P, 3).
       T_world_gripper: its pose, shape (4, 4).
       displacement: how the gripper moves in the plane [m], shape (2,).
