@@ -215,11 +215,12 @@ def _pair_distance(prints: Footprints, heading: Array) -> tuple[Array, Array]:
     along_sides = reach(prints, jnp.broadcast_to(sides[:, :, None], (n, 2, n, 2)))
     own = jnp.diagonal(along_sides, axis1=0, axis2=2).T
     offset = prints.position[:, None] - prints.position[None]
-    lateral = _dot(offset, _perpendicular(heading)[None, None])
-    across = reach(prints, jnp.broadcast_to(_perpendicular(heading)[None], prints.position.shape))
+    side = _perpendicular(heading)
+    lateral = _dot(offset, side[None, None])
+    across = reach(prints, jnp.broadcast_to(side[None], prints.position.shape))
     widest = across[:, None] + across[None]
     inside = jnp.clip(lateral, GRAZE / 4 - widest, widest - GRAZE / 4)
-    start = offset + (inside - lateral)[..., None] * _perpendicular(heading)[None, None]
+    start = offset + (inside - lateral)[..., None] * side[None, None]
 
     def slabs(width, speed, normal):
         """When it enters, minus when it leaves, and the gap, over normals along the first axis of (..., N, N)."""
