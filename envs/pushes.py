@@ -74,7 +74,7 @@ class PushesConfig:
     gap: tuple[float, float] = (0.005, 0.015)
     planned: float = 0.8
     highest: float = 0.16
-    tries: int = 12
+    tries: int = 24
     renewed: float = 0.2
     renewed_toppled: float = 0.7
 
@@ -389,7 +389,7 @@ class Generation:
     """
 
     seed: int = 0
-    pushes: int = 800_000
+    pushes: int = 900_000
     worlds: int = 8192
     rounds: int = 8
 

@@ -873,7 +873,7 @@ def train_push(
     *,
     out: Path,
     data: Path | None = None,
-    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 800_000,
+    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 900_000,
     worlds: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     rounds: int = 8,
     frame: Literal["push", "world"] = "push",
@@ -884,6 +884,7 @@ def train_push(
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None,
     batch: int = 1024,
     rate: float = 2e-3,
+    decay: float = 0.1,
     chunk: int = 50,
     held_out: int = 20_000,
 ) -> None:
@@ -902,6 +903,7 @@ def train_push(
       minutes: length in minutes instead, without simulation and scoring; 5 if neither is given.
       batch: pushes in a step.
       rate: highest learning rate.
+      decay: of the weights, times the learning rate, in every step.
       chunk: steps that the device makes before it reports.
       held_out: pushes, at most, for the scores at the end.
     """
@@ -917,7 +919,14 @@ def train_push(
     if steps is None and minutes is None:
         minutes = 5.0
     config = TrainConfig(
-        seed=seed, steps=steps, minutes=minutes, batch=batch, rate=rate, chunk=chunk, held_out=held_out
+        seed=seed,
+        steps=steps,
+        minutes=minutes,
+        batch=batch,
+        rate=rate,
+        decay=decay,
+        chunk=chunk,
+        held_out=held_out,
     )
     network = PushConfig(width=width, layers=layers, frame=frame)
     worlds = (64 if jax.default_backend() == "cpu" else 8192) if worlds is None else worlds

@@ -157,6 +157,27 @@ def varied(key: Key[Array, ""], start: PushStart, truth: PushTruth) -> tuple[Pus
     return start, truth.replace(valid=valid)
 
 
+# A pose that is off by a length is off by that over this in its turn [m].
+_TURN_RADIUS = 0.08
+
+
+def blurred(key: Key[Array, ""], start: PushStart, blur: float) -> PushStart:
+    """The same push with every object told a little beside where it is.
+
+    So the network cannot know pushes by heart, and bears what recognition makes of poses.
+
+    Args:
+      key: PRNG key.
+      start: of a push.
+      blur: standard deviation of what is added to each coordinate of an object in the plane [m].
+    """
+    prints = start.prints
+    keys = jax.random.split(key)
+    position = prints.position + blur * jax.random.normal(keys[0], prints.position.shape)
+    yaw = prints.yaw + blur / _TURN_RADIUS * jax.random.normal(keys[1], prints.yaw.shape)
+    return start.replace(prints=prints.replace(position=position, yaw=yaw))
+
+
 class PushExample(flax.struct.PyTreeNode):
     """Pushes as the network is told them, and what became of them."""
 
@@ -198,6 +219,7 @@ class PushTask:
       network: sizes of the network.
       shelf: the shelf.
       pusher: surface of the gripper in its own frame [m].
+      blur: see `blurred`; of what is learnt from alone [m].
       precision: type in which the network computes.
     """
 
@@ -207,6 +229,7 @@ class PushTask:
     network: PushConfig = dataclasses.field(default_factory=PushConfig)
     shelf: Shelf = dataclasses.field(default_factory=Shelf)
     pusher: Array = dataclasses.field(default_factory=lambda: push_tables(PushesConfig()).pusher)
+    blur: float = 5e-4
     precision: Any = jnp.float32
     name: str = NAME
 
@@ -223,11 +246,13 @@ class PushTask:
         return PushNetwork(self.network).init(key, jax.tree.map(lambda a: a[0], first))["params"]
 
     def sample(self, key: Key[Array, ""], batch: int) -> PushExample:
-        key, vary_key = jax.random.split(key)
+        key, vary_key, blur_key = jax.random.split(key, 3)
         chosen = jax.random.randint(key, (batch,), 0, len(self.pushes.object))
         pushes: Pushes = jax.tree.map(lambda a: jnp.asarray(a)[chosen], self.pushes)
         start, truth = self.start(pushes), push_truth(pushes)
-        return PushExample(*jax.vmap(varied)(jax.random.split(vary_key, batch), start, truth))
+        start, truth = jax.vmap(varied)(jax.random.split(vary_key, batch), start, truth)
+        start = jax.vmap(blurred, in_axes=(0, 0, None))(jax.random.split(blur_key, batch), start, self.blur)
+        return PushExample(start, truth)
 
     def loss(self, parameters: Any, examples: PushExample) -> tuple[Float[Array, ""], dict[str, Any]]:
         network = PushNetwork(self.network, self.precision)
