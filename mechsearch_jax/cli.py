@@ -884,7 +884,7 @@ def train_push(
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None,
     batch: int = 1024,
     rate: float = 2e-3,
-    decay: float = 0.1,
+    decay: float = 0.03,
     chunk: int = 50,
     held_out: int = 20_000,
 ) -> None:

@@ -114,7 +114,7 @@ class PlannerConfig:
     push_distances: tuple[float, ...] = (0.05, 0.10, 0.15)
     caution: float = 1.0
     topple_charge: float = 0.5
-    push_model: PushModelName = "quasi-static"
+    push_model: PushModelName = "learned"
     focus: float = 0.7
     max_steps: int = 10
 
