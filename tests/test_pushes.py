@@ -340,6 +340,35 @@ def test_what_is_left_out_of_a_push_had_no_part_in_it(pushes):
     assert close > baseline[1] - 0.15
 
 
+def test_poses_are_blurred_in_what_is_learnt_from_and_nothing_else(pushes):
+    start = task_of(pushes).start(jax.tree.map(lambda a: jnp.asarray(a[:1]), pushes))
+    start = jax.tree.map(lambda a: a[0], start)
+    keys = jax.random.split(jax.random.key(3), 2000)
+    blurred = jax.vmap(training.blurred, in_axes=(0, None, None))(keys, start, 1e-3)
+    off = np.asarray(blurred.prints.position - start.prints.position[None])
+    turn = np.asarray(blurred.prints.yaw - start.prints.yaw[None])
+    np.testing.assert_allclose(off.std(axis=0), 1e-3, rtol=0.1)
+    np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=1.5e-4)
+    np.testing.assert_allclose(turn.std(axis=0), 1e-3 / 0.08, rtol=0.1)
+    assert abs(np.corrcoef(off[:, 0, 0], turn[:, 0])[0, 1]) < 0.1
+    same = blurred.replace(prints=blurred.prints.replace(position=start.prints.position, yaw=start.prints.yaw))
+    for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(start), strict=True):
+        np.testing.assert_array_equal(np.broadcast_to(a, np.shape(a)), np.broadcast_to(b, np.shape(a)))
+    exactly = training.blurred(keys[0], start, 0.0)
+    np.testing.assert_array_equal(exactly.prints.position, start.prints.position)
+
+
+def test_what_is_sampled_to_learn_from_is_told_blurred(pushes):
+    task = dataclasses.replace(task_of(pushes), blur=0.0)
+    sample = jax.jit(lambda key, task=task: task.sample(key, 32))
+    blurred = jax.jit(lambda key, task=dataclasses.replace(task, blur=1e-3): task.sample(key, 32))
+    sharp, soft = sample(jax.random.key(0)), blurred(jax.random.key(0))
+    for a, b in zip(jax.tree.leaves(sharp.truth), jax.tree.leaves(soft.truth), strict=True):
+        np.testing.assert_array_equal(a, b)
+    off = np.asarray(soft.start.prints.position - sharp.start.prints.position)
+    assert 8e-4 < off.std() < 1.2e-3
+
+
 def row_of_boxes(*gaps):
     """A push of the first of some boxes in a row along y, which moves by 5 cm; nothing becomes of the others."""
     half = np.float32([0.03, 0.03, 0.05])
