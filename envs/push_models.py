@@ -9,7 +9,6 @@ import jax
 
 from mechsearch_jax.dynamics import PushModel
 from mechsearch_jax.envs.physics_push import MjxPhysics, NativePhysics
-from mechsearch_jax.planner import PlannerConfig
 from mechsearch_jax.push_models import own_push_model
 
 
@@ -30,7 +29,7 @@ def push_models(name: str) -> PushModels:
     """The push models of a name; the same objects for the same name, so that nothing is compiled twice.
 
     "physics" simulates every push on a GPU. On a CPU that would take too long: the first action of every sequence is
-    simulated there, and the others are predicted by the model that is used where none is named.
+    simulated there, and the others are predicted by the network.
 
     Args:
       name: "quasi-static", "learned" or "physics".
@@ -41,5 +40,5 @@ def push_models(name: str) -> PushModels:
     if name != "physics":
         return PushModels(own_push_model(name), own_push_model(name))
     if jax.default_backend() == "cpu":
-        return PushModels(NativePhysics(), own_push_model(PlannerConfig().push_model))
+        return PushModels(NativePhysics(), own_push_model("learned"))
     return PushModels(MjxPhysics(), MjxPhysics())

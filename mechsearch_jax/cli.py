@@ -47,8 +47,8 @@ class PlannerOptions:
       criterion: what makes a target visible; "detector", the default, counts pixels as the detector does.
       focus: share of the sampled actions that go to objects by how much they hide or are in the way, 0.7 by default;
         0 is the paper's even draw.
-      push_model: what predicts pushes: "quasi-static" by geometry, "learned" by a network, "physics" by simulating
-        them, on a CPU only those that come first.
+      push_model: what predicts pushes: "learned", the default, by a network, "quasi-static" by geometry, "physics" by
+        simulating them, on a CPU only those that come first.
       max_steps: actions in an episode; 10 by default.
       recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses; the others see
         a noisy depth image, "masks" with the true segmentation, "full" without.
@@ -502,7 +502,7 @@ def bench_perceive(
 
 def bench_predict(
     *,
-    push_model: PushModel = "quasi-static",
+    push_model: PushModel = "learned",
     weights: WeightsFile = None,
     objects: int = 8,
     batch: int = 30,

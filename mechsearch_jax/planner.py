@@ -98,8 +98,8 @@ class PlannerConfig:
         share of the possible poses at which it would do so.
       topple_charge: what an object that falls over would cost, in units of J: a sampled push is charged with J times
         the number of objects that are expected to. `ActionConfig.topple` says which pushes are ruled out altogether.
-      push_model: what predicts pushes; see `push_models.own_push_model`, and `envs.push_models` for "physics", which
-        needs a simulator.
+      push_model: what predicts pushes, by default the network; see `push_models.own_push_model`, and `envs.push_models`
+        for "physics", which needs a simulator.
       focus: share of the draws that go to objects by how much they hide or are in the way; the others are even, as the
         paper's all are. 0 to below 1.
       max_steps: T, actions in an episode.

@@ -293,7 +293,7 @@ def test_the_commands_measure_print_and_write(weights, tmp_path, capsys, monkeyp
     enabled = jax.config.jax_enable_compilation_cache
     cli.parse(["bench", "predict", "--objects", "2", "--batch", "3", "--repeats", "2", "--out", "predict.json"])()
     jax.config.update("jax_enable_compilation_cache", enabled)
-    assert "predict: quasi-static" in capsys.readouterr().out
+    assert "predict: learned" in capsys.readouterr().out
     timing = json.loads((tmp_path / "predict.json").read_text())
     assert timing["shapes"]["predictions"] == 3
     assert len(timing["seconds"]) == 2

@@ -119,7 +119,10 @@ WRONG = {
     "pushes in a file": (["bench", "push", "--models", "no motion", "--data", "good.json"], "cannot be written to"),
     "nothing to predict": (["bench", "predict", "--batch", "0"], "bench predict: --batch 0 must be at least 1"),
     "too many objects to push": (["bench", "predict", "--objects", "9"], "--objects 9 is not between 1 and 8"),
-    "weights of no network": (["bench", "predict", "--weights", "push.npz"], "--weights is for --push-model learned"),
+    "weights of no network": (
+        ["bench", "predict", "--push-model", "quasi-static", "--weights", "push.npz"],
+        "--weights is for --push-model learned",
+    ),
     "no weights to time": (
         ["bench", "predict", "--push-model", "learned", "--weights", "none.npz"],
         "none.json: cannot be read",

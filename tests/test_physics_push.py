@@ -222,7 +222,8 @@ def test_every_name_stands_for_models(monkeypatch):
     assert all_push_models.push_models("quasi-static") == (QuasiStatic(), QuasiStatic())
     physics = all_push_models.push_models("physics")
     assert physics.first == NativePhysics()
-    assert physics.later == push_models.own_push_model(PlannerConfig().push_model)
+    assert physics.later == push_models.own_push_model("learned")
+    assert PlannerConfig().push_model == "learned"
     # The same objects, so that nothing is compiled twice.
     assert all_push_models.push_models("physics") is physics
     with pytest.raises(InputError, match="needs a simulator"):
@@ -275,7 +276,7 @@ def test_a_decision_simulates_once(problem, monkeypatch):
 
     monkeypatch.setattr(physics_push, "_simulate", counted)
     config = PlannerConfig(sequences=6, horizon=2, push_model="physics")
-    models = (NativePhysics(threads=5), QuasiStatic())
+    models = (NativePhysics(threads=5), all_push_models.push_models("physics").later)
     objects = jax.tree.map(lambda a: a[:8], SCENE)
     belief = planner.observe_belief(
         problem, planner.initial_belief(problem), objects, jnp.array(False), jnp.zeros(3), config

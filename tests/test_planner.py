@@ -264,6 +264,16 @@ def test_impossible_options_are_refused_with_what_would_do(changes, message):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_a_decision_with_pushes_predicted_by_geometry_is_one_too(decision, problem):
+    objects, belief, learned = decision
+    geometric = dataclasses.replace(CONFIG, push_model="quasi-static")
+    plan = planner.plan(jax.random.key(0), problem, belief, objects, geometric)
+    assert float(plan.value) < 0
+    assert float(plan.predicted_cost) < float(plan.cost) == float(learned.cost)
+    assert not np.array_equal(np.asarray(plan.sequences.cost), np.asarray(learned.sequences.cost))
+
+
 def test_decisions_in_a_batch_are_those_made_alone(problem):
     _, first = load("first-light")
     _, second = load("crowded-shelf")

@@ -340,7 +340,7 @@ def test_what_is_left_out_of_a_push_had_no_part_in_it(pushes):
     assert close > baseline[1] - 0.15
 
 
-def test_poses_are_blurred_in_what_is_learnt_from_and_nothing_else(pushes):
+def test_poses_are_blurred_and_nothing_else(pushes):
     start = task_of(pushes).start(jax.tree.map(lambda a: jnp.asarray(a[:1]), pushes))
     start = jax.tree.map(lambda a: a[0], start)
     keys = jax.random.split(jax.random.key(3), 2000)
@@ -359,10 +359,12 @@ def test_poses_are_blurred_in_what_is_learnt_from_and_nothing_else(pushes):
 
 
 def test_what_is_sampled_to_learn_from_is_told_blurred(pushes):
-    task = dataclasses.replace(task_of(pushes), blur=0.0)
-    sample = jax.jit(lambda key, task=task: task.sample(key, 32))
-    blurred = jax.jit(lambda key, task=dataclasses.replace(task, blur=1e-3): task.sample(key, 32))
-    sharp, soft = sample(jax.random.key(0)), blurred(jax.random.key(0))
+    def sampled(blur):
+        task = dataclasses.replace(task_of(pushes), blur=blur)
+        return jax.jit(lambda key: task.sample(key, 32))(jax.random.key(0))
+
+    assert task_of(pushes).blur > 0
+    sharp, soft = sampled(0.0), sampled(1e-3)
     for a, b in zip(jax.tree.leaves(sharp.truth), jax.tree.leaves(soft.truth), strict=True):
         np.testing.assert_array_equal(a, b)
     off = np.asarray(soft.start.prints.position - sharp.start.prints.position)
@@ -494,11 +496,13 @@ def test_the_command_simulates_trains_scores_and_writes_weights(tmp_path, capsys
     from mechsearch_jax.learned_push import LearnedPush
 
     arguments = (
-        f"train push --out {tmp_path} --pushes 30 --worlds 16 --rounds 2 --steps 4 --batch 8 --chunk 2 --width 16"
+        f"train push --out {tmp_path} --pushes 30 --worlds 16 --rounds 2 --steps 4 --batch 8 --chunk 2 --width 16 --decay 0.1"
     )
     cli.parse(arguments.split())()
     card = json.loads((tmp_path / "push.json").read_text())
     assert set(card["scores"]) == {"network", "quasi-static", "no motion"}
+    assert card["training"]["decay"] == 0.1
+    assert card["data"]["blur"] == PushTask.blur
     assert card["data"]["found"] >= 30
     assert card["config"]["width"] == 16
     model = LearnedPush(tmp_path / "push.npz")
