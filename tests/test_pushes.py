@@ -496,7 +496,8 @@ def test_the_command_simulates_trains_scores_and_writes_weights(tmp_path, capsys
     from mechsearch_jax.learned_push import LearnedPush
 
     arguments = (
-        f"train push --out {tmp_path} --pushes 30 --worlds 16 --rounds 2 --steps 4 --batch 8 --chunk 2 --width 16 --decay 0.1"
+        f"train push --out {tmp_path} --pushes 30 --worlds 16 --rounds 2 --steps 4 --batch 8 --chunk 2 --width 16"
+        " --decay 0.1"
     )
     cli.parse(arguments.split())()
     card = json.loads((tmp_path / "push.json").read_text())
