@@ -264,7 +264,6 @@ def test_impossible_options_are_refused_with_what_would_do(changes, message):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_decision_with_pushes_predicted_by_geometry_is_one_too(decision, problem):
     objects, belief, learned = decision
     geometric = dataclasses.replace(CONFIG, push_model="quasi-static")
@@ -274,6 +273,7 @@ def test_a_decision_with_pushes_predicted_by_geometry_is_one_too(decision, probl
     assert not np.array_equal(np.asarray(plan.sequences.cost), np.asarray(learned.sequences.cost))
 
 
+@pytest.mark.slow
 def test_decisions_in_a_batch_are_those_made_alone(problem):
     _, first = load("first-light")
     _, second = load("crowded-shelf")
