@@ -389,8 +389,8 @@ class Generation:
     """
 
     seed: int = 0
-    pushes: int = 900_000
-    worlds: int = 8192
+    pushes: int = 950_000
+    worlds: int = 16_384
     rounds: int = 8
 
     def __post_init__(self):

@@ -873,7 +873,7 @@ def train_push(
     *,
     out: Path,
     data: Path | None = None,
-    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 900_000,
+    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 950_000,
     worlds: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     rounds: int = 8,
     frame: Literal["push", "world"] = "push",
@@ -884,7 +884,7 @@ def train_push(
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None,
     batch: int = 1024,
     rate: float = 2e-3,
-    decay: float = 0.03,
+    decay: float = 0.1,
     chunk: int = 50,
     held_out: int = 20_000,
 ) -> None:
@@ -894,13 +894,13 @@ def train_push(
       out: folder for the checkpoint, the curves (scalars.jsonl), and in the end push.npz and its card push.json.
       data: folder for the pushes, a kilobyte each; OUT/pushes if left out. What lies there is not simulated again.
       pushes: at least so many are simulated; an eighth of them is held out.
-      worlds: simulated at once; 8192 on a GPU and 64 on a CPU if left out.
+      worlds: simulated at once; 16,384 on a GPU and 64 on a CPU if left out.
       rounds: pushes that follow each other in a world before all are begun anew.
       frame: "push" sees objects along the push; "world" is the baseline without symmetry.
       width, layers: sizes of the network.
       seed: of the weights, the scenes and the pushes.
       steps: length in steps.
-      minutes: length in minutes instead, without simulation and scoring; 5 if neither is given.
+      minutes: length in minutes instead, without simulation and scoring; 5.5 if neither is given.
       batch: pushes in a step.
       rate: highest learning rate.
       decay: of the weights, times the learning rate, in every step.
@@ -917,7 +917,7 @@ def train_push(
     from mechsearch_jax.train.run import counting, run
 
     if steps is None and minutes is None:
-        minutes = 5.0
+        minutes = 5.5
     config = TrainConfig(
         seed=seed,
         steps=steps,
@@ -929,7 +929,7 @@ def train_push(
         held_out=held_out,
     )
     network = PushConfig(width=width, layers=layers, frame=frame)
-    worlds = (64 if jax.default_backend() == "cpu" else 8192) if worlds is None else worlds
+    worlds = (64 if jax.default_backend() == "cpu" else 16_384) if worlds is None else worlds
     generation = Generation(seed, pushes, worlds, rounds)
     check_writable(out)
     folder = data or out / "pushes"

@@ -18,7 +18,6 @@ from mechsearch_jax.models.push import PushNetwork, push_start, told_by
 from mechsearch_jax.models.weights import Weights, load_weights
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import transform
 
 NAME = "push"
 # An object is moved if it moves with a probability above this: of those that stay, at most 1 in 100 is then moved.
@@ -101,7 +100,7 @@ def predicted(
     )
     moved = rigid_motion(scene, before.position, prints.position, told.turn)
     after = jax.tree.map(lambda new, old: jnp.where(moves.reshape(-1, *[1] * (new.ndim - 1)), new, old), moved, scene)
-    end = transform(T_world_gripper, pusher) + displacement[None]
+    end = start.points + displacement[None]
     return PushOutcome(
         scene=after,
         residual=jnp.maximum(unresolved(shelf, before, prints, end) - slack, 0.0),

@@ -4,8 +4,8 @@ Like SQPD-Net (S. Kim et al., "SE(2)-equivariant pushing dynamics models for tab
 sees every object in a planar frame of its own and its neighbours from there. The frame has its origin in the object's
 centre and its first axis along the push, and an object is described by how far it reaches in a few directions: so a box
 turned by half a turn, or a cylinder turned at all, is the same to the network, and turning and moving everything turns
-and moves the answer. A push and its mirror image are both looked at and the answers averaged, so that what is symmetric
-stays symmetric. Walls are seen by how near they are, and not at all beyond `REACH`.
+and moves the answer. A push and its mirror image are looked at together, by layers that treat both alike, so that what
+is symmetric stays symmetric. Walls are seen by how near they are, and not at all beyond `REACH`.
 
 `push_geometry` computes from a `PushStart` all that the network is told, and `PushNetwork` maps a `PushStart` to a
 `PushMotion`. As a baseline that is not equivariant, the same network can be told the same in the frame of the world.
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import Any, Literal, cast
 
 import flax.linen as nn
@@ -26,7 +27,6 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.dynamics import TOUCH, Footprints, footprints, turned
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models.layers import FeedForward
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.transforms import transform
@@ -41,19 +41,21 @@ GRAZE = 1e-3
 DEEPEST = 0.02
 # Points of the gripper that are looked at.
 POINTS = 192
-# How far behind the first point of contact others still count as touching, for two notions of a contact [m].
-SOFTNESS = (0.003, 0.015)
+# How far behind the first point of contact others still count as touching [m], and a stricter notion of that: its
+# weights are a power of the others, which saves an exponential.
+SOFTNESS, STRICTER = 0.015, 5
+# Normals along which a pair of objects meets at most this much earlier than it really does count, too [m].
+SAME_TIME = 2e-3
 # Objects that push each other on, one after the other, in the estimate of who is reached when.
 CHAIN = 4
 # Units of what the network is told and of what it says: lengths [m], angles [rad].
 _LENGTH, _SHIFT, _TURN = 0.1, 0.05, 0.3
-_OUTPUTS = 7
+_EVEN, _ODD = 5, 2
 # Weaker than any neighbour.
 _NOBODY = -1e9
 # The inward normals of the back, right and left walls, and of the front edge, beyond which is nothing.
 NORMALS = np.array([[-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], np.float32)
 _IS_EDGE = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
-_MIRROR = np.array([1.0, -1.0], np.float32)
 _MIRRORED_DIRECTIONS = (-np.arange(DIRECTIONS)) % DIRECTIONS
 
 
@@ -78,17 +80,25 @@ class PushConfig:
             raise InputError(f'PushConfig: frame "{self.frame}" is unknown; use "push" or "world"')
 
 
-class PushGeometry(flax.struct.PyTreeNode):
-    """A push as the network is told it. Vectors are planar, in the push's frame.
-
-    Within the network, a push and its mirror image lie along a leading axis of every field.
+class Told(flax.struct.PyTreeNode):
+    """Numbers that are told, by what a mirror along the frame's first axis makes of them; any leading axes.
 
     Attributes:
-      scalars: of each object, shape (N, S).
-      vectors: of each object, shape (N, V, 2).
-      extents: reach of each object from its centre in `DIRECTIONS` directions, shape (N, K).
-      pair_scalars, pair_vectors: of object j as seen from object i, shapes (N, N, S') and (N, N, V', 2).
-      wall_scalars, wall_vectors: of each wall as seen from each object, shapes (N, 4, S'') and (N, 4, 1, 2).
+      even: what stays as it is: lengths, and vectors along the axis.
+      odd: what changes its sign: vectors across the axis.
+    """
+
+    even: jax.Array
+    odd: jax.Array
+
+
+class PushGeometry(flax.struct.PyTreeNode):
+    """A push as the network is told it.
+
+    Attributes:
+      objects: of each object, shapes (N, ...).
+      pairs: of object j as seen from object i, shapes (N, N, ...).
+      walls: of each wall as seen from each object, shapes (N, 4, ...).
       wall_near: 1 at the wall, 0 from `REACH` on, shape (N, 4).
       carry: how far each object would be carried if nothing turned or slid off [m], shape (N,).
       heading: unit vector of the push in the frame, shape (2,).
@@ -97,13 +107,9 @@ class PushGeometry(flax.struct.PyTreeNode):
       valid: which objects are there, shape (N,).
     """
 
-    scalars: jax.Array
-    vectors: jax.Array
-    extents: jax.Array
-    pair_scalars: jax.Array
-    pair_vectors: jax.Array
-    wall_scalars: jax.Array
-    wall_vectors: jax.Array
+    objects: Told
+    pairs: Told
+    walls: Told
     wall_near: jax.Array
     carry: jax.Array
     heading: jax.Array
@@ -198,11 +204,28 @@ def pusher_distance(
     return _grazing(enters, leaves, widest - jnp.abs(lateral), longest), level
 
 
-def _pair_distance(prints: Footprints, heading: Array) -> tuple[Array, Array]:
-    """How far object i moves along the heading until it touches j, and the gap between them now; both (N, N) [m].
+class Meetings(flax.struct.PyTreeNode):
+    """Where object i would meet object j if it moved along the heading; leading axes (N, N).
 
     Exact for two boxes; a cylinder is taken as a polygon around it, up to 2% wider.
+
+    Attributes:
+      distance: how far i moves until it touches j, at most `REACH` [m].
+      gap: between them now; negative where they overlap [m].
+      normal: unit vector along which they meet, from i to j, (N, N, 2); the mean where they meet along several at once.
+      middle: of where they overlap across the heading, to its left, from the centre of i [m].
+      breadth: of that overlap; negative where i passes by [m].
     """
+
+    distance: jax.Array
+    gap: jax.Array
+    normal: jax.Array
+    middle: jax.Array
+    breadth: jax.Array
+
+
+def meetings(prints: Footprints, heading: Float[Array, "2"]) -> Meetings:
+    """Where footprints (N) would meet each other along a planar unit vector."""
     n = prints.yaw.shape[0]
     fan = _fan(heading)
     rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
@@ -222,32 +245,49 @@ def _pair_distance(prints: Footprints, heading: Array) -> tuple[Array, Array]:
     inside = jnp.clip(lateral, GRAZE / 4 - widest, widest - GRAZE / 4)
     start = offset + (inside - lateral)[..., None] * side[None, None]
 
-    def slabs(width, speed, normal):
-        """When it enters, minus when it leaves, and the gap, over normals along the first axis of (..., N, N)."""
-        safe = jnp.where(jnp.abs(speed) < 1e-5, 1e-5, speed)
-        middle, half = -_dot(normal, start[None]) / safe, width / jnp.abs(safe)
-        gap = jnp.abs(_dot(normal, offset[None])) - width
-        return tuple(jnp.max(a, axis=0) for a in (middle - half, -(middle + half), gap))
-
-    onward = _dot(rays, heading[None])
-    width, normal = jnp.moveaxis(own[:, :, None] + along_sides, 1, 0), jnp.moveaxis(sides, 1, 0)
-    speed = _dot(normal, heading[None, None])
-    parts = (
-        slabs(along_rays[:, :, None] + along_rays[:, None], onward[:, None, None], rays[:, None, None]),
-        slabs(width, speed[:, :, None], normal[:, :, None]),
-        slabs(jnp.swapaxes(width, 1, 2), speed[:, None], normal[:, None]),
+    normals = (
+        jnp.broadcast_to(rays[:, None, None], (DIRECTIONS, n, n, 2)),
+        jnp.broadcast_to(jnp.moveaxis(sides, 1, 0)[:, :, None], (2, n, n, 2)),
+        jnp.broadcast_to(jnp.moveaxis(sides, 1, 0)[:, None], (2, n, n, 2)),
     )
-    enters, minus_leaves, gap = (functools.reduce(jnp.maximum, a) for a in zip(*parts, strict=True))
-    return _grazing(enters, -minus_leaves, widest - jnp.abs(lateral)), gap
+    normals = jnp.concatenate(normals)
+    width = jnp.moveaxis(own[:, :, None] + along_sides, 1, 0)
+    width = jnp.concatenate([along_rays[:, :, None] + along_rays[:, None], width, jnp.swapaxes(width, 1, 2)])
+    speed = _dot(normals, heading[None, None, None])
+    safe = jnp.where(jnp.abs(speed) < 1e-5, 1e-5, speed)
+    middle, half = -_dot(normals, start[None]) / safe, width / jnp.abs(safe)
+    each = middle - half
+    enters, leaves = jnp.max(each, axis=0), jnp.min(middle + half, axis=0)
+    gap = jnp.max(jnp.abs(_dot(normals, offset[None])) - width, axis=0)
+    share = jnp.maximum(1.0 - (enters[None] - each) / SAME_TIME, 0.0) * jnp.sign(speed)
+    normal = jnp.sum(share[..., None] * normals, axis=0)
+    length = _norm(normal)[..., None]
+    normal = jnp.where(length > 1e-6, normal / jnp.where(length > 1e-6, length, 1.0), 0.0)
+    # From the centre of i, j reaches from -lateral - across_j to -lateral + across_j.
+    left = jnp.minimum(across[:, None], across[None] - lateral)
+    right = jnp.maximum(-across[:, None], -across[None] - lateral)
+    return Meetings(
+        distance=_grazing(enters, leaves, widest - jnp.abs(lateral)),
+        gap=gap,
+        normal=normal,
+        middle=0.5 * (left + right),
+        breadth=left - right,
+    )
 
 
-def _soft_contact(distance: Array, level: Array, softness: float, values: Array) -> Array:
-    """Mean over the points of values (N, P, C) that are the first to touch, (N, C)."""
+def _soft_contacts(distance: Array, level: Array, points: Array, heading: Array) -> tuple[Array, Array]:
+    """Where points (P, 3), moved along the heading by distances (N, P), first touch, strictly and less so; (N, 3)."""
     first = jnp.min(jnp.where(level, distance, REACH), axis=1, keepdims=True)
     # What is not level may be reached long before; the inner `where` keeps it from overflowing.
-    weight = jnp.where(level, jnp.exp((first - jnp.where(level, distance, first)) / softness), 0.0)
-    weight = weight / jnp.maximum(jnp.sum(weight, axis=1, keepdims=True), 1e-6)
-    return jnp.sum(weight[..., None] * values, axis=1)
+    weight = jnp.where(level, jnp.exp((first - jnp.where(level, distance, first)) / SOFTNESS), 0.0)
+
+    def mean(weight):
+        total = jnp.maximum(jnp.sum(weight, axis=1), 1e-6)
+        place = jnp.matmul(weight, points, precision=jax.lax.Precision.HIGHEST)
+        way = jnp.sum(weight * distance, axis=1)[:, None] * jnp.append(heading, 0.0)[None]
+        return (place + way) / total[:, None]
+
+    return mean(weight**STRICTER), mean(weight)
 
 
 class PushStart(flax.struct.PyTreeNode):
@@ -314,7 +354,7 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     axis = heading if frame == "push" else jnp.array([1.0, 0.0])
     basis = jnp.stack([axis, _perpendicular(axis)])
 
-    def told(vectors):
+    def framed(vectors):
         """Planar vectors in the frame."""
         along = basis.reshape(*[1] * (vectors.ndim - 1), 2, 2)
         return jnp.stack([_dot(vectors, along[..., 0, :]), _dot(vectors, along[..., 1, :])], axis=-1)
@@ -326,18 +366,17 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     valid = prints.valid[:, None]
     level &= valid
     direct = jnp.min(jnp.where(level, distance, REACH), axis=1)
-    pair_distance, gap = _pair_distance(prints, heading)
+    met = meetings(prints, heading)
     other = ~jnp.eye(n, dtype=bool) & valid & valid.T
-    onward = jnp.where(other, jnp.maximum(pair_distance, 0.0), REACH)
+    onward = jnp.where(other, jnp.maximum(met.distance, 0.0), REACH)
     reached = direct
     for _ in range(CHAIN):
         reached = jnp.minimum(reached, jnp.min(reached[:, None] + onward, axis=0))
     carry = jnp.maximum(length - reached, 0.0)
 
     touching = jnp.maximum(1.0 - direct / REACH, 0.0)[:, None]
-    where = points[None, :, :2] - prints.position[:, None] + distance[..., None] * heading[None, None]
-    height = jnp.broadcast_to(points[None, :, 2:], (*distance.shape, 1)) - prints.low[:, None, None]
-    contacts = [_soft_contact(distance, level, s, jnp.concatenate([where, height], -1)) * touching for s in SOFTNESS]
+    base = jnp.concatenate([prints.position, prints.low[:, None]], axis=1)
+    contacts = [(c - base) * touching for c in _soft_contacts(distance, level, points, heading)]
     # The band that the gripper sweeps at the object's height.
     across = _dot(points[None, :, :2] - prints.position[:, None], _perpendicular(heading)[None, None])
     low = jnp.min(jnp.where(level, across, REACH), axis=1)
@@ -349,25 +388,22 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     gripper = T_world_gripper[:2, 3]
     approach, closing = T_world_gripper[:2, 2], T_world_gripper[:2, 1]
     # The hand is the same after half a turn about its approach.
-    closing = told(closing[None])[0]
+    closing = framed(closing[None])[0]
     twice = jnp.stack([closing[0] ** 2 - closing[1] ** 2, 2.0 * closing[0] * closing[1]])
     to_gripper = gripper[None] - prints.position
     faces = start.faces
-    room = 0.5 * jnp.stack([faces[3] - faces[0], faces[1] - faces[2]])
-    place = prints.position - room[None] if frame == "world" else jnp.zeros((n, 2))
-    planar = jnp.stack(
-        [
-            to_gripper,
-            to_gripper + (length * heading)[None],
-            contacts[0][:, :2],
-            contacts[1][:, :2],
-            carry[:, None] * heading[None],
-            middle[:, None] * _perpendicular(heading)[None],
-            place,
-        ],
-        axis=1,
-    )
-    units = jnp.stack([spread(told(approach[None])[0]), spread(twice), spread(told(heading[None])[0])], axis=1)
+    planar = [
+        to_gripper,
+        contacts[0][:, :2],
+        contacts[1][:, :2],
+        middle[:, None] * _perpendicular(heading)[None],
+    ]
+    units = [spread(framed(approach[None])[0]), spread(twice)]
+    if frame == "world":
+        room = 0.5 * jnp.stack([faces[3] - faces[0], faces[1] - faces[2]])
+        planar += [prints.position - room[None], carry[:, None] * heading[None], to_gripper + (length * heading)[None]]
+        units += [spread(framed(heading[None])[0])]
+    vectors = jnp.concatenate([framed(jnp.stack(planar, axis=1)) / _LENGTH, jnp.stack(units, axis=1)], axis=1)
     tall = prints.high - prints.low
     lengths = jnp.stack(
         [
@@ -397,12 +433,27 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     )
     fan = _fan(axis)
     rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
-    extents = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, n, 2))).T
+    extents = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, n, 2))).T / _LENGTH
+    half = DIRECTIONS // 2
+    opposite = extents[:, _MIRRORED_DIRECTIONS]
+    even, odd = 0.5 * (extents + opposite)[:, : half + 1], 0.5 * (extents - opposite)[:, 1:half]
+    objects = Told(
+        even=jnp.concatenate([lengths / _LENGTH, plain, vectors[..., 0], even], axis=1),
+        odd=jnp.concatenate([vectors[..., 1], odd], axis=1),
+    )
 
-    offset = prints.position[None] - prints.position[:, None]
+    offset = framed(prints.position[None] - prints.position[:, None]) / _LENGTH
     overlap = jnp.minimum(prints.high[:, None], prints.high[None]) - jnp.maximum(prints.low[:, None], prints.low[None])
-    onward = jnp.clip(pair_distance, -DEEPEST, REACH)
-    pair_lengths = jnp.stack([onward, onward.T, jnp.clip(gap, -DEEPEST, REACH), jnp.clip(overlap, -0.05, 0.2)], axis=-1)
+    onward = jnp.clip(met.distance, -DEEPEST, REACH)
+    # How far i carries j.
+    passed = jnp.maximum(carry[:, None] - onward, 0.0)
+    side = met.middle[..., None] * _perpendicular(heading)[None, None]
+    # From the centre of i; from that of j it differs by the offset, which is told.
+    normal, side = framed(met.normal), framed(side) / _LENGTH
+    lengths = [onward, onward.T, passed, passed.T, jnp.clip(met.gap, -DEEPEST, REACH), jnp.clip(overlap, -0.05, 0.2)]
+    lengths = jnp.stack([*lengths, jnp.clip(met.breadth, -DEEPEST, REACH)], axis=-1) / _LENGTH
+    vectors = jnp.stack([offset, normal, jnp.swapaxes(normal, 0, 1), side], axis=-2)
+    pairs = Told(even=jnp.concatenate([lengths, vectors[..., 0]], axis=-1), odd=vectors[..., 1])
 
     normals = jnp.asarray(NORMALS)
     toward = reach(prints, jnp.broadcast_to(normals[:, None], (4, n, 2))).T
@@ -410,80 +461,109 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     wall_gap = jnp.clip(wall_gap, -0.05, REACH)
     near = 1.0 - jnp.maximum(wall_gap, 0.0) / REACH
     edge = jnp.broadcast_to(jnp.asarray(_IS_EDGE)[None], (n, 4))
+    inwards = jnp.broadcast_to(framed(normals)[None], (n, 4, 2))
     return PushGeometry(
-        scalars=jnp.concatenate([lengths / _LENGTH, plain], axis=1),
-        vectors=jnp.concatenate([told(planar) / _LENGTH, units], axis=1),
-        extents=extents / _LENGTH,
-        pair_scalars=pair_lengths / _LENGTH,
-        pair_vectors=told(offset)[:, :, None] / _LENGTH,
-        wall_scalars=jnp.stack([wall_gap / _LENGTH, near, edge], axis=-1),
-        wall_vectors=jnp.broadcast_to(told(normals)[None, :, None], (n, 4, 1, 2)),
+        objects=objects,
+        pairs=pairs,
+        walls=Told(
+            even=jnp.stack([wall_gap / _LENGTH, near, edge, inwards[..., 0]], axis=-1),
+            odd=inwards[..., 1:],
+        ),
         wall_near=near,
         carry=carry,
-        heading=told(heading[None])[0],
+        heading=framed(heading[None])[0],
         axis=axis,
         round=prints.round,
         valid=prints.valid,
     )
 
 
-def mirrored(geometry: PushGeometry) -> PushGeometry:
-    """The same push seen in a mirror along the frame's first axis."""
-    flip = {
-        name: getattr(geometry, name) * jnp.asarray(_MIRROR).reshape(*[1] * (getattr(geometry, name).ndim - 1), 2)
-        for name in ("vectors", "pair_vectors", "wall_vectors", "heading")
-    }
-    return geometry.replace(extents=geometry.extents[..., _MIRRORED_DIRECTIONS], **flip)
+def _images(told: Told) -> Array:
+    """Numbers of a push and of its mirror image, (2, ...), from what is even and what is odd in them (...)."""
+    return math.sqrt(0.5) * jnp.stack([told.even + told.odd, told.even - told.odd])
 
 
-def _flat(scalars: Array, vectors: Array) -> Array:
-    return jnp.concatenate([scalars, vectors.reshape(*vectors.shape[:-2], -1)], axis=-1)
+def _told(images: Array) -> Told:
+    """The inverse of `_images`."""
+    return Told(math.sqrt(0.5) * (images[0] + images[1]), math.sqrt(0.5) * (images[0] - images[1]))
+
+
+class MirrorDense(nn.Module):
+    """A dense layer on a push and its mirror image, (2, ..., width): if they are exchanged, so is what comes out.
+
+    Its matrix is one for what is even in them and another for what is odd, which costs no more than one for each image.
+    Without `symmetric` there is one image, (1, ..., width), and the layer is an ordinary one.
+    """
+
+    features: int
+    symmetric: bool
+    use_bias: bool = True
+    dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Told | Array) -> Array:
+        even = nn.Dense(self.features, use_bias=self.use_bias, dtype=self.dtype, name="even")
+        if not self.symmetric:
+            return even(jnp.concatenate([x.even, x.odd], axis=-1)[None] if isinstance(x, Told) else x)
+        odd = nn.Dense(self.features, use_bias=False, dtype=self.dtype, name="odd")
+        halves = x if isinstance(x, Told) else _told(x)
+        return _images(Told(even(halves.even), odd(halves.odd)))
 
 
 class Messages(nn.Module):
     """A message from the strongest neighbour of each object, by what both are and how they stand; to be added."""
 
     width: int
+    symmetric: bool
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: Array, pairs: Array, other: Array) -> Array:
+    def __call__(self, x: Array, pairs: Told, other: Array) -> Array:
+        dense = functools.partial(MirrorDense, self.width, self.symmetric, dtype=self.dtype)
         h = nn.LayerNorm()(x)
-        own = nn.Dense(self.width, dtype=self.dtype, name="own")(h)
-        theirs = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="theirs")(h)
-        pair = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="pair")(pairs)
+        own = dense(name="own")(h)
+        theirs = dense(use_bias=False, name="theirs")(h)
+        pair = dense(use_bias=False, name="pair")(pairs)
         # What an object is itself does not change which neighbour is the strongest, in each channel by itself. The
         # inner `where` keeps `gelu` and its gradient from `_NOBODY`.
-        strongest = jnp.max(jnp.where(other[..., None], theirs[..., None, :, :] + pair, _NOBODY), axis=-2)
-        alone = ~jnp.any(other, axis=-1)[..., None]
+        strongest = jnp.max(jnp.where(other[None, ..., None], theirs[:, None] + pair, _NOBODY), axis=-2)
+        alone = ~jnp.any(other, axis=-1)[None, :, None]
         message = jnp.where(alone, 0.0, nn.gelu(own + jnp.where(alone, 0.0, strongest)))
-        return nn.Dense(self.width, dtype=self.dtype, name="out")(message).astype(jnp.float32)
+        return dense(name="out")(message).astype(jnp.float32)
 
 
 class PushTrunk(nn.Module):
-    """From what is told of a push to numbers for each object, (..., N, 7); those of absent objects mean nothing."""
+    """From what is told of a push to numbers for each object, (N, 5) even and (N, 2) odd ones.
+
+    What is said of absent objects means nothing.
+    """
 
     config: PushConfig
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, geometry: PushGeometry) -> Array:
-        width = self.config.width
-        objects = jnp.concatenate([_flat(geometry.scalars, geometry.vectors), geometry.extents], axis=-1)
-        pairs = _flat(geometry.pair_scalars, geometry.pair_vectors)
-        walls = _flat(geometry.wall_scalars, geometry.wall_vectors)
-        n = geometry.valid.shape[-1]
-        eye = jnp.eye(n, dtype=bool).reshape(*[1] * (geometry.valid.ndim - 1), n, n)
-        other = geometry.valid[..., None, :] & geometry.valid[..., :, None] & ~eye
-        x = nn.Dense(width, name="objects")(objects)
-        x = x + nn.Dense(width, name="bend")(nn.gelu(nn.Dense(2 * width, name="widen")(objects)))
+    def __call__(self, geometry: PushGeometry) -> Told:
+        width, symmetric = self.config.width, self.config.frame == "push"
+        dense = functools.partial(MirrorDense, symmetric=symmetric)
+        n = geometry.valid.shape[0]
+        other = geometry.valid[None] & geometry.valid[:, None] & ~jnp.eye(n, dtype=bool)
+        x = dense(width, name="objects")(geometry.objects)
+        x = x + dense(width, name="bend")(nn.gelu(dense(2 * width, name="widen")(geometry.objects)))
         # Nothing is said of a wall out of reach: its bias too fades with the distance.
-        met = nn.gelu(nn.Dense(width // 2, name="walls")(walls)) * geometry.wall_near[..., None]
-        x = x + nn.Dense(width, use_bias=False, name="met")(jnp.sum(met, axis=-2))
-        for _ in range(self.config.layers):
-            x = x + Messages(width, self.dtype)(x, pairs, other)
-            x = x + FeedForward(width, growth=2, dtype=self.dtype)(x)
-        return nn.Dense(_OUTPUTS, name="outputs", kernel_init=nn.initializers.normal(1e-3))(nn.LayerNorm()(x))
+        met = nn.gelu(dense(width // 2, name="walls")(geometry.walls)) * geometry.wall_near[None, ..., None]
+        x = x + dense(width, use_bias=False, name="met")(jnp.sum(met, axis=-2))
+        for i in range(self.config.layers):
+            x = x + Messages(width, symmetric, self.dtype, name=f"messages_{i}")(x, geometry.pairs, other)
+            layer = functools.partial(dense, dtype=self.dtype)
+            h = layer(2 * width, name=f"widen_{i}")(nn.LayerNorm(name=f"norm_{i}")(x))
+            x = x + layer(width, name=f"narrow_{i}")(nn.gelu(h)).astype(jnp.float32)
+        small = nn.initializers.normal(1e-3)
+        x = nn.LayerNorm(name="norm")(x)
+        halves = _told(x) if symmetric else Told(x[0], x[0])
+        return Told(
+            even=nn.Dense(_EVEN, name="even", kernel_init=small)(halves.even),
+            odd=nn.Dense(_ODD, use_bias=not symmetric, name="odd", kernel_init=small)(halves.odd),
+        )
 
 
 class PushNetwork(nn.Module):
@@ -494,23 +574,18 @@ class PushNetwork(nn.Module):
 
     @nn.compact
     def __call__(self, start: PushStart) -> PushMotion:
-        trunk = PushTrunk(self.config, self.dtype, name="trunk")
         geometry = push_geometry(start, self.config.frame)
-        if self.config.frame == "push":
-            both = trunk(jax.tree.map(lambda *images: jnp.stack(images), geometry, mirrored(geometry)))
-            # In the mirror, what goes to the left goes to the right, and turns are the other way round.
-            signs = jnp.array([1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
-            outputs = 0.5 * (both[0] + signs[None] * both[1])
-        else:
-            outputs = trunk(geometry)
+        outputs = cast(Told, PushTrunk(self.config, self.dtype, name="trunk")(geometry))
         x, y = geometry.axis[None], _perpendicular(geometry.axis)[None]
-        planar = _SHIFT * outputs[:, :2] + geometry.carry[:, None] * geometry.heading[None]
+        # In the mirror, what goes to the left goes to the right, and turns are the other way round.
+        along, (across, turn) = outputs.even[:, 0], jnp.moveaxis(outputs.odd, -1, 0)
+        planar = _SHIFT * jnp.stack([along, across], axis=-1) + geometry.carry[:, None] * geometry.heading[None]
         return PushMotion(
             shift=planar[:, :1] * x + planar[:, 1:] * y,
-            turn=jnp.where(geometry.round, 0.0, _TURN * outputs[:, 2]),
-            moves=outputs[:, 3],
-            topples=outputs[:, 4],
-            log_scale=jnp.clip(outputs[:, 5:], -4.0, 3.0) + jnp.log(jnp.array([0.01, 0.05]))[None],
+            turn=jnp.where(geometry.round, 0.0, _TURN * turn),
+            moves=outputs.even[:, 1],
+            topples=outputs.even[:, 2],
+            log_scale=jnp.clip(outputs.even[:, 3:], -4.0, 3.0) + jnp.log(jnp.array([0.01, 0.05]))[None],
         )
 
 
