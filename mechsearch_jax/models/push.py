@@ -37,15 +37,16 @@ DIRECTIONS = 8
 REACH = 0.25
 # Over how much lateral overlap a contact comes into being: a graze is no contact [m].
 GRAZE = 1e-3
-# Deeper overlaps are all the same to the network [m].
+# Deeper overlaps are all the same to the network, and so are objects passed by at more than this [m].
 DEEPEST = 0.02
 # Points of the gripper that are looked at.
 POINTS = 192
 # How far behind the first point of contact others still count as touching [m], and a stricter notion of that: its
 # weights are a power of the others, which saves an exponential.
 SOFTNESS, STRICTER = 0.015, 5
-# Normals along which a pair of objects meets at most this much earlier than it really does count, too [m].
-SAME_TIME = 2e-3
+# Two objects meet along a normal if it parts them until they touch and, linearly less, if it does so until at most this
+# much before [m].
+SAME_CONTACT = 2e-3
 # Objects that push each other on, one after the other, in the estimate of who is reached when.
 CHAIN = 4
 # Units of what the network is told and of what it says: lengths [m], angles [rad].
@@ -66,7 +67,8 @@ class PushConfig:
     Attributes:
       width: of what is known of an object.
       layers: of messages between objects.
-      frame: "push" for each object's own frame along the push; "world" for the baseline without symmetry.
+      frame: "push" for each object's own frame along the push; "world" for the baseline without symmetry, which has as
+        many parameters as the other if it is 1.4 times as wide.
     """
 
     width: int = 64
@@ -80,8 +82,8 @@ class PushConfig:
             raise InputError(f'PushConfig: frame "{self.frame}" is unknown; use "push" or "world"')
 
 
-class Told(flax.struct.PyTreeNode):
-    """Numbers that are told, by what a mirror along the frame's first axis makes of them; any leading axes.
+class Parity(flax.struct.PyTreeNode):
+    """Numbers by what a mirror along the frame's first axis makes of them; any leading axes.
 
     Attributes:
       even: what stays as it is: lengths, and vectors along the axis.
@@ -93,7 +95,7 @@ class Told(flax.struct.PyTreeNode):
 
 
 class PushGeometry(flax.struct.PyTreeNode):
-    """A push as the network is told it.
+    """A push as the network is told it: in the frame of `PushConfig`, lengths in units of 10 cm but where [m] is given.
 
     Attributes:
       objects: of each object, shapes (N, ...).
@@ -107,9 +109,9 @@ class PushGeometry(flax.struct.PyTreeNode):
       valid: which objects are there, shape (N,).
     """
 
-    objects: Told
-    pairs: Told
-    walls: Told
+    objects: Parity
+    pairs: Parity
+    walls: Parity
     wall_near: jax.Array
     carry: jax.Array
     heading: jax.Array
@@ -207,13 +209,15 @@ def pusher_distance(
 class Meetings(flax.struct.PyTreeNode):
     """Where object i would meet object j if it moved along the heading; leading axes (N, N).
 
-    Exact for two boxes; a cylinder is taken as a polygon around it, up to 2% wider.
+    Exact for two boxes; a cylinder is taken as a polygon around it, up to 2% wider, so that normals at cylinders are
+    known to about 11 degrees.
 
     Attributes:
-      distance: how far i moves until it touches j, at most `REACH` [m].
+      distance: how far i moves until it touches j [m]: at least `-DEEPEST`, and `REACH` where it passes by or is past.
       gap: between them now; negative where they overlap [m].
-      normal: unit vector along which they meet, from i to j, (N, N, 2); the mean where they meet along several at once.
-      middle: of where they overlap across the heading, to its left, from the centre of i [m].
+      normal: unit vector along which i meets j, never against the heading, (N, N, 2); the mean where there are several.
+        Where i passes by, it is that of a graze, and where it is past, that of a meeting before.
+      middle: of where they overlap across the heading, or of the room between them, to its left, from i's centre [m].
       breadth: of that overlap; negative where i passes by [m].
     """
 
@@ -255,11 +259,11 @@ def meetings(prints: Footprints, heading: Float[Array, "2"]) -> Meetings:
     width = jnp.concatenate([along_rays[:, :, None] + along_rays[:, None], width, jnp.swapaxes(width, 1, 2)])
     speed = _dot(normals, heading[None, None, None])
     safe = jnp.where(jnp.abs(speed) < 1e-5, 1e-5, speed)
-    middle, half = -_dot(normals, start[None]) / safe, width / jnp.abs(safe)
-    each = middle - half
-    enters, leaves = jnp.max(each, axis=0), jnp.min(middle + half, axis=0)
+    nearest, half = -_dot(normals, start[None]) / safe, width / jnp.abs(safe)
+    each = nearest - half
+    enters, leaves = jnp.max(each, axis=0), jnp.min(nearest + half, axis=0)
     gap = jnp.max(jnp.abs(_dot(normals, offset[None])) - width, axis=0)
-    share = jnp.maximum(1.0 - (enters[None] - each) / SAME_TIME, 0.0) * jnp.sign(speed)
+    share = jnp.maximum(1.0 - (enters[None] - each) / SAME_CONTACT, 0.0) * jnp.sign(speed)
     normal = jnp.sum(share[..., None] * normals, axis=0)
     length = _norm(normal)[..., None]
     normal = jnp.where(length > 1e-6, normal / jnp.where(length > 1e-6, length, 1.0), 0.0)
@@ -437,7 +441,7 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     half = DIRECTIONS // 2
     opposite = extents[:, _MIRRORED_DIRECTIONS]
     even, odd = 0.5 * (extents + opposite)[:, : half + 1], 0.5 * (extents - opposite)[:, 1:half]
-    objects = Told(
+    objects = Parity(
         even=jnp.concatenate([lengths / _LENGTH, plain, vectors[..., 0], even], axis=1),
         odd=jnp.concatenate([vectors[..., 1], odd], axis=1),
     )
@@ -445,15 +449,15 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     offset = framed(prints.position[None] - prints.position[:, None]) / _LENGTH
     overlap = jnp.minimum(prints.high[:, None], prints.high[None]) - jnp.maximum(prints.low[:, None], prints.low[None])
     onward = jnp.clip(met.distance, -DEEPEST, REACH)
-    # How far i carries j.
+    # How far i carries j, and a little more where they overlap.
     passed = jnp.maximum(carry[:, None] - onward, 0.0)
-    side = met.middle[..., None] * _perpendicular(heading)[None, None]
     # From the centre of i; from that of j it differs by the offset, which is told.
+    side = met.middle[..., None] * _perpendicular(heading)[None, None]
     normal, side = framed(met.normal), framed(side) / _LENGTH
     lengths = [onward, onward.T, passed, passed.T, jnp.clip(met.gap, -DEEPEST, REACH), jnp.clip(overlap, -0.05, 0.2)]
     lengths = jnp.stack([*lengths, jnp.clip(met.breadth, -DEEPEST, REACH)], axis=-1) / _LENGTH
     vectors = jnp.stack([offset, normal, jnp.swapaxes(normal, 0, 1), side], axis=-2)
-    pairs = Told(even=jnp.concatenate([lengths, vectors[..., 0]], axis=-1), odd=vectors[..., 1])
+    pairs = Parity(even=jnp.concatenate([lengths, vectors[..., 0]], axis=-1), odd=vectors[..., 1])
 
     normals = jnp.asarray(NORMALS)
     toward = reach(prints, jnp.broadcast_to(normals[:, None], (4, n, 2))).T
@@ -465,7 +469,7 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     return PushGeometry(
         objects=objects,
         pairs=pairs,
-        walls=Told(
+        walls=Parity(
             even=jnp.stack([wall_gap / _LENGTH, near, edge, inwards[..., 0]], axis=-1),
             odd=inwards[..., 1:],
         ),
@@ -478,14 +482,14 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     )
 
 
-def _images(told: Told) -> Array:
+def _join(told: Parity) -> Array:
     """Numbers of a push and of its mirror image, (2, ...), from what is even and what is odd in them (...)."""
     return math.sqrt(0.5) * jnp.stack([told.even + told.odd, told.even - told.odd])
 
 
-def _told(images: Array) -> Told:
-    """The inverse of `_images`."""
-    return Told(math.sqrt(0.5) * (images[0] + images[1]), math.sqrt(0.5) * (images[0] - images[1]))
+def _split(images: Array) -> Parity:
+    """The inverse of `_join`."""
+    return Parity(math.sqrt(0.5) * (images[0] + images[1]), math.sqrt(0.5) * (images[0] - images[1]))
 
 
 class MirrorDense(nn.Module):
@@ -501,13 +505,13 @@ class MirrorDense(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: Told | Array) -> Array:
+    def __call__(self, x: Parity | Array) -> Array:
         even = nn.Dense(self.features, use_bias=self.use_bias, dtype=self.dtype, name="even")
         if not self.symmetric:
-            return even(jnp.concatenate([x.even, x.odd], axis=-1)[None] if isinstance(x, Told) else x)
+            return even(jnp.concatenate([x.even, x.odd], axis=-1)[None] if isinstance(x, Parity) else x)
         odd = nn.Dense(self.features, use_bias=False, dtype=self.dtype, name="odd")
-        halves = x if isinstance(x, Told) else _told(x)
-        return _images(Told(even(halves.even), odd(halves.odd)))
+        halves = x if isinstance(x, Parity) else _split(x)
+        return _join(Parity(even(halves.even), odd(halves.odd)))
 
 
 class Messages(nn.Module):
@@ -518,7 +522,7 @@ class Messages(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: Array, pairs: Told, other: Array) -> Array:
+    def __call__(self, x: Array, pairs: Parity, other: Array) -> Array:
         dense = functools.partial(MirrorDense, self.width, self.symmetric, dtype=self.dtype)
         h = nn.LayerNorm()(x)
         own = dense(name="own")(h)
@@ -542,7 +546,7 @@ class PushTrunk(nn.Module):
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, geometry: PushGeometry) -> Told:
+    def __call__(self, geometry: PushGeometry) -> Parity:
         width, symmetric = self.config.width, self.config.frame == "push"
         dense = functools.partial(MirrorDense, symmetric=symmetric)
         n = geometry.valid.shape[0]
@@ -550,8 +554,8 @@ class PushTrunk(nn.Module):
         x = dense(width, name="objects")(geometry.objects)
         x = x + dense(width, name="bend")(nn.gelu(dense(2 * width, name="widen")(geometry.objects)))
         # Nothing is said of a wall out of reach: its bias too fades with the distance.
-        met = nn.gelu(dense(width // 2, name="walls")(geometry.walls)) * geometry.wall_near[None, ..., None]
-        x = x + dense(width, use_bias=False, name="met")(jnp.sum(met, axis=-2))
+        walls = nn.gelu(dense(width // 2, name="walls")(geometry.walls)) * geometry.wall_near[None, ..., None]
+        x = x + dense(width, use_bias=False, name="met")(jnp.sum(walls, axis=-2))
         for i in range(self.config.layers):
             x = x + Messages(width, symmetric, self.dtype, name=f"messages_{i}")(x, geometry.pairs, other)
             layer = functools.partial(dense, dtype=self.dtype)
@@ -559,8 +563,8 @@ class PushTrunk(nn.Module):
             x = x + layer(width, name=f"narrow_{i}")(nn.gelu(h)).astype(jnp.float32)
         small = nn.initializers.normal(1e-3)
         x = nn.LayerNorm(name="norm")(x)
-        halves = _told(x) if symmetric else Told(x[0], x[0])
-        return Told(
+        halves = _split(x) if symmetric else Parity(x[0], x[0])
+        return Parity(
             even=nn.Dense(_EVEN, name="even", kernel_init=small)(halves.even),
             odd=nn.Dense(_ODD, use_bias=not symmetric, name="odd", kernel_init=small)(halves.odd),
         )
@@ -575,7 +579,7 @@ class PushNetwork(nn.Module):
     @nn.compact
     def __call__(self, start: PushStart) -> PushMotion:
         geometry = push_geometry(start, self.config.frame)
-        outputs = cast(Told, PushTrunk(self.config, self.dtype, name="trunk")(geometry))
+        outputs = cast(Parity, PushTrunk(self.config, self.dtype, name="trunk")(geometry))
         x, y = geometry.axis[None], _perpendicular(geometry.axis)[None]
         # In the mirror, what goes to the left goes to the right, and turns are the other way round.
         along, (across, turn) = outputs.even[:, 0], jnp.moveaxis(outputs.odd, -1, 0)
