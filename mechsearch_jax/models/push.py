@@ -344,6 +344,53 @@ def push_start(
     )
 
 
+def _framed(axis: Array, vectors: Array) -> Array:
+    """Planar vectors (..., 2) in the frame with this first axis."""
+    x, y = (a.reshape(*[1] * (vectors.ndim - 1), 2) for a in (axis, _perpendicular(axis)))
+    return jnp.stack([_dot(vectors, x), _dot(vectors, y)], axis=-1)
+
+
+def _pairs(prints: Footprints, met: Meetings, carry: Array, heading: Array, axis: Array) -> Parity:
+    """What is told of object j as seen from object i, (N, N, ...)."""
+    offset = prints.position[None] - prints.position[:, None]
+    overlap = jnp.minimum(prints.high[:, None], prints.high[None]) - jnp.maximum(prints.low[:, None], prints.low[None])
+    onward = jnp.clip(met.distance, -DEEPEST, REACH)
+    # How far i carries j, and a little more where they overlap.
+    passed = jnp.maximum(carry[:, None] - onward, 0.0)
+    gap, breadth = (jnp.clip(a, -DEEPEST, REACH) for a in (met.gap, met.breadth))
+    lengths = [onward, onward.T, passed, passed.T, gap, jnp.clip(overlap, -0.05, 0.2), breadth]
+    # From the centre of i; from that of j it differs by the offset, which is told.
+    side = met.middle[..., None] * _perpendicular(heading)[None, None]
+    normal = _framed(axis, met.normal)
+    offset, side = _framed(axis, offset) / _LENGTH, _framed(axis, side) / _LENGTH
+    vectors = jnp.stack([offset, normal, jnp.swapaxes(normal, 0, 1), side], axis=-2)
+    even = jnp.concatenate([jnp.stack(lengths, axis=-1) / _LENGTH, vectors[..., 0]], axis=-1)
+    return Parity(even=even, odd=vectors[..., 1])
+
+
+def _walls(prints: Footprints, faces: Array, axis: Array) -> tuple[Parity, Array]:
+    """What is told of each wall as seen from each object, (N, 4, ...), and how near it is; see `PushGeometry`."""
+    n = prints.yaw.shape[0]
+    normals = jnp.asarray(NORMALS)
+    toward = reach(prints, jnp.broadcast_to(normals[:, None], (4, n, 2))).T
+    gap = _dot(prints.position[:, None], normals[None]) - faces[None] - toward
+    gap = jnp.clip(gap, -0.05, REACH)
+    near = 1.0 - jnp.maximum(gap, 0.0) / REACH
+    edge = jnp.broadcast_to(jnp.asarray(_IS_EDGE)[None], (n, 4))
+    inwards = jnp.broadcast_to(_framed(axis, normals)[None], (n, 4, 2))
+    even = jnp.stack([gap / _LENGTH, near, edge, inwards[..., 0]], axis=-1)
+    return Parity(even=even, odd=inwards[..., 1:]), near
+
+
+def _extents(prints: Footprints, axis: Array) -> Parity:
+    """How far each object reaches in directions that begin with the axis [m], (N, ...)."""
+    fan = _fan(axis)
+    rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
+    extents = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, prints.yaw.shape[0], 2))).T
+    opposite, half = extents[:, _MIRRORED_DIRECTIONS], DIRECTIONS // 2
+    return Parity(even=0.5 * (extents + opposite)[:, : half + 1], odd=0.5 * (extents - opposite)[:, 1:half])
+
+
 def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") -> PushGeometry:
     """What the network is told of a push.
 
@@ -356,12 +403,7 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     length = _norm(start.displacement)
     heading = jnp.where(length > 1e-6, start.displacement / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0]))
     axis = heading if frame == "push" else jnp.array([1.0, 0.0])
-    basis = jnp.stack([axis, _perpendicular(axis)])
-
-    def framed(vectors):
-        """Planar vectors in the frame."""
-        along = basis.reshape(*[1] * (vectors.ndim - 1), 2, 2)
-        return jnp.stack([_dot(vectors, along[..., 0, :]), _dot(vectors, along[..., 1, :])], axis=-1)
+    framed = functools.partial(_framed, axis)
 
     def spread(vector):
         return jnp.broadcast_to(vector[None], (n, *vector.shape))
@@ -435,44 +477,15 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
         ],
         axis=1,
     )
-    fan = _fan(axis)
-    rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
-    extents = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, n, 2))).T / _LENGTH
-    half = DIRECTIONS // 2
-    opposite = extents[:, _MIRRORED_DIRECTIONS]
-    even, odd = 0.5 * (extents + opposite)[:, : half + 1], 0.5 * (extents - opposite)[:, 1:half]
-    objects = Parity(
-        even=jnp.concatenate([lengths / _LENGTH, plain, vectors[..., 0], even], axis=1),
-        odd=jnp.concatenate([vectors[..., 1], odd], axis=1),
-    )
-
-    offset = framed(prints.position[None] - prints.position[:, None]) / _LENGTH
-    overlap = jnp.minimum(prints.high[:, None], prints.high[None]) - jnp.maximum(prints.low[:, None], prints.low[None])
-    onward = jnp.clip(met.distance, -DEEPEST, REACH)
-    # How far i carries j, and a little more where they overlap.
-    passed = jnp.maximum(carry[:, None] - onward, 0.0)
-    # From the centre of i; from that of j it differs by the offset, which is told.
-    side = met.middle[..., None] * _perpendicular(heading)[None, None]
-    normal, side = framed(met.normal), framed(side) / _LENGTH
-    lengths = [onward, onward.T, passed, passed.T, jnp.clip(met.gap, -DEEPEST, REACH), jnp.clip(overlap, -0.05, 0.2)]
-    lengths = jnp.stack([*lengths, jnp.clip(met.breadth, -DEEPEST, REACH)], axis=-1) / _LENGTH
-    vectors = jnp.stack([offset, normal, jnp.swapaxes(normal, 0, 1), side], axis=-2)
-    pairs = Parity(even=jnp.concatenate([lengths, vectors[..., 0]], axis=-1), odd=vectors[..., 1])
-
-    normals = jnp.asarray(NORMALS)
-    toward = reach(prints, jnp.broadcast_to(normals[:, None], (4, n, 2))).T
-    wall_gap = _dot(prints.position[:, None], normals[None]) - faces[None] - toward
-    wall_gap = jnp.clip(wall_gap, -0.05, REACH)
-    near = 1.0 - jnp.maximum(wall_gap, 0.0) / REACH
-    edge = jnp.broadcast_to(jnp.asarray(_IS_EDGE)[None], (n, 4))
-    inwards = jnp.broadcast_to(framed(normals)[None], (n, 4, 2))
+    extents = _extents(prints, axis)
+    walls, near = _walls(prints, faces, axis)
     return PushGeometry(
-        objects=objects,
-        pairs=pairs,
-        walls=Parity(
-            even=jnp.stack([wall_gap / _LENGTH, near, edge, inwards[..., 0]], axis=-1),
-            odd=inwards[..., 1:],
+        objects=Parity(
+            even=jnp.concatenate([lengths / _LENGTH, plain, vectors[..., 0], extents.even / _LENGTH], axis=1),
+            odd=jnp.concatenate([vectors[..., 1], extents.odd / _LENGTH], axis=1),
         ),
+        pairs=_pairs(prints, met, carry, heading, axis),
+        walls=walls,
         wall_near=near,
         carry=carry,
         heading=framed(heading[None])[0],
