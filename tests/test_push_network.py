@@ -325,7 +325,7 @@ def test_an_object_reaches_as_far_as_its_outline():
 
 
 def test_how_two_objects_meet_is_told_from_both():
-    # The gripper is 4 cm before the first, which is 6 cm before the second, and 1 cm off its middle to the left.
+    # The gripper is 4 cm before the first, which is 6 cm before the second, whose middle is 2 cm to the left.
     scene = standing(((0.02, 0.03, 0.05), BOX, 0.6, 0.0, 0.0), ((0.02, 0.02, 0.08), BOX, 0.7, 0.02, 0.0))
     start = push_start(OPEN, scene, jnp.zeros((1, 3)), gripper_at(0.54, 0.0), jnp.float32([0.15, 0.0, 0.0]))
     pairs = jax.jit(push_geometry)(start).pairs

@@ -495,9 +495,9 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     )
 
 
-def _join(told: Parity) -> Array:
+def _join(halves: Parity) -> Array:
     """Numbers of a push and of its mirror image, (2, ...), from what is even and what is odd in them (...)."""
-    return math.sqrt(0.5) * jnp.stack([told.even + told.odd, told.even - told.odd])
+    return math.sqrt(0.5) * jnp.stack([halves.even + halves.odd, halves.even - halves.odd])
 
 
 def _split(images: Array) -> Parity:
@@ -509,7 +509,8 @@ class MirrorDense(nn.Module):
     """A dense layer on a push and its mirror image, (2, ..., width): if they are exchanged, so is what comes out.
 
     Its matrix is one for what is even in them and another for what is odd, which costs no more than one for each image.
-    Without `symmetric` there is one image, (1, ..., width), and the layer is an ordinary one.
+    Without `symmetric` there is one image, (1, ..., width), and the layer is an ordinary one. What is told of a push
+    comes in as its `Parity`, (..., width).
     """
 
     features: int
@@ -562,6 +563,7 @@ class PushTrunk(nn.Module):
     def __call__(self, geometry: PushGeometry) -> Parity:
         width, symmetric = self.config.width, self.config.frame == "push"
         dense = functools.partial(MirrorDense, symmetric=symmetric)
+        layer = functools.partial(dense, dtype=self.dtype)
         n = geometry.valid.shape[0]
         other = geometry.valid[None] & geometry.valid[:, None] & ~jnp.eye(n, dtype=bool)
         x = dense(width, name="objects")(geometry.objects)
@@ -571,7 +573,6 @@ class PushTrunk(nn.Module):
         x = x + dense(width, use_bias=False, name="met")(jnp.sum(walls, axis=-2))
         for i in range(self.config.layers):
             x = x + Messages(width, symmetric, self.dtype, name=f"messages_{i}")(x, geometry.pairs, other)
-            layer = functools.partial(dense, dtype=self.dtype)
             h = layer(2 * width, name=f"widen_{i}")(nn.LayerNorm(name=f"norm_{i}")(x))
             x = x + layer(width, name=f"narrow_{i}")(nn.gelu(h)).astype(jnp.float32)
         small = nn.initializers.normal(1e-3)
