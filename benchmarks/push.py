@@ -66,7 +66,7 @@ def weights_of(model: PushModel) -> dict[str, Any] | None:
 
 
 def held_out_generation(pushes: int, worlds: int, seed: int = 0, rounds: int = Generation.rounds) -> Generation:
-    """Pushes that are made as for training, of a seed that training refuses.
+    """Pushes that are made as for training, but for how many objects there are, of a seed that training refuses.
 
     Args:
       pushes, worlds, rounds: as in `Generation`.
@@ -162,7 +162,7 @@ class Bench:
           InputError: what lies in the folder is damaged or was made otherwise, it cannot be written, no push was
             possible, or Warp cannot be imported.
         """
-        return random_pushes(self.generation, folder, self.gpu, told, lambda: self.simulator)
+        return random_pushes(self.generation, folder, self.gpu, push_scenes(), told, lambda: self.simulator)
 
     def run(self, pushes: Pushes, told: Callable[[str, int], None] = lambda row, pushes: None) -> Measured:
         """Compare predictions with what the simulation made of pushes.

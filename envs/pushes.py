@@ -135,11 +135,12 @@ class Worlds(Protocol):
 
 
 def push_simulation() -> SimulatorConfig:
-    """How pushes are simulated here: as in an episode, less the way in and out, on which nothing is touched.
+    """How pushes are simulated here: as in an episode, but for most of the way in and out.
 
-    An approximation: what has not come to rest 0.4 s after the retreat is taken to rest where it is.
+    Approximations: what the hand would drag along on the rest of the way out stays where it is, and what has not come
+    to rest 0.4 s after the retreat is taken to rest where it is.
     """
-    motion = dataclasses.replace(MotionConfig(), approach=0.06, approach_steps=50)
+    motion = dataclasses.replace(MotionConfig(), approach=0.03, approach_steps=50)
     return SimulatorConfig(motion=motion, settle_steps=100)
 
 
@@ -388,9 +389,9 @@ class Generation:
       rounds: pushes that follow each other in a portion.
     """
 
-    seed: int = 0
-    pushes: int = 950_000
-    worlds: int = 16_384
+    seed: int
+    pushes: int
+    worlds: int
     rounds: int = 8
 
     def __post_init__(self):

@@ -49,6 +49,8 @@ class PlannerOptions:
         0 is the paper's even draw.
       push_model: what predicts pushes: "learned", the default, by a network, "quasi-static" by geometry, "physics" by
         simulating them, on a CPU only those that come first.
+      topple_charge: what an object that may fall over costs, as a share of the cost J; 0 by default. Pushes after which
+        one probably falls are never made.
       max_steps: actions in an episode; 10 by default.
       recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses; the others see
         a noisy depth image, "masks" with the true segmentation, "full" without.
@@ -67,6 +69,7 @@ class PlannerOptions:
     ] = None
     focus: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     push_model: Annotated[PushModel | None, tyro.conf.arg(metavar="{quasi-static,learned,physics}")] = None
+    topple_charge: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     max_steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     recognition: Recognition = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
@@ -81,7 +84,17 @@ class PlannerOptions:
         from mechsearch_jax.planner import PlannerConfig
 
         presets = {"paper": PlannerConfig.paper, "best": PlannerConfig.paper}
-        names = ("gamma", "horizon", "sequences", "actions", "criterion", "focus", "push_model", "max_steps")
+        names = (
+            "gamma",
+            "horizon",
+            "sequences",
+            "actions",
+            "criterion",
+            "focus",
+            "push_model",
+            "topple_charge",
+            "max_steps",
+        )
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         config = presets[self.preset](method=method, **given)
         # Missing weights are to be told of now, not by every episode.
@@ -873,7 +886,7 @@ def train_push(
     *,
     out: Path,
     data: Path | None = None,
-    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 950_000,
+    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 900_000,
     worlds: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     rounds: int = 8,
     frame: Literal["push", "world"] = "push",
@@ -893,14 +906,14 @@ def train_push(
     Args:
       out: folder for the checkpoint, the curves (scalars.jsonl), and in the end push.npz and its card push.json.
       data: folder for the pushes, a kilobyte each; OUT/pushes if left out. What lies there is not simulated again.
-      pushes: at least so many are simulated; an eighth of them is held out.
+      pushes: at least so many are simulated; one in 32 of the scenes is held out.
       worlds: simulated at once; 16,384 on a GPU and 64 on a CPU if left out.
       rounds: pushes that follow each other in a world before all are begun anew.
       frame: "push" sees objects along the push; "world" is the baseline without symmetry.
       width, layers: sizes of the network.
       seed: of the weights, the scenes and the pushes.
       steps: length in steps.
-      minutes: length in minutes instead, without simulation and scoring; 5.5 if neither is given.
+      minutes: length in minutes instead, without simulation and scoring; 5 if neither is given.
       batch: pushes in a step.
       rate: highest learning rate.
       decay: of the weights, times the learning rate, in every step.
@@ -917,7 +930,7 @@ def train_push(
     from mechsearch_jax.train.run import counting, run
 
     if steps is None and minutes is None:
-        minutes = 5.5
+        minutes = 5.0
     config = TrainConfig(
         seed=seed,
         steps=steps,

@@ -122,7 +122,7 @@ def test_rows_of_other_options_stay(tmp_path, files, command):
         {"caution": 0.5},
         {"push_distances": (0.1,)},
         {"push_model": "physics"},
-        {"topple_charge": 0.0},
+        {"topple_charge": 0.5},
     ],
     ids=lambda other: next(iter(other)),
 )

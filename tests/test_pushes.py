@@ -262,7 +262,7 @@ def test_pushes_are_made_once_and_read_again(tmp_path):
 @pytest.mark.parametrize("wrong", [{"pushes": 0}, {"worlds": 0}, {"rounds": 0}, {"seed": -1}])
 def test_impossible_generations_are_refused(wrong):
     with pytest.raises(InputError):
-        Generation(**wrong)
+        Generation(**{"seed": 0, "pushes": 5, "worlds": 8, **wrong})
 
 
 @pytest.mark.parametrize("wrong", [{"planned": 1.5}, {"lengths": (0.1, 0.05)}, {"tries": 0}])

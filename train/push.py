@@ -40,7 +40,7 @@ from mechsearch_jax.train.scenes import SceneConfig, origin, random_world
 from mechsearch_jax.transforms import matmul
 
 # Every so many lanes of pushes one is never trained on.
-HELD_OUT_LANES = 8
+HELD_OUT_LANES = 32
 # What has moved less than this counts as still: objects settle by as much [m, rad].
 STILL, STILL_TURN = 1e-3, np.deg2rad(0.5)
 # A box is the same after half a turn [rad].
@@ -55,6 +55,11 @@ DISTANCES, WITHIN = (0.05, 0.10, 0.15), 0.025
 def push_scenes() -> SceneConfig:
     """Scenes in which pushes begin: nothing leans, since nothing would hold it."""
     return SceneConfig(objects=(1, 8), lying=0.03, leaning=0.0)
+
+
+def crowded_scenes() -> SceneConfig:
+    """Scenes in which the network learns: with few objects hardly any pushes another, and `varied` takes some away."""
+    return dataclasses.replace(push_scenes(), objects=(3, 8))
 
 
 class PushTruth(flax.struct.PyTreeNode):
@@ -282,11 +287,11 @@ def random_pushes(
     generation: Generation,
     folder: Path,
     gpu: bool,
+    scenes: SceneConfig,
     told: Callable[[int], None] = lambda pushes: None,
     make_simulator: Callable[[], Worlds] | None = None,
 ) -> Pushes:
-    """Pushes as the network learns from, simulated on a GPU or not; see `envs.pushes.portions` for the rest."""
-    scenes = push_scenes()
+    """Pushes in such scenes, simulated on a GPU or not; see `envs.pushes.portions` for the rest."""
     draw_world = functools.partial(random_world, config=scenes)
     simulate = make_simulator or functools.partial(generator.engine, gpu)
     source = repr((generator.engine_name(gpu), generator.push_simulation(), origin(scenes)))
@@ -311,9 +316,9 @@ def push_task(
       InputError: what lies in the folder is damaged or was made otherwise, the folder cannot be written, or there are
         too few pushes to hold some out.
     """
-    scenes, config = push_scenes(), PushesConfig()
+    scenes, config = crowded_scenes(), PushesConfig()
     gpu = jax.default_backend() != "cpu"
-    pushes = random_pushes(generation, folder, gpu, told)
+    pushes = random_pushes(generation, folder, gpu, scenes, told)
     held = pushes.lane % HELD_OUT_LANES == 0
     if held.all() or not held.any():
         raise InputError("train push: too few pushes to hold some out; give more --pushes or --worlds")
@@ -429,7 +434,6 @@ def _compare(told: PushOutcome, pushes: Pushes, truth: PushTruth) -> _Compared:
 
 def outcome_scores(told: PushOutcome, pushes: Pushes) -> dict[str, Any]:
     """How well outcomes were predicted: over all, by distance, by the number of objects, and by both.
-
     Args:
       told: what was predicted of each push, with all nine bodies of a world in its scene.
       pushes: on the host.
@@ -460,7 +464,9 @@ def outcome_scores(told: PushOutcome, pushes: Pushes) -> dict[str, Any]:
     }
     near = {f"{100 * d:.0f} cm": np.abs(length - d) <= WITHIN for d in DISTANCES}
     counts = {f"{n} objects": objects == n for n in range(1, pushes.before.valid.shape[1])}
-    groups |= near | counts
+    # Together, those of about one of the distances; between them is no gap.
+    together = f"{100 * (DISTANCES[0] - WITHIN):.1f} to {100 * (DISTANCES[-1] + WITHIN):.1f} cm"
+    groups |= near | {together: np.any(list(near.values()), axis=0)} | counts
     groups |= {f"{a}, {b}": x & y for a, x in near.items() for b, y in counts.items()}
     return {name: _summary(compared, truth, failed, pushes, chosen) for name, chosen in groups.items() if chosen.any()}
 

@@ -6,6 +6,7 @@ float32, so that millimetres survive.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import flax.linen as nn
@@ -24,17 +25,18 @@ def fourier_features(points: Float[Array, "*batch 3"], octaves: int = 6) -> Floa
 
 
 class FeedForward(nn.Module):
-    """Normalise, widen, bend, narrow; to be added to its input."""
+    """Normalise, widen, bend, narrow; to be added to its input. `dense(features, dtype=...)` makes its two layers."""
 
     width: int
     growth: int = 4
     dtype: Any = jnp.float32
+    dense: Callable[..., nn.Module] = nn.Dense
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
         h = nn.LayerNorm()(x)
-        h = nn.Dense(self.growth * self.width, dtype=self.dtype)(h)
-        return nn.Dense(self.width, dtype=self.dtype)(nn.gelu(h)).astype(jnp.float32)
+        h = self.dense(self.growth * self.width, dtype=self.dtype)(h)
+        return self.dense(self.width, dtype=self.dtype)(nn.gelu(h)).astype(jnp.float32)
 
 
 class Attention(nn.Module):

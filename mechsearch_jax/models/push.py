@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.dynamics import TOUCH, Footprints, footprints, turned
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.models.layers import FeedForward
 from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.transforms import transform
@@ -47,6 +48,8 @@ SOFTNESS, STRICTER = 0.015, 5
 # Two objects meet along a normal if it parts them until they touch and, linearly less, if it does so until at most this
 # much before [m].
 SAME_CONTACT = 2e-3
+# A step towards a contact at a cylinder is taken as if it were met at no flatter an angle than one of this sine.
+_FLATTEST = 0.3
 # Objects that push each other on, one after the other, in the estimate of who is reached when.
 CHAIN = 4
 # Units of what the network is told and of what it says: lengths [m], angles [rad].
@@ -209,14 +212,14 @@ def pusher_distance(
 class Meetings(flax.struct.PyTreeNode):
     """Where object i would meet object j if it moved along the heading; leading axes (N, N).
 
-    Exact for two boxes; a cylinder is taken as a polygon around it, up to 2% wider, so that normals at cylinders are
-    known to about 11 degrees.
+    Exact for two boxes. A cylinder's contact is sought with a polygon around it, up to 2% wider, and then moved onto
+    the circle by one step of Newton's method: up to 1 mm too soon where it is nearly passed by.
 
     Attributes:
       distance: how far i moves until it touches j [m]: at least `-DEEPEST`, and `REACH` where it passes by or is past.
       gap: between them now; negative where they overlap [m].
-      normal: unit vector along which i meets j, never against the heading, (N, N, 2); the mean where there are several.
-        Where i passes by, it is that of a graze, and where it is past, that of a meeting before.
+      normal: unit vector along which i meets j, never against the heading, (N, N, 2); of two boxes the mean where there
+        are several. Where i passes by, it is about that of a graze, and where it is past, that of a meeting before.
       middle: of where they overlap across the heading, or of the room between them, to its left, from i's centre [m].
       breadth: of that overlap; negative where i passes by [m].
     """
@@ -228,15 +231,44 @@ class Meetings(flax.struct.PyTreeNode):
     breadth: jax.Array
 
 
+def _round_contacts(prints: Footprints, axis: Array, offset: Array) -> tuple[Array, Array]:
+    """The way from footprints i to footprints j where they are nearest, if one of them is round.
+
+    An approximation: an ellipse is taken for a circle of its mean half-axis. Of two boxes it says nothing.
+
+    Args:
+      prints: the footprints (N).
+      axis: first axis of each, planar unit vectors (N, 2).
+      offset: of i from j, (K, N, N, 2) [m].
+
+    Returns:
+      Unit vectors (K, N, N, 2), and how far they are apart, (K, N, N) [m]; below 0 they overlap.
+    """
+    # Seen from the one that may be a box, the other one is a disc.
+    disc_moves = prints.round[:, None, None]
+    axis = jnp.where(disc_moves, axis[None], axis[:, None])[None]
+    side = _perpendicular(axis)
+    flat = jnp.where(prints.round[:, None], 0.0, prints.half)
+    half = jnp.where(disc_moves, flat[None], flat[:, None])[None]
+    seen = jnp.where(disc_moves[None], offset, -offset)
+    x, y = _dot(seen, axis), _dot(seen, side)
+    x, y = x - jnp.clip(x, -half[..., 0], half[..., 0]), y - jnp.clip(y, -half[..., 1], half[..., 1])
+    away = x[..., None] * axis + y[..., None] * side
+    length = _norm(away)
+    radii = jnp.where(prints.round, 0.5 * (prints.half[:, 0] + prints.half[:, 1]), 0.0)
+    way = jnp.where(disc_moves[None], -away, away) / jnp.maximum(length, 1e-6)[..., None]
+    return way, length - (radii[:, None] + radii[None])[None]
+
+
 def meetings(prints: Footprints, heading: Float[Array, "2"]) -> Meetings:
     """Where footprints (N) would meet each other along a planar unit vector."""
     n = prints.yaw.shape[0]
     fan = _fan(heading)
     rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
-    # A round object has no sides of its own.
+    # A round object has no sides of its own: in their place, two of the rays are taken once more.
     axis = jnp.stack([jnp.cos(prints.yaw), jnp.sin(prints.yaw)], axis=-1)
-    axis = jnp.where(prints.round[:, None], heading[None], axis)
-    sides = jnp.stack([axis, _perpendicular(axis)], axis=1)
+    first = jnp.where(prints.round[:, None], heading[None], axis)
+    sides = jnp.stack([first, _perpendicular(first)], axis=1)
     # How far all objects reach along the rays, (K, N), and along each other's sides: [k, s, m] is m along those of k.
     along_rays = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, n, 2)))
     along_sides = reach(prints, jnp.broadcast_to(sides[:, :, None], (n, 2, n, 2)))
@@ -267,6 +299,13 @@ def meetings(prints: Footprints, heading: Float[Array, "2"]) -> Meetings:
     normal = jnp.sum(share[..., None] * normals, axis=0)
     length = _norm(normal)[..., None]
     normal = jnp.where(length > 1e-6, normal / jnp.where(length > 1e-6, length, 1.0), 0.0)
+    is_round = prints.round[:, None] | prints.round[None]
+    places = [start + enters[..., None] * heading[None, None], start + leaves[..., None] * heading[None, None], offset]
+    way, between = _round_contacts(prints, axis, jnp.stack(places))
+    normal = jnp.where(is_round[..., None], way[0], normal)
+    steepness = _dot(way[:2], heading[None, None, None]) * jnp.array([1.0, -1.0]).reshape(2, 1, 1)
+    step = jnp.where(is_round[None], jnp.maximum(between[:2], 0.0) / jnp.maximum(steepness, _FLATTEST), 0.0)
+    enters, leaves, gap = enters + step[0], leaves - step[1], jnp.where(is_round, between[2], gap)
     # From the centre of i, j reaches from -lateral - across_j to -lateral + across_j.
     left = jnp.minimum(across[:, None], across[None] - lateral)
     right = jnp.maximum(-across[:, None], -across[None] - lateral)
@@ -355,8 +394,8 @@ def _pairs(prints: Footprints, met: Meetings, carry: Array, heading: Array, axis
     offset = prints.position[None] - prints.position[:, None]
     overlap = jnp.minimum(prints.high[:, None], prints.high[None]) - jnp.maximum(prints.low[:, None], prints.low[None])
     onward = jnp.clip(met.distance, -DEEPEST, REACH)
-    # How far i carries j, and a little more where they overlap.
-    passed = jnp.maximum(carry[:, None] - onward, 0.0)
+    # How far i carries j.
+    passed = jnp.maximum(carry[:, None] - jnp.maximum(onward, 0.0), 0.0)
     gap, breadth = (jnp.clip(a, -DEEPEST, REACH) for a in (met.gap, met.breadth))
     lengths = [onward, onward.T, passed, passed.T, gap, jnp.clip(overlap, -0.05, 0.2), breadth]
     # From the centre of i; from that of j it differs by the offset, which is told.
@@ -563,7 +602,6 @@ class PushTrunk(nn.Module):
     def __call__(self, geometry: PushGeometry) -> Parity:
         width, symmetric = self.config.width, self.config.frame == "push"
         dense = functools.partial(MirrorDense, symmetric=symmetric)
-        layer = functools.partial(dense, dtype=self.dtype)
         n = geometry.valid.shape[0]
         other = geometry.valid[None] & geometry.valid[:, None] & ~jnp.eye(n, dtype=bool)
         x = dense(width, name="objects")(geometry.objects)
@@ -573,8 +611,7 @@ class PushTrunk(nn.Module):
         x = x + dense(width, use_bias=False, name="met")(jnp.sum(walls, axis=-2))
         for i in range(self.config.layers):
             x = x + Messages(width, symmetric, self.dtype, name=f"messages_{i}")(x, geometry.pairs, other)
-            h = layer(2 * width, name=f"widen_{i}")(nn.LayerNorm(name=f"norm_{i}")(x))
-            x = x + layer(width, name=f"narrow_{i}")(nn.gelu(h)).astype(jnp.float32)
+            x = x + FeedForward(width, 2, self.dtype, dense, name=f"forward_{i}")(x)
         small = nn.initializers.normal(1e-3)
         x = nn.LayerNorm(name="norm")(x)
         halves = _split(x) if symmetric else Parity(x[0], x[0])
