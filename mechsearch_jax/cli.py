@@ -49,8 +49,8 @@ class PlannerOptions:
         0 is the paper's even draw.
       push_model: what predicts pushes: "learned", the default, by a network, "quasi-static" by geometry, "physics" by
         simulating them, on a CPU only those that come first.
-      topple_charge: what an object that may fall over costs, as a share of the cost J; 0 by default. Pushes after which
-        one probably falls are never made.
+      topple_charge: what a push costs, as a share of the cost J, times how many objects are expected to fall over; 0 by
+        default. One after which an object falls with more than 0.5 is never made.
       max_steps: actions in an episode; 10 by default.
       recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses; the others see
         a noisy depth image, "masks" with the true segmentation, "full" without.
@@ -910,7 +910,8 @@ def train_push(
       worlds: simulated at once; 16,384 on a GPU and 64 on a CPU if left out.
       rounds: pushes that follow each other in a world before all are begun anew.
       frame: "push" sees objects along the push; "world" is the baseline without symmetry.
-      width, layers: sizes of the network.
+      width: of what the network knows of an object.
+      layers: of messages between objects.
       seed: of the weights, the scenes and the pushes.
       steps: length in steps.
       minutes: length in minutes instead, without simulation and scoring; 5 if neither is given.

@@ -20,7 +20,8 @@ from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.superquadric import Superquadrics
 
 NAME = "push"
-# An object is moved if it moves with a probability above this: of those that stay, at most 1 in 100 is then moved.
+# An object is moved if it moves with a probability above this: of those that stay, less than 1 in 100 is then moved,
+# but 3 in 100 where there is one object and the target.
 LIKELY = 0.75
 # The hand gives way and ends short of where it was sent: what simulated pushes come to overlaps in 1 of 20 cases by
 # about this with the hand where it was sent or with a neighbour [m]. Next to a wall, predictions are as far off.

@@ -434,6 +434,7 @@ def _compare(told: PushOutcome, pushes: Pushes, truth: PushTruth) -> _Compared:
 
 def outcome_scores(told: PushOutcome, pushes: Pushes) -> dict[str, Any]:
     """How well outcomes were predicted: over all, by distance, by the number of objects, and by both.
+
     Args:
       told: what was predicted of each push, with all nine bodies of a world in its scene.
       pushes: on the host.

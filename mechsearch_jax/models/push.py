@@ -212,8 +212,9 @@ def pusher_distance(
 class Meetings(flax.struct.PyTreeNode):
     """Where object i would meet object j if it moved along the heading; leading axes (N, N).
 
-    Exact for two boxes. A cylinder's contact is sought with a polygon around it, up to 2% wider, and then moved onto
-    the circle by one step of Newton's method: up to 1 mm too soon where it is nearly passed by.
+    Distances are exact for two boxes, and gaps then a lower bound. A cylinder's contact is sought with a polygon around
+    it, up to 2% wider, and then moved onto the circle by one step of Newton's method: too soon by up to 3 mm where it
+    is nearly passed by.
 
     Attributes:
       distance: how far i moves until it touches j [m]: at least `-DEEPEST`, and `REACH` where it passes by or is past.
@@ -242,7 +243,8 @@ def _round_contacts(prints: Footprints, axis: Array, offset: Array) -> tuple[Arr
       offset: of i from j, (K, N, N, 2) [m].
 
     Returns:
-      Unit vectors (K, N, N, 2), and how far they are apart, (K, N, N) [m]; below 0 they overlap.
+      Unit vectors (K, N, N, 2), and how far they are apart, (K, N, N) [m]; below 0 they overlap. Where the axis of one
+      is inside the other the vector is 0, and less is told than how deep.
     """
     # Seen from the one that may be a box, the other one is a disc.
     disc_moves = prints.round[:, None, None]
