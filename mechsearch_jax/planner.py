@@ -98,7 +98,7 @@ class PlannerConfig:
         share of the possible poses at which it would do so.
       topple_charge: what an object that falls over would cost, in units of J: a sampled push is charged with J times
         the number of objects that are expected to. `ActionConfig.topple` says which pushes are ruled out altogether;
-        with what is left, a charge of 0.5 made episodes longer.
+        to charge what is left with 0.5 gained nothing.
       push_model: what predicts pushes, by default the network; see `push_models.own_push_model`, and `envs.push_models`
         for "physics", which needs a simulator.
       focus: share of the draws that go to objects by how much they hide or are in the way; the others are even, as the
