@@ -185,7 +185,7 @@ class Bench:
         settings = {
             "pushes": len(pushes.object),
             "generation": dataclasses.asdict(self.generation),
-            "simulator": generator.engine_name(self.gpu),
+            "simulator": type(self.simulator).__name__ if self.make_simulator else generator.engine_name(self.gpu),
             "objects": scenes.objects,
             "lengths": config.lengths,
             "sideways": config.sideways,
