@@ -22,13 +22,14 @@ from mechsearch_jax import planner
 from mechsearch_jax.actions import Action, ActionKind, PossibleSpace, candidates, sample_action
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
+from mechsearch_jax.envs.records import ACTION_NAMES
 from mechsearch_jax.envs.simulator import NativeSimulator, Outcome
 from mechsearch_jax.envs.world import CYLINDER, World, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.planner import PlannerConfig, Problem
-from mechsearch_jax.results import ACTION_NAMES, versions
-from mechsearch_jax.scenario import MAX_OBJECTS, Scenario
+from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Scenario
 
 # What counts as the same final pose [m, degrees].
 NEAR, ALIGNED = 5e-3, 3.0

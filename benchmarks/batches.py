@@ -8,16 +8,17 @@ from collections.abc import Callable, Iterator, Sequence
 import jax
 
 from mechsearch_jax.benchmarks.evaluate import Job
+from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.cache import kept_problem
 from mechsearch_jax.envs.batch_episode import BatchSimulator, Start, run_episodes
 from mechsearch_jax.envs.episode import row, target_of
 from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.native_worlds import NativeWorlds
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
+from mechsearch_jax.envs.records import Episode
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.results import Episode, Row
-from mechsearch_jax.target import Target
+from mechsearch_jax.workspace.target import Target
 
 ENGINES: dict[str, Callable[[], BatchSimulator]] = {
     NativeWorlds.engine: NativeWorlds,

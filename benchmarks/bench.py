@@ -21,9 +21,8 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax import planner
 from mechsearch_jax.actions import Action
 from mechsearch_jax.benchmarks.push import named_model, weights_of
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.dynamics import PushOutcome
-from mechsearch_jax.envs import motion
+from mechsearch_jax.dynamics.named import PushModelName
+from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.envs.episode import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator, commands
@@ -34,16 +33,17 @@ from mechsearch_jax.envs.world import TARGET, World, from_scenario, true_superqu
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.files import PathLike, save_json
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation
 from mechsearch_jax.planner import Belief, PlannerConfig, Problem
-from mechsearch_jax.push_models import PushModelName
-from mechsearch_jax.results import versions
-from mechsearch_jax.scenario import MAX_OBJECTS
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.robot import motion
 from mechsearch_jax.train.push import push_scenes
 from mechsearch_jax.train.scenes import random_world
-from mechsearch_jax.transforms import make
+from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS
+from mechsearch_jax.workspace.shelf import Shelf
 
 # What a call does many of; how many is in `Timing.shapes`.
 COUNTED = ("evaluations", "operations", "bytes", "recognitions", "predictions")

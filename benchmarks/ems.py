@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.geometry.superquadric import Superquadrics
 
 EXPONENTS = (0.05, 2.0)
 LEAST_POINTS = 11

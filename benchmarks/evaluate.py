@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import importlib.metadata
 from collections.abc import Callable, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Protocol
 
+from mechsearch_jax.benchmarks.rows import Row, configuration, identity, read_code, read_rows, write_rows
 from mechsearch_jax.envs.recognisers import RecognitionName
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.results import Row, configuration, identity, read_code, read_rows, write_rows
-from mechsearch_jax.scenario import Scenario, load_scenario
+from mechsearch_jax.versions import source_digest
+from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,15 +104,10 @@ def present_code() -> str:
     """The code that decides about an episode: the package's version, and a digest of planner, perception (with its
     weights) and environment.
 
-    The version alone would not tell a checkout from the next commit. The command line decides nothing.
+    The version alone would not tell a checkout from the next commit. The command line and pictures decide nothing.
     """
-    digest = hashlib.sha256()
-    for package in ("", ".perception", ".models", ".envs"):
-        for file in sorted(resources.files(f"mechsearch_jax{package}").iterdir(), key=lambda file: file.name):
-            if file.name.endswith((".py", ".npz")) and file.name != "cli.py":
-                source = file.read_bytes()
-                digest.update(f"{package} {file.name} {len(source)} ".encode() + source)
-    return f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')} ({digest.hexdigest()[:12]})"
+    digest = source_digest((".py", ".npz"), ("mechsearch_jax", "mechsearch_jax.envs"))
+    return f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')} ({digest[:12]})"
 
 
 def _check_code(path: PathLike, rows: Sequence[Row]) -> None:

@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Sequence
 
 from mechsearch_jax.benchmarks.evaluate import Job
-from mechsearch_jax.results import Row, identity
+from mechsearch_jax.benchmarks.rows import Row, identity
 
 WORKER = (sys.executable, "-m", "mechsearch_jax.benchmarks.worker")
 # Several processes cannot share a GPU's memory, of which the first takes most.

@@ -20,7 +20,8 @@ import numpy as np
 
 from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.benchmarks.agreement import NUDGE
-from mechsearch_jax.dynamics import PushModel, PushOutcome
+from mechsearch_jax.dynamics.learned import NAME, LearnedPush
+from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
 from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.mjx_simulator import Failure
 from mechsearch_jax.envs.push_models import push_models
@@ -28,13 +29,12 @@ from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, Worlds,
 from mechsearch_jax.envs.world import superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, save_json
-from mechsearch_jax.learned_push import NAME, LearnedPush
-from mechsearch_jax.models.weights import load_weights
-from mechsearch_jax.results import versions
+from mechsearch_jax.geometry.transforms import translate
+from mechsearch_jax.networks.weights import load_weights
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.push import no_motion, outcome_scores, predictions, push_scenes, random_pushes
 from mechsearch_jax.train.run import commit
-from mechsearch_jax.transforms import translate
+from mechsearch_jax.versions import versions
 
 RowName = Literal["no motion", "quasi-static", "learned", "physics", "nudged"]
 ROWS: tuple[str, ...] = get_args(RowName)

@@ -22,21 +22,21 @@ from matplotlib.figure import Figure
 
 from mechsearch_jax.benchmarks import ems
 from mechsearch_jax.benchmarks.images import NOISES, Look, Scene, Shown, image_of, named, save_rows
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs.world import CYLINDER, TARGET, World, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
-from mechsearch_jax.models.recognition import RecognitionNetwork
-from mechsearch_jax.models.weights import Weights, shipped_weights
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.networks.recognition import RecognitionNetwork
+from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.perception.recognition import recognise
 from mechsearch_jax.perception.refinement import RefinementConfig, refine, select
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
-from mechsearch_jax.results import versions
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.train.scenes import PIXELS
+from mechsearch_jax.versions import versions
 from mechsearch_jax.viz import drawing
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
 
 MethodName = Literal["network", "network-refined", "ems", "ems-refined"]
 # Visible shares by which figures are broken down: name, from, to below.

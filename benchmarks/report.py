@@ -15,18 +15,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from mechsearch_jax.benchmarks.rates import Rates, summarise, wilson
+from mechsearch_jax.benchmarks.rows import Row, identity, label_variants, read_rows
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
-from mechsearch_jax.results import (
-    Rates,
-    Row,
-    check_writable,
-    identity,
-    label_variants,
-    read_rows,
-    summarise,
-    wilson,
-)
+from mechsearch_jax.files import PathLike, check_writable, replacing
 from mechsearch_jax.viz.drawing import INK, MUTED, save_figure
 
 FILES = ("report.md", "rates.csv", "rates.json", "failures.csv", "success.png")

@@ -11,15 +11,15 @@ import os
 import sys
 from typing import Any, TextIO
 
+from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.cache import keep_compilations, kept_problem
 from mechsearch_jax.envs.episode import row as row_of
 from mechsearch_jax.envs.episode import run_episode, target_of
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.simulator import NativeSimulator
 from mechsearch_jax.planner import PlannerConfig, Problem
-from mechsearch_jax.results import Row
-from mechsearch_jax.scenario import load_scenario
-from mechsearch_jax.target import Target
+from mechsearch_jax.workspace.scenario import load_scenario
+from mechsearch_jax.workspace.target import Target
 
 
 class Worker:

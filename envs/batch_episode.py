@@ -41,11 +41,11 @@ from mechsearch_jax.envs.episode import (
 )
 from mechsearch_jax.envs.mjx_simulator import RETRIEVE, Outcomes, Overflow
 from mechsearch_jax.envs.push_models import push_models
+from mechsearch_jax.envs.records import Episode
 from mechsearch_jax.envs.world import TARGET, World
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner import Belief, GraspChoice, PlannerConfig, Problem
-from mechsearch_jax.results import Episode
-from mechsearch_jax.scenario import Scenario
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.workspace.scenario import Scenario
 
 
 @runtime_checkable

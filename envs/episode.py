@@ -21,19 +21,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax import planner, results
+from mechsearch_jax import planner
 from mechsearch_jax.actions import Action, ActionKind
-from mechsearch_jax.camera import Camera
+from mechsearch_jax.benchmarks.rows import Row, configuration
 from mechsearch_jax.envs.observation import Observation, is_found, observe
 from mechsearch_jax.envs.push_models import push_models
+from mechsearch_jax.envs.records import ActionRecord, Episode, Step, record_action
 from mechsearch_jax.envs.simulator import Outcome, Retrieval
 from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner import Belief, GraspChoice, Plan, PlannerConfig, Problem
-from mechsearch_jax.results import ActionRecord, Episode, Step
-from mechsearch_jax.scenario import Scenario
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.target import Target
+from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 MAX_TILT = math.radians(15)
 BOX_YAWS = 6
@@ -412,7 +414,7 @@ class EpisodeLog:
             scenario=scenario.name,
             objects=len(scenario.objects),
             config=options,
-            versions=results.versions(),
+            versions=versions(),
             steps=tuple(self.steps),
             found_step=self._found_step,
             graspable_step=self._graspable_step,
@@ -448,7 +450,7 @@ def record(
         action = ActionRecord("retrieve", None, T, [0.0, 0.0, 0.0], T, float(grasp.q7), float(grasp.opening))
     elif choice is not None:
         cost, predicted = float(choice.cost), float(choice.predicted_cost)
-        action = results.record_action(choice.action)
+        action = record_action(choice.action)
         sequences = int(choice.sequences)
     return Step(
         belief_size=belief_size,
@@ -476,12 +478,12 @@ def describe(seed: int, problem: Problem, config: PlannerConfig, recognition: st
     }
 
 
-def row(episode: Episode) -> results.Row:
+def row(episode: Episode) -> Row:
     """An episode as a line of a table."""
     config = episode.config
     planning = ("recognise", "believe", "grasp", "plan")
     seconds = {name: sum(s.timings.get(name, 0.0) for s in episode.steps) for name in (*planning, "simulate")}
-    return results.Row(
+    return Row(
         scenario=episode.scenario,
         objects=episode.objects,
         target=config["target"],
@@ -499,5 +501,5 @@ def row(episode: Episode) -> results.Row:
         failure=episode.failure,
         planning_seconds=sum(seconds[name] for name in planning),
         simulation_seconds=seconds["simulate"],
-        configuration=results.configuration(config),
+        configuration=configuration(config),
     )

@@ -9,16 +9,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
 
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs.observation import target_pixels
 from mechsearch_jax.envs.simulator import NativeSimulator
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.graspability import GraspConfig, grasp_tables
-from mechsearch_jax.gripper import Gripper
-from mechsearch_jax.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 # Full sizes [m]; a box's x and y may be swapped.
 BOXES = (

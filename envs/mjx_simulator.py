@@ -42,16 +42,16 @@ from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import Action, ActionKind
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs import model as models
-from mechsearch_jax.envs import motion
 from mechsearch_jax.envs.batch_model import BodyFields, body_fields
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig
 from mechsearch_jax.envs.world import BODIES, TARGET, World, from_scenario
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.kinematics import HOME, gripper_pose
-from mechsearch_jax.scenario import Scenario
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.robot import motion
+from mechsearch_jax.robot.kinematics import HOME, gripper_pose
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 # Kinds of an action beside those of `ActionKind`: take the target out; hold still until everything is at rest.
 RETRIEVE = len(ActionKind)

@@ -9,8 +9,8 @@ from rich.status import Status
 
 from mechsearch_jax.envs import pictures
 from mechsearch_jax.envs.episode import Moment
+from mechsearch_jax.envs.records import Episode
 from mechsearch_jax.planner import PlannerConfig, Problem
-from mechsearch_jax.results import Episode
 from mechsearch_jax.viz.filmstrip import Frame
 
 STAGES = {

@@ -20,7 +20,7 @@ from mechsearch_jax.envs.mjx_simulator import RETRIEVE, Failure, Outcomes
 from mechsearch_jax.envs.simulator import NativeSimulator, SimulatorConfig
 from mechsearch_jax.envs.world import BODIES, World
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.scenario import Scenario
+from mechsearch_jax.workspace.scenario import Scenario
 
 
 class NativeWorlds:

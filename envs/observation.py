@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.camera import Camera, pixel_rays, project, rays
 from mechsearch_jax.envs.model import shelf_boxes
 from mechsearch_jax.envs.world import BODIES, CYLINDER, TARGET, World
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.transforms import rotate
+from mechsearch_jax.geometry.transforms import rotate
+from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
+from mechsearch_jax.workspace.shelf import Shelf
 
 BACKGROUND, SHELF = -1, BODIES
 FOUND_PIXELS = 100

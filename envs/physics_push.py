@@ -32,19 +32,20 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.dynamics import ROUND_EXPONENT, PushOutcome
+from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.mjx_simulator import WAIT, Failure, MjxConfig, MjxSimulator, Overflow
-from mechsearch_jax.envs.motion import Reference, push_reference
 from mechsearch_jax.envs.pushes import push_simulation, toppled
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, controls
 from mechsearch_jax.envs.world import BODIES, BOX, CYLINDER, World, bodies_of
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.kinematics import HOME
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics, pad
-from mechsearch_jax.transforms import matmul, rotate
+from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
+from mechsearch_jax.geometry.superquadric import Superquadrics, pad
+from mechsearch_jax.geometry.transforms import matmul, rotate
+from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.robot.motion import Reference, push_reference
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
 
 # An object that has moved by less than this [m], and turned by less than this [rad], was not pushed.
 STILL, STILL_TURN = 1e-3, 0.02

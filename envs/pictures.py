@@ -14,10 +14,9 @@ from mechsearch_jax.envs.episode import Moment, Recogniser, Snapshot, oracle, tr
 from mechsearch_jax.envs.observation import Observation
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.planner import PlannerConfig, Problem
-from mechsearch_jax.results import Maps
-from mechsearch_jax.scenario import Scenario
 from mechsearch_jax.viz.filmstrip import Frame
-from mechsearch_jax.viz.maps import maps_figure
+from mechsearch_jax.viz.maps import Maps, maps_figure
+from mechsearch_jax.workspace.scenario import Scenario
 
 
 def colour_image(observation: Observation) -> UInt8[np.ndarray, "h w 3"]:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import jax
 
-from mechsearch_jax.dynamics import PushModel
+from mechsearch_jax.dynamics.named import own_push_model
+from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.envs.physics_push import MjxPhysics, NativePhysics
-from mechsearch_jax.push_models import own_push_model
 
 
 class PushModels(NamedTuple):

@@ -23,22 +23,22 @@ from flax import serialization
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Bool, Key
 
-from mechsearch_jax import superquadric
 from mechsearch_jax.actions import Action, ActionConfig, ActionKind, ActionTables, action_tables
-from mechsearch_jax.collision import hits_shelf
-from mechsearch_jax.dynamics import LOW_CONTACT, bounding_half_extents, footprints
+from mechsearch_jax.dynamics.push_model import LOW_CONTACT
 from mechsearch_jax.envs.mjx_simulator import Failure, Outcomes
-from mechsearch_jax.envs.motion import MotionConfig
 from mechsearch_jax.envs.simulator import SimulatorConfig
 from mechsearch_jax.envs.world import CYLINDER, TARGET, World, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import replacing
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.footprints import bounding_half_extents, footprints
+from mechsearch_jax.geometry.transforms import back_off, inverse, make, transform, translate
 from mechsearch_jax.graspability import gripper_rotation
-from mechsearch_jax.gripper import Gripper, arm_hits_shelf
-from mechsearch_jax.kinematics import path_kinematics
-from mechsearch_jax.models.push import pusher_distance
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.transforms import back_off, inverse, make, transform, translate
+from mechsearch_jax.networks.push import pusher_distance
+from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
+from mechsearch_jax.robot.kinematics import path_kinematics
+from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 
 # An object whose vertical has turned by more than this has fallen over [rad].
 TOPPLED = math.radians(15)

@@ -15,15 +15,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.assignment import assign
-from mechsearch_jax.camera import Camera, project
 from mechsearch_jax.envs.episode import Recogniser, Recognition, Snapshot, oracle
 from mechsearch_jax.envs.observation import observe
 from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models.recognition import RecognitionNetwork
-from mechsearch_jax.models.segmentation import SegmentationNetwork, told_by
-from mechsearch_jax.models.weights import Weights, shipped_weights
+from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
+from mechsearch_jax.networks.recognition import RecognitionNetwork
+from mechsearch_jax.networks.segmentation import SegmentationNetwork, told_by
+from mechsearch_jax.networks.weights import Weights, shipped_weights
+from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.perception.cloud import MARGIN, View, above_board, cloud_of, draw, resample, shelf_view
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.noise import NoiseModel, RandomDirection
@@ -31,9 +31,9 @@ from mechsearch_jax.perception.recognition import recognise
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
 from mechsearch_jax.perception.target_pose import target_pose
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics, standard_edges
-from mechsearch_jax.target import Target
+from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 RecognitionName = Literal["oracle", "masks", "full"]
 # Points of the target that its pose is fitted to.

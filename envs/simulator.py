@@ -21,14 +21,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, ActionKind
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs import model as models
-from mechsearch_jax.envs import motion
-from mechsearch_jax.envs.motion import MotionConfig, Reference
 from mechsearch_jax.envs.world import BODIES, TARGET, World, bodies_of, from_scenario, slots
-from mechsearch_jax.kinematics import HOME
-from mechsearch_jax.scenario import Body, Scenario, rotation_matrix
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.robot import motion
+from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.robot.motion import MotionConfig, Reference
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, Scenario, rotation_matrix
+from mechsearch_jax.workspace.shelf import Shelf
 
 ARM = len(HOME)
 ROBOT = ARM + 2

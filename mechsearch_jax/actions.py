@@ -14,27 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax import superquadric
-from mechsearch_jax.collision import Pair, any_inside, hits_shelf
-from mechsearch_jax.dynamics import (
-    LEVERAGE,
-    LOW_CONTACT,
-    TOUCH,
-    Footprints,
-    bounding_half_extents,
-    footprints,
-    in_hand,
-    turned,
-)
+from mechsearch_jax.dynamics.push_model import LEVERAGE, LOW_CONTACT, TOUCH
+from mechsearch_jax.dynamics.rigid import in_hand
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.graspability import WRIST_ORIGIN, boxes_overlap, gripper_rotation
-from mechsearch_jax.gripper import Gripper, arm_hits_shelf, gripper_cloud, swept_cloud
-from mechsearch_jax.kinematics import line_kinematics, line_poses, path_kinematics
-from mechsearch_jax.masked import masked_vmap
-from mechsearch_jax.object_grasps import PASSING_GAP, ObjectGraspConfig, grasp_variants, object_grasps
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import (
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.collision import Pair, any_inside
+from mechsearch_jax.geometry.footprints import Footprints, bounding_half_extents, footprints, turned
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import (
     back_off,
     compose,
     inverse,
@@ -45,6 +33,11 @@ from mechsearch_jax.transforms import (
     translate,
     yaw_rotation,
 )
+from mechsearch_jax.graspability import WRIST_ORIGIN, boxes_overlap, gripper_rotation
+from mechsearch_jax.object_grasps import PASSING_GAP, ObjectGraspConfig, grasp_variants, object_grasps
+from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf, gripper_cloud, swept_cloud
+from mechsearch_jax.robot.kinematics import line_kinematics, line_poses, path_kinematics
+from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 
 # Longer pushes would leave the shelf [m].
 LONGEST_PUSH = 0.5

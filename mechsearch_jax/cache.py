@@ -17,15 +17,16 @@ import numpy as np
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionConfig, ActionTables
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig, ExistenceTables
 from mechsearch_jax.files import replacing
 from mechsearch_jax.graspability import GraspConfig, GraspTables
-from mechsearch_jax.gripper import Gripper
 from mechsearch_jax.planner import Problem
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.versions import source_digest
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 VARIABLE = "MECHSEARCH_CACHE_DIR"
 # Problems of older versions of the package are of no use; a few are left for those who switch between versions.
@@ -93,10 +94,7 @@ def kept_problem(target: Target | None = None) -> Problem:
 @functools.cache
 def _source() -> str:
     """A digest of the package's source: a problem is no better than the code that built it."""
-    digest = hashlib.sha256()
-    for file in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(f"{file.name} {file.stat().st_size} ".encode() + file.read_bytes())
-    return digest.hexdigest()
+    return source_digest((".py",))
 
 
 def _key(parts: dict[str, Any]) -> str:

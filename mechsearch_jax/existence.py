@@ -21,15 +21,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from mechsearch_jax import render, superquadric
-from mechsearch_jax.camera import Camera, project
-from mechsearch_jax.collision import Pair, any_inside
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.masked import masked_vmap
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.target import Target
-from mechsearch_jax.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.collision import Pair, any_inside
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.workspace import render
+from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 FAR = 1.5
 

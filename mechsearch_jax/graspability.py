@@ -19,15 +19,15 @@ import scipy.spatial
 import trimesh
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.collision import Pair, hits_shelf, mark_hits
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.gripper import Gripper, arm_hits_shelf, swept_cloud
-from mechsearch_jax.kinematics import line_kinematics
-from mechsearch_jax.masked import block_size, for_each, masked_vmap, merged, rows_of
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.target import Target
-from mechsearch_jax.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.geometry.collision import Pair, mark_hits
+from mechsearch_jax.geometry.masked import block_size, for_each, masked_vmap, merged, rows_of
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf, swept_cloud
+from mechsearch_jax.robot.kinematics import line_kinematics
+from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
+from mechsearch_jax.workspace.target import Target
 
 WRIST_ORIGIN = math.pi / 4
 # So many grasps of a pose are looked at together, and so many points of a cloud first.

@@ -35,8 +35,9 @@ from mechsearch_jax.actions import (
     sample_action,
     widen,
 )
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.dynamics import PushModel, changed, pick_and_place
+from mechsearch_jax.dynamics.named import PushModelName, check_name, own_push_model
+from mechsearch_jax.dynamics.push_model import PushModel
+from mechsearch_jax.dynamics.rigid import changed, pick_and_place
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import (
     ExistenceConfig,
@@ -48,6 +49,8 @@ from mechsearch_jax.existence import (
     object_views,
     occluders,
 )
+from mechsearch_jax.geometry.superquadric import Superquadrics, gauge, to_object_frame
+from mechsearch_jax.geometry.transforms import compose, upright_pose
 from mechsearch_jax.graspability import (
     FoundGrasps,
     GraspConfig,
@@ -60,13 +63,11 @@ from mechsearch_jax.graspability import (
     no_hits,
     pairs,
 )
-from mechsearch_jax.gripper import Gripper, arm_points
-from mechsearch_jax.kinematics import line_kinematics, line_poses, path_kinematics
-from mechsearch_jax.push_models import PushModelName, check_name, own_push_model
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics, gauge, to_object_frame
-from mechsearch_jax.target import Target
-from mechsearch_jax.transforms import compose, upright_pose
+from mechsearch_jax.robot.gripper import Gripper, arm_points
+from mechsearch_jax.robot.kinematics import line_kinematics, line_poses, path_kinematics
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 CLEARANCES = (0.0, 0.004, 0.008, 0.012, 0.02)
 # Small enough that, at a pose, no number of hits outweighs one object of the cost proper.

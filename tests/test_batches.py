@@ -6,14 +6,15 @@ import jax
 import pytest
 from test_envs_episode import CONFIG, HIDDEN, OPEN
 
-from mechsearch_jax import results
 from mechsearch_jax.benchmarks import batches
 from mechsearch_jax.benchmarks.batches import Batches, fitting_worlds
 from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
+from mechsearch_jax.benchmarks.rows import identity, read_rows
 from mechsearch_jax.envs.episode import EpisodeLog, describe
 from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.native_worlds import NativeWorlds
-from mechsearch_jax.scenario import save_scenario
+from mechsearch_jax.envs.records import Step
+from mechsearch_jax.workspace.scenario import save_scenario
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ class Stand:
                 raise error
             log = EpisodeLog(config)
             log.decide(
-                results.Step(1, True, True, 1.0, None, None, None, 0, None, {}),
+                Step(1, True, True, 1.0, None, None, None, 0, None, {}),
             )
             log.act(None, "not found", {})
             options = describe(start.seed, problem, config, "oracle", simulator.engine)
@@ -57,7 +58,7 @@ def test_every_job_becomes_a_row_with_its_options(problem, tmp_path, files, monk
     jobs = jobs_of(files, seeds=(0, 1))
     rows = evaluate(jobs, tmp_path / "rows.parquet", Batches(worlds=3))
     assert [(r.scenario, r.seed) for r in rows] == [(j.scenario.name, j.seed) for j in jobs]
-    assert {results.identity(r) for r in rows} == {results.identity(j.failed("")) for j in jobs}
+    assert {identity(r) for r in rows} == {identity(j.failed("")) for j in jobs}
     assert stand.slots == [3]
 
 
@@ -104,7 +105,7 @@ def test_what_fails_at_once_ends_the_run(problem, tmp_path, files, monkeypatch):
     Stand(problem, monkeypatch, lambda name, slots: ValueError("never"))
     with pytest.raises(ValueError, match="never"):
         evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=2))
-    assert results.read_rows(tmp_path / "rows.parquet") == []
+    assert read_rows(tmp_path / "rows.parquet") == []
 
 
 @pytest.mark.slow
@@ -120,12 +121,12 @@ def test_a_run_that_was_killed_goes_on_to_the_same_rows(tmp_path, files):
     out = tmp_path / "killed.parquet"
     with pytest.raises(KeyboardInterrupt):
         evaluate(jobs, out, Batches(worlds=2), stop)
-    kept = results.read_rows(out)
+    kept = read_rows(out)
     assert 0 < len(kept) < len(jobs)
     rows = evaluate(jobs, out, Batches(worlds=2))
     assert facts(rows) == facts(whole)
-    assert len(results.read_rows(out)) == len(jobs)
-    assert results.read_rows(out)[: len(kept)] == kept
+    assert len(read_rows(out)) == len(jobs)
+    assert read_rows(out)[: len(kept)] == kept
 
 
 def test_the_memory_of_the_device_bounds_the_worlds(monkeypatch):

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mechsearch_jax import cli
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.benchmarks import bench, push, tables
 from mechsearch_jax.benchmarks.push import Bench, Measured, held_out_generation, nudged, repeated
+from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.native_worlds import NativeWorlds
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models.push import PushConfig, PushNetwork
-from mechsearch_jax.models.weights import ARCHITECTURES, save_weights
+from mechsearch_jax.networks.push import PushConfig, PushNetwork
+from mechsearch_jax.networks.weights import ARCHITECTURES, save_weights
 from mechsearch_jax.train.loop import TrainConfig
 from mechsearch_jax.train.push import outcome_scores
 

@@ -16,9 +16,9 @@ from mechsearch_jax.envs.world import true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.perception.scores import sharpened
-from mechsearch_jax.scenario import example_scenarios, load_scenario
-from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.viz.drawing import save_figure
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 SCENE = images.scenes_of([load_scenario(example_scenarios()["first-light"])])[0]
 TRUTH = sharpened(true_superquadrics(SCENE.world))

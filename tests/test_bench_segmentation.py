@@ -14,8 +14,8 @@ from mechsearch_jax.benchmarks.segmentation import Bench, overlaps
 from mechsearch_jax.envs.recognisers import true_masks
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.scenario import example_scenarios, load_scenario
 from mechsearch_jax.viz.drawing import save_figure
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
 SCENE = images.scenes_of([load_scenario(example_scenarios()["first-light"])])[0]
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax import cache, planner
-from mechsearch_jax.target import Target
+from mechsearch_jax.workspace.target import Target
 
 
 @pytest.fixture

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import camera, render, superquadric, transforms
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric, transforms
+from mechsearch_jax.workspace import camera, render
+from mechsearch_jax.workspace.camera import Camera
 
 COARSE = Camera().scaled(7)
 

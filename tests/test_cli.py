@@ -8,11 +8,21 @@ import sys
 import numpy as np
 import pytest
 
-from mechsearch_jax import cli, results
 from mechsearch_jax.benchmarks.report import FILES
+from mechsearch_jax.benchmarks.rows import Row, write_rows
+from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs.records import Episode, save_episode
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.scenario import Body, Scenario, example_scenarios, format_scenario, load_scenario, save_scenario
+from mechsearch_jax.viz.maps import load_maps
+from mechsearch_jax.workspace.scenario import (
+    Body,
+    Scenario,
+    example_scenarios,
+    format_scenario,
+    load_scenario,
+    save_scenario,
+)
 
 SCENE = Scenario(
     name="one-box",
@@ -21,16 +31,14 @@ SCENE = Scenario(
 )
 
 
-ROW = results.Row(
-    "one-box", 1, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.5
-)
+ROW = Row("one-box", 1, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.5)
 
 
 def mechsearch(folder, *arguments):
     """Run the program as a user would, in a folder that has nothing to do with the checkout."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     environment["JAX_COMPILATION_CACHE_DIR"] = str(cache())
-    program = (sys.executable, "-m", "mechsearch_jax.cli")
+    program = (sys.executable, "-m", "mechsearch_jax.commands.main")
     return subprocess.run(
         [*program, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=600
     )
@@ -54,7 +62,7 @@ def folder(tmp_path):
         (tmp_path / "out" / name).parent.mkdir(exist_ok=True)
         (tmp_path / "out" / name).write_text("from before")
     (tmp_path / "empty").mkdir()
-    results.write_rows([ROW], tmp_path / "table.parquet")
+    write_rows([ROW], tmp_path / "table.parquet")
     return tmp_path
 
 
@@ -191,7 +199,7 @@ def test_checking_names_the_bad_and_lists_the_good(folder, monkeypatch, capsys):
 def test_a_folder_that_search_wrote_is_good(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     save_scenario(SCENE, "out/scenario.json")
-    results.save_episode(results.Episode("one-box", 1, {}, {}, (), None, None, False, "not found"), "out/episode.json")
+    save_episode(Episode("one-box", 1, {}, {}, (), None, None, False, "not found"), "out/episode.json")
     cli.parse(["scenarios", "check", "out"])()
     printed = capsys.readouterr()
     assert printed.out == "out/scenario.json: 1 objects, target cylinder\n"
@@ -221,7 +229,7 @@ def test_a_report_is_printed_and_written(folder, monkeypatch, capsys):
 def test_inspecting_writes_maps_and_a_picture(folder):
     answer = mechsearch(folder, "inspect", "good.json", "--out", "maps")
     assert answer.returncode == 0, answer.stderr
-    maps = results.load_maps(folder / "maps" / "one-box.npz")
+    maps = load_maps(folder / "maps" / "one-box.npz")
     assert maps.poses.shape == (792, 3)
     assert 0 < maps.existence.sum() < 792
     assert maps.graspability.max() == 1

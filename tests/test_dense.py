@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax import dense, superquadric, transforms
-from mechsearch_jax.dense import Tiling
+from mechsearch_jax.benchmarks import dense
+from mechsearch_jax.benchmarks.dense import Tiling
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric, transforms
 
 # A float32 coordinate 20 half-extents from a centre is known to about 5e-6 half-extents.
 CLOSE = {"rtol": 1e-5, "atol": 2e-5}

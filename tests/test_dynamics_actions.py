@@ -7,15 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import actions, dynamics, planner, scenario, superquadric, transforms
+from mechsearch_jax import actions, planner
 from mechsearch_jax.actions import ActionConfig, ActionKind
+from mechsearch_jax.dynamics import quasi_static, rigid
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.workspace import scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
-PUSH = jax.jit(dynamics.QuasiStatic(), static_argnums=0)
+PUSH = jax.jit(quasi_static.QuasiStatic(), static_argnums=0)
 Q7 = jnp.zeros(())
 
 
@@ -84,7 +87,7 @@ def test_a_pushed_object_pushes_its_neighbour_and_nothing_else_moves():
     scene = on_board((*BOX, 0.6, 0.1, 0.0), (*BOX, 0.6, 0.18, 0.0), (*BOX, 0.72, -0.2, 0.0))
     pusher, T = finger_at(0.6, 0.05)
     after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7).scene
-    moved = np.asarray(dynamics.changed(scene, after))
+    moved = np.asarray(rigid.changed(scene, after))
     assert moved.tolist() == [True, True] + [False] * 6
     assert float(after.position[1, 1] - after.position[0, 1]) >= 0.06 - 2e-3
 
@@ -100,7 +103,7 @@ def test_a_push_that_misses_moves_nothing():
     scene = on_board((*BOX, 0.6, 0.1, 0.0))
     pusher, T = finger_at(0.5, 0.05)
     after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7).scene
-    assert not np.any(dynamics.changed(scene, after))
+    assert not np.any(rigid.changed(scene, after))
 
 
 def side_grasp(x, y, yaw):
@@ -114,7 +117,7 @@ def test_pick_and_place_turns_flat_sides_into_the_hand_and_then_moves_rigidly(bo
     yaw = expected - 0.5 + 0.1 * (body == BOX)
     scene = on_board((*body, 0.6, 0.1, yaw), (*ROUND, 0.55, -0.1, 0.0))
     grasp, place = side_grasp(0.6, 0.1, 0.1), side_grasp(0.7, -0.05, 0.6)
-    after = jax.jit(dynamics.pick_and_place)(scene, jnp.int32(0), grasp, place)
+    after = jax.jit(rigid.pick_and_place)(scene, jnp.int32(0), grasp, place)
     np.testing.assert_allclose(after.position[0], [0.7, -0.05, scene.position[0, 2]], atol=1e-6)
     np.testing.assert_allclose(yaw_of(np.asarray(after.rotation[0])), expected, atol=1e-5)
     np.testing.assert_array_equal(after.position[1:], scene.position[1:])
@@ -123,7 +126,7 @@ def test_pick_and_place_turns_flat_sides_into_the_hand_and_then_moves_rigidly(bo
 def test_footprints_of_objects_on_their_side():
     scene = on_board((*ROUND, 0.6, 0.1, 0.0))
     lying = scene.replace(rotation=scene.rotation.at[0].set(jnp.float32([[1, 0, 0], [0, 0, -1], [0, 1, 0]])))
-    prints = dynamics.footprints(lying)
+    prints = footprints.footprints(lying)
     assert not bool(prints.round[0])
     np.testing.assert_allclose(np.sort(prints.half[0]), [0.03, 0.06], rtol=1e-5)
     np.testing.assert_allclose(prints.high[0] - prints.low[0], 0.06, rtol=1e-5)
@@ -217,7 +220,7 @@ def test_placed_objects_stand_clear_of_each_other_on_the_board(sampled, problem)
     action = samples.action
     for i in np.flatnonzero(action.kind == ActionKind.PICK_AND_PLACE)[:25]:
         k = int(action.object[i])
-        after = dynamics.pick_and_place(
+        after = rigid.pick_and_place(
             objects, jnp.int32(k), jnp.asarray(action.T_world_gripper[i]), jnp.asarray(action.T_world_place[i])
         )
         np.testing.assert_allclose(after.position[k, 2], objects.position[k, 2], atol=1e-5)
@@ -232,7 +235,7 @@ def test_placed_objects_stand_clear_of_each_other_on_the_board(sampled, problem)
 
 def test_grasped_objects_fit_between_the_fingers(sampled, problem):
     objects, options, _ = sampled
-    prints = dynamics.footprints(objects)
+    prints = footprints.footprints(objects)
     narrow = 2 * np.min(np.asarray(prints.half), axis=1)
     graspable = np.asarray(options.grasp_reached).any(axis=1)
     assert np.all(narrow[graspable] <= problem.gripper.usable_opening + 1e-5)

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.benchmarks import ems
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.superquadric import Superquadrics, sample_surface
 from mechsearch_jax.perception import scores
-from mechsearch_jax.superquadric import Superquadrics, sample_surface
 
 SHAPES = {
     "box": ((0.03, 0.05, 0.08), (0.2, 0.2)),

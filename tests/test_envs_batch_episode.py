@@ -16,7 +16,7 @@ from mechsearch_jax.envs.native_worlds import NativeWorlds
 from mechsearch_jax.envs.simulator import NativeSimulator
 from mechsearch_jax.envs.world import BODIES, from_scenario
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.scenario import Scenario
+from mechsearch_jax.workspace.scenario import Scenario
 
 TWO = Scenario("two", (BOX, dataclasses.replace(BOX, position=(0.6, -0.15, 0.4845))), CYLINDER)
 AT_ONCE = 2

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import results
 from mechsearch_jax.envs import episode as episodes
 from mechsearch_jax.envs.episode import Recognition, Snapshot, oracle, run_episode, target_of
+from mechsearch_jax.envs.records import load_episode, save_episode
 from mechsearch_jax.envs.simulator import NativeSimulator, Outcome, Retrieval, Trace
 from mechsearch_jax.envs.world import TARGET, from_scenario
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.scenario import Body, Scenario
+from mechsearch_jax.workspace.scenario import Body, Scenario
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 BOX = Body("box", (0.048, 0.028, 0.08), (0.5, 0.135, 0.4845), UPRIGHT)
@@ -95,8 +95,8 @@ def test_a_search_goes_on_until_the_target_is_out(problem, tmp_path):
     assert diary.decided_at == [0, 1]
     assert [moment.record.action.kind for moment in diary.moments][-1] == "retrieve"
     assert "plan" in diary.stages
-    results.save_episode(episode, tmp_path / "episode.json")
-    assert results.load_episode(tmp_path / "episode.json") == episode
+    save_episode(episode, tmp_path / "episode.json")
+    assert load_episode(tmp_path / "episode.json") == episode
     row = episodes.row(episode)
     assert (row.steps, row.objects, row.seed, row.method) == (2, 1, 0, "search-for-grasp")
     assert row.planning_seconds > 0

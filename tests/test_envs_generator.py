@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs import generator, observation, world
 from mechsearch_jax.envs.generator import BOXES, CYLINDERS, GeneratorConfig, ScenarioGenerator, outline, separation
 from mechsearch_jax.envs.simulator import NativeSimulator
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.scenario import Body, format_scenario, parse_scenario
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, format_scenario, parse_scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 SHELF = Shelf()
 SIZES = {tuple(round(s / 2, 6) for s in box) for box in BOXES}

@@ -15,15 +15,15 @@ import pytest
 from test_envs_simulator import BOARD, pick_and_place, pose, push, scene, standing, wrist_for
 
 from mechsearch_jax.actions import ActionKind, no_action
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs import mjx_simulator, model, simulator
 from mechsearch_jax.envs.batch_model import BodyFields, body_fields
 from mechsearch_jax.envs.mjx_simulator import Failure, MjxConfig, MjxSimulator, Overflow, choose, retrievals
-from mechsearch_jax.envs.motion import MotionConfig, Reference
 from mechsearch_jax.envs.simulator import NativeSimulator, SimulatorConfig
 from mechsearch_jax.envs.world import TARGET, from_scenario, slots
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.robot.motion import MotionConfig, Reference
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
 
 BOX = standing("box", (0.054, 0.025, 0.054), 0.55, 0.1)
 BOTTLE = standing("cylinder", (0.032, 0.032, 0.067), 0.6, 0.1)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs import observation, world
 from mechsearch_jax.envs.model import shelf_boxes
 from mechsearch_jax.envs.world import CYLINDER, TARGET
-from mechsearch_jax.scenario import Body, Scenario
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, Scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 CAMERA = Camera().scaled(8)
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -111,7 +111,7 @@ np.save(sys.argv[2], renderer.render())
 
 
 def test_depth_is_within_a_millimetre_of_the_renderer(tmp_path):
-    from mechsearch_jax.scenario import save_scenario
+    from mechsearch_jax.workspace.scenario import save_scenario
 
     scene = random_scenario(7)
     save_scenario(scene, tmp_path / "scene.json")

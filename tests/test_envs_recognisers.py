@@ -7,17 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import scenario, superquadric
-from mechsearch_jax.camera import Camera, back_project
 from mechsearch_jax.envs.episode import Snapshot, oracle, target_of
 from mechsearch_jax.envs.observation import observe
 from mechsearch_jax.envs.recognisers import measured_depth, numbered, recogniser, true_labels
 from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.scores import intersection_over_union, sharpened
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.workspace import scenario
+from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.shelf import Shelf
 
 CAMERA, SHELF = Camera(), Shelf()
 SCENE = scenario.load_scenario(scenario.example_scenarios()["first-light"])

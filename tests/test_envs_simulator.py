@@ -11,18 +11,26 @@ import pytest
 from published import published_scenarios
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.envs import model, motion, simulator, world
-from mechsearch_jax.envs.motion import MotionConfig
+from mechsearch_jax.envs import model, simulator, world
 from mechsearch_jax.envs.simulator import NativeSimulator
 from mechsearch_jax.envs.world import BODIES, TARGET
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import gripper_rotation
-from mechsearch_jax.gripper import arm_hits_shelf
-from mechsearch_jax.kinematics import HOME, JOINT_LOWER, JOINT_UPPER, forward_kinematics, gripper_pose, line_kinematics
-from mechsearch_jax.scenario import Body, Scenario, load_scenario
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.transforms import make
+from mechsearch_jax.robot import motion
+from mechsearch_jax.robot.gripper import arm_hits_shelf
+from mechsearch_jax.robot.kinematics import (
+    HOME,
+    JOINT_LOWER,
+    JOINT_UPPER,
+    forward_kinematics,
+    gripper_pose,
+    line_kinematics,
+)
+from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 BOARD = Shelf().board
 WRISTS = tuple(math.pi / 4 + math.radians(a) for a in (15, -60, 60, -15, -45, 30, -30, 0, 45))

@@ -9,15 +9,17 @@ import pyarrow.parquet
 import pytest
 from rich.console import Console
 
-from mechsearch_jax import results
+from mechsearch_jax import versions
 from mechsearch_jax.benchmarks import evaluate as benchmark
 from mechsearch_jax.benchmarks import tables
 from mechsearch_jax.benchmarks.evaluate import Job, evaluate, make_jobs, present_code
 from mechsearch_jax.benchmarks.processes import Processes
+from mechsearch_jax.benchmarks.rates import summarise
+from mechsearch_jax.benchmarks.rows import configuration, identity, read_code, read_rows, write_rows
 from mechsearch_jax.benchmarks.worker import parse_config
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.scenario import Body, Scenario, save_scenario
+from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 
 TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
 
@@ -68,10 +70,8 @@ def test_all_combinations_become_rows(tmp_path, files, command):
     configs = [PlannerConfig(), PlannerConfig(method="search-and-grasp")]
     jobs = make_jobs([files[0], files[1]], configs, (0, 1))
     rows = evaluate(jobs, tmp_path / "rows.parquet", Processes(2, command))
-    assert len(rows) == len({results.identity(row) for row in rows}) == 8
-    assert sorted(map(results.identity, results.read_rows(tmp_path / "rows.parquet"))) == sorted(
-        map(results.identity, rows)
-    )
+    assert len(rows) == len({identity(row) for row in rows}) == 8
+    assert sorted(map(identity, read_rows(tmp_path / "rows.parquet"))) == sorted(map(identity, rows))
 
 
 def test_failures_are_rows_with_their_reason_and_do_not_end_the_run(tmp_path, files, command):
@@ -96,11 +96,11 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path, files, command):
 
     with pytest.raises(KeyboardInterrupt):
         evaluate(jobs, out, Processes(1, command), ended=stop)
-    first = results.read_rows(out)
+    first = read_rows(out)
     assert len(first) == 2
     rows = evaluate(jobs, out, Processes(1, command))
     assert [row.scenario for row in rows] == ["one", "two", "crash", "raise", "three"]
-    assert results.read_rows(out)[:2] == first
+    assert read_rows(out)[:2] == first
     (tmp_path / "log").write_text("")
     assert evaluate(jobs, out, Processes(1, command)) == rows
     assert ran(tmp_path) == []
@@ -111,7 +111,7 @@ def test_rows_of_other_options_stay(tmp_path, files, command):
     for gamma in (0.9, 0.5):
         rows = evaluate(make_jobs(files[:1], [PlannerConfig(gamma=gamma)], (0,)), out, Processes(1, command))
         assert [row.gamma for row in rows] == [gamma]
-    assert sorted(row.gamma for row in results.read_rows(out)) == [0.5, 0.9]
+    assert sorted(row.gamma for row in read_rows(out)) == [0.5, 0.9]
 
 
 @pytest.mark.parametrize(
@@ -132,10 +132,10 @@ def test_every_option_tells_rows_apart(tmp_path, files, command, other):
         rows = evaluate(make_jobs(files[:1], [config], (0,)), out, Processes(1, command))
         assert len(rows) == 1
     assert ran(tmp_path) == ["one", "one"]
-    both = results.read_rows(out)
+    both = read_rows(out)
     assert len(both) == 2
-    assert len({results.identity(row) for row in both}) == 2
-    assert [rates.episodes for rates in results.summarise(both)] == [1] * 4
+    assert len({identity(row) for row in both}) == 2
+    assert [rates.episodes for rates in summarise(both)] == [1] * 4
 
 
 def test_rows_that_do_not_say_how_they_ran_are_kept_but_not_believed(tmp_path, files, command):
@@ -146,13 +146,13 @@ def test_rows_that_do_not_say_how_they_ran_are_kept_but_not_believed(tmp_path, f
     pyarrow.parquet.write_table(table.drop_columns(["configuration"]), out)
     evaluate(jobs, out, Processes(1, command))
     assert ran(tmp_path) == ["one", "one"]
-    assert results.read_rows(out) == [dataclasses.replace(row, configuration=None), row]
+    assert read_rows(out) == [dataclasses.replace(row, configuration=None), row]
 
 
 def test_rows_of_other_code_are_not_added_to(tmp_path, files, command, monkeypatch):
     out = tmp_path / "rows.parquet"
     evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), out, Processes(1, command))
-    assert results.read_code(out) == present_code()
+    assert read_code(out) == present_code()
     before = out.read_bytes()
     monkeypatch.setattr(benchmark, "present_code", lambda: "mechsearch-jax 9.9 (abc)")
     with pytest.raises(InputError, match=r"rows.parquet: .* run by mechsearch-jax 0.* is mechsearch-jax 9.9 \(abc\);"):
@@ -161,25 +161,27 @@ def test_rows_of_other_code_are_not_added_to(tmp_path, files, command, monkeypat
     assert ran(tmp_path) == ["one"]
 
     # A table that does not say what ran it may be anything.
-    results.write_rows(results.read_rows(out), out)
+    write_rows(read_rows(out), out)
     with pytest.raises(InputError, match="does not say which"):
         evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), out, Processes(1, command))
 
 
 def test_the_code_is_that_of_planner_perception_and_environment(tmp_path, monkeypatch):
-    for name in ("mechsearch_jax", "mechsearch_jax.envs", "mechsearch_jax.perception", "mechsearch_jax.models"):
-        (tmp_path / name).mkdir()
-        for file in ("planner.py", "cli.py", "network.npz", "network.json"):
+    inside = ["planner", "perception/far", "commands", "networks"]
+    for name in (*(f"mechsearch_jax/{folder}" for folder in inside), "mechsearch_jax.envs"):
+        (tmp_path / name).mkdir(parents=True)
+        for file in ("one.py", "network.npz", "network.json"):
             (tmp_path / name / file).write_text(name)
-    monkeypatch.setattr(benchmark.resources, "files", lambda package: tmp_path / package)
+    monkeypatch.setattr(versions.importlib.resources, "files", lambda package: tmp_path / package)
     before = present_code.__wrapped__()
     for decides, change in (
-        (False, "mechsearch_jax/cli.py"),
-        (False, "mechsearch_jax.models/network.json"),
-        (True, "mechsearch_jax/planner.py"),
-        (True, "mechsearch_jax.envs/planner.py"),
-        (True, "mechsearch_jax.perception/planner.py"),
-        (True, "mechsearch_jax.models/network.npz"),
+        (False, "mechsearch_jax/commands/one.py"),
+        (False, "mechsearch_jax/networks/network.json"),
+        (True, "mechsearch_jax/planner/one.py"),
+        (True, "mechsearch_jax/planner/two.py"),
+        (True, "mechsearch_jax.envs/one.py"),
+        (True, "mechsearch_jax/perception/far/one.py"),
+        (True, "mechsearch_jax/networks/network.npz"),
     ):
         (tmp_path / change).write_text("changed")
         after = present_code.__wrapped__()
@@ -205,7 +207,7 @@ def test_the_row_of_a_job_is_that_of_its_episode(problem):
 
     config = PlannerConfig(push_distances=(0.05, 0.2))
     job = Job("", Scenario("one", (), TARGET), config, 3)
-    assert job.configuration == results.configuration(describe(3, problem, config, "oracle", "NativeSimulator"))
+    assert job.configuration == configuration(describe(3, problem, config, "oracle", "NativeSimulator"))
 
 
 def test_another_table_is_not_overwritten(tmp_path, files, command):

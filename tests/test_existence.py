@@ -10,11 +10,13 @@ import pytest
 from published import published_scenarios
 from test_camera_render import reference_superquadric_depth
 
-from mechsearch_jax import existence, planner, scenario, superquadric
+from mechsearch_jax import existence, planner
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
+from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.workspace import scenario
 
 CONFIG = PlannerConfig.paper()
 UNSEEN, NOWHERE = jnp.array(False), jnp.zeros(3)

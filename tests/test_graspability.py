@@ -4,12 +4,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import graspability, kinematics, planner, scenario, superquadric, transforms
+from mechsearch_jax import graspability, planner
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.graspability import GraspConfig
-from mechsearch_jax.gripper import Gripper
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.robot import kinematics
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace import scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax import collision, masked, superquadric, transforms
-from mechsearch_jax.collision import Pair
-from mechsearch_jax.masked import masked_vmap
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.geometry import collision, masked, superquadric, transforms
+from mechsearch_jax.geometry.collision import Pair
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.workspace import shelf
+from mechsearch_jax.workspace.shelf import Shelf
 
 
 def function(shared, row, i):
@@ -153,7 +154,7 @@ def test_points_inside_ignores_absent_objects():
     ],
 )
 def test_the_shelf_is_what_surrounds_its_free_box(point, hit):
-    assert bool(collision.hits_shelf(Shelf(), jnp.float32(point))) == hit
+    assert bool(shelf.hits_shelf(Shelf(), jnp.float32(point))) == hit
 
 
 def test_a_sphere_touches_the_board_a_radius_above_it():
@@ -161,7 +162,7 @@ def test_a_sphere_touches_the_board_a_radius_above_it():
     radius = jnp.array([0.05])
 
     def hits(x, y, z):
-        return bool(collision.spheres_hit_shelf(shelf, jnp.float32([[x, y, z]]), radius)[0])
+        return bool(shelf.spheres_hit_shelf(shelf, jnp.float32([[x, y, z]]), radius)[0])
 
     assert hits(0.6, 0.1, shelf.board + 0.04)
     assert not hits(0.6, 0.1, shelf.board + 0.06)

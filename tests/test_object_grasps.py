@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import dynamics, superquadric, transforms
+from mechsearch_jax.dynamics import rigid
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.gripper import Gripper
+from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.object_grasps import (
     LOWEST,
     PALM,
@@ -21,7 +21,8 @@ from mechsearch_jax.object_grasps import (
     grasp_variants,
     object_grasps,
 )
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF, GRIPPER, CONFIG = Shelf(), Gripper(), ObjectGraspConfig()
 MAX_YAW, WRISTS = np.pi / 4, 3
@@ -41,7 +42,7 @@ def upright(half, exponents, yaw):
 def grasps_of(half, exponents, yaw):
     """float64: tip centres relative to the object's centre (A, 3), rotations (A, 3, 3), and whether each fits (A,)."""
     scene = upright(half, exponents, yaw)
-    T, fits = GRASPS(dynamics.footprints(scene))
+    T, fits = GRASPS(footprints.footprints(scene))
     T = np.asarray(T[0], np.float64)
     return T[:, :3, 3] - np.asarray(scene.position[0]), T[:, :3, :3], np.asarray(fits[0])
 
@@ -93,7 +94,7 @@ def test_a_turned_grasp_is_turned_towards_the_front_and_back_by_the_hand():
     assert fits[fully].all()
     scene = upright(half, superquadric.BOX_EXPONENTS, yaw)
     for rotation in R[fits]:
-        held = dynamics.in_hand(scene, jnp.int32(0), transforms.make(jnp.float32(rotation), jnp.zeros(3)))
+        held = rigid.in_hand(scene, jnp.int32(0), transforms.make(jnp.float32(rotation), jnp.zeros(3)))
         alignment = np.abs(np.asarray(held)[:2, :2].T @ rotation[:2, 1])
         np.testing.assert_allclose(np.sort(alignment), [0, 1], atol=1e-5)
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.camera import Camera, back_project
 from mechsearch_jax.envs import observation, world
 from mechsearch_jax.envs.observation import PALETTE
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception import colour, planes
 from mechsearch_jax.perception.colour import TargetColour
-from mechsearch_jax.scenario import Body, Scenario
+from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.scenario import Body, Scenario
 
 CAMERA = Camera().scaled(4)
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)

@@ -9,17 +9,17 @@ import pytest
 from robot_images import ROBOT, robot_image
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.camera import Camera, back_project
 from mechsearch_jax.envs.observation import SHELF
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.kinematics import HOME
 from mechsearch_jax.perception import camera_pose, real_camera
 from mechsearch_jax.perception.camera_pose import PoseConfig, with_pose
 from mechsearch_jax.perception.colour import TargetColour
 from mechsearch_jax.perception.real_camera import RealCameraConfig
-from mechsearch_jax.scenario import Body, Scenario
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.scenario import Body, Scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 CAMERA = Camera().scaled(4)

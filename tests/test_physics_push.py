@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from test_envs_simulator import pose, push, scene, standing
 
-from mechsearch_jax import planner, push_models, superquadric, transforms
-from mechsearch_jax.dynamics import QuasiStatic
+from mechsearch_jax import planner
+from mechsearch_jax.dynamics import named as push_models
+from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs import physics_push
 from mechsearch_jax.envs import push_models as all_push_models
 from mechsearch_jax.envs.physics_push import STILL, MjxPhysics, NativePhysics
@@ -19,8 +20,9 @@ from mechsearch_jax.envs.pushes import push_simulation
 from mechsearch_jax.envs.simulator import NativeSimulator
 from mechsearch_jax.envs.world import BOX, CYLINDER, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
 PUSHER = jnp.zeros((1, 3))
@@ -234,11 +236,11 @@ def test_every_name_stands_for_models(monkeypatch):
 
 
 def test_missing_weights_are_one_line(tmp_path, monkeypatch):
-    from mechsearch_jax import learned_push
+    from mechsearch_jax.dynamics import learned as learned_push
 
     monkeypatch.setattr(learned_push.importlib.resources, "files", lambda package: tmp_path)
     with pytest.raises(
-        InputError, match=r'push model "learned" cannot be used: .*models/push.* `mechsearch train push`'
+        InputError, match=r'push model "learned" cannot be used: .*networks/push.* `mechsearch train push`'
     ) as told:
         push_models.own_push_model.__wrapped__("learned")
     assert "\n" not in str(told.value)

@@ -7,11 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import masked, planner, scenario, superquadric
+from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.dynamics import QuasiStatic, changed
+from mechsearch_jax.dynamics.quasi_static import QuasiStatic
+from mechsearch_jax.dynamics.rigid import changed
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import masked, superquadric
 from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.workspace import scenario
 
 CONFIG = PlannerConfig.paper()
 

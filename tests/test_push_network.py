@@ -11,18 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax import dynamics, superquadric, transforms
 from mechsearch_jax.actions import ActionConfig, action_tables
+from mechsearch_jax.dynamics import rigid
+from mechsearch_jax.dynamics.learned import LearnedPush, predicted
 from mechsearch_jax.envs.generator import separation
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import footprints, superquadric, transforms
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import gripper_rotation
-from mechsearch_jax.gripper import Gripper
-from mechsearch_jax.learned_push import LearnedPush, predicted
-from mechsearch_jax.models import push
-from mechsearch_jax.models.push import REACH, PushConfig, PushNetwork, push_geometry, push_start
-from mechsearch_jax.models.weights import save_weights
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.networks import push
+from mechsearch_jax.networks.push import REACH, PushConfig, PushNetwork, push_geometry, push_start
+from mechsearch_jax.networks.weights import save_weights
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
 # Nothing is within reach of these walls.
@@ -237,7 +238,7 @@ def travelled(inside, longest):
 
 def test_the_distance_to_contact_is_that_of_small_steps():
     scene, T, displacement = cluttered(7)
-    prints = dynamics.footprints(scene)
+    prints = footprints.footprints(scene)
     heading = displacement[:2] / jnp.linalg.norm(displacement[:2])
     points = transforms.transform(T, pusher())
     found, level = jax.jit(push.pusher_distance)(prints, points, heading)
@@ -270,7 +271,7 @@ def outline_of(prints, i, corners=180):
 
 def test_the_distance_between_objects_is_that_of_small_steps():
     scene, _, displacement = cluttered(9)
-    prints = dynamics.footprints(scene)
+    prints = footprints.footprints(scene)
     heading = np.asarray(displacement[:2], float) / np.linalg.norm(displacement[:2])
     met = jax.jit(push.meetings)(prints, jnp.float32(heading))
     found, gap = met.distance, met.gap
@@ -304,7 +305,7 @@ def test_how_objects_meet_is_known_where_it_is_plain():
         ((0.02, 0.02, 0.05), BOX, 0.7, -0.05, np.radians(30)),
         ((0.02, 0.02, 0.05), ROUND, 0.7, 0.2, 0.0),
     )
-    met = jax.jit(push.meetings)(dynamics.footprints(scene), jnp.float32([1.0, 0.0]))
+    met = jax.jit(push.meetings)(footprints.footprints(scene), jnp.float32([1.0, 0.0]))
     assert float(met.distance[0, 1]) == pytest.approx(0.06, abs=1e-6)
     np.testing.assert_allclose(met.normal[0, 1], [1.0, 0.0], atol=1e-5)
     # From 0 to 3 cm to the left of the first's centre, and from 2 cm to the right to 1 cm to the left of the second's.
@@ -325,7 +326,7 @@ def test_at_cylinders_objects_meet_along_the_line_to_their_axis(yaw):
         ((0.02, 0.02, 0.05), BOX, 0.72, 0.038, 0.0),
         ((0.02, 0.06, 0.05), BOX, 0.70, -0.05, 0.0),
     )
-    prints = dynamics.footprints(scene)
+    prints = footprints.footprints(scene)
     centre = prints.position[:1]
     c, s = np.cos(yaw), np.sin(yaw)
     turn = jnp.float32([[c, -s], [s, c]])
@@ -355,7 +356,7 @@ def test_cylinders_that_touch_are_not_met_on_the_way_apart():
     scene = standing(
         ((0.03, 0.03, 0.05), ROUND, 0.6, 0.0, 0.0), ((0.05, 0.05, 0.05), ROUND, 0.6 + away[0], away[1], 0.0)
     )
-    met = jax.jit(push.meetings)(dynamics.footprints(scene), jnp.float32([1.0, 0.0]))
+    met = jax.jit(push.meetings)(footprints.footprints(scene), jnp.float32([1.0, 0.0]))
     assert float(met.gap[0, 1]) == pytest.approx(5e-4, abs=1e-6)
     assert float(met.distance[0, 1]) == pytest.approx(REACH)
     assert float(met.distance[1, 0]) == pytest.approx(5e-4 / np.cos(0.5), abs=2e-4)
@@ -363,7 +364,7 @@ def test_cylinders_that_touch_are_not_met_on_the_way_apart():
 
 def test_an_object_reaches_as_far_as_its_outline():
     scene, _, _ = cluttered(8)
-    prints = dynamics.footprints(scene)
+    prints = footprints.footprints(scene)
     for i in range(5):
         outline = outline_of(prints, i, 4000) - np.asarray(prints.position[i])
         for direction in ([1.0, 0.0], [0.6, 0.8]):
@@ -453,7 +454,7 @@ def test_what_does_not_move_stays_exactly_where_it_is(weights):
     probability = np.sort(jax.nn.sigmoid(expected.moves))
     model = LearnedPush(weights, likely=float(probability[1:3].mean()))
     outcome = jax.jit(model, static_argnums=0)(SHELF, scene, pusher(), T, displacement, jnp.zeros(()))
-    same = np.asarray(~dynamics.changed(scene, outcome.scene))
+    same = np.asarray(~rigid.changed(scene, outcome.scene))
     assert same.sum() == 2
     np.testing.assert_allclose(
         (outcome.scene.position - scene.position)[~same, :2], np.asarray(expected.shift)[~same], atol=2e-4

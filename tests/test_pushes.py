@@ -11,22 +11,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax import dynamics, superquadric, transforms
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.benchmarks.push import repeated
+from mechsearch_jax.dynamics import push_model
 from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.native_worlds import NativeWorlds
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
 from mechsearch_jax.envs.world import BOX, CYLINDER, TARGET, World, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.graspability import gripper_rotation
-from mechsearch_jax.models.push import NORMALS, PushConfig, push_start, reach
-from mechsearch_jax.scenario import Body, Scenario
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.networks.push import NORMALS, PushConfig, push_start, reach
 from mechsearch_jax.train import push as training
 from mechsearch_jax.train.loop import TrainConfig, train
 from mechsearch_jax.train.push import PushTask, average_precision, model_scores, planar_turn, push_truth
 from mechsearch_jax.train.scenes import SceneConfig, random_world
+from mechsearch_jax.workspace.scenario import Body, Scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
 CONFIG = PushesConfig()
@@ -420,7 +421,7 @@ def test_walls_are_set_elsewhere_only_where_nothing_meets_them(pushes):
         assert not np.asarray(truth.toppled)[push][valid].any()
         normal, face = NORMALS[wall], np.asarray(varied.faces)[push, wall]
         for world in (pushes.before, pushes.after):
-            prints = dynamics.footprints(superquadrics(jax.tree.map(lambda a, push=push: a[push], world)))
+            prints = footprints.footprints(superquadrics(jax.tree.map(lambda a, push=push: a[push], world)))
             toward = reach(prints, jnp.broadcast_to(-jnp.asarray(normal)[None], prints.position.shape))
             inside = np.asarray(prints.position) @ normal - np.asarray(toward) - face
             # Those that lean end with other footprints than they began with.
@@ -440,7 +441,7 @@ def test_a_model_that_knows_the_outcome_scores_best(pushes):
             position=jnp.asarray(after.position)[row],
             rotation=jnp.asarray(after.rotation)[row],
         )
-        return dynamics.PushOutcome(known, jnp.zeros(()), jnp.asarray(pushes.toppled)[row].astype(jnp.float32))
+        return push_model.PushOutcome(known, jnp.zeros(()), jnp.asarray(pushes.toppled)[row].astype(jnp.float32))
 
     pusher = push_tables(CONFIG).pusher
     best = model_scores(oracle, pushes, pusher, batch=8)["all"]
@@ -492,8 +493,8 @@ def test_the_batch_simulator_pushes_as_the_native_one_does(pushes):
 
 @pytest.mark.slow
 def test_the_command_simulates_trains_scores_and_writes_weights(tmp_path, capsys):
-    from mechsearch_jax import cli
-    from mechsearch_jax.learned_push import LearnedPush
+    from mechsearch_jax.commands import main as cli
+    from mechsearch_jax.dynamics.learned import LearnedPush
 
     arguments = (
         f"train push --out {tmp_path} --pushes 30 --worlds 16 --rounds 2 --steps 4 --batch 8 --chunk 2 --width 16"

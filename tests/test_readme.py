@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from mechsearch_jax.scenario import example_scenarios
+from mechsearch_jax.workspace.scenario import example_scenarios
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

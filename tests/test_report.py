@@ -7,10 +7,10 @@ import json
 import pytest
 from matplotlib import image
 
-from mechsearch_jax import results
 from mechsearch_jax.benchmarks import report
+from mechsearch_jax.benchmarks.rates import summarise, wilson
+from mechsearch_jax.benchmarks.rows import Row, write_rows
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.results import Row
 
 WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)
 LOST = dataclasses.replace(
@@ -49,7 +49,7 @@ def test_a_report_holds_what_the_rows_say(tmp_path):
         ("search-for-grasp", "8", "1", "1"),
         ("search-for-grasp", "all", "3", "1"),
     ]
-    low, high = results.wilson(1, 3)
+    low, high = wilson(1, 3)
     assert (float(lines[-1]["retrieved"]), float(lines[-1]["retrieved_low"])) == pytest.approx((1 / 3, low))
     value = json.loads((tmp_path / "new" / "rates.json").read_text())
     assert value["rates"][-1]["retrieved_high"] == pytest.approx(high)
@@ -69,7 +69,7 @@ def test_a_report_of_one_success_has_no_failures(tmp_path):
 
 def test_configurations_do_not_mix():
     rows = [WON, dataclasses.replace(WON, gamma=0.5, retrieved=False, failure="not found")]
-    assert [(r.method, r.retrieved) for r in results.summarise(rows) if r.objects is None] == [
+    assert [(r.method, r.retrieved) for r in summarise(rows) if r.objects is None] == [
         ("search-for-grasp, gamma 0.5", 0.0),
         ("search-for-grasp, gamma 0.9", 1.0),
     ]
@@ -80,9 +80,9 @@ def test_configurations_do_not_mix():
 
 def test_an_episode_counts_once(tmp_path):
     for name in ("a", "b"):
-        results.write_rows([WON], tmp_path / f"{name}.parquet")
+        write_rows([WON], tmp_path / f"{name}.parquet")
     with pytest.raises(InputError, match=r"b\.parquet: holds scenario 'a', seed 0.*one by one"):
         report.read_tables([tmp_path / "a.parquet", tmp_path / "b.parquet"])
-    results.write_rows([], tmp_path / "none.parquet")
+    write_rows([], tmp_path / "none.parquet")
     with pytest.raises(InputError, match="no episodes"):
         report.read_tables([tmp_path / "none.parquet"])

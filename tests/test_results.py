@@ -11,19 +11,23 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 
-from mechsearch_jax import results, superquadric
 from mechsearch_jax.actions import ActionKind, no_action
+from mechsearch_jax.benchmarks.rates import summarise, wilson
+from mechsearch_jax.benchmarks.rows import SCHEMA, Row, configuration, identity, label_variants, read_rows, write_rows
+from mechsearch_jax.envs.records import EARLIER, Episode, Step, load_episode, record_action, save_episode
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.results import Episode, Maps, Row, Step
+from mechsearch_jax.files import check_writable, replacing
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.viz.maps import Maps, load_maps, save_maps
 
 PUSH = no_action().replace(
     kind=jnp.int32(ActionKind.PUSH), object=jnp.int32(3), displacement=jnp.array([0.0, 0.1, 0.0]), q7=jnp.float32(0.75)
 )
 STEPS = (
-    Step(40, False, False, 52.0, results.record_action(PUSH), 31.0, 33.0, 24, None, {"plan": 0.5}),
+    Step(40, False, False, 52.0, record_action(PUSH), 31.0, 33.0, 24, None, {"plan": 0.5}),
     Step(17, True, True, 33.0, None, None, None, 0, "the object slipped", {"plan": 0.25}),
 )
-EPISODE = Episode("two-things", 2, {**results.EARLIER, "gamma": 0.9}, {"jax": "1.2.3"}, STEPS, 1, 1, True, None)
+EPISODE = Episode("two-things", 2, {**EARLIER, "gamma": 0.9}, {"jax": "1.2.3"}, STEPS, 1, 1, True, None)
 ROW = Row(
     scenario="two-things",
     objects=2,
@@ -55,13 +59,13 @@ def maps():
 
 
 def test_an_episode_is_read_back(tmp_path):
-    results.save_episode(EPISODE, tmp_path / "new" / "episode.json")
-    assert results.load_episode(tmp_path / "new" / "episode.json") == EPISODE
+    save_episode(EPISODE, tmp_path / "new" / "episode.json")
+    assert load_episode(tmp_path / "new" / "episode.json") == EPISODE
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["episode.json"]
 
 
 def test_an_episode_has_the_documented_keys(tmp_path):
-    results.save_episode(EPISODE, tmp_path / "episode.json")
+    save_episode(EPISODE, tmp_path / "episode.json")
     value = json.loads((tmp_path / "episode.json").read_text())
     assert {"scenario", "config", "versions", "steps", "found_step", "graspable_step", "retrieved", "failure"} <= set(
         value
@@ -74,7 +78,7 @@ def test_an_episode_has_the_documented_keys(tmp_path):
 def test_what_is_no_episode_is_one_line(tmp_path, text):
     (tmp_path / "episode.json").write_text(text)
     with pytest.raises(InputError) as error:
-        results.load_episode(tmp_path / "episode.json")
+        load_episode(tmp_path / "episode.json")
     assert str(tmp_path / "episode.json") in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -82,19 +86,19 @@ def test_what_is_no_episode_is_one_line(tmp_path, text):
 def test_an_episode_without_a_push_model_was_planned_with_the_first_one(tmp_path):
     known = {"push_model": "physics", "topple_charge": 0.25}
     for config in ({"gamma": 0.9}, {"gamma": 0.9, **known}):
-        results.save_episode(dataclasses.replace(EPISODE, config=config), tmp_path / "episode.json")
-        assert results.load_episode(tmp_path / "episode.json").config == {**results.EARLIER, **config}
+        save_episode(dataclasses.replace(EPISODE, config=config), tmp_path / "episode.json")
+        assert load_episode(tmp_path / "episode.json").config == {**EARLIER, **config}
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "episode.json"
-    results.save_episode(EPISODE, path)
+    save_episode(EPISODE, path)
     before = path.read_bytes()
     with pytest.raises(ValueError):
-        results.save_episode(dataclasses.replace(EPISODE, config={"gamma": float("nan")}), path)
+        save_episode(dataclasses.replace(EPISODE, config={"gamma": float("nan")}), path)
 
     def fail_halfway():
-        with results.replacing(path) as file:
+        with replacing(path) as file:
             file.write(b"half")
             raise ZeroDivisionError
 
@@ -106,7 +110,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 
 def test_a_file_gets_ordinary_permissions(tmp_path):
     (tmp_path / "plain").write_text("")
-    results.save_episode(EPISODE, tmp_path / "episode.json")
+    save_episode(EPISODE, tmp_path / "episode.json")
     modes = {stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("plain", "episode.json")}
     assert len(modes) == 1
 
@@ -114,18 +118,18 @@ def test_a_file_gets_ordinary_permissions(tmp_path):
 def test_an_unwritable_place_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
     for write in (
-        lambda: results.save_episode(EPISODE, tmp_path / "file" / "episode.json"),
-        lambda: results.check_writable(tmp_path / "file"),
+        lambda: save_episode(EPISODE, tmp_path / "file" / "episode.json"),
+        lambda: check_writable(tmp_path / "file"),
     ):
         with pytest.raises(InputError, match="cannot be written"):
             write()
 
 
 def test_maps_are_read_back(tmp_path):
-    results.save_maps(maps(), tmp_path / "maps.npz")
+    save_maps(maps(), tmp_path / "maps.npz")
     jax.tree.map(
         np.testing.assert_array_equal,
-        dataclasses.asdict(results.load_maps(tmp_path / "maps.npz")),
+        dataclasses.asdict(load_maps(tmp_path / "maps.npz")),
         dataclasses.asdict(maps()),
     )
     with np.load(tmp_path / "maps.npz") as file:
@@ -139,53 +143,53 @@ def test_what_holds_no_maps_is_one_line(tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     for name in ("text.npz", "other.npz", "none.npz"):
         with pytest.raises(InputError, match=name) as error:
-            results.load_maps(tmp_path / name)
+            load_maps(tmp_path / name)
         assert "\n" not in str(error.value)
 
 
 def test_rows_are_read_back(tmp_path):
     rows = [ROW, dataclasses.replace(ROW, seed=1, found_step=None, failure=None, graspable_step=2, retrieved=True)]
-    results.write_rows(rows, tmp_path / "new" / "rows.parquet")
-    assert results.read_rows(tmp_path / "new" / "rows.parquet") == rows
-    assert pyarrow.parquet.read_schema(tmp_path / "new" / "rows.parquet").equals(results.SCHEMA)
+    write_rows(rows, tmp_path / "new" / "rows.parquet")
+    assert read_rows(tmp_path / "new" / "rows.parquet") == rows
+    assert pyarrow.parquet.read_schema(tmp_path / "new" / "rows.parquet").equals(SCHEMA)
 
 
 def test_rows_of_the_first_version_are_read(tmp_path):
-    results.write_rows([ROW], tmp_path / "rows.parquet")
+    write_rows([ROW], tmp_path / "rows.parquet")
     table = pyarrow.parquet.read_table(tmp_path / "rows.parquet")
     pyarrow.parquet.write_table(table.drop_columns(["configuration"]), tmp_path / "rows.parquet")
-    assert results.read_rows(tmp_path / "rows.parquet") == [ROW]
+    assert read_rows(tmp_path / "rows.parquet") == [ROW]
 
 
 @pytest.mark.parametrize("text", ["{", "3"])
 def test_a_configuration_that_is_none_is_one_line(tmp_path, text):
-    results.write_rows([dataclasses.replace(ROW, configuration=text)], tmp_path / "rows.parquet")
+    write_rows([dataclasses.replace(ROW, configuration=text)], tmp_path / "rows.parquet")
     with pytest.raises(InputError, match=r"rows\.parquet: the configuration of 'two-things'"):
-        results.read_rows(tmp_path / "rows.parquet")
+        read_rows(tmp_path / "rows.parquet")
 
 
 def test_options_that_differ_tell_rows_apart():
-    full = results.configuration({"gamma": 0.9, "push_distances": [0.05, 0.1], "seed": 3, "target": "box"})
+    full = configuration({"gamma": 0.9, "push_distances": [0.05, 0.1], "seed": 3, "target": "box"})
     assert json.loads(full) == {"gamma": 0.9, "push_distances": [0.05, 0.1]}
     rows = [dataclasses.replace(ROW, configuration=full), ROW, dataclasses.replace(ROW, gamma=0.5)]
-    assert results.label_variants(rows) == [
+    assert label_variants(rows) == [
         "search-for-grasp, gamma 0.9, push distances 0.05/0.1",
         "search-for-grasp, gamma 0.9, push distances unknown",
         "search-for-grasp, gamma 0.5, push distances unknown",
     ]
-    assert results.label_variants(rows[1:2]) == ["search-for-grasp"]
-    assert [rates.episodes for rates in results.summarise(rows)] == [1] * 6
+    assert label_variants(rows[1:2]) == ["search-for-grasp"]
+    assert [rates.episodes for rates in summarise(rows)] == [1] * 6
 
 
 def test_rows_without_a_push_model_were_planned_with_the_first_one(tmp_path):
     old, new, other = (
-        dataclasses.replace(ROW, configuration=results.configuration({"gamma": 0.9, **more}))
+        dataclasses.replace(ROW, configuration=configuration({"gamma": 0.9, **more}))
         for more in ({}, {"push_model": "quasi-static", "topple_charge": 0.0}, {"push_model": "physics"})
     )
-    results.write_rows([old, new, other], tmp_path / "rows.parquet")
-    old, new, other = results.read_rows(tmp_path / "rows.parquet")
-    assert results.identity(old) == results.identity(new) != results.identity(other)
-    labels = results.label_variants([old, new, other])
+    write_rows([old, new, other], tmp_path / "rows.parquet")
+    old, new, other = read_rows(tmp_path / "rows.parquet")
+    assert identity(old) == identity(new) != identity(other)
+    labels = label_variants([old, new, other])
     assert labels == [
         "search-for-grasp, push model quasi-static",
         "search-for-grasp, push model quasi-static",
@@ -198,12 +202,12 @@ def test_confidence_intervals_are_wilsons():
     for counts, interval in {
         (81, 263): (0.2553, 0.3662), (15, 148): (0.0624, 0.1605), (0, 20): (0.0, 0.1611), (29, 29): (0.8830, 1.0),
     }.items():  # fmt: skip
-        assert results.wilson(*counts) == pytest.approx(interval, abs=5e-5)
-    assert results.wilson(0, 0) == (0.0, 1.0)
+        assert wilson(*counts) == pytest.approx(interval, abs=5e-5)
+    assert wilson(0, 0) == (0.0, 1.0)
 
 
 def test_the_schema_is_the_row():
-    assert results.SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
+    assert SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
 
 
 def test_what_is_no_table_of_episodes_is_one_line(tmp_path):
@@ -211,7 +215,7 @@ def test_what_is_no_table_of_episodes_is_one_line(tmp_path):
     pyarrow.parquet.write_table(pyarrow.table({"a": [1]}), tmp_path / "other.parquet")
     for name in ("text.parquet", "other.parquet", "none.parquet"):
         with pytest.raises(InputError, match=name) as error:
-            results.read_rows(tmp_path / name)
+            read_rows(tmp_path / name)
         assert "\n" not in str(error.value)
 
 
@@ -222,7 +226,7 @@ def test_rows_are_summarised_by_method_and_number_of_objects():
         dataclasses.replace(ROW, objects=8, found_step=None, steps=10),
         dataclasses.replace(ROW, method="search-and-grasp"),
     ]
-    summary = results.summarise(rows)
+    summary = summarise(rows)
     assert [(r.method, r.objects, r.episodes) for r in summary] == [
         ("search-and-grasp", 2, 1),
         ("search-and-grasp", None, 1),

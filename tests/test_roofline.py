@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import cli, dense
-from mechsearch_jax.benchmarks import bench, ceilings, roofline
+from mechsearch_jax.benchmarks import bench, ceilings, dense, roofline
 from mechsearch_jax.benchmarks.bench import Timing
 from mechsearch_jax.benchmarks.ceilings import Ceiling
 from mechsearch_jax.benchmarks.tables import timings_table
+from mechsearch_jax.commands import main as cli
 from mechsearch_jax.errors import InputError
 
 RESULTS = Path(__file__).parent.parent / "benchmarks" / "results"

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from published import published_scenarios
 
-from mechsearch_jax import scenario as scenarios
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.scenario import Body, Scenario
+from mechsearch_jax.workspace import scenario as scenarios
+from mechsearch_jax.workspace.scenario import Body, Scenario
 
 SCENE = Scenario(
     name="two-things",

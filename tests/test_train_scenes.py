@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.camera import Camera, back_project, rays
 from mechsearch_jax.envs.generator import outline, separation
 from mechsearch_jax.envs.world import CYLINDER, TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.cloud import above_board, cloud_of, draw, remove_shelf, resample, shelf_view, view
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.noise import RandomDirection, TimeOfFlight, no_noise
-from mechsearch_jax.scenario import Body
-from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train import scenes
+from mechsearch_jax.workspace.camera import Camera, back_project, rays
+from mechsearch_jax.workspace.scenario import Body
+from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
 VIEW = shelf_view(stride=4)

@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax import transforms
+from mechsearch_jax.geometry import transforms
 
 
 def random_transforms(seed, *shape):

@@ -9,18 +9,17 @@ import pytest
 from matplotlib.image import imread
 from matplotlib.patches import Circle, FancyArrowPatch, Polygon
 
-from mechsearch_jax import scenario as scenarios
-from mechsearch_jax import superquadric
 from mechsearch_jax.actions import ActionKind, no_action
-from mechsearch_jax.camera import Camera, project
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.results import Maps
-from mechsearch_jax.scenario import Body
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.viz.filmstrip import Frame, filmstrip
-from mechsearch_jax.viz.maps import maps_figure
+from mechsearch_jax.viz.maps import Maps, maps_figure
+from mechsearch_jax.workspace import scenario as scenarios
+from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.scenario import Body
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 CAMERA, SHELF = Camera(), Shelf()
 TURNED = (np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8))

@@ -15,13 +15,16 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from mechsearch_jax.dynamics import PushModel, PushOutcome, QuasiStatic
+from mechsearch_jax.dynamics.learned import LIKELY, NAME, SLACK, predicted
+from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
+from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, Worlds, joined, portions, push_tables
 from mechsearch_jax.envs.world import CYLINDER, superquadrics
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.learned_push import LIKELY, NAME, SLACK, predicted
-from mechsearch_jax.models.push import (
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import matmul
+from mechsearch_jax.networks.push import (
     CHAIN,
     NORMALS,
     REACH,
@@ -33,11 +36,9 @@ from mechsearch_jax.models.push import (
     pusher_distance,
     told_by,
 )
-from mechsearch_jax.models.weights import save_weights
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.train.scenes import SceneConfig, origin, random_world
-from mechsearch_jax.transforms import matmul
+from mechsearch_jax.workspace.shelf import Shelf
 
 # Every so many lanes of pushes one is never trained on.
 HELD_OUT_LANES = 32

@@ -15,9 +15,10 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax import superquadric
 from mechsearch_jax.envs.world import CYLINDER, TARGET, World, true_superquadrics
-from mechsearch_jax.models.recognition import (
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.transforms import matmul, rotate
+from mechsearch_jax.networks.recognition import (
     BASE_ROTATIONS,
     HYPOTHESES,
     IS_CYLINDER,
@@ -26,12 +27,11 @@ from mechsearch_jax.models.recognition import (
     RecognitionNetwork,
     told_by,
 )
-from mechsearch_jax.models.weights import save_weights
+from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.perception.cloud import View, shelf_view
 from mechsearch_jax.perception.recognition import best_hypothesis
 from mechsearch_jax.perception.scores import centre_error, intersection_over_union, sharpened
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
-from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import (
     PIXELS,
@@ -46,7 +46,7 @@ from mechsearch_jax.train.scenes import (
     visible_share,
     worth_seeing,
 )
-from mechsearch_jax.transforms import matmul, rotate
+from mechsearch_jax.workspace.shelf import Shelf
 
 # Points of the true surface that equation 7 is averaged over.
 SURFACE = 512

@@ -14,16 +14,16 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.assignment import assign
 from mechsearch_jax.envs.world import TARGET
-from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork, told_by
-from mechsearch_jax.models.weights import save_weights
+from mechsearch_jax.networks.segmentation import SegmentationConfig, SegmentationNetwork, told_by
+from mechsearch_jax.networks.weights import save_weights
+from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.perception.cloud import POINTS, View, cloud_of, resample, shelf_view
 from mechsearch_jax.perception.labels import INSTANCES, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of
-from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, origin, random_world, worth_seeing
+from mechsearch_jax.workspace.shelf import Shelf
 
 # What a layer's loss counts against the next one's.
 _EARLIER = 0.5

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
-from mechsearch_jax.camera import Camera, project
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.shelf import Shelf
 
 POINTS = 2048
 STRIDE = 2

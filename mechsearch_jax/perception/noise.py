@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from mechsearch_jax.camera import Camera, back_project
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.workspace.camera import Camera, back_project
 
 
 class NoiseModel(Protocol):

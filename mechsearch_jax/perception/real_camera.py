@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.camera import Camera, back_project
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.camera_pose import PoseConfig, PoseEstimate, estimate_pose
 from mechsearch_jax.perception.colour import ClusterConfig, Detection, TargetColour, cluster_by_colour, detect_target
 from mechsearch_jax.perception.planes import Plane, PlaneConfig, find_plane
-from mechsearch_jax.scenario import MAX_OBJECTS
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS
+from mechsearch_jax.workspace.shelf import Shelf
 
 BACKGROUND = -1
 # The plane of the floor and the camera's pose are found from at most so many points.

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.models.recognition import Hypotheses, RecognitionNetwork, told_by
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import matmul, transform
+from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, told_by
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import matmul, transform
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
 
 
 def best_hypothesis(told: Hypotheses, segments: Segments) -> Superquadrics:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.masked import masked_vmap
+from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 
 

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
-from mechsearch_jax.transforms import yaw_rotation
+from mechsearch_jax.geometry.transforms import yaw_rotation
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 ITERATIONS = 12
 # Residuals beyond this count only in proportion: mixed pixels at edges, and points of others [m].

@@ -18,11 +18,11 @@ from matplotlib.patheffects import Normal, Stroke
 from scipy.spatial import ConvexHull
 
 from mechsearch_jax.actions import Action, ActionKind
-from mechsearch_jax.camera import Camera, project
 from mechsearch_jax.files import PathLike, replacing
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.target import Target
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 INK = "#22303c"
 MUTED = "#75828e"

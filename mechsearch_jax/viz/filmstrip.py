@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.figure import Figure
 
 from mechsearch_jax.actions import Action
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.target import Target
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.viz import drawing
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 _WIDTH = 4.6
 _CAPTION, _GAP, _LEGEND = 0.52, 0.16, 0.55

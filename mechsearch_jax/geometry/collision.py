@@ -14,10 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax import superquadric
-from mechsearch_jax.masked import block_size, for_each, merged, rows_of
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.masked import block_size, for_each, merged, rows_of
+from mechsearch_jax.geometry.superquadric import Superquadrics
 
 
 def _transform_cloud(T, cloud):
@@ -148,38 +147,3 @@ def points_inside(scene: Superquadrics, points: Float[Array, "*batch 3"]) -> Boo
     local = superquadric.to_object_frame(scene, points)
     inside = superquadric.gauge(scene.size, scene.exponents, local) < 1.0
     return inside & jnp.broadcast_to(scene.valid, inside.shape)
-
-
-def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
-    """Whether world points are in the shelf, whose sides and ceiling are taken closer by their margins.
-
-    Everything beyond the front edge has to be inside the free box, or counts as in the shelf.
-    """
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    inside = (
-        (x <= shelf.back)
-        & (y >= shelf.right + shelf.side_margin)
-        & (y <= shelf.left - shelf.side_margin)
-        & (z >= shelf.board)
-        & (z <= shelf.ceiling - shelf.ceiling_margin)
-    )
-    return (x > shelf.front) & ~inside
-
-
-def spheres_hit_shelf(
-    shelf: Shelf, centres: Float[Array, "*batch n 3"], radii: Float[Array, " n"]
-) -> Bool[Array, "*batch n"]:
-    """Whether spheres touch what `hits_shelf` is true for; one in front of the shelf may bulge past its front edges.
-
-    Args:
-      shelf: the shelf.
-      centres: in the world [m].
-      radii: above 0 [m].
-    """
-    x, y, z = centres[..., 0], centres[..., 1], centres[..., 2]
-    to_wall = jnp.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
-    to_board = jnp.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
-    beside = jnp.maximum(jnp.minimum(to_wall, to_board), 0.0)
-    before = jnp.maximum(shelf.front - x, 0.0)
-    radii = radii.reshape((1,) * (x.ndim - 1) + radii.shape)
-    return (beside**2 + before**2 < radii**2) | (x + radii > shelf.back)

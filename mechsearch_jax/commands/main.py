@@ -164,7 +164,7 @@ def find_scenario(name: str) -> Path:
     Raises:
       InputError: there is neither.
     """
-    from mechsearch_jax.scenario import example_scenarios
+    from mechsearch_jax.workspace.scenario import example_scenarios
 
     shipped = example_scenarios()
     if Path(name).is_file():
@@ -183,7 +183,7 @@ def find_scenarios(names: Sequence[str]) -> list[Path]:
     Raises:
       InputError: there is nothing for one of them.
     """
-    from mechsearch_jax.scenario import is_another_format
+    from mechsearch_jax.workspace.scenario import is_another_format
 
     files: list[Path] = []
     for name in names:
@@ -232,11 +232,12 @@ def search(
     from mechsearch_jax.envs.generator import generate_scenario
     from mechsearch_jax.envs.narration import Narrator, verdict
     from mechsearch_jax.envs.recognisers import recogniser
+    from mechsearch_jax.envs.records import save_episode
     from mechsearch_jax.envs.simulator import NativeSimulator
-    from mechsearch_jax.results import check_writable, save_episode
-    from mechsearch_jax.scenario import load_scenario, save_scenario
+    from mechsearch_jax.files import check_writable
     from mechsearch_jax.viz.drawing import save_figure
     from mechsearch_jax.viz.filmstrip import filmstrip
+    from mechsearch_jax.workspace.scenario import load_scenario, save_scenario
 
     if (scenario is None) == (objects is None):
         raise InputError("search: give either a scenario or --objects N, not both")
@@ -288,9 +289,10 @@ def inspect(
     from mechsearch_jax.envs.episode import target_of
     from mechsearch_jax.envs.pictures import inspect_scenario
     from mechsearch_jax.envs.recognisers import recogniser
-    from mechsearch_jax.results import check_writable, save_maps
-    from mechsearch_jax.scenario import load_scenario
+    from mechsearch_jax.files import check_writable
     from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.viz.maps import save_maps
+    from mechsearch_jax.workspace.scenario import load_scenario
 
     options.only_native("inspect")
     config = options.config("search-for-grasp")
@@ -400,9 +402,9 @@ def generate(*, objects: int, out: Path, count: int = 1, target: TargetShape = "
 
     from mechsearch_jax.cache import keep_compilations
     from mechsearch_jax.envs.generator import ScenarioGenerator
-    from mechsearch_jax.results import check_writable
-    from mechsearch_jax.scenario import save_scenario
-    from mechsearch_jax.target import Target
+    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.workspace.scenario import save_scenario
+    from mechsearch_jax.workspace.target import Target
 
     at_least_one("scenarios generate", count=count)
     check_writable(out)
@@ -420,7 +422,7 @@ def check(scenarios: Scenarios, /) -> None:
     Args:
       scenarios: scenario files, folders of them, or names of shipped ones.
     """
-    from mechsearch_jax.scenario import load_scenario
+    from mechsearch_jax.workspace.scenario import load_scenario
 
     bad = 0
     for file in find_scenarios(scenarios):
@@ -446,7 +448,7 @@ def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing])
 
     from mechsearch_jax.benchmarks.bench import save_timing
     from mechsearch_jax.benchmarks.tables import timing_table
-    from mechsearch_jax.results import check_writable
+    from mechsearch_jax.files import check_writable
 
     if out is not None:
         check_writable(out.parent)
@@ -572,7 +574,7 @@ def bench_inside(
     from mechsearch_jax.benchmarks import roofline
     from mechsearch_jax.benchmarks.bench import save_timings
     from mechsearch_jax.benchmarks.tables import timings_table
-    from mechsearch_jax.results import check_writable
+    from mechsearch_jax.files import check_writable
 
     if out is not None:
         check_writable(out.parent)
@@ -624,8 +626,8 @@ def bench_agreement(
     from mechsearch_jax.benchmarks.tables import agreement_table
     from mechsearch_jax.cache import keep_compilations
     from mechsearch_jax.envs.mjx_simulator import import_mjx
-    from mechsearch_jax.results import check_writable
-    from mechsearch_jax.scenario import load_scenario
+    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.workspace.scenario import load_scenario
 
     at_least_one("bench agreement", actions=actions, scenes=scenes)
     files = find_scenarios(scenarios) if scenarios else []
@@ -683,11 +685,11 @@ def bench_recognition(
 
     from mechsearch_jax.benchmarks import images, recognition
     from mechsearch_jax.benchmarks.tables import recognition_tables, recognition_times_table
+    from mechsearch_jax.files import check_writable
     from mechsearch_jax.perception.cloud import shelf_view
-    from mechsearch_jax.results import check_writable
-    from mechsearch_jax.scenario import load_scenario
-    from mechsearch_jax.shelf import Shelf
     from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.workspace.scenario import load_scenario
+    from mechsearch_jax.workspace.shelf import Shelf
 
     at_least_one("bench recognition", worst=worst)
     for file in (out, picture):
@@ -748,9 +750,9 @@ def bench_segmentation(
 
     from mechsearch_jax.benchmarks import images, segmentation
     from mechsearch_jax.benchmarks.tables import segmentation_tables
-    from mechsearch_jax.results import check_writable
-    from mechsearch_jax.scenario import load_scenario
+    from mechsearch_jax.files import check_writable
     from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.workspace.scenario import load_scenario
 
     at_least_one("bench segmentation", worst=worst)
     for file in (out, picture):
@@ -811,7 +813,7 @@ def bench_push(
     from mechsearch_jax.benchmarks import push
     from mechsearch_jax.benchmarks.tables import push_scores_tables
     from mechsearch_jax.cache import keep_compilations
-    from mechsearch_jax.results import check_writable
+    from mechsearch_jax.files import check_writable
     from mechsearch_jax.train.run import counting
 
     worlds = (64 if jax.default_backend() == "cpu" else 512) if worlds is None else worlds
@@ -848,7 +850,7 @@ def _training_of(name: Literal["segmentation", "recognition"], batch: int, rate:
         chunk: int = 20,
         held_out: int = 512,
     ) -> None:
-        from mechsearch_jax.results import check_writable
+        from mechsearch_jax.files import check_writable
         from mechsearch_jax.train.loop import TrainConfig
         from mechsearch_jax.train.run import TASKS, run
 
@@ -924,8 +926,8 @@ def train_push(
     import jax
 
     from mechsearch_jax.envs.pushes import Generation
-    from mechsearch_jax.models.push import PushConfig
-    from mechsearch_jax.results import check_writable
+    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.networks.push import PushConfig
     from mechsearch_jax.train.loop import TrainConfig
     from mechsearch_jax.train.push import push_task
     from mechsearch_jax.train.run import counting, run

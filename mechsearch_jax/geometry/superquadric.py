@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.transforms import align, inverse, make, transform
+from mechsearch_jax.geometry.transforms import align, inverse, make, transform
 
 BOX_EXPONENTS = (0.2, 0.2)
 CYLINDER_EXPONENTS = (0.2, 1.0)

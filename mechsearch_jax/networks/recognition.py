@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models.layers import Attention, FeedForward, fourier_features
+from mechsearch_jax.geometry.transforms import matmul
+from mechsearch_jax.networks.layers import Attention, FeedForward, fourier_features
 from mechsearch_jax.perception.segments import MARKS
-from mechsearch_jax.transforms import matmul
 
 BOX_YAWS, LYING_YAWS = 6, 6
 HYPOTHESES = BOX_YAWS + 1 + LYING_YAWS

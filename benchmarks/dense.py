@@ -30,9 +30,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.masked import block_size
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import compose, inverse, make
+from mechsearch_jax.geometry.masked import block_size
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import compose, inverse, make
 
 Method = Literal["auto", "xla", "kernel"]
 Function = Callable[[Array], Array]

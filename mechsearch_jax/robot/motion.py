@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.kinematics import line_poses, path_kinematics
-from mechsearch_jax.transforms import translate
+from mechsearch_jax.geometry.transforms import translate
+from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
 
 # Added to the turn between two waypoints, so that a stretch along which no joint turns has a length too [rad].
 LEAST_TURN = 1e-3

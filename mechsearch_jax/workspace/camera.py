@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.transforms import rotate
+from mechsearch_jax.geometry.transforms import rotate
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from mechsearch_jax import superquadric
-from mechsearch_jax.camera import Camera, pixel_rays, project, rays
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import make, rotate, transform
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import make, rotate, transform
+from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
 
 SHARPNESS = 1000.0
 TAU = 100.0

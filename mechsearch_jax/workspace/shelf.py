@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
 from mechsearch_jax.errors import InputError
 
 
@@ -41,3 +44,38 @@ class Shelf:
         for low, high in (("front", "back"), ("right", "left"), ("board", "ceiling")):
             if not getattr(self, low) < getattr(self, high):
                 raise InputError(f"Shelf: {low} ({getattr(self, low)}) must be below {high} ({getattr(self, high)})")
+
+
+def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
+    """Whether world points are in the shelf, whose sides and ceiling are taken closer by their margins.
+
+    Everything beyond the front edge has to be inside the free box, or counts as in the shelf.
+    """
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    inside = (
+        (x <= shelf.back)
+        & (y >= shelf.right + shelf.side_margin)
+        & (y <= shelf.left - shelf.side_margin)
+        & (z >= shelf.board)
+        & (z <= shelf.ceiling - shelf.ceiling_margin)
+    )
+    return (x > shelf.front) & ~inside
+
+
+def spheres_hit_shelf(
+    shelf: Shelf, centres: Float[Array, "*batch n 3"], radii: Float[Array, " n"]
+) -> Bool[Array, "*batch n"]:
+    """Whether spheres touch what `hits_shelf` is true for; one in front of the shelf may bulge past its front edges.
+
+    Args:
+      shelf: the shelf.
+      centres: in the world [m].
+      radii: above 0 [m].
+    """
+    x, y, z = centres[..., 0], centres[..., 1], centres[..., 2]
+    to_wall = jnp.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
+    to_board = jnp.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
+    beside = jnp.maximum(jnp.minimum(to_wall, to_board), 0.0)
+    before = jnp.maximum(shelf.front - x, 0.0)
+    radii = radii.reshape((1,) * (x.ndim - 1) + radii.shape)
+    return (beside**2 + before**2 < radii**2) | (x + radii > shelf.back)

@@ -23,12 +23,12 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
-from mechsearch_jax.models.push import PushConfig, PushNetwork, push_start
-from mechsearch_jax.models.recognition import RecognitionConfig, RecognitionNetwork
-from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork
+from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.networks.push import PushConfig, PushNetwork, push_start
+from mechsearch_jax.networks.recognition import RecognitionConfig, RecognitionNetwork
+from mechsearch_jax.networks.segmentation import SegmentationConfig, SegmentationNetwork
 from mechsearch_jax.perception.segments import SegmentConfig
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import empty
+from mechsearch_jax.workspace.shelf import Shelf
 
 FORMAT = "mechsearch-weights"
 VERSION = 1
@@ -181,4 +181,4 @@ def shipped_weights(name: str) -> Weights:
     Raises:
       InputError: they are missing or damaged.
     """
-    return load_weights(Path(str(importlib.resources.files("mechsearch_jax") / "models" / f"{name}.npz")), name)
+    return load_weights(Path(str(importlib.resources.files("mechsearch_jax") / "networks" / f"{name}.npz")), name)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 from typing import Literal, get_args
 
-from mechsearch_jax.dynamics import PushModel, QuasiStatic
+from mechsearch_jax.dynamics.push_model import PushModel
+from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.errors import InputError
 
 PushModelName = Literal["quasi-static", "learned", "physics"]
@@ -39,7 +40,7 @@ def own_push_model(name: str) -> PushModel:
     if name == "quasi-static":
         return QuasiStatic()
     # Networks take long to import.
-    from mechsearch_jax.learned_push import LearnedPush
+    from mechsearch_jax.dynamics.learned import LearnedPush
 
     try:
         return LearnedPush()

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models.layers import Attention, FeedForward, fourier_features
+from mechsearch_jax.networks.layers import Attention, FeedForward, fourier_features
 from mechsearch_jax.perception.labels import INSTANCES
 
 # The middle of the shelf's space [m]: where the network's frame has its origin.

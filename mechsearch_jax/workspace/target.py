@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from mechsearch_jax import superquadric
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.workspace.shelf import Shelf
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from mechsearch_jax import superquadric
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import replacing
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.workspace.shelf import Shelf
 
 FORMAT = "mechsearch-scenario"
 VERSION = 1

@@ -21,11 +21,10 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax import kinematics
-from mechsearch_jax.collision import spheres_hit_shelf
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.kinematics import Numbers
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.robot import kinematics
+from mechsearch_jax.robot.kinematics import Numbers
+from mechsearch_jax.workspace.shelf import Shelf, spheres_hit_shelf
 
 FINGER_BASE = 0.0584  # z of the fingers' frames in the hand frame [m]
 FINE = 0.5  # spacing of a cloud near the front, relative to the rest

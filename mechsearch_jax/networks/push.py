@@ -25,12 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.dynamics import TOUCH, Footprints, footprints, turned
+from mechsearch_jax.dynamics.push_model import TOUCH
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models.layers import FeedForward
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import transform
+from mechsearch_jax.geometry.footprints import Footprints, footprints, turned
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import transform
+from mechsearch_jax.networks.layers import FeedForward
+from mechsearch_jax.workspace.shelf import Shelf
 
 # Directions, spread over half a turn, in which an object's reach is told; an even number.
 DIRECTIONS = 8

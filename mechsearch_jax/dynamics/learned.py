@@ -12,12 +12,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mechsearch_jax.dynamics import PushOutcome, rigid_motion, unresolved
+from mechsearch_jax.dynamics.contacts import unresolved
+from mechsearch_jax.dynamics.push_model import PushOutcome
+from mechsearch_jax.dynamics.rigid import rigid_motion
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models.push import PushNetwork, push_start, told_by
-from mechsearch_jax.models.weights import Weights, load_weights
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.networks.push import PushNetwork, push_start, told_by
+from mechsearch_jax.networks.weights import Weights, load_weights
+from mechsearch_jax.workspace.shelf import Shelf
 
 NAME = "push"
 # An object is moved if it moves with a probability above this: of those that stay, less than 1 in 100 is then moved,
@@ -61,7 +63,7 @@ class LearnedPush:
             raise InputError(
                 f"LearnedPush: likely {self.likely} must be from 0 to 1, and slack {self.slack} m must not be negative"
             )
-        path = self.path or Path(str(importlib.resources.files("mechsearch_jax") / "models" / f"{NAME}.npz"))
+        path = self.path or Path(str(importlib.resources.files("mechsearch_jax") / "networks" / f"{NAME}.npz"))
         # What a frozen instance derives from its arguments can be set in no other way.
         object.__setattr__(self, "path", path)
         object.__setattr__(self, "digest", load_weights(path, NAME).card["sha256"])
