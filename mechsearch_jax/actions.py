@@ -55,6 +55,7 @@ class ActionKind(enum.IntEnum):
     NONE = 0
     PUSH = 1
     PICK_AND_PLACE = 2
+    RETRIEVE = 3
 
 
 class Action(flax.struct.PyTreeNode):
@@ -810,3 +811,64 @@ def sample_action(
     body = superquadric.sample_surface(scene.size[index], scene.exponents[index], config.object_points)
     swept = jnp.concatenate([transform(grippers[:, None], cloud[None]), transform(bodies[:, None], body[None])], axis=1)
     return Sample(action, wrist, jnp.where(able, _risk(possible, swept), 0.0))
+
+
+# --- A stand-in for the registry of kinds, until there is one -----------------------------------------------------------
+
+
+def retrieve_action(T_world_gripper: Array, q7: Array, opening: Array) -> Action:
+    """The action that takes the target out; any leading axes."""
+    lead = jnp.shape(q7)
+    return Action(
+        kind=jnp.full(lead, ActionKind.RETRIEVE, jnp.int32),
+        object=jnp.zeros(lead, jnp.int32),
+        T_world_gripper=T_world_gripper,
+        displacement=jnp.zeros((*lead, 3)),
+        T_world_place=T_world_gripper,
+        q7=jnp.asarray(q7, jnp.float32),
+        opening=jnp.asarray(opening, jnp.float32),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    code: int
+    name: str
+    reference: object
+    moves_object: bool = False
+    holds_object: bool = False
+    takes_target: bool = False
+    returns_home: bool = False
+
+
+def _reference(kind, action, config):
+    from mechsearch_jax.robot import motion
+
+    T, q7, opening = action.T_world_gripper, action.q7, action.opening
+    if kind is ActionKind.PUSH:
+        return motion.push_reference(T, action.displacement, q7, config)
+    if kind is ActionKind.PICK_AND_PLACE:
+        return motion.pick_and_place_reference(T, action.T_world_place, q7, opening, config)
+    return motion.retrieve_reference(T, q7, opening, config) if kind is ActionKind.RETRIEVE else None
+
+
+def _made(kind: ActionKind, name: str, **flags: bool) -> Kind:
+    return Kind(int(kind), name, functools.partial(_reference, kind), **flags)
+
+
+KINDS = {
+    ActionKind.NONE: _made(ActionKind.NONE, "none"),
+    ActionKind.PUSH: _made(ActionKind.PUSH, "push", moves_object=True, returns_home=True),
+    ActionKind.PICK_AND_PLACE: _made(
+        ActionKind.PICK_AND_PLACE, "pick-and-place", moves_object=True, holds_object=True, returns_home=True
+    ),
+    ActionKind.RETRIEVE: _made(ActionKind.RETRIEVE, "retrieve", takes_target=True),
+}
+
+
+def kind_of(code: int) -> Kind:
+    if code not in set(KINDS):
+        raise InputError(
+            f"action kind {code} is unknown; there are {', '.join(f'{k.code} ({k.name})' for k in KINDS.values())}"
+        )
+    return KINDS[ActionKind(code)]
