@@ -112,8 +112,8 @@ def _look(
 
     def one(belief, here, key):
         seen = recogniser(key, Snapshot(problem.camera, problem.shelf, here))
-        found = jnp.asarray(seen.found)
-        return _Minds(planner.observe_belief(problem, belief, seen.scene, found, seen.target_pose, config), seen.scene)
+        found, objects = jnp.asarray(seen.target_visible), seen.objects
+        return _Minds(planner.observe_belief(problem, belief, objects, found, seen.target_pose, config), objects)
 
     here = _some(world, rows)
     # An empty shelf costs next to nothing.
@@ -279,7 +279,7 @@ class _Crew:
                 ),
                 jax.tree.map(lambda a: a[0], world),
             )
-            one = (planner.initial_belief(self._problem), look.scene)
+            one = (planner.initial_belief(self._problem), look.objects)
             self._minds = _Minds(*jax.tree.map(lambda a: jnp.zeros((len(starts), *a.shape), a.dtype), one))
         else:
             self._simulator.replace(scenarios)

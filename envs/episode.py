@@ -8,7 +8,6 @@ and leaves the world as it made it.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -19,20 +18,19 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.benchmarks.rows import Row, configuration
-from mechsearch_jax.envs.observation import Observation, is_found, observe
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.records import ActionRecord, Episode, Step, record_action
 from mechsearch_jax.envs.simulator import Outcome, Retrieval
-from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
+from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, objects_on_the_board, oracle, true_target_pose
+from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner import Belief, GraspChoice, Plan, PlannerConfig, Problem
 from mechsearch_jax.versions import versions
-from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -52,70 +50,6 @@ class Simulator(Protocol):
     def execute(self, action: Action) -> Outcome: ...
 
     def retrieve(self, T_world_gripper: Array, q7: Array | float, opening: Array | float) -> Retrieval: ...
-
-
-@dataclasses.dataclass(frozen=True)
-class Snapshot:
-    """The shelf at one moment, as the camera can see it; images are ray-cast only when they are asked for.
-
-    Attributes:
-      camera, shelf: of the problem.
-      world: the true state, for a recogniser that may know it.
-    """
-
-    camera: Camera
-    shelf: Shelf
-    world: World
-
-    @functools.cached_property
-    def observation(self) -> Observation:
-        """Depth, segmentation and colour at full resolution."""
-        return observe(self.camera, self.world, self.shelf)
-
-    @functools.cached_property
-    def target_seen(self) -> Bool[Array, ""]:
-        """Whether the detector finds the target in the image; much cheaper than the image."""
-        return is_found(self.camera, self.world)
-
-
-class Recognition(flax.struct.PyTreeNode):
-    """What a recogniser makes of a snapshot.
-
-    Attributes:
-      scene: the objects, without the target.
-      found: whether the target is seen.
-      target_pose: where, as x, y [m] and yaw [rad]; anything if it is not seen.
-    """
-
-    scene: Superquadrics
-    found: Bool[Array, ""] | bool
-    target_pose: Float[Array, " 3"]
-
-
-@runtime_checkable
-class Recogniser(Protocol):
-    """Turns what the camera sees into what the planner plans with. For batches it has to be traceable by JAX."""
-
-    def __call__(self, key: Array, snapshot: Snapshot) -> Recognition: ...
-
-
-def oracle(key: Array, snapshot: Snapshot) -> Recognition:
-    """Knows the true shapes and poses, of the target once the detector sees it. Needs no key."""
-    scene = objects_on_the_board(snapshot)
-    return Recognition(scene, snapshot.target_seen, true_target_pose(snapshot.world))
-
-
-def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:
-    """The true objects, without those that have fallen off the board."""
-    scene, shelf = true_superquadrics(snapshot.world), snapshot.shelf
-    fallen = (scene.position[:, 0] < shelf.front) | (scene.position[:, 2] < shelf.board)
-    return scene.replace(valid=scene.valid & ~fallen)
-
-
-def true_target_pose(world: World) -> Float[Array, " 3"]:
-    """x, y [m] and yaw [rad] of the target."""
-    R, t = world.rotation[TARGET], world.position[TARGET]
-    return jnp.stack([t[0], t[1], jnp.arctan2(R[1, 0], R[0, 0])])
 
 
 def target_of(scenario: Scenario) -> Target:
@@ -229,19 +163,19 @@ def run_episode(
             seen = recogniser(jax.random.fold_in(environment_key, log.index), snapshot)
             jax.block_until_ready(seen)
         with clock("believe"):
-            found = jnp.asarray(seen.found)
-            belief = planner.observe_belief(problem, belief, seen.scene, found, seen.target_pose, config)
+            found = jnp.asarray(seen.target_visible)
+            belief = planner.observe_belief(problem, belief, seen.objects, found, seen.target_pose, config)
             jax.block_until_ready(belief)
 
         trouble = _target_trouble(snapshot) if belief.found else None
         grasp = decision = choice = None
         if belief.found and trouble is None:
             with clock("grasp"):
-                grasp = _grasp(problem, seen.scene, belief.found_pose)
+                grasp = _grasp(problem, seen.objects, belief.found_pose)
         if grasp is None and trouble is None and not log.last:
             with clock("plan"):
                 key = jax.random.fold_in(planner_key, log.index)
-                decision = planner.plan(key, problem, belief, seen.scene, config, *models)
+                decision = planner.plan(key, problem, belief, seen.objects, config, *models)
                 jax.block_until_ready(decision)
             choice = chosen(decision)
             trouble = distrust(choice)
@@ -250,7 +184,7 @@ def run_episode(
         graspable = bool(belief.found) and _truly_graspable(problem, snapshot)
         index = log.index
         step = log.decide(record(bool(belief.found), size, graspable, grasp, None if trouble else choice, config))
-        moment = Moment(index, snapshot, seen.scene, belief, decision, grasp, step, None)
+        moment = Moment(index, snapshot, seen.objects, belief, decision, grasp, step, None)
         deed = outcome = None
         if log.acts:
             watcher.decided(moment)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.envs import episode as episodes
-from mechsearch_jax.envs.episode import Recognition, Snapshot, oracle, run_episode, target_of
+from mechsearch_jax.envs.episode import Snapshot, oracle, run_episode, target_of
 from mechsearch_jax.envs.records import load_episode, save_episode
 from mechsearch_jax.envs.simulator import NativeSimulator, Outcome, Retrieval, Trace
 from mechsearch_jax.envs.world import TARGET, from_scenario
+from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig
 from mechsearch_jax.workspace.scenario import Body, Scenario
 
@@ -136,7 +137,8 @@ def test_verdicts_are_passed_on_the_truth_and_not_on_what_was_recognised(problem
     def blind(key, snapshot):
         """Sees the target, but no object."""
         seen = oracle(key, snapshot)
-        return Recognition(seen.scene.replace(valid=jnp.zeros_like(seen.scene.valid)), True, seen.target_pose)
+        objects = seen.objects.replace(valid=jnp.zeros_like(seen.objects.valid))
+        return Observation(objects, jnp.array(True), seen.target_pose)
 
     front = dataclasses.replace(BOX, position=(0.52, 0.07, 0.4845))
     episode = run_episode(0, Scenario("blocked", (front,), CYLINDER), problem, CONFIG, Stage(retrieval="missed"), blind)
@@ -161,8 +163,8 @@ def test_the_oracle_leaves_out_what_fell_off_the_board(problem):
     world = from_scenario(OPEN)
     fallen = world.replace(position=world.position.at[0, 2].set(0.1))
     seen = oracle(jax.random.key(0), Snapshot(problem.camera, problem.shelf, fallen))
-    assert not seen.scene.valid.any()
-    assert seen.found
+    assert not seen.objects.valid.any()
+    assert seen.target_visible
     np.testing.assert_allclose(seen.target_pose, [0.62, 0.07, 0.0], atol=1e-6)
 
 
