@@ -87,7 +87,7 @@ def test_a_pushed_object_pushes_its_neighbour_and_nothing_else_moves():
     scene = on_board((*BOX, 0.6, 0.1, 0.0), (*BOX, 0.6, 0.18, 0.0), (*BOX, 0.72, -0.2, 0.0))
     pusher, T = finger_at(0.6, 0.05)
     after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7).scene
-    moved = np.asarray(rigid.changed(scene, after))
+    moved = np.asarray(rigid.moved_objects(scene, after))
     assert moved.tolist() == [True, True] + [False] * 6
     assert float(after.position[1, 1] - after.position[0, 1]) >= 0.06 - 2e-3
 
@@ -103,7 +103,7 @@ def test_a_push_that_misses_moves_nothing():
     scene = on_board((*BOX, 0.6, 0.1, 0.0))
     pusher, T = finger_at(0.5, 0.05)
     after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7).scene
-    assert not np.any(rigid.changed(scene, after))
+    assert not np.any(rigid.moved_objects(scene, after))
 
 
 def side_grasp(x, y, yaw):

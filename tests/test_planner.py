@@ -10,7 +10,7 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
-from mechsearch_jax.dynamics.rigid import changed
+from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import masked, superquadric
 from mechsearch_jax.planner import PlannerConfig
@@ -169,7 +169,7 @@ class Shaky:
 
     def __call__(self, shelf, scene, pusher, T_world_gripper, displacement, q7):
         told = QuasiStatic()(shelf, scene, pusher, T_world_gripper, displacement, q7)
-        feared = jnp.where(changed(scene, told.scene), self.chance, 0.0)
+        feared = jnp.where(moved_objects(scene, told.scene), self.chance, 0.0)
         return told.replace(topples=jnp.maximum(told.topples, feared), residual=told.residual + self.residual)
 
 
