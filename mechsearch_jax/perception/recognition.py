@@ -109,6 +109,7 @@ class LabelledImage(flax.struct.PyTreeNode):
     of_target: jax.Array
 
 
+@functools.partial(jax.jit, static_argnames=("camera", "shelf", "target", "refinement"))
 def recognise_image(
     keys: Key[Array, "2"],
     image: LabelledImage,
