@@ -7,8 +7,8 @@ import sys
 import jax.numpy as jnp
 import numpy as np
 
-from mechsearch_jax.envs.observation import FOUND_PIXELS, observe
 from mechsearch_jax.envs.recognisers import true_labels
+from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS, observe
 from mechsearch_jax.envs.world import TARGET, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.examples import Images, save_images
