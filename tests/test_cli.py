@@ -11,6 +11,7 @@ import pytest
 from mechsearch_jax.benchmarks.report import FILES
 from mechsearch_jax.benchmarks.rows import Row, write_rows
 from mechsearch_jax.commands import main as cli
+from mechsearch_jax.commands import options
 from mechsearch_jax.envs.records import Episode, save_episode
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PlannerConfig
@@ -177,13 +178,13 @@ def test_help_is_no_mistake(capsys, arguments):
 def test_a_scenario_is_found_by_file_by_folder_and_by_name(folder, monkeypatch):
     monkeypatch.chdir(folder)
     name, shipped = next(iter(example_scenarios().items()))
-    assert cli.find_scenario("good.json").name == "good.json"
-    assert cli.find_scenario(name) == shipped
-    assert [file.name for file in cli.find_scenarios([".", name])] == [
+    assert options.find_scenario("good.json").name == "good.json"
+    assert options.find_scenario(name) == shipped
+    assert [file.name for file in options.find_scenarios([".", name])] == [
         "broken.json", "good.json", "negative.json", shipped.name,
     ]  # fmt: skip
     with pytest.raises(InputError, match=name):
-        cli.find_scenario("none")
+        options.find_scenario("none")
 
 
 def test_checking_names_the_bad_and_lists_the_good(folder, monkeypatch, capsys):
@@ -211,10 +212,10 @@ def test_a_folder_that_search_wrote_is_good(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("preset", ["paper", "best"])
 def test_what_is_given_goes_before_the_preset(preset):
-    options = cli.PlannerOptions(preset=preset)
-    assert options.config("search-and-grasp") == PlannerConfig.paper(method="search-and-grasp")
-    options = cli.PlannerOptions(preset=preset, gamma=0.5, actions="push")
-    assert options.config("search-for-grasp") == PlannerConfig.paper(gamma=0.5, actions="push")
+    given = options.PlannerOptions(preset=preset)
+    assert given.config("search-and-grasp") == PlannerConfig.paper(method="search-and-grasp")
+    given = options.PlannerOptions(preset=preset, gamma=0.5, actions="push")
+    assert given.config("search-for-grasp") == PlannerConfig.paper(gamma=0.5, actions="push")
 
 
 def test_a_report_is_printed_and_written(folder, monkeypatch, capsys):

@@ -1,0 +1,192 @@
+"""`mechsearch bench`: how long the parts take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from mechsearch_jax.commands.options import DEFAULTS, JsonFile, Options, PushModel, WeightsFile, at_least_one
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.benchmarks.bench import Timing
+
+
+def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing]) -> None:
+    """Measure, print and write a timing.
+
+    Raises:
+      InputError: the file cannot be written, or what `measure` raises.
+    """
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.bench import save_timing
+    from mechsearch_jax.benchmarks.tables import timing_table
+    from mechsearch_jax.files import check_writable
+
+    if out is not None:
+        check_writable(out.parent)
+    # A compilation that was read from disk would not tell how long compiling takes.
+    jax.config.update("jax_enable_compilation_cache", False)
+    console = Console(highlight=False)
+    with console.status(f"timing {subject}"):
+        timing = measure()
+    console.print(timing_table(timing))
+    if out is not None:
+        save_timing(timing, out)
+
+
+def _timing_of(subject: Literal["existence", "graspability", "plan"], what: str) -> Callable[..., None]:
+    """The command that times one part of the planner."""
+
+    def command(
+        *,
+        objects: int = 8,
+        batch: int = 1,
+        repeats: int = 10,
+        out: JsonFile = None,
+        options: Options = DEFAULTS,
+    ) -> None:
+        from mechsearch_jax.benchmarks.bench import bench
+
+        at_least_one(f"bench {subject}", repeats=repeats, batch=batch)
+        config = options.config("search-for-grasp")
+        _print_timing(subject, out, lambda: bench(subject, objects, config, batch=batch, repeats=repeats))
+
+    command.__name__ = subject
+    command.__doc__ = f"""Time {what}: compilation, median and spread.
+
+    Args:
+      objects: number of objects in a scene.
+      batch: how many scenes at once.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+      options: how the planner decides.
+    """
+    return command
+
+
+def bench_perceive(
+    *,
+    objects: int = 8,
+    batch: int = 1,
+    repeats: int = 10,
+    recognition: Literal["masks", "full"] = "full",
+    out: JsonFile = None,
+) -> None:
+    """Time recognising all objects of a scene from its noisy depth image: compilation, median and spread.
+
+    Args:
+      objects: number of objects in a scene.
+      batch: how many scenes at once.
+      repeats: number of timed calls.
+      recognition: "masks" is told which pixels are whose, "full" finds out.
+      out: JSON file for the result.
+    """
+    from mechsearch_jax.benchmarks import bench as benches
+
+    at_least_one("bench perceive", repeats=repeats, batch=batch)
+    _print_timing("perceive", out, lambda: benches.bench_perceive(recognition, objects, batch, repeats=repeats))
+
+
+def bench_predict(
+    *,
+    push_model: PushModel = "learned",
+    weights: WeightsFile = None,
+    objects: int = 8,
+    batch: int = 30,
+    repeats: int = 20,
+    out: JsonFile = None,
+) -> None:
+    """Time predicting random pushes, all at once, each in a scene of its own: compilation, median and spread.
+
+    Args:
+      push_model: what predicts them; "physics" simulates every one.
+      weights: of the learned model; those that ship if not given.
+      objects: number of objects in a scene.
+      batch: pushes predicted at once; each step of a decision predicts 30.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
+    from mechsearch_jax.benchmarks import bench as benches
+
+    at_least_one("bench predict", repeats=repeats, batch=batch)
+    if weights is not None and push_model != "learned":
+        raise InputError(f"bench predict: --weights is for --push-model learned, not for {push_model}")
+    _print_timing("predict", out, lambda: benches.bench_predict(push_model, objects, batch, repeats, weights))
+
+
+def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, out: JsonFile = None) -> None:
+    """Time the batch simulator with 8 objects, the arm sweeping through them: steps per second of all worlds together.
+
+    Args:
+      worlds: simulated at once.
+      steps: time steps in a timed call.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
+    from mechsearch_jax.benchmarks import bench as benches
+
+    _print_timing("simulate", out, lambda: benches.bench_simulate(worlds, steps, repeats))
+
+
+def bench_inside(
+    *, placed: int = 1024, objects: int = 8, points: int = 2560, repeats: int = 10, out: JsonFile = None
+) -> None:
+    """Time every point of clouds against every superquadric, and what the device can do at most, apart from compiling.
+
+    Args:
+      placed: clouds in one call; a GPU needs some 100000 to be busy for milliseconds.
+      objects: that each is tested against.
+      points: of a cloud.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import roofline
+    from mechsearch_jax.benchmarks.bench import save_timings
+    from mechsearch_jax.benchmarks.tables import timings_table
+    from mechsearch_jax.files import check_writable
+
+    if out is not None:
+        check_writable(out.parent)
+    jax.config.update("jax_enable_compilation_cache", False)
+    console = Console(highlight=False)
+    with console.status("timing inside"):
+        timings = roofline.bench_inside(placed, objects, points, repeats)
+    console.print(timings_table(timings))
+    if out is not None:
+        save_timings(timings, out)
+
+
+def bench_roofline(
+    results: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")], /, *, out: Path
+) -> None:
+    """Write the page that compares measured rates with what devices allow, from results of `inside` and `simulate`.
+
+    Args:
+      results: folder with their JSON files; others are left out.
+      out: Markdown file.
+    """
+    from mechsearch_jax.benchmarks.roofline import write_page
+
+    write_page(results, out)
+    print(out)
+
+
+COMMANDS = {
+    "existence": _timing_of("existence", "f"),
+    "graspability": _timing_of("graspability", "g where f = 1"),
+    "plan": _timing_of("plan", "a whole decision"),
+    "predict": bench_predict,
+    "perceive": bench_perceive,
+    "simulate": bench_simulate,
+    "inside": bench_inside,
+    "roofline": bench_roofline,
+}
