@@ -454,7 +454,7 @@ def test_what_does_not_move_stays_exactly_where_it_is(weights):
     probability = np.sort(jax.nn.sigmoid(expected.moves))
     model = LearnedPush(weights, likely=float(probability[1:3].mean()))
     outcome = jax.jit(model, static_argnums=0)(SHELF, scene, pusher(), T, displacement, jnp.zeros(()))
-    same = np.asarray(~rigid.changed(scene, outcome.scene))
+    same = np.asarray(~rigid.moved_objects(scene, outcome.scene))
     assert same.sum() == 2
     np.testing.assert_allclose(
         (outcome.scene.position - scene.position)[~same, :2], np.asarray(expected.shift)[~same], atol=2e-4

@@ -47,7 +47,7 @@ def pick_and_place(
     )
 
 
-def changed(before: Superquadrics, after: Superquadrics) -> Bool[Array, " n"]:
+def moved_objects(before: Superquadrics, after: Superquadrics) -> Bool[Array, " n"]:
     """Which objects differ in pose between two scenes."""
     return jnp.any(before.position != after.position, axis=-1) | jnp.any(
         before.rotation != after.rotation, axis=(-1, -2)

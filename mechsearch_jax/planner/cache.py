@@ -15,13 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mechsearch_jax import planner
-from mechsearch_jax.actions import ActionConfig, ActionTables
+from mechsearch_jax.actions.config import ActionTables
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.existence import ExistenceConfig, ExistenceTables
+from mechsearch_jax.existence import ExistenceTables
 from mechsearch_jax.files import replacing
-from mechsearch_jax.graspability import GraspConfig, GraspTables
-from mechsearch_jax.planner import Problem
+from mechsearch_jax.graspability import GraspTables
+from mechsearch_jax.planner import problem as problems
+from mechsearch_jax.planner.config import ProblemConfig
+from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.versions import source_digest
 from mechsearch_jax.workspace.camera import Camera
@@ -30,7 +31,7 @@ from mechsearch_jax.workspace.target import Target
 
 VARIABLE = "MECHSEARCH_CACHE_DIR"
 # Problems of older versions of the package are of no use; a few are left for those who switch between versions.
-KEPT_PROBLEMS = 6
+CACHED_PROBLEMS = 6
 
 _TABLES = {"existence": ExistenceTables, "grasps": GraspTables, "actions": ActionTables, "retrieval": GraspTables}
 
@@ -58,8 +59,9 @@ def keep_compilations() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-def kept_problem(target: Target | None = None) -> Problem:
-    """`planner.build_problem` for a target, with everything else at its default: read from disk if it was built before.
+def cached_problem(target: Target | None = None, config: ProblemConfig | None = None) -> Problem:
+    """`build_problem` for a target and a configuration, with everything else at its default: read from disk if it was
+    built before.
 
     The file is told apart by the package's source, the versions of what computes it, the device and the settings. One
     that is damaged or of something else is built anew, and a folder that cannot be written to is done without.
@@ -72,19 +74,16 @@ def kept_problem(target: Target | None = None) -> Problem:
         "shelf": Shelf(),
         "gripper": Gripper(),
         "target": target or Target(),
-        "existence_config": ExistenceConfig(),
-        "grasp_config": GraspConfig(),
-        "retrieval_config": GraspConfig.dense(),
-        "action_config": ActionConfig(),
+        "config": config or ProblemConfig(),
     }
     folder = cache_folder()
     if folder is None:
-        return planner.build_problem(**parts)
+        return problems.build_problem(**parts)
     key = _key(parts)
     file = folder / f"problem-{key[:32]}.npz"
     problem = _load(file, key, parts)
     if problem is None:
-        problem = planner.build_problem(**parts)
+        problem = problems.build_problem(**parts)
         with contextlib.suppress(InputError):
             _save(problem, file, key)
             _forget_old(folder)
@@ -138,5 +137,5 @@ def _load(file: Path, key: str, parts: dict[str, Any]) -> Problem | None:
 
 def _forget_old(folder: Path) -> None:
     files = sorted(folder.glob("problem-*.npz"), key=lambda file: file.stat().st_mtime, reverse=True)
-    for file in files[KEPT_PROBLEMS:]:
+    for file in files[CACHED_PROBLEMS:]:
         file.unlink(missing_ok=True)
