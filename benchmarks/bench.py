@@ -226,7 +226,7 @@ def bench_perceive(
     states = [(jax.random.key(seed), world) for seed, world in enumerate(worlds)]
 
     def perceive(key: Array, world: World) -> Superquadrics:
-        return see(key, Snapshot(camera, shelf, world)).scene
+        return see(key, Snapshot(camera, shelf, world)).objects
 
     function, calls = perceive, states
     if batch > 1:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
 
+from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.observation import target_pixels
-from mechsearch_jax.envs.simulator import NativeSimulator
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.graspability import GraspConfig, grasp_tables
@@ -118,7 +118,7 @@ class ScenarioGenerator:
         self.config = config or GeneratorConfig()
         self._shelf = shelf or Shelf()
         self._camera = camera or Camera()
-        self._simulator = NativeSimulator(self._shelf, self._camera)
+        self._simulator = NativeWorld(self._shelf, self._camera)
         poses = self.target.candidate_poses(self._shelf).astype(float)
         if graspable is None:
             allowed = graspable_alone(self._shelf, self.target)

@@ -34,7 +34,8 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.actions import Action, ActionKind, no_action
 from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.envs import model as models
-from mechsearch_jax.envs.mjx_simulator import WAIT, Failure, MjxConfig, MjxSimulator, Overflow
+from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
+from mechsearch_jax.envs.outcome import Failure, Overflow
 from mechsearch_jax.envs.pushes import push_simulation, toppled
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, controls
 from mechsearch_jax.envs.world import BODIES, BOX, CYLINDER, World, bodies_of
@@ -223,12 +224,12 @@ def _batched(shelf: Shelf, config: MjxConfig) -> Callable[[World, Action], Simul
 
     @jax.custom_batching.custom_vmap
     def simulate(world: World, action: Action) -> Simulated:
-        rested, waited = simulator.simulate(world, action.replace(kind=jnp.full_like(action.kind, WAIT)))
+        rested, waited = simulator.simulate(world, None)
         loose = _differ(_poses(world), _poses(rested), LOOSE, LOOSE_TURN).any(axis=-1)
         world = jax.tree.map(lambda a, b: jnp.where(loose.reshape(-1, *[1] * (a.ndim - 1)), a, b), rested, world)
-        after, outcomes = simulator.simulate(world, action)
-        failed = (waited.failure != Failure.NONE) | (outcomes.failure != Failure.NONE)
-        failed |= (waited.overflow | outcomes.overflow) != Overflow.NONE
+        after, pushed = simulator.simulate(world, action)
+        failed = (waited.failure != Failure.NONE) | (pushed.failure != Failure.NONE)
+        failed |= (waited.overflow | pushed.overflow) != Overflow.NONE
         return Simulated(_poses(world), _poses(after), failed)
 
     @simulate.def_vmap

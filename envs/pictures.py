@@ -78,7 +78,7 @@ def inspect_scenario(
       seed: of the recogniser's random numbers.
     """
     snapshot = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))
-    scene = recogniser(jax.random.key(seed), snapshot).scene
+    scene = recogniser(jax.random.key(seed), snapshot).objects
     belief = planner.initial_belief(problem)
     belief = planner.observe_belief(problem, belief, scene, jnp.array(False), jnp.zeros(3), config)
     maps = Maps(

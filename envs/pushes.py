@@ -2,7 +2,7 @@
 
 A few pushes follow each other in a world before it is drawn anew, so that scenes drift into what physics makes of them:
 objects that touch, lean on walls, or lie. Worlds are simulated all at once, by `MjxSimulator` on a GPU or by
-`NativeWorlds` on a CPU.
+`NativeSimulator` on a CPU.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import math
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import flax.struct
 import jax
@@ -25,8 +25,8 @@ from jaxtyping import Array, Bool, Key
 
 from mechsearch_jax.actions import Action, ActionConfig, ActionKind, ActionTables, action_tables
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT
-from mechsearch_jax.envs.mjx_simulator import Failure, Outcomes
-from mechsearch_jax.envs.simulator import SimulatorConfig
+from mechsearch_jax.envs.outcome import Failure
+from mechsearch_jax.envs.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import CYLINDER, TARGET, World, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import replacing
@@ -118,20 +118,6 @@ class Pushes(flax.struct.PyTreeNode):
         """Whether the target was touched."""
         shift = jnp.abs(self.after.position[:, TARGET] - self.before.position[:, TARGET])
         return self.before.valid[:, TARGET] & (jnp.max(shift, axis=-1) > TOUCHED)
-
-
-class Worlds(Protocol):
-    """Simulates many worlds: `MjxSimulator`, `NativeWorlds`."""
-
-    world: World | None
-
-    def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
-        """Take over the state of all worlds, or of some."""
-        ...
-
-    def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcomes:
-        """Execute an action in every active world."""
-        ...
 
 
 def push_simulation() -> SimulatorConfig:
@@ -271,7 +257,7 @@ def generate_pushes(
     key: Key[Array, ""],
     worlds: int,
     rounds: int,
-    simulator: Worlds,
+    simulator: Simulator,
     draw_world: Callable[[Array], World],
     config: PushesConfig | None = None,
     shelf: Shelf | None = None,
@@ -280,7 +266,7 @@ def generate_pushes(
     """Push in many worlds, several times one after the other.
 
     Args:
-      key: PRNG key; with `NativeWorlds` the same key gives the same pushes.
+      key: PRNG key; with `NativeSimulator` the same key gives the same pushes.
       worlds: how many at once; each is a lane of its own.
       rounds: how many pushes follow each other, less those of which none was possible.
       simulator: simulates them.
@@ -312,14 +298,14 @@ def generate_pushes(
         assert before is not None
         before = jax.tree.map(jnp.copy, before)
         action, possible = draw(jax.random.split(push_key, worlds), before)
-        outcomes = simulator.execute(action, possible)
+        outcome = simulator.execute(action, possible)
         after = simulator.world
         assert after is not None
-        fallen = outcomes.fallen & before.valid
+        fallen = outcome.fallen & before.valid
         over = fell_over(before, after) | fallen
-        sound = np.asarray(possible & (outcomes.failure == int(Failure.NONE)) & (outcomes.overflow == 0))
+        sound = np.asarray(possible & (outcome.failure == int(Failure.NONE)) & (outcome.overflow == 0))
         # What is stopped in its fall would go on falling in the next push.
-        lost = np.asarray(jnp.any(fallen, axis=1) | ~outcomes.settled) | ~sound
+        lost = np.asarray(jnp.any(fallen, axis=1) | ~outcome.settled) | ~sound
         chance = np.where(np.asarray(jnp.any(over, axis=1)), config.renewed_toppled, config.renewed)
         renew = lost | (np.asarray(jax.random.uniform(renew_key, (worlds,))) < chance)
         pushes = Pushes(
@@ -413,7 +399,7 @@ def _drawn_from(config: PushesConfig) -> dict[str, Any]:
 def portions(
     generation: Generation,
     folder: Path,
-    make_simulator: Callable[[], Worlds],
+    make_simulator: Callable[[], Simulator],
     draw_world: Callable[[Array], World],
     source: str = "",
     config: PushesConfig | None = None,
@@ -434,7 +420,7 @@ def portions(
       InputError: what lies in the folder is damaged or was made otherwise, or the folder cannot be written.
     """
     config = config or PushesConfig()
-    simulator: Worlds | None = None
+    simulator: Simulator | None = None
     count = number = 0
     while count < generation.pushes:
         path = folder / f"pushes-{number:03d}.npz"
@@ -466,19 +452,19 @@ def portions(
 
 def engine_name(gpu: bool) -> str:
     """The name of what `engine` returns."""
-    return "MjxSimulator" if gpu else "NativeWorlds"
+    return "MjxSimulator" if gpu else "NativeSimulator"
 
 
-def engine(gpu: bool, threads: int | None = None) -> Worlds:
+def engine(gpu: bool, threads: int | None = None) -> Simulator:
     """The simulator of pushes for a machine with or without a GPU.
 
     Raises:
       InputError: the batch simulator needs Warp, which cannot be imported.
     """
     if not gpu:
-        from mechsearch_jax.envs.native_worlds import NativeWorlds
+        from mechsearch_jax.envs.native import NativeSimulator
 
-        return NativeWorlds(threads, push_simulation())
+        return NativeSimulator(threads, push_simulation())
     from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
 
     return MjxSimulator(config=MjxConfig(simulator=push_simulation()))

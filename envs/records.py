@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from mechsearch_jax.actions import Action, ActionKind
+from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
-
-ACTION_NAMES = {ActionKind.NONE: "none", ActionKind.PUSH: "push", ActionKind.PICK_AND_PLACE: "pick-and-place"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,8 +20,8 @@ class ActionRecord:
     """An action as a file keeps it; fields as in `mechsearch_jax.actions.Action`.
 
     Attributes:
-      kind: "push", "pick-and-place", "retrieve" or "none".
-      object: index of the object in the scenario; None for a retrieval, which takes the target, and for "none".
+      kind: name of a registered kind: "push", "pick-and-place", "retrieve", "none", ...
+      object: index of the object in the scenario; None where the action moves none, for example for a retrieval.
       T_world_gripper, T_world_place: rows of the 4 x 4 poses [m].
       displacement: [m].
       q7: [rad].
@@ -40,11 +38,15 @@ class ActionRecord:
 
 
 def record_action(action: Action) -> ActionRecord:
-    """A single action, as a file keeps it."""
-    kind = ActionKind(int(action.kind))
+    """A single action, as a file keeps it.
+
+    Raises:
+      InputError: its kind is unknown.
+    """
+    kind = kind_of(int(action.kind))
     return ActionRecord(
-        kind=ACTION_NAMES[kind],
-        object=None if kind is ActionKind.NONE else int(action.object),
+        kind=kind.name,
+        object=int(action.object) if kind.moves_object else None,
         T_world_gripper=np.asarray(action.T_world_gripper).tolist(),
         displacement=np.asarray(action.displacement).tolist(),
         T_world_place=np.asarray(action.T_world_place).tolist(),

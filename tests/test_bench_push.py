@@ -16,7 +16,7 @@ from mechsearch_jax.benchmarks import bench, push, tables
 from mechsearch_jax.benchmarks.push import Bench, Measured, held_out_generation, nudged, repeated
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.native_worlds import NativeWorlds
+from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.push import PushConfig, PushNetwork
@@ -29,7 +29,7 @@ GENERATION = held_out_generation(pushes=5, worlds=8, rounds=1)
 
 
 def simulator():
-    return NativeWorlds(2, generator.push_simulation())
+    return NativeSimulator(2, generator.push_simulation())
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +189,7 @@ def test_scores_are_written_with_how_they_came_about(measured, weights, tmp_path
     value = json.loads((tmp_path / "new" / "push.json").read_text())
     assert value["models"] == measured.scores
     assert value["settings"]["generation"] == dataclasses.asdict(GENERATION)
-    assert value["settings"]["simulator"] == "NativeWorlds"
+    assert value["settings"]["simulator"] == "NativeSimulator"
     assert value["weights"]["sha256"] == hashlib.sha256(weights.read_bytes()).hexdigest()
     assert value["weights"]["parameters"] == json.loads(weights.with_suffix(".json").read_text())["parameters"]
     assert "device" in value["versions"]

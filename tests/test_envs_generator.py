@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs import generator, observation, world
 from mechsearch_jax.envs.generator import BOXES, CYLINDERS, GeneratorConfig, ScenarioGenerator, outline, separation
-from mechsearch_jax.envs.simulator import NativeSimulator
+from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, format_scenario, parse_scenario
@@ -50,7 +50,7 @@ def check(scene, objects, target, allowed):
     placed = np.array([*scene.target.position[:2], yaw])
     assert np.abs(allowed - placed).max(axis=1).min() < 1e-4
 
-    simulator = NativeSimulator()
+    simulator = NativeWorld()
     simulator.reset(scene)
     outcome = simulator.settle()
     assert outcome.settled

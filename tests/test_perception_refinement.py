@@ -10,12 +10,11 @@ from published import published_scenarios
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs import observation, world
-from mechsearch_jax.envs.recognisers import measured_depth
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import BOX_EXPONENTS, CYLINDER_EXPONENTS, sample_surface
 from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
 from mechsearch_jax.perception import refinement, scores
-from mechsearch_jax.perception.noise import TimeOfFlight
+from mechsearch_jax.perception.noise import TimeOfFlight, measured_depth
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.workspace.camera import Camera, back_project, pixel_rays, project
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario

@@ -15,9 +15,9 @@ from mechsearch_jax.dynamics import named as push_models
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs import physics_push
 from mechsearch_jax.envs import push_models as all_push_models
+from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.physics_push import STILL, MjxPhysics, NativePhysics
 from mechsearch_jax.envs.pushes import push_simulation
-from mechsearch_jax.envs.simulator import NativeSimulator
 from mechsearch_jax.envs.world import BOX, CYLINDER, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
@@ -73,11 +73,11 @@ def outcome():
 def test_a_push_ends_where_the_simulator_ends_it(outcome):
     assert (outcome.residual == 0).all()
     assert (outcome.topples == 0).all()
-    simulator = NativeSimulator(config=push_simulation())
+    simulator = NativeWorld(config=push_simulation())
     for row in range(4):
         simulator.load(from_scenario(START))
         action = jax.tree.map(lambda a, row=row: a[row], PUSHES)
-        assert simulator.execute(action).failure is None
+        assert simulator.execute(action).reason() is None
         gap = np.linalg.norm(outcome.scene.position[row] - simulator.world.position, axis=1)
         moved = np.linalg.norm(outcome.scene.position[row] - SCENE.position, axis=1)
         assert moved[0] > 0.5 * float(action.displacement[1])

@@ -84,7 +84,7 @@ def parameters(config=CONFIG):
 
 @functools.partial(jax.jit, static_argnames=("shelf", "config"))
 def answer(weights, points, scene, T, displacement, shelf, config):
-    return push.told_by(PushNetwork(config), weights, push_start(shelf, scene, points, T, displacement))
+    return push.apply_network(PushNetwork(config), weights, push_start(shelf, scene, points, T, displacement))
 
 
 def told(scene, T, displacement, shelf=OPEN, config=CONFIG, points=None):
@@ -428,7 +428,7 @@ def test_gradients_are_finite_also_where_things_touch_or_nothing_moves():
     @functools.partial(jax.grad, argnums=(0, 1, 2, 3))
     def gradient(position, T, displacement, weights):
         start = push_start(SHELF, aligned.replace(position=position), points, T, displacement)
-        found = push.told_by(PushNetwork(CONFIG), weights, start)
+        found = push.apply_network(PushNetwork(CONFIG), weights, start)
         return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(found))
 
     # High above, nothing of the gripper is level with the objects, though it is deep inside their footprints.

@@ -15,7 +15,7 @@ from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.benchmarks.push import repeated
 from mechsearch_jax.dynamics import push_model
 from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.native_worlds import NativeWorlds
+from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
 from mechsearch_jax.envs.world import BOX, CYLINDER, TARGET, World, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
@@ -40,7 +40,7 @@ WORLDS = 8
 
 def simulated(seed, rounds):
     # As many worlds everywhere, so that everything is compiled once.
-    simulator = NativeWorlds(2, generator.push_simulation())
+    simulator = NativeSimulator(2, generator.push_simulation())
     return generate_pushes(jax.random.key(seed), WORLDS, rounds, simulator, DRAW_WORLD)
 
 
@@ -217,7 +217,7 @@ def test_a_world_is_simulated_as_its_scenario_is():
         (Body("box", (0.054, 0.025, 0.054), (0.55, 0.1, SHELF.board + 0.054), turn),),
         Body("cylinder", (0.02, 0.02, 0.05), (0.65, 0.25, SHELF.board + 0.05), (1.0, 0.0, 0.0, 0.0)),
     )
-    simulator = NativeWorlds(1)
+    simulator = NativeSimulator(1)
     world = simulator.load(jax.tree.map(lambda a: a[None], from_scenario(scenario)))
     assert np.asarray(world.valid).sum() == 2
     bodies = bodies_of(from_scenario(scenario))
@@ -235,7 +235,7 @@ def test_pushes_are_made_once_and_read_again(tmp_path):
     generation = Generation(seed=1, pushes=3, worlds=WORLDS, rounds=1)
     counts = []
     made = list(
-        generator.portions(generation, tmp_path, lambda: NativeWorlds(2), DRAW_WORLD, "here", CONFIG, counts.append)
+        generator.portions(generation, tmp_path, lambda: NativeSimulator(2), DRAW_WORLD, "here", CONFIG, counts.append)
     )
 
     def simulate():
@@ -330,7 +330,7 @@ def test_what_is_left_out_of_a_push_had_no_part_in_it(pushes):
     there = np.asarray(kept.valid & truth.moved & ~truth.toppled)[some]
 
     def agreement(again):
-        outcome = repeated(again, NativeWorlds(2, generator.push_simulation()), WORLDS)
+        outcome = repeated(again, NativeSimulator(2, generator.push_simulation()), WORLDS)
         gap = np.linalg.norm((outcome.scene.position - pushes.after.position[some])[..., :2], axis=-1)[there]
         return np.median(gap), np.mean(gap < 5e-3)
 

@@ -298,9 +298,9 @@ def test_recognition_does_not_mind_the_order_of_the_points():
     task, (_, _, examples) = some_segments()
     segments = jax.tree.map(lambda a: a[0], examples.segments)
     order = jax.random.permutation(jax.random.key(0), task.segments.points)
-    told_by = jax.jit(functools.partial(model.told_by, model.RecognitionNetwork(RECOGNITION)))
-    told = told_by(parameters("recognition"), segments.points, segments.mark, segments.camera)
-    again = told_by(parameters("recognition"), segments.points[:, order], segments.mark[:, order], segments.camera)
+    network = jax.jit(functools.partial(model.apply_network, model.RecognitionNetwork(RECOGNITION)))
+    told = network(parameters("recognition"), segments.points, segments.mark, segments.camera)
+    again = network(parameters("recognition"), segments.points[:, order], segments.mark[:, order], segments.camera)
     for a, b in zip(jax.tree.leaves(told), jax.tree.leaves(again), strict=True):
         assert np.allclose(a, b, atol=1e-4)
     assert (np.asarray(told.size) > 0).all()

@@ -11,7 +11,7 @@ import pytest
 from mechsearch_jax.envs.generator import outline, separation
 from mechsearch_jax.envs.world import CYLINDER, TARGET
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.perception.cloud import above_board, cloud_of, draw, remove_shelf, resample, shelf_view, view
+from mechsearch_jax.perception.cloud import above_board, cloud_of, draw, resample, shelf_view, view
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.noise import RandomDirection, TimeOfFlight, no_noise
 from mechsearch_jax.train import scenes
@@ -173,7 +173,8 @@ def test_drawing_takes_true_elements_evenly():
 
 def test_the_cloud_is_the_image_without_the_shelf():
     _, seen = clean()
-    cloud = remove_shelf(cloud_of(jnp.asarray(seen.points[0])), SHELF)
+    points = jnp.asarray(seen.points[0])
+    cloud = cloud_of(jnp.where(above_board(SHELF, points)[..., None], points, jnp.nan))
     labels = seen.labels[0].reshape(-1)
     assert (np.asarray(cloud.valid) == (labels >= 0)).all()
     sample = resample(jax.random.key(0), cloud)

@@ -32,9 +32,9 @@ from mechsearch_jax.networks.push import (
     PushMotion,
     PushNetwork,
     PushStart,
+    apply_network,
     push_start,
     pusher_distance,
-    told_by,
 )
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.train.scenes import SceneConfig, origin, random_world
@@ -263,7 +263,7 @@ class PushTask:
 
     def loss(self, parameters: Any, examples: PushExample) -> tuple[Float[Array, ""], dict[str, Any]]:
         network = PushNetwork(self.network, self.precision)
-        told = jax.vmap(functools.partial(told_by, network, parameters))(examples.start)
+        told = jax.vmap(functools.partial(apply_network, network, parameters))(examples.start)
         terms = example_loss(told, examples.truth)
         loss = sum((weight * terms[name] for name, weight in LOSS_WEIGHTS.items()), jnp.zeros(()))
         return loss, terms

@@ -25,7 +25,7 @@ from mechsearch_jax.networks.recognition import (
     Hypotheses,
     RecognitionConfig,
     RecognitionNetwork,
-    told_by,
+    apply_network,
 )
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.perception.cloud import View, shelf_view
@@ -228,7 +228,7 @@ class RecognitionTask:
     def loss(self, parameters: Any, examples: Example) -> tuple[Float[Array, ""], dict[str, Any]]:
         segments = examples.segments
         network = RecognitionNetwork(self.network, self.precision)
-        told = told_by(network, parameters, segments.points, segments.mark, segments.camera)
+        told = apply_network(network, parameters, segments.points, segments.mark, segments.camera)
         terms = jax.vmap(example_loss)(told, examples.truth)
         total = jnp.maximum(jnp.sum(examples.weight), 1.0)
         means = jax.tree.map(lambda a: jnp.sum(a * examples.weight) / total, terms)
@@ -317,7 +317,7 @@ class _Scored(flax.struct.PyTreeNode):
 def _score_batch(task: RecognitionTask, parameters: Any, key: Array, batch: int) -> _Scored:
     worlds, seen, examples = jax.vmap(task.scene)(jax.random.split(key, batch))
     flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), examples.segments)
-    told = told_by(RecognitionNetwork(task.network), parameters, flat.points, flat.mark, flat.camera)
+    told = apply_network(RecognitionNetwork(task.network), parameters, flat.points, flat.mark, flat.camera)
     found = jax.tree.map(lambda a: a.reshape(batch, TARGET, *a.shape[1:]), best_hypothesis(told, flat))
     truth = sharpened(true_superquadrics(worlds))
     return _Scored(

@@ -17,7 +17,7 @@ from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.dynamics.rigid import rigid_motion
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.networks.push import PushNetwork, push_start, told_by
+from mechsearch_jax.networks.push import PushNetwork, apply_network, push_start
 from mechsearch_jax.networks.weights import Weights, load_weights
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -94,7 +94,7 @@ def predicted(
 ) -> PushOutcome:
     """What a network predicts of a push; see `LearnedPush` and `dynamics.PushModel` for the arguments."""
     start = push_start(shelf, scene, pusher, T_world_gripper, displacement)
-    told = told_by(network, parameters, start)
+    told = apply_network(network, parameters, start)
     moves = scene.valid & (jax.nn.sigmoid(told.moves) > likely)
     before = start.prints
     prints = before.replace(

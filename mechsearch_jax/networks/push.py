@@ -625,7 +625,7 @@ class PushTrunk(nn.Module):
 
 
 class PushNetwork(nn.Module):
-    """See the module's text. With the order of the objects, that of what is said of them changes, and nothing else."""
+    """Permutation-equivariant over objects: reordering them reorders the motions. See the module's text."""
 
     config: PushConfig = PushConfig()
     dtype: Any = jnp.float32
@@ -647,6 +647,6 @@ class PushNetwork(nn.Module):
         )
 
 
-def told_by(network: PushNetwork, parameters: Any, start: PushStart) -> PushMotion:
-    """What the network with these parameters says of a push."""
+def apply_network(network: PushNetwork, parameters: Any, start: PushStart) -> PushMotion:
+    """The network's forward pass: the predicted motion of every object in a push."""
     return cast(PushMotion, network.apply({"params": parameters}, start))

@@ -153,9 +153,9 @@ def decode(outputs: Float[Array, "*batch k o"], logit: Float[Array, "*batch k"])
 
 
 class RecognitionNetwork(nn.Module):
-    """Attention among a segment's points and one token that stands for the whole; see the module's text.
+    """Self-attention among a segment's points and one summary token; see the module's text.
 
-    The order of the points means nothing to it.
+    Permutation-invariant over a segment's points, and independent between segments.
     """
 
     config: RecognitionConfig = RecognitionConfig()
@@ -192,12 +192,19 @@ class RecognitionNetwork(nn.Module):
         return decode(outputs.reshape(-1, HYPOTHESES, OUTPUTS + UNCERTAIN), logit)
 
 
-def told_by(
+def apply_network(
     network: RecognitionNetwork,
     parameters: Any,
     points: Float[Array, "s p 3"],
     mark: Int[Array, "s p"],
     camera: Float[Array, "s 3"],
 ) -> Hypotheses:
-    """What the network with these parameters says of segments."""
+    """The network's forward pass: the hypotheses of a batch of segments, in the segments' frames.
+
+    Args:
+      network, parameters: the network and its Flax parameters.
+      points: of each segment, in its frame [m].
+      mark: their fourth channel, see `perception.segments`.
+      camera: the camera's position in that frame [m].
+    """
     return cast(Hypotheses, network.apply({"params": parameters}, points, mark, camera))

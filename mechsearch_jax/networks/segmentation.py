@@ -57,7 +57,7 @@ class SegmentationConfig:
 
 
 class SegmentationOutput(flax.struct.PyTreeNode):
-    """What the network says of a cloud's points.
+    """The network's output for the points of a cloud.
 
     Attributes:
       logits: for each layer, of the probability that a point is of each of nine instances, or (last) of none, shape
@@ -200,7 +200,7 @@ class EdgeConvolution(nn.Module):
 
 
 class SegmentationNetwork(nn.Module):
-    """See the module's text. With the order of the points, that of what is said of them changes, and nothing else."""
+    """Permutation-equivariant over the points: reordering them reorders the output. See the module's text."""
 
     config: SegmentationConfig = SegmentationConfig()
     dtype: Any = jnp.float32
@@ -237,6 +237,8 @@ class SegmentationNetwork(nn.Module):
         return SegmentationOutput(jnp.stack(logits), centres)
 
 
-def told_by(network: SegmentationNetwork, parameters: Any, points: Float[Array, "batch p 3"]) -> SegmentationOutput:
-    """What the network with these parameters says of clouds."""
+def apply_network(
+    network: SegmentationNetwork, parameters: Any, points: Float[Array, "batch p 3"]
+) -> SegmentationOutput:
+    """The network's forward pass: logits and centres of the points of a batch of clouds in the world [m]."""
     return cast(SegmentationOutput, network.apply({"params": parameters}, points))

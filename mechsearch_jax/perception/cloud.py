@@ -124,11 +124,6 @@ def above_board(shelf: Shelf, points: Float[Array, "*batch 3"], margin: float = 
     return deep & wide & (z > shelf.board + margin) & (z < shelf.ceiling - margin)
 
 
-def remove_shelf(cloud: PointCloud, shelf: Shelf, margin: float = MARGIN) -> PointCloud:
-    """The cloud without the points on the shelf, or outside it."""
-    return cloud.replace(valid=cloud.valid & above_board(shelf, cloud.points, margin))
-
-
 def draw(key: Key[Array, ""], chosen: Bool[Array, " p"], count: int) -> tuple[Int[Array, " count"], Int[Array, ""]]:
     """Random indices of true elements, in rising order and spread evenly: each of `count` equal shares gives one.
 
