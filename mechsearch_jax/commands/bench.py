@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from mechsearch_jax.commands.options import DEFAULTS, JsonFile, Options, PushModel, WeightsFile, at_least_one
+from mechsearch_jax.commands.options import (
+    DEFAULTS,
+    EpisodeOptions,
+    JsonFile,
+    OneMethod,
+    OnePolicy,
+    PushModel,
+    WeightsFile,
+    at_least_one,
+    chosen_policies,
+)
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,8 +50,8 @@ def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing])
         save_timing(timing, out)
 
 
-def _timing_of(subject: Literal["existence", "graspability", "plan"], what: str) -> Callable[..., None]:
-    """The command that times one part of the planner."""
+def _timing_of(subject: Literal["existence", "graspability"], what: str) -> Callable[..., None]:
+    """The command that times a part of the planner that no policy matters to."""
 
     def command(
         *,
@@ -49,13 +59,9 @@ def _timing_of(subject: Literal["existence", "graspability", "plan"], what: str)
         batch: int = 1,
         repeats: int = 10,
         out: JsonFile = None,
-        options: Options = DEFAULTS,
+        options: EpisodeOptions = DEFAULTS,
     ) -> None:
-        from mechsearch_jax.benchmarks.bench import bench
-
-        at_least_one(f"bench {subject}", repeats=repeats, batch=batch)
-        config = options.config("search-for-grasp")
-        _print_timing(subject, out, lambda: bench(subject, objects, config, batch=batch, repeats=repeats))
+        _time_planner(subject, options, chosen_policies(subject, None, None), objects, batch, repeats, out)
 
     command.__name__ = subject
     command.__doc__ = f"""Time {what}: compilation, median and spread.
@@ -68,6 +74,47 @@ def _timing_of(subject: Literal["existence", "graspability", "plan"], what: str)
       options: how the planner decides.
     """
     return command
+
+
+def bench_plan(
+    *,
+    method: OneMethod = None,
+    policy: OnePolicy = None,
+    objects: int = 8,
+    batch: int = 1,
+    repeats: int = 10,
+    out: JsonFile = None,
+    options: EpisodeOptions = DEFAULTS,
+) -> None:
+    """Time a whole decision: compilation, median and spread.
+
+    Args:
+      method: how it is decided; "search-for-grasp" by default.
+      policy: instead of a method, the name of a policy ("random" is one more), or the import path of another.
+      objects: number of objects in a scene.
+      batch: how many scenes at once.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+      options: how the planner decides.
+    """
+    chosen = chosen_policies("bench plan", method and (method,), policy and (policy,))
+    _time_planner("plan", options, chosen, objects, batch, repeats, out)
+
+
+def _time_planner(
+    subject: Literal["existence", "graspability", "plan"],
+    options: EpisodeOptions,
+    policies: Sequence[str],
+    objects: int,
+    batch: int,
+    repeats: int,
+    out: Path | None,
+) -> None:
+    from mechsearch_jax.benchmarks.bench import bench
+
+    at_least_one(f"bench {subject}", repeats=repeats, batch=batch)
+    (method,) = options.methods(policies)
+    _print_timing(subject, out, lambda: bench(subject, objects, method, batch=batch, repeats=repeats))
 
 
 def bench_perceive(
@@ -183,7 +230,7 @@ def bench_roofline(
 COMMANDS = {
     "existence": _timing_of("existence", "f"),
     "graspability": _timing_of("graspability", "g where f = 1"),
-    "plan": _timing_of("plan", "a whole decision"),
+    "plan": bench_plan,
     "predict": bench_predict,
     "perceive": bench_perceive,
     "simulate": bench_simulate,

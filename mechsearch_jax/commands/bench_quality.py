@@ -34,9 +34,9 @@ def bench_agreement(
 
     from mechsearch_jax.benchmarks.agreement import agreement, draw_actions, generated_scenes, save_agreement
     from mechsearch_jax.benchmarks.tables import agreement_table
-    from mechsearch_jax.cache import keep_compilations
     from mechsearch_jax.envs.mjx_simulator import import_mjx
     from mechsearch_jax.files import check_writable
+    from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import load_scenario
 
     at_least_one("bench agreement", actions=actions, scenes=scenes)
@@ -222,8 +222,8 @@ def bench_push(
 
     from mechsearch_jax.benchmarks import push
     from mechsearch_jax.benchmarks.tables import push_scores_tables
-    from mechsearch_jax.cache import keep_compilations
     from mechsearch_jax.files import check_writable
+    from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.train.run import counting
 
     worlds = (64 if jax.default_backend() == "cpu" else 512) if worlds is None else worlds

@@ -10,10 +10,11 @@ import tyro
 
 from mechsearch_jax.commands.options import (
     DEFAULTS,
-    Method,
-    Options,
+    EpisodeOptions,
+    PaperMethod,
     Scenarios,
     at_least_one,
+    chosen_policies,
     find_scenarios,
     has_gpu,
 )
@@ -25,11 +26,12 @@ def evaluate(
     /,
     *,
     out: Path,
-    method: tuple[Method, ...] = ("search-for-grasp",),
+    method: tuple[PaperMethod, ...] = (),
+    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE ...")] = (),
     seed: tuple[int, ...] = (0,),
     workers: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     batch: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
-    options: Options = DEFAULTS,
+    options: EpisodeOptions = DEFAULTS,
 ) -> None:
     """Run many episodes; killed and started again, it goes on where it stopped.
 
@@ -38,7 +40,8 @@ def evaluate(
     Args:
       scenarios: scenario files, folders of them, or names of shipped ones.
       out: Parquet file with one row for each episode; rows that it already holds are not run again.
-      method: one or more.
+      method: one or more; search-for-grasp by default.
+      policy: instead of methods, names of policies ("random" is one more), or import paths of others, one or more.
       seed: one or more.
       workers: number of processes, which use the CPU; by default one for each core, where there is no GPU.
       batch: number of episodes that run at the same time in this process; by default, on a GPU, what its memory holds.
@@ -50,8 +53,9 @@ def evaluate(
     from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
     from mechsearch_jax.benchmarks.processes import Processes
     from mechsearch_jax.benchmarks.tables import EpisodeProgress, rates_table
-    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.planner.cache import keep_compilations
 
+    policies = chosen_policies("evaluate", method, policy)
     at_least_one("evaluate", workers=workers, batch=batch)
     if workers is not None and batch is not None:
         raise InputError("evaluate: give either --workers or --batch, not both")
@@ -59,8 +63,7 @@ def evaluate(
         raise InputError("evaluate: --workers run the native simulator; leave --workers out, or --simulator mjx")
     in_processes = workers is not None or (batch is None and options.simulator != "mjx" and not has_gpu())
     engine = "NativeSimulator" if in_processes else options.engine()
-    configs = [options.config(one) for one in method]
-    jobs = make_jobs(find_scenarios(scenarios), configs, seed, engine, options.recognition)
+    jobs = make_jobs(find_scenarios(scenarios), options.methods(policies, engine), seed)
     console = Console(highlight=False)
     with EpisodeProgress(console, len(jobs)) as progress:
         if in_processes:

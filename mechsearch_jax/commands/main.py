@@ -9,16 +9,19 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
+import inspect
 import io
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, get_type_hints
 
 import tyro
 
 from mechsearch_jax.commands import bench, bench_quality, scenarios, train
 from mechsearch_jax.commands.evaluate import evaluate
-from mechsearch_jax.commands.inspect import inspect
+from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
+from mechsearch_jax.commands.options import with_planner_options
 from mechsearch_jax.commands.report import report
 from mechsearch_jax.commands.search import search
 from mechsearch_jax.errors import InputError
@@ -26,24 +29,23 @@ from mechsearch_jax.errors import InputError
 Commands = Mapping[str, Callable[..., None]]
 
 
-def _group(name: str, description: str) -> Callable[[], None]:
-    """What stands for a group among the commands; `parse` looks into the group before it could be called."""
+def _only_described(description: str | None) -> Callable[[], None]:
+    """A command without arguments that does nothing, for the list of commands."""
 
-    def group() -> None: ...
+    def described() -> None: ...
 
-    group.__name__ = name
-    group.__doc__ = description
-    return group
+    described.__doc__ = description
+    return described
 
 
 COMMANDS: Commands = {
     "search": search,
-    "inspect": inspect,
+    "inspect": inspect_scenarios,
     "evaluate": evaluate,
     "report": report,
-    "scenarios": _group("scenarios", "Generate and check scenario files: mechsearch scenarios generate|check."),
-    "train": _group("train", "Train the networks: mechsearch train segmentation|recognition|push."),
-    "bench": _group("bench", "Measure the parts, one command each."),
+    "scenarios": _only_described("Generate and check scenario files: mechsearch scenarios generate|check."),
+    "train": _only_described("Train the networks: mechsearch train segmentation|recognition|push."),
+    "bench": _only_described("Measure the parts, one command each."),
 }
 GROUPS: Mapping[str, Commands] = {
     "scenarios": scenarios.COMMANDS,
@@ -53,12 +55,20 @@ GROUPS: Mapping[str, Commands] = {
 
 
 def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-    """A function with the same signature that only returns what is to be run."""
+    """A function that takes the command's arguments, with all options if it takes any, and only returns what is to be
+    run."""
 
-    @functools.wraps(command)
-    def parsed(*args, **kwargs):
-        return functools.partial(command, *args, **kwargs)
-
+    # A named function may be wrapped by a checker of annotations, and the parser looks beneath what is wrapped.
+    parsed: Any = lambda *args, **kwargs: functools.partial(command, *args, **kwargs)  # noqa: E731
+    plain = inspect.unwrap(command)
+    hints, signature = get_type_hints(plain, include_extras=True), inspect.signature(plain)
+    parameters = dict(signature.parameters)
+    if "options" in hints:
+        options = with_planner_options()
+        hints["options"] = Annotated[options, tyro.conf.arg(name="")]
+        parameters["options"] = parameters["options"].replace(default=options())
+    parsed.__name__, parsed.__doc__, parsed.__annotations__ = command.__name__, command.__doc__, hints
+    parsed.__signature__ = signature.replace(parameters=list(parameters.values()))
     return parsed
 
 
@@ -87,14 +97,17 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     program = f"mechsearch {group}" if group else "mechsearch"
     commands = GROUPS[group] if group else COMMANDS
     description = COMMANDS[group].__doc__ if group else "Find a hidden object on a cluttered shelf and take it out."
+    rest = list(arguments[1:] if group else arguments)
+    asked = rest[0] if rest else None
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
             return tyro.extras.subcommand_cli_from_dict(
-                {name: _deferred(command) for name, command in commands.items()},
+                # What options there are takes long to find out, and is of no use to other commands.
+                {n: _deferred(c) if n == asked else _only_described(c.__doc__) for n, c in commands.items()},
                 prog=program,
                 description=description,
-                args=list(arguments[1:] if group else arguments),
+                args=rest,
             )
     except SystemExit as end:
         if not end.code:

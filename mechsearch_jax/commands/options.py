@@ -3,95 +3,71 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
-    from mechsearch_jax.planner import PlannerConfig
+    from mechsearch_jax.envs.method import EngineName, Method
+    from mechsearch_jax.planner import Config, Option
 
-Method = Literal["search-for-grasp", "search-and-grasp"]
-Actions = Literal["both", "push", "pick-and-place"]
-Recognition = Literal["oracle", "masks", "full"]
+PaperMethod = Literal["search-for-grasp", "search-and-grasp"]
 PushModel = Literal["quasi-static", "learned", "physics"]
 TargetShape = Literal["cylinder", "box"]
 
 
 @dataclasses.dataclass(frozen=True)
-class PlannerOptions:
-    """How the planner decides. What is not given is the preset's.
+class EpisodeOptions:
+    """What episodes run with. `with_planner_options` adds the preset and all of the planner's options.
 
     Attributes:
-      preset: where settings come from that are not given; "best" stands for the best known ones, which so far are
-        the same as "paper".
-      gamma: discount of later actions, above 0 and at most 1; the paper's is 0.9.
-      horizon: actions in a sequence; the paper's is 3.
-      sequences: sequences that are sampled for a decision; 30 by default.
-      actions: which actions are used; both by default.
-      criterion: what makes a target visible; "detector", the default, counts pixels as the detector does.
-      focus: share of the sampled actions that go to objects by how much they hide or are in the way, 0.7 by default;
-        0 is the paper's even draw.
-      push_model: what predicts pushes: "learned", the default, by a network, "quasi-static" by geometry, "physics" by
-        simulating them, on a CPU only those that come first.
-      topple_charge: what a push costs, as a share of the cost J, times how many objects are expected to fall over; 0 by
-        default. One after which an object falls with more than 0.5 is never made.
-      max_steps: actions in an episode; 10 by default.
       recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses; the others see
         a noisy depth image, "masks" with the true segmentation, "full" without.
       simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
         batches where there is a GPU.
     """
 
-    preset: Literal["paper", "best"] = "paper"
-    gamma: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    horizon: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    sequences: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    actions: Annotated[Actions | None, tyro.conf.arg(metavar="{both,push,pick-and-place}")] = None
-    criterion: Annotated[
-        Literal["detector", "depth-mse", "depth-norm"] | None,
-        tyro.conf.arg(metavar="{detector,depth-mse,depth-norm}"),
-    ] = None
-    focus: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    push_model: Annotated[PushModel | None, tyro.conf.arg(metavar="{quasi-static,learned,physics}")] = None
-    topple_charge: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    max_steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    recognition: Recognition = "oracle"
+    recognition: Literal["oracle", "masks", "full"] = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
 
-    def config(self, method: Method) -> PlannerConfig:
-        """The planner's configuration: the preset's, with what is given in its place.
+    def config(self) -> Config:
+        """The preset's configuration, with what is given in its place.
 
         Raises:
-          InputError: an option is impossible, or the push model cannot be used.
+          InputError: an option is impossible.
         """
-        from mechsearch_jax.envs.push_models import push_models
-        from mechsearch_jax.planner import PlannerConfig
+        from mechsearch_jax.planner import OPTIONS, PRESETS
 
-        presets = {"paper": PlannerConfig.paper, "best": PlannerConfig.paper}
-        names = (
-            "gamma",
-            "horizon",
-            "sequences",
-            "actions",
-            "criterion",
-            "focus",
-            "push_model",
-            "topple_charge",
-            "max_steps",
-        )
-        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        config = presets[self.preset](method=method, **given)
-        # Missing weights are to be told of now, not by every episode.
-        push_models(config.push_model)
-        return config
+        given = {option.name: getattr(self, option.name, None) for option in OPTIONS}
+        preset = PRESETS[getattr(self, "preset", DEFAULT_PRESET)]
+        return preset().with_options(**{name: value for name, value in given.items() if value is not None})
 
-    def engine(self) -> str:
-        """The class of the simulator that runs many episodes.
+    def methods(self, policies: Sequence[str], engine: EngineName = "NativeSimulator") -> list[Method]:
+        """What episodes are run with: one for each policy.
+
+        Raises:
+          InputError: a policy, an option, the push model or the recognition cannot be used; told of now, not by every
+            episode.
+        """
+        from mechsearch_jax.envs.method import Method
+
+        if any(":" in policy for policy in policies) and "" not in sys.path:
+            # As Python itself does for a program that is not installed.
+            sys.path.append("")
+        config = self.config()
+        methods = [Method(policy, config, self.recognition, engine) for policy in policies]
+        for method in methods:
+            method.check()
+        return methods
+
+    def engine(self) -> EngineName:
+        """The simulator that runs many episodes.
 
         Raises:
           InputError: it is not installed.
@@ -122,6 +98,64 @@ class PlannerOptions:
             )
 
 
+DEFAULT_PRESET = "standard"
+# What a command's parameter `options` is until `with_planner_options` knows the rest.
+DEFAULTS = EpisodeOptions()
+
+
+@functools.cache
+def with_planner_options() -> type[EpisodeOptions]:
+    """`EpisodeOptions` with one more field for the preset and for each of the planner's options, None if not given.
+
+    They are those of the configuration, which takes a second to import.
+    """
+    from mechsearch_jax.planner import OPTIONS, PRESETS
+
+    preset = tyro.conf.arg(help="where settings come from that are not given: what is best known, or the paper.")
+    fields: list[tuple[str, Any, Any]] = [("preset", Annotated[Literal[tuple(PRESETS)], preset], DEFAULT_PRESET)]
+    fields += [(option.name, _annotation(option), None) for option in OPTIONS]
+    return dataclasses.make_dataclass("Options", fields, bases=(EpisodeOptions,), frozen=True, kw_only=True)
+
+
+def _annotation(option: Option) -> Any:
+    """The type of a command line's option that may be left out."""
+    kind = Literal[option.choices] if option.choices else option.type
+    shown = "{" + ",".join(option.choices) + "}" if option.choices else _METAVARS.get(option.type)
+    about = tyro.conf.arg(metavar=shown, help=f"{option.help}.", help_behavior_hint=_usual(option))
+    return Annotated[kind | None, about]
+
+
+def _usual(option: Option) -> str:
+    """What an option is where it is not given."""
+    from mechsearch_jax.planner import PRESETS
+
+    values = {name: preset().options()[option.name] for name, preset in PRESETS.items()}
+    said = {name: " ".join(map(str, value)) if isinstance(value, list) else value for name, value in values.items()}
+    if len(set(said.values())) == 1:
+        return f"(default: {said[DEFAULT_PRESET]})"
+    return f"(default: {', '.join(f'{value} in preset {name}' for name, value in said.items())})"
+
+
+_METAVARS: dict[Any, str] = {
+    float: "FLOAT",
+    int: "INT",
+    bool: "{True,False}",
+    tuple[float, ...]: "FLOAT ...",
+    tuple[str, ...]: "NAME ...",
+}
+
+
+def chosen_policies(command: str, method: Sequence[str] | None, policy: Sequence[str] | None) -> Sequence[str]:
+    """The policies that `--policy`, or `--method` for short, name; search-for-grasp where neither is given.
+
+    Raises:
+      InputError: both are given.
+    """
+    if method and policy:
+        raise InputError(f"{command}: give either --method or --policy, not both; --policy takes a method's name too")
+    return method or policy or ("search-for-grasp",)
+
+
 def has_gpu() -> bool:
     """Whether JAX computes on something else than the CPU."""
     import jax
@@ -129,8 +163,8 @@ def has_gpu() -> bool:
     return jax.default_backend() != "cpu"
 
 
-Options = Annotated[PlannerOptions, tyro.conf.arg(name="")]
-DEFAULTS = PlannerOptions()
+OnePolicy = Annotated[str | None, tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE")]
+OneMethod = Annotated[PaperMethod | None, tyro.conf.arg(metavar="{search-for-grasp,search-and-grasp}")]
 Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER ...")]
 
 JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]

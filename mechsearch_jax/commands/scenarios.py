@@ -21,9 +21,9 @@ def generate(*, objects: int, out: Path, count: int = 1, target: TargetShape = "
     """
     from rich.progress import track
 
-    from mechsearch_jax.cache import keep_compilations
     from mechsearch_jax.envs.generator import ScenarioGenerator
     from mechsearch_jax.files import check_writable
+    from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import save_scenario
     from mechsearch_jax.workspace.target import Target
 
