@@ -295,6 +295,16 @@ def test_confidence_intervals_are_wilsons():
     assert wilson(0, 0) == (0.0, 1.0)
 
 
+def test_confidence_intervals_are_those_of_the_formula():
+    z = 1.959963984540054
+    for count in (1, 2, 7, 100):
+        for successes in range(count + 1):
+            share = successes / count
+            middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
+            half = z / (1 + z**2 / count) * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
+            assert wilson(successes, count) == pytest.approx((middle - half, middle + half), abs=1e-12)
+
+
 def test_the_columns_are_those_of_earlier_tables_but_for_names():
     assert SCHEMA.types == OLD_SCHEMA.types
     assert SCHEMA.names == [RENAMED.get(name, name) for name in OLD_SCHEMA.names]
