@@ -17,7 +17,9 @@ from mechsearch_jax.commands.options import (
     PushModel,
     WeightsFile,
     at_least_one,
+    check_files,
     chosen_policies,
+    forget_kept_compilations,
 )
 from mechsearch_jax.errors import InputError
 
@@ -31,17 +33,13 @@ def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing])
     Raises:
       InputError: the file cannot be written, or what `measure` raises.
     """
-    import jax
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.bench import save_timing
     from mechsearch_jax.benchmarks.tables import timing_table
-    from mechsearch_jax.files import check_writable
 
-    if out is not None:
-        check_writable(out.parent)
-    # A compilation that was read from disk would not tell how long compiling takes.
-    jax.config.update("jax_enable_compilation_cache", False)
+    check_files(out)
+    forget_kept_compilations()
     console = Console(highlight=False)
     with console.status(f"timing {subject}"):
         timing = measure()
@@ -193,17 +191,14 @@ def bench_inside(
       repeats: number of timed calls.
       out: JSON file for the result.
     """
-    import jax
     from rich.console import Console
 
     from mechsearch_jax.benchmarks import roofline
     from mechsearch_jax.benchmarks.bench import save_timings
     from mechsearch_jax.benchmarks.tables import timings_table
-    from mechsearch_jax.files import check_writable
 
-    if out is not None:
-        check_writable(out.parent)
-    jax.config.update("jax_enable_compilation_cache", False)
+    check_files(out)
+    forget_kept_compilations()
     console = Console(highlight=False)
     with console.status("timing inside"):
         timings = roofline.bench_inside(placed, objects, points, repeats)

@@ -3,17 +3,41 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
-from mechsearch_jax.commands.options import JsonFile, WeightsFile, at_least_one, find_scenarios
+from mechsearch_jax.commands.options import (
+    JsonFile,
+    SomeScenarios,
+    WeightsFile,
+    at_least_one,
+    check_files,
+    find_scenarios,
+    forget_kept_compilations,
+)
 from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.workspace.scenario import Scenario
+
+
+Noise = Literal["clean", "gaussian", "time-of-flight"]
+Recogniser = Literal["network", "network-refined", "ems", "ems-refined"]
+ComparedModel = Literal["no motion", "quasi-static", "learned", "physics", "nudged"]
+
+
+def _loaded(names: Sequence[str]) -> list[Scenario]:
+    """What files, folders and names of scenarios stand for; none if there are none."""
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    return [load_scenario(file) for file in find_scenarios(names)] if names else []
 
 
 def bench_agreement(
-    scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")] = (),
+    scenarios: SomeScenarios = (),
     /,
     *,
     actions: int = 200,
@@ -35,19 +59,16 @@ def bench_agreement(
     from mechsearch_jax.benchmarks.agreement import agreement, draw_actions, generated_scenes, save_agreement
     from mechsearch_jax.benchmarks.tables import agreement_table
     from mechsearch_jax.envs.mjx_simulator import import_mjx
-    from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
-    from mechsearch_jax.workspace.scenario import load_scenario
 
     at_least_one("bench agreement", actions=actions, scenes=scenes)
-    files = find_scenarios(scenarios) if scenarios else []
-    if out is not None:
-        check_writable(out.parent)
+    given = _loaded(scenarios)
+    check_files(out)
     import_mjx()
     keep_compilations()
     console = Console(highlight=False)
     with console.status("making scenes") as status:
-        where = [load_scenario(file) for file in files] or generated_scenes(scenes, seed)
+        where = given or generated_scenes(scenes, seed)
         status.update("drawing actions")
         cases = draw_actions(where, actions, seed)
         status.update("executing actions")
@@ -58,23 +79,18 @@ def bench_agreement(
 
 
 def bench_recognition(
-    scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")] = (),
+    scenarios: SomeScenarios = (),
     /,
     *,
     scenes: int = 40,
     seed: int = 0,
-    noise: tuple[Literal["clean", "gaussian", "time-of-flight"], ...] = ("clean", "gaussian"),
-    method: tuple[Literal["network", "network-refined", "ems", "ems-refined"], ...] = (
-        "network",
-        "network-refined",
-        "ems",
-        "ems-refined",
-    ),
+    noise: tuple[Noise, ...] = ("clean", "gaussian"),
+    method: tuple[Recogniser, ...] = get_args(Recogniser),
     ems_scenes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     out: JsonFile = None,
     picture: JsonFile = None,
     worst: int = 12,
-    worst_of: Literal["network", "network-refined", "ems", "ems-refined"] = "network-refined",
+    worst_of: Recogniser = "network-refined",
 ) -> None:
     """Compare recognisers, given true masks, with the truth: the network, refinement and the classical EMS.
 
@@ -90,22 +106,17 @@ def bench_recognition(
       worst: how many of them.
       worst_of: which method's.
     """
-    import jax
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import images, recognition
+    from mechsearch_jax.benchmarks import images, recognition, recognition_figure
     from mechsearch_jax.benchmarks.tables import recognition_tables, recognition_times_table
-    from mechsearch_jax.files import check_writable
     from mechsearch_jax.perception.cloud import shelf_view
     from mechsearch_jax.viz.drawing import save_figure
-    from mechsearch_jax.workspace.scenario import load_scenario
     from mechsearch_jax.workspace.shelf import Shelf
 
     at_least_one("bench recognition", worst=worst)
-    for file in (out, picture):
-        if file is not None:
-            check_writable(file.parent)
-    given = images.scenes_of([load_scenario(file) for file in find_scenarios(scenarios)] if scenarios else [])
+    check_files(out, picture)
+    given = images.scenes_of(_loaded(scenarios))
     console = Console(highlight=False)
     with console.status("making scenes") as status:
         methods = recognition.shipped_methods(shelf_view().camera, Shelf())
@@ -118,8 +129,7 @@ def bench_recognition(
         )
         if picture is not None and worst_of not in bench.methods:
             raise InputError(f"bench recognition: --worst-of {worst_of} is not among the methods; add it to --method")
-        # A compilation that was read from disk would not tell how long compiling takes.
-        jax.config.update("jax_enable_compilation_cache", False)
+        forget_kept_compilations()
         total = len(bench.scenes) * len(bench.noises)
         status.update("compiling")
         measured = bench.run(lambda done: status.update(f"recognising {done}/{total}"))
@@ -127,19 +137,19 @@ def bench_recognition(
             recognition.save_recognition(measured, out)
         if picture is not None:
             status.update("drawing")
-            rows = recognition.worst(measured.rows, worst_of, worst)
-            save_figure(recognition.worst_figure(bench, rows), picture)
+            rows = recognition_figure.worst(measured.rows, worst_of, worst)
+            save_figure(recognition_figure.worst_figure(bench, rows), picture)
     console.print(recognition_tables(measured))
     console.print(recognition_times_table(measured))
 
 
 def bench_segmentation(
-    scenarios: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")] = (),
+    scenarios: SomeScenarios = (),
     /,
     *,
     scenes: int = 100,
     seed: int = 0,
-    noise: tuple[Literal["clean", "gaussian", "time-of-flight"], ...] = ("clean", "gaussian"),
+    noise: tuple[Noise, ...] = ("clean", "gaussian"),
     out: JsonFile = None,
     picture: JsonFile = None,
     worst: int = 6,
@@ -155,26 +165,20 @@ def bench_segmentation(
       picture: PNG file for the worst images, the true masks above those found.
       worst: how many of them.
     """
-    import jax
     from rich.console import Console
 
     from mechsearch_jax.benchmarks import images, segmentation
     from mechsearch_jax.benchmarks.tables import segmentation_tables
-    from mechsearch_jax.files import check_writable
     from mechsearch_jax.viz.drawing import save_figure
-    from mechsearch_jax.workspace.scenario import load_scenario
 
     at_least_one("bench segmentation", worst=worst)
-    for file in (out, picture):
-        if file is not None:
-            check_writable(file.parent)
-    given = images.scenes_of([load_scenario(file) for file in find_scenarios(scenarios)] if scenarios else [])
+    check_files(out, picture)
+    given = images.scenes_of(_loaded(scenarios))
     console = Console(highlight=False)
     with console.status("making scenes") as status:
         everything = [*images.held_out_scenes(scenes, seed), *given]
         bench = segmentation.Bench(everything, tuple(dict.fromkeys(noise)), seed)
-        # A compilation that was read from disk would not tell how long compiling takes.
-        jax.config.update("jax_enable_compilation_cache", False)
+        forget_kept_compilations()
         total = len(bench.scenes) * len(bench.noises)
         status.update("compiling")
         measured = bench.run(lambda done: status.update(f"segmenting {done}/{total}"))
@@ -190,13 +194,7 @@ def bench_push(
     *,
     pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 2000,
     seed: int = 0,
-    models: tuple[Literal["no motion", "quasi-static", "learned", "physics", "nudged"], ...] = (
-        "no motion",
-        "quasi-static",
-        "learned",
-        "physics",
-        "nudged",
-    ),
+    models: tuple[ComparedModel, ...] = get_args(ComparedModel),
     weights: WeightsFile = None,
     worlds: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     data: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None,

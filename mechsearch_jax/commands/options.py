@@ -167,6 +167,7 @@ OnePolicy = Annotated[str | None, tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE")
 OneMethod = Annotated[PaperMethod | None, tyro.conf.arg(metavar="{search-for-grasp,search-and-grasp}")]
 Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER ...")]
 
+SomeScenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")]
 JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 WeightsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")]
 
@@ -180,6 +181,26 @@ def at_least_one(command: str, **options: int | None) -> None:
     for name, value in options.items():
         if value is not None and value < 1:
             raise InputError(f"{command}: --{name.replace('_', '-')} {value} must be at least 1")
+
+
+def check_files(*files: Path | None) -> None:
+    """Fail before the work begins rather than after it, if a file that is asked for cannot be written.
+
+    Raises:
+      InputError: one cannot.
+    """
+    from mechsearch_jax.files import check_writable
+
+    for file in files:
+        if file is not None:
+            check_writable(file.parent)
+
+
+def forget_kept_compilations() -> None:
+    """Compile everything anew: what was read from disk would not tell how long compiling takes."""
+    import jax
+
+    jax.config.update("jax_enable_compilation_cache", False)
 
 
 def find_scenario(name: str) -> Path:
