@@ -9,7 +9,7 @@ import pytest
 from robot_images import ROBOT, robot_image
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs.observation import SHELF
+from mechsearch_jax.envs.simulated_camera import SHELF
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception import camera_pose, real_camera
