@@ -19,7 +19,8 @@ from mechsearch_jax.dynamics.learned import LIKELY, NAME, SLACK, predicted
 from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, Worlds, joined, portions, push_tables
+from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, joined, portions, push_tables
+from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.envs.world import CYLINDER, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -290,7 +291,7 @@ def random_pushes(
     gpu: bool,
     scenes: SceneConfig,
     told: Callable[[int], None] = lambda pushes: None,
-    make_simulator: Callable[[], Worlds] | None = None,
+    make_simulator: Callable[[], Simulator] | None = None,
 ) -> Pushes:
     """Pushes in such scenes, simulated on a GPU or not; see `envs.pushes.portions` for the rest."""
     draw_world = functools.partial(random_world, config=scenes)
