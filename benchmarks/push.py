@@ -23,9 +23,10 @@ from mechsearch_jax.benchmarks.agreement import NUDGE
 from mechsearch_jax.dynamics.learned import NAME, LearnedPush
 from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
 from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.mjx_simulator import Failure
+from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.push_models import push_models
-from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, Worlds, push_tables, toppled
+from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, push_tables, toppled
+from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.envs.world import superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, save_json
@@ -123,7 +124,7 @@ class Bench:
     generation: Generation
     rows: Sequence[str] = ROWS
     weights: Path | None = None
-    make_simulator: Callable[[], Worlds] | None = None
+    make_simulator: Callable[[], Simulator] | None = None
 
     def __post_init__(self):
         unknown = next((name for name in self.rows if name not in ROWS), None)
@@ -147,7 +148,7 @@ class Bench:
         return jax.default_backend() != "cpu"
 
     @functools.cached_property
-    def simulator(self) -> Worlds:
+    def simulator(self) -> Simulator:
         """What simulates the pushes."""
         return (self.make_simulator or functools.partial(generator.engine, self.gpu))()
 
@@ -204,7 +205,7 @@ def nudged(pushes: Pushes, seed: int = 0) -> Pushes:
 
 
 def repeated(
-    pushes: Pushes, simulator: Worlds, worlds: int, told: Callable[[int], None] = lambda pushes: None
+    pushes: Pushes, simulator: Simulator, worlds: int, told: Callable[[int], None] = lambda pushes: None
 ) -> PushOutcome:
     """What becomes of pushes if each is simulated by itself from where it began.
 
