@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
 
 from mechsearch_jax.envs.native import NativeWorld
-from mechsearch_jax.envs.observation import target_pixels
+from mechsearch_jax.envs.simulated_camera import target_pixels
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.graspability import GraspConfig, grasp_tables

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.envs.observation import observe
+from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.errors import InputError

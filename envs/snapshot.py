@@ -9,8 +9,7 @@ from typing import Protocol, runtime_checkable
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.envs.observation import Observation as Image
-from mechsearch_jax.envs.observation import is_found, observe
+from mechsearch_jax.envs.simulated_camera import Image, is_found, observe
 from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
@@ -32,7 +31,7 @@ class Snapshot:
     world: World
 
     @functools.cached_property
-    def observation(self) -> Image:
+    def image(self) -> Image:
         """Depth, segmentation and colour at full resolution."""
         return observe(self.camera, self.world, self.shelf)
 

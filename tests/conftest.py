@@ -21,9 +21,9 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 @pytest.fixture(scope="session")
 def problem():
     """The default problem: the paper's shelf, camera and gripper, and the cylinder as the target."""
-    from mechsearch_jax import planner
+    from mechsearch_jax.planner import build_problem
 
-    return planner.build_problem()
+    return build_problem()
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -4,7 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from mechsearch_jax import cache, planner
+from mechsearch_jax.planner import cache
+from mechsearch_jax.planner import problem as problems
+from mechsearch_jax.planner.presets import paper
 from mechsearch_jax.workspace.target import Target
 
 
@@ -26,23 +28,25 @@ def assert_same(a, b):
 
 
 def test_a_problem_read_from_disk_is_the_one_that_was_built(folder, problem, monkeypatch):
-    assert_same(cache.kept_problem(), problem)
+    assert_same(cache.cached_problem(), problem)
     (file,) = folder.iterdir()
-    monkeypatch.setattr(planner, "build_problem", refuse)
-    assert_same(cache.kept_problem(), problem)
+    monkeypatch.setattr(problems, "build_problem", refuse)
+    assert_same(cache.cached_problem(), problem)
     with pytest.raises(AssertionError):
-        cache.kept_problem(Target.box())
+        cache.cached_problem(Target.box())
+    with pytest.raises(AssertionError):
+        cache.cached_problem(config=paper().problem)
     # Another version of the source makes another file.
     monkeypatch.setattr(cache, "_source", lambda: "another")
     with pytest.raises(AssertionError):
-        cache.kept_problem()
+        cache.cached_problem()
     assert list(folder.iterdir()) == [file]
 
 
 @pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "altered", "renamed"])
 def test_a_damaged_file_is_built_anew(folder, problem, monkeypatch, damage):
-    monkeypatch.setattr(planner, "build_problem", lambda **parts: problem)
-    cache.kept_problem()
+    monkeypatch.setattr(problems, "build_problem", lambda **parts: problem)
+    cache.cached_problem()
     (file,) = folder.iterdir()
     whole = file.read_bytes()
     if damage == "altered":
@@ -54,23 +58,23 @@ def test_a_damaged_file_is_built_anew(folder, problem, monkeypatch, damage):
             np.savez(file, **{name.replace("poses", "places"): array for name, array in saved.items()})
     else:
         file.write_bytes({"cut": whole[: len(whole) // 2], "garbage": b"no archive", "empty": b""}[damage])
-    assert cache.kept_problem() is problem
-    monkeypatch.setattr(planner, "build_problem", refuse)
-    assert_same(cache.kept_problem(), problem)
+    assert cache.cached_problem() is problem
+    monkeypatch.setattr(problems, "build_problem", refuse)
+    assert_same(cache.cached_problem(), problem)
 
 
 def test_without_a_folder_problems_are_built(tmp_path, problem, monkeypatch):
-    monkeypatch.setattr(planner, "build_problem", lambda **parts: problem)
+    monkeypatch.setattr(problems, "build_problem", lambda **parts: problem)
     monkeypatch.setenv(cache.VARIABLE, "")
-    assert cache.kept_problem() is problem
+    assert cache.cached_problem() is problem
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file"))
-    assert cache.kept_problem() is problem
+    assert cache.cached_problem() is problem
 
 
 def test_only_a_few_problems_are_kept(folder, problem, monkeypatch):
-    monkeypatch.setattr(planner, "build_problem", lambda **parts: problem)
-    for version in range(cache.KEPT_PROBLEMS + 2):
+    monkeypatch.setattr(problems, "build_problem", lambda **parts: problem)
+    for version in range(cache.CACHED_PROBLEMS + 2):
         monkeypatch.setattr(cache, "_source", lambda version=version: str(version))
-        cache.kept_problem()
-    assert len(list(folder.iterdir())) == cache.KEPT_PROBLEMS
+        cache.cached_problem()
+    assert len(list(folder.iterdir())) == cache.CACHED_PROBLEMS

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.envs.episode import target_of
-from mechsearch_jax.envs.observation import observe
 from mechsearch_jax.envs.recognisers import numbered, recogniser, true_labels
+from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError

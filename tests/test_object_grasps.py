@@ -9,10 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.dynamics import rigid
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.geometry import footprints, superquadric, transforms
-from mechsearch_jax.object_grasps import (
+from mechsearch_jax.actions.object_grasps import (
     LOWEST,
     PALM,
     PASSING_GAP,
@@ -21,6 +18,9 @@ from mechsearch_jax.object_grasps import (
     grasp_variants,
     object_grasps,
 )
+from mechsearch_jax.dynamics import rigid
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.workspace.shelf import Shelf
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs import observation, world
-from mechsearch_jax.envs.observation import PALETTE
+from mechsearch_jax.envs.simulated_camera import PALETTE
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception import colour, planes
 from mechsearch_jax.perception.colour import TargetColour

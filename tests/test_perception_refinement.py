@@ -121,6 +121,7 @@ def test_published_scenes_with_noise():
     assert iou(refined.scene, truth)[seen].mean() > 0.88
 
 
+@pytest.mark.slow
 def test_stray_points_do_not_undo_a_good_guess():
     """A time-of-flight camera's pixels at edges measure a mixture of what is before and behind; the network knows."""
     rng = np.random.default_rng(10)
@@ -173,6 +174,7 @@ def test_absent_objects_and_those_without_points_stay_as_they_are():
     assert jnp.all(jnp.isfinite(blind.cost))
 
 
+@pytest.mark.slow
 def test_rays_bound_what_no_point_bounds():
     """A tall box is guessed 3 cm too high above what is hidden of nothing: its points end, and rays pass above."""
     rng = np.random.default_rng(4)

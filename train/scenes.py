@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.envs.generator import BOXES, CYLINDERS
-from mechsearch_jax.envs.observation import cast_body, cast_shelf
 from mechsearch_jax.envs.recognisers import true_labels
+from mechsearch_jax.envs.simulated_camera import cast_body, cast_shelf
 from mechsearch_jax.envs.world import BODIES, BOX, CYLINDER, TARGET, World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import matmul, yaw_rotation

@@ -7,8 +7,8 @@ turned by half a turn, or a cylinder turned at all, is the same to the network, 
 and moves the answer. A push and its mirror image are looked at together, by layers that treat both alike, so that what
 is symmetric stays symmetric. Walls are seen by how near they are, and not at all beyond `REACH`.
 
-`push_geometry` computes from a `PushStart` all that the network is told, and `PushNetwork` maps a `PushStart` to a
-`PushMotion`. As a baseline that is not equivariant, the same network can be told the same in the frame of the world.
+`push_geometry` computes the network's input features from a `PushStart`, and `PushNetwork` maps a `PushStart` to a
+`PushMotion`. As a baseline that is not equivariant, the same network can be given the features in the world's frame.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mechsearch_jax.geometry.transforms import transform
 from mechsearch_jax.networks.layers import FeedForward
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Directions, spread over half a turn, in which an object's reach is told; an even number.
+# Directions, spread over half a turn, in which an object's reach is a feature; an even number.
 DIRECTIONS = 8
 # Contacts and walls farther away than this are all the same to the network [m]: no push is longer.
 REACH = 0.25
@@ -53,7 +53,7 @@ SAME_CONTACT = 2e-3
 _FLATTEST = 0.3
 # Objects that push each other on, one after the other, in the estimate of who is reached when.
 CHAIN = 4
-# Units of what the network is told and of what it says: lengths [m], angles [rad].
+# Units of the network's inputs and outputs: lengths [m], angles [rad].
 _LENGTH, _SHIFT, _TURN = 0.1, 0.05, 0.3
 _EVEN, _ODD = 5, 2
 # Weaker than any neighbour.
@@ -66,7 +66,7 @@ _MIRRORED_DIRECTIONS = (-np.arange(DIRECTIONS)) % DIRECTIONS
 
 @dataclasses.dataclass(frozen=True)
 class PushConfig:
-    """Sizes of the network, and what it is told the push in.
+    """Sizes of the network, and the frame of its input features.
 
     Attributes:
       width: of what is known of an object.
@@ -99,7 +99,7 @@ class Parity(flax.struct.PyTreeNode):
 
 
 class PushGeometry(flax.struct.PyTreeNode):
-    """A push as the network is told it: in the frame of `PushConfig`, lengths in units of 10 cm but where [m] is given.
+    """Input features of a push, in the frame of `PushConfig`; lengths in units of 10 cm but where [m] is given.
 
     Attributes:
       objects: of each object, shapes (N, ...).
@@ -125,7 +125,7 @@ class PushGeometry(flax.struct.PyTreeNode):
 
 
 class PushMotion(flax.struct.PyTreeNode):
-    """What the network says of each object; every field has the leading axis (N,).
+    """The network's output for each object; every field has the leading axis (N,).
 
     Attributes:
       shift: planar motion of its centre in the world, if it moves [m], (N, 2).
@@ -393,7 +393,7 @@ def _framed(axis: Array, vectors: Array) -> Array:
 
 
 def _pairs(prints: Footprints, met: Meetings, carry: Array, heading: Array, axis: Array) -> Parity:
-    """What is told of object j as seen from object i, (N, N, ...)."""
+    """Features of object j in the frame of object i, (N, N, ...)."""
     offset = prints.position[None] - prints.position[:, None]
     overlap = jnp.minimum(prints.high[:, None], prints.high[None]) - jnp.maximum(prints.low[:, None], prints.low[None])
     onward = jnp.clip(met.distance, -DEEPEST, REACH)
@@ -401,7 +401,7 @@ def _pairs(prints: Footprints, met: Meetings, carry: Array, heading: Array, axis
     passed = jnp.maximum(carry[:, None] - jnp.maximum(onward, 0.0), 0.0)
     gap, breadth = (jnp.clip(a, -DEEPEST, REACH) for a in (met.gap, met.breadth))
     lengths = [onward, onward.T, passed, passed.T, gap, jnp.clip(overlap, -0.05, 0.2), breadth]
-    # From the centre of i; from that of j it differs by the offset, which is told.
+    # From the centre of i; from that of j it differs by the offset, which is a feature.
     side = met.middle[..., None] * _perpendicular(heading)[None, None]
     normal = _framed(axis, met.normal)
     offset, side = _framed(axis, offset) / _LENGTH, _framed(axis, side) / _LENGTH
@@ -411,7 +411,7 @@ def _pairs(prints: Footprints, met: Meetings, carry: Array, heading: Array, axis
 
 
 def _walls(prints: Footprints, faces: Array, axis: Array) -> tuple[Parity, Array]:
-    """What is told of each wall as seen from each object, (N, 4, ...), and how near it is; see `PushGeometry`."""
+    """Features of each wall in each object's frame, (N, 4, ...), and how near it is; see `PushGeometry`."""
     n = prints.yaw.shape[0]
     normals = jnp.asarray(NORMALS)
     toward = reach(prints, jnp.broadcast_to(normals[:, None], (4, n, 2))).T
@@ -434,7 +434,7 @@ def _extents(prints: Footprints, axis: Array) -> Parity:
 
 
 def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") -> PushGeometry:
-    """What the network is told of a push.
+    """The network's input features of a push.
 
     Args:
       start: see there.
@@ -551,8 +551,8 @@ class MirrorDense(nn.Module):
     """A dense layer on a push and its mirror image, (2, ..., width): if they are exchanged, so is what comes out.
 
     Its matrix is one for what is even in them and another for what is odd, which costs no more than one for each image.
-    Without `symmetric` there is one image, (1, ..., width), and the layer is an ordinary one. What is told of a push
-    comes in as its `Parity`, (..., width).
+    Without `symmetric` there is one image, (1, ..., width), and the layer is an ordinary one. The features of a push
+    come in as its `Parity`, (..., width).
     """
 
     features: int
@@ -593,7 +593,7 @@ class Messages(nn.Module):
 
 
 class PushTrunk(nn.Module):
-    """From what is told of a push to numbers for each object, (N, 5) even and (N, 2) odd ones.
+    """From the features of a push to numbers for each object, (N, 5) even and (N, 2) odd ones.
 
     What is said of absent objects means nothing.
     """

@@ -1,11 +1,11 @@
 """The network that recognises a segment: from its cloud to size, exponents and pose (paper section 4.1, B.1).
 
-A pose is answered by one of a few hypotheses, each of which is a shape at a coarse orientation: a box at one of six yaw
-angles within a quarter turn, a cylinder that stands, a cylinder that lies at one of six yaw angles within half a turn.
-The network rates the hypotheses and gives for each what is left to tell: a small rotation, the size, the exponents and
-where it is. So no answer has to jump where the paper's parametrisation does, as at boxes whose yaw passes 90 degrees
-and whose width and depth swap roles. That objects stand on the board is a prior: height is told relative to an object
-that rests on it, and tilt relative to one that is level.
+The output is a mixture of a few hypotheses (classification of a coarse orientation, regression of the residual): a box
+at one of six yaw angles within a quarter turn, a standing cylinder, a lying cylinder at one of six yaw angles within
+half a turn. The network gives a logit for each hypothesis, and its small residual rotation, size, exponents and
+position. So the regression targets are continuous where the paper's parametrisation jumps, as at boxes whose yaw passes
+90 degrees and whose width and depth swap roles. That objects stand on the board is a prior: height is relative to an
+object that rests on it, and tilt relative to one that is level.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def recognise(
       key: PRNG key of the points that are drawn.
       network, parameters: as `networks.weights` loads them; the network is static.
       camera: the camera of the image, a `View`'s as in training; static.
-      points: in the world [m]; NaN where nothing was measured.
+      points: in the world [m]; NaN invalidates the pixel, whose label is then MISSING.
       labels: a segment's number, or one of `perception.labels`.
       shelf: the shelf; static.
       count: number of slots; static.
@@ -96,7 +96,7 @@ class LabelledImage(flax.struct.PyTreeNode):
     """An image of points of which is known what each pixel shows.
 
     Attributes:
-      points: in the world [m], shape (h, w, 3); NaN where nothing was measured.
+      points: in the world [m], shape (h, w, 3); NaN invalidates the pixel: nothing was measured.
       depth: of the points along the camera's axis [m], shape (h, w); infinite where nothing is, NaN where nothing was
         measured.
       labels: as `perception.labels` has them, shape (h, w).
@@ -109,6 +109,7 @@ class LabelledImage(flax.struct.PyTreeNode):
     of_target: jax.Array
 
 
+@functools.partial(jax.jit, static_argnames=("camera", "shelf", "target", "refinement"))
 def recognise_image(
     keys: Key[Array, "2"],
     image: LabelledImage,

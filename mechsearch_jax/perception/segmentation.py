@@ -31,7 +31,7 @@ class Segmenter(Protocol):
         Args:
           key: PRNG key.
           shelf: static.
-          points: in the world [m]; NaN where nothing was measured.
+          points: in the world [m]; NaN invalidates the pixel.
           of_target: where the detector sees the target.
 
         Returns:
@@ -120,7 +120,7 @@ def spread_labels(
     """Labels of an image's pixels from those of a cloud drawn from it: each takes that of the nearest cloud point.
 
     Args:
-      points: of the pixels [m]; NaN where nothing was measured.
+      points: of the pixels [m]; NaN invalidates the pixel.
       candidates: which pixels show something on the shelf, not the shelf itself.
       cloud: [m].
       labels: of the cloud's points; OTHER points count as any.

@@ -44,7 +44,7 @@ LIGHT = (-0.62, 0.25, 0.74)
 AMBIENT = 0.55
 
 
-class Observation(flax.struct.PyTreeNode):
+class Image(flax.struct.PyTreeNode):
     """An image of the shelf.
 
     Attributes:
@@ -173,7 +173,7 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
 
 
 @partial(jax.jit, static_argnames=("camera", "shelf"))
-def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Observation:
+def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Image:
     """The camera's image of the shelf and everything on it; the robot is out of the way.
 
     Args:
@@ -193,7 +193,7 @@ def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Observa
     shade = AMBIENT + (1.0 - AMBIENT) * jnp.maximum(sum(normals[..., k] * light[k] for k in range(3)), 0.0)
     colour = jnp.asarray(PALETTE)[jnp.clip(owner, 0, SHELF)] * shade[..., None]
     colour = jnp.where((owner == BACKGROUND)[..., None], jnp.array([[BACKGROUND_COLOUR]]), colour)
-    return Observation(depth, owner, colour)
+    return Image(depth, owner, colour)
 
 
 @partial(jax.jit, static_argnames=("camera", "window"))
