@@ -6,7 +6,6 @@ Compilation is timed apart from the steady state.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -25,8 +24,8 @@ from mechsearch_jax.dynamics.named import PushModelName
 from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.envs.episode import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.generator import ScenarioGenerator
+from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator, commands
-from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.pushes import PushesConfig, draw_push, push_tables
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.world import TARGET, World, from_scenario, true_superquadrics
@@ -36,7 +35,8 @@ from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation
-from mechsearch_jax.planner import Belief, PlannerConfig, Problem
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import Belief, Problem
 from mechsearch_jax.robot import motion
 from mechsearch_jax.train.push import push_scenes
 from mechsearch_jax.train.scenes import random_world
@@ -139,8 +139,8 @@ def measure(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repe
 def f_of(problem: Problem, scene: Superquadrics) -> Bool[Array, " x"]:
     """f of a single state, for all poses."""
     everywhere = jnp.ones(problem.poses.shape[0], bool)
-    views = object_views(problem.existence, problem.camera, scene, everywhere, problem.existence_config)
-    return existence(problem.existence, problem.camera, views, everywhere, problem.existence_config)
+    views = object_views(problem.existence, problem.camera, scene, everywhere, problem.config.existence)
+    return existence(problem.existence, problem.camera, views, everywhere, problem.config.existence)
 
 
 def g_of(problem: Problem, belief: Belief, scene: Superquadrics) -> Int[Array, " x"]:
@@ -152,7 +152,7 @@ def g_of(problem: Problem, belief: Belief, scene: Superquadrics) -> Int[Array, "
 def bench(
     subject: Literal["existence", "graspability", "plan"],
     objects: int,
-    config: PlannerConfig,
+    method: Method,
     batch: int = 1,
     scenes: int = 5,
     repeats: int = 20,
@@ -162,7 +162,7 @@ def bench(
     Args:
       subject: what is timed.
       objects: number of objects in a scene.
-      config: the planner's options.
+      method: what decides, and with which settings.
       batch: number of scenes in one call; 1 times the function itself, without a batch axis.
       scenes: number of different scenes, taken in turn.
       repeats: number of timed calls.
@@ -171,34 +171,34 @@ def bench(
       InputError: the number of objects does not fit, or the push model cannot be used.
     """
     generator = ScenarioGenerator()
-    problem = planner.build_problem(target=generator.target)
-    observe = jax.jit(functools.partial(planner.observe_belief, config=config))
-    states = []
+    problem = planner.build_problem(target=generator.target, config=method.config.problem)
+    policy, states = method.policy(), []
     for seed in range(scenes):
         world = from_scenario(generator.generate(seed, objects))
         scene = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-        belief = observe(problem, planner.initial_belief(problem), scene, jnp.array(False), jnp.zeros(3))
-        states.append((jax.random.key(seed), belief, scene))
+        observation = Observation(scene, jnp.array(False), jnp.zeros(3))
+        belief = planner.update_belief(problem, planner.initial_belief(problem), observation)
+        states.append((jax.random.key(seed), belief, observation))
     poses = [int(belief.exists.sum()) for _, belief, _ in states]
-    shapes = {"poses": problem.poses.shape[0], "capacity": states[0][2].capacity, "scenes": scenes, "batch": batch}
-    models = push_models(config.push_model)
+    capacity = states[0][2].objects.capacity
+    shapes = {"poses": problem.poses.shape[0], "capacity": capacity, "scenes": scenes, "batch": batch}
     functions: dict[str, Callable[..., Any]] = {
-        "existence": lambda problem, key, belief, scene: f_of(problem, scene),
-        "graspability": lambda problem, key, belief, scene: g_of(problem, belief, scene),
-        "plan": lambda problem, key, belief, scene: planner.plan(key, problem, belief, scene, config, *models),
+        "existence": lambda policy, problem, key, belief, seen: f_of(problem, seen.objects),
+        "graspability": lambda policy, problem, key, belief, seen: g_of(problem, belief, seen.objects),
+        "plan": lambda policy, problem, key, belief, seen: policy(key, problem, belief, seen),
     }
     if subject == "graspability":
         shapes["median_possible_poses"] = int(statistics.median(poses))
     elif subject == "plan":
-        shapes |= {"sequences": config.sequences, "horizon": config.horizon}
-    function, calls = functions[subject], [(problem, *state) for state in states]
+        shapes |= {"sequences": method.config.planner.sequences, "horizon": method.config.planner.horizon}
+    function, calls = functions[subject], [(policy, problem, *state) for state in states]
     if batch > 1:
-        function = jax.vmap(function, in_axes=(None, 0, 0, 0))
+        function = jax.vmap(function, in_axes=(None, None, 0, 0, 0))
         several = jax.tree.map(lambda *leaves: jnp.stack([leaves[i % scenes] for i in range(batch)]), *states)
-        calls = [(problem, *several)]
+        calls = [(policy, problem, *several)]
     compile_seconds, seconds = measure(function, calls, repeats)
     # f and g predict no push.
-    told = {"push model": config.push_model} if subject == "plan" else {}
+    told = {"push model": method.config.push_model} if subject == "plan" else {}
     return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions() | told)
 
 

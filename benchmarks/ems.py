@@ -87,7 +87,7 @@ def _norm2(a: np.ndarray, b: np.ndarray, p: float) -> np.ndarray:
 
 
 def _radial(shape: Recovered, points: np.ndarray) -> np.ndarray:
-    """Signed radial distances, positive outside (the paper's and DESIGN's equation 6, with its sign)."""
+    """Signed radial distances, positive outside (the paper's equation 6, with its sign)."""
     local = (points - shape.position) @ shape.rotation
     x, y, z = np.abs(local.T) / shape.size[:, None]
     gauge = _norm2(_norm2(x, y, 2.0 / shape.exponents[1]), z, 2.0 / shape.exponents[0])

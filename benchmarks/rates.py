@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
+
+import scipy.stats
 
 from mechsearch_jax.benchmarks.rows import Row, label_variants
 
@@ -39,18 +40,12 @@ class Rates:
     simulation_seconds: float
 
 
-Z = 1.959964
-
-
 def wilson(successes: int, count: int) -> tuple[float, float]:
     """Wilson's 95% confidence interval of a share: low and high; (0, 1) if nothing was counted."""
     if count == 0:
         return 0.0, 1.0
-    share = successes / count
-    middle = (share + Z**2 / (2 * count)) / (1 + Z**2 / count)
-    half = Z / (1 + Z**2 / count) * math.sqrt(share * (1 - share) / count + Z**2 / (4 * count**2))
-    low = 0.0 if successes == 0 else middle - half
-    return low, 1.0 if successes == count else middle + half
+    interval = scipy.stats.binomtest(successes, count).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def is_error(row: Row) -> bool:

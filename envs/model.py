@@ -1,4 +1,5 @@
-"""The MuJoCo model: a Panda in front of a shelf with eight object slots and the target (DESIGN.md section 6).
+"""The MuJoCo model: a Panda in front of a shelf with eight object slots and the target (docs/method.md,
+"The simulator").
 
 One MJCF serves every scenario. Each slot is a free body with a box and a cylinder; the one that is not in use is shrunk
 into the inside of the other, and an unused slot is parked in front of the shelf as a weightless millimetre. Sizes,

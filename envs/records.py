@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mechsearch_jax.actions import Action, kind_of
+from mechsearch_jax.envs.earlier import present_options
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
 
@@ -123,7 +123,7 @@ def save_episode(episode: Episode, path: PathLike) -> None:
 
 
 def load_episode(path: PathLike) -> Episode:
-    """Read `episode.json`; options that it does not know yet have the values of `EARLIER`.
+    """Read `episode.json`; options of earlier versions are as `earlier.present_options` has them.
 
     Raises:
       InputError: the file cannot be read or is not the record of an episode.
@@ -139,10 +139,6 @@ def load_episode(path: PathLike) -> Episode:
             Step(**{**step, "action": None if step["action"] is None else ActionRecord(**step["action"])})
             for step in value["steps"]
         )
-        return Episode(**{**value, "steps": steps, "config": {**EARLIER, **value["config"]}})
+        return Episode(**{**value, "steps": steps, "config": present_options(value["config"])})
     except (TypeError, KeyError) as error:
         raise InputError(f"{path}: is not the record of an episode ({error})") from error
-
-
-# What options that files of earlier versions do not hold were then.
-EARLIER: Mapping[str, Any] = {"push_model": "quasi-static", "topple_charge": 0.0}

@@ -1,4 +1,5 @@
-"""The existence function f: where can the target still be? (paper section 4.2 and appendix B.2, DESIGN.md section 5)
+"""The existence function f: where can the target still be? (paper section 4.2 and appendix B.2;
+docs/method.md, "Existence")
 
 A candidate pose stands for its whole grid cell, so the target is tried at several places of the cell. At each it must
 be hidden (it would show no more pixels than the detector needs) and free of collision. f is 1 if any of the places

@@ -1,4 +1,5 @@
-"""The graspability function g: could the target be grasped where it is? (paper appendix B.3, DESIGN.md section 5)
+"""The graspability function g: could the target be grasped where it is? (paper appendix B.3; docs/method.md,
+"Graspability")
 
 Everything that a grasp sweeps (hand, fingers, links 7 and 6 on their straight way in, and the target on its way out) is
 a constant point cloud in the target's frame. Which grasps the arm can make at a candidate pose, and which the shelf

@@ -4,17 +4,20 @@ import dataclasses
 
 import jax
 import pytest
-from test_envs_episode import CONFIG, HIDDEN, OPEN
+from test_envs_episode import HIDDEN, OPEN
 
 from mechsearch_jax.benchmarks import batches
 from mechsearch_jax.benchmarks.batches import Batches, fitting_worlds
 from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
 from mechsearch_jax.benchmarks.rows import identity, read_rows
-from mechsearch_jax.envs.episode import EpisodeLog, describe
+from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.mjx_simulator import MjxSimulator
-from mechsearch_jax.envs.native_worlds import NativeWorlds
-from mechsearch_jax.envs.records import Step
+from mechsearch_jax.envs.native import NativeSimulator
+from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.workspace.scenario import save_scenario
+
+METHOD = Method(config=PRESETS["standard"](max_steps=2))
 
 
 @pytest.fixture
@@ -26,7 +29,7 @@ def files(tmp_path):
 
 
 def jobs_of(files, seeds=(0,)):
-    return make_jobs(files, [CONFIG], seeds)
+    return make_jobs(files, [METHOD], seeds)
 
 
 class Stand:
@@ -36,21 +39,18 @@ class Stand:
         self.slots = []
         self._fail = fail
         monkeypatch.setattr(batches, "run_episodes", self)
-        monkeypatch.setattr(batches, "kept_problem", lambda target: problem)
+        monkeypatch.setattr(batches, "cached_problem", lambda target, config: problem)
 
-    def __call__(self, starts, problem, config, simulator, slots, ended, **options):
+    def __call__(self, starts, problem, policy, simulator, slots, ended, *, max_steps, options, **rest):
+        assert max_steps == METHOD.config.max_steps
         self.slots.append(slots)
         for place, start in enumerate(starts):
             error = self._fail(start.scenario.name, slots)
             if error:
                 raise error
-            log = EpisodeLog(config)
-            log.decide(
-                Step(1, True, True, 1.0, None, None, None, 0, None, {}),
-            )
-            log.act(None, "not found", {})
-            options = describe(start.seed, problem, config, "oracle", simulator.engine)
-            ended([(place, log.episode(start.scenario, options))])
+            scene = start.scenario
+            config = {**options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
+            ended([(place, Episode(scene.name, len(scene.objects), config, {}, (), 0, 0, False, "not found"))])
 
 
 def test_every_job_becomes_a_row_with_its_options(problem, tmp_path, files, monkeypatch):
@@ -131,7 +131,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_rows(tmp_path, files):
 
 def test_the_memory_of_the_device_bounds_the_worlds(monkeypatch):
     simulator = MjxSimulator()
-    assert fitting_worlds(NativeWorlds()) == batches.MOST_WORLDS_ON_CPU
+    assert fitting_worlds(NativeSimulator()) == batches.MOST_WORLDS_ON_CPU
     assert 1e5 < simulator.bytes_per_world() < 1e7
 
     class Device:

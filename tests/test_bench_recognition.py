@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks import images, recognition, tables
+from mechsearch_jax.benchmarks import images, recognition, recognition_figure, tables
 from mechsearch_jax.benchmarks.recognition import Bench, Method, Row
 from mechsearch_jax.envs.world import true_superquadrics
 from mechsearch_jax.errors import InputError
@@ -157,11 +157,11 @@ def test_tables_name_every_method_and_fit_a_terminal(measured):
 
 
 def test_the_picture_shows_the_worst_answers(bench, measured, tmp_path):
-    rows = recognition.worst(measured.rows, "nan", 3)
+    rows = recognition_figure.worst(measured.rows, "nan", 3)
     assert rows[0].outcome == "not finite"
     ious = [row.iou for row in measured.rows if row.method == "nan"]
     assert [row.iou for row in rows] == sorted(ious)[:3]
-    figure = recognition.worst_figure(bench, rows)
+    figure = recognition_figure.worst_figure(bench, rows)
     lines = [len(axes.lines) for axes in figure.axes]
     # Both views of each: the truth alone where the answer cannot be drawn.
     assert lines == [1, 1, 1, 1, 2, 2]
@@ -169,7 +169,7 @@ def test_the_picture_shows_the_worst_answers(bench, measured, tmp_path):
     save_figure(figure, tmp_path / "worst.png")
     assert (tmp_path / "worst.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(InputError, match="no 0 answers"):
-        recognition.worst(measured.rows, "nan", 0)
+        recognition_figure.worst(measured.rows, "nan", 0)
 
 
 def test_held_out_scenes_are_reproducible_and_their_seeds_checked():

@@ -11,9 +11,10 @@ import pytest
 from mechsearch_jax.benchmarks.report import FILES
 from mechsearch_jax.benchmarks.rows import Row, write_rows
 from mechsearch_jax.commands import main as cli
+from mechsearch_jax.commands import options
 from mechsearch_jax.envs.records import Episode, save_episode
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.viz.maps import load_maps
 from mechsearch_jax.workspace.scenario import (
     Body,
@@ -93,6 +94,18 @@ WRONG = {
     "nowhere to report to": (["report", "table.parquet", "--out", "good.json"], "good.json: cannot be written to"),
     "the same table twice": (["report", "table.parquet", "table.parquet"], "report them one by one"),
     "unknown preset": (["search", "good.json", "--out", "out", "--preset", "worst"], "'worst'"),
+    "best preset": (["search", "good.json", "--out", "out", "--preset", "best"], "'best'"),
+    "both method and policy": (
+        ["search", "good.json", "--out", "out", "--method", "search-for-grasp", "--policy", "random"],
+        "search: give either --method or --policy, not both",
+    ),
+    "both methods and policies": (
+        ["evaluate", "good.json", "--out", "out", "--method", "search-for-grasp", "--policy", "random"],
+        "evaluate: give either --method or --policy, not both",
+    ),
+    "unknown method": (["search", "good.json", "--out", "out", "--method", "random"], "'random'"),
+    "unknown policy": (["search", "good.json", "--out", "out", "--policy", "guess"], 'policy "guess"'),
+    "missing policy": (["evaluate", "good.json", "--out", "new.parquet", "--policy", "nobody.there:Mine"], "nobody"),
     "unknown subject": (["bench", "speed"], "speed"),
     "no table to report": (["report", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
     "no scenarios": (["scenarios", "generate", "--objects", "2", "--count", "0", "--out", "new"], "--count 0"),
@@ -177,13 +190,13 @@ def test_help_is_no_mistake(capsys, arguments):
 def test_a_scenario_is_found_by_file_by_folder_and_by_name(folder, monkeypatch):
     monkeypatch.chdir(folder)
     name, shipped = next(iter(example_scenarios().items()))
-    assert cli.find_scenario("good.json").name == "good.json"
-    assert cli.find_scenario(name) == shipped
-    assert [file.name for file in cli.find_scenarios([".", name])] == [
+    assert options.find_scenario("good.json").name == "good.json"
+    assert options.find_scenario(name) == shipped
+    assert [file.name for file in options.find_scenarios([".", name])] == [
         "broken.json", "good.json", "negative.json", shipped.name,
     ]  # fmt: skip
     with pytest.raises(InputError, match=name):
-        cli.find_scenario("none")
+        options.find_scenario("none")
 
 
 def test_checking_names_the_bad_and_lists_the_good(folder, monkeypatch, capsys):
@@ -209,12 +222,61 @@ def test_a_folder_that_search_wrote_is_good(tmp_path, monkeypatch, capsys):
         cli.parse(["scenarios", "check", "out/episode.json"])()
 
 
-@pytest.mark.parametrize("preset", ["paper", "best"])
+def options_of(*arguments):
+    """The options that a command would be called with."""
+    return cli.parse(["inspect", "first-light", "--out", "out", *arguments]).keywords["options"]
+
+
+@pytest.mark.parametrize("preset", list(PRESETS))
 def test_what_is_given_goes_before_the_preset(preset):
-    options = cli.PlannerOptions(preset=preset)
-    assert options.config("search-and-grasp") == PlannerConfig.paper(method="search-and-grasp")
-    options = cli.PlannerOptions(preset=preset, gamma=0.5, actions="push")
-    assert options.config("search-for-grasp") == PlannerConfig.paper(gamma=0.5, actions="push")
+    assert options_of("--preset", preset).config() == PRESETS[preset]()
+    given = options_of("--preset", preset, "--gamma", "0.5", "--actions", "push", "--push-distances", "0.1", "0.2")
+    assert given.config() == PRESETS[preset](gamma=0.5, actions="push", push_distances=(0.1, 0.2))
+
+
+def test_the_default_preset_is_the_standard():
+    assert options_of().config() == PRESETS["standard"]()
+    assert options.DEFAULTS.config() == PRESETS["standard"]()
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
+def test_every_option_of_the_configuration_is_one_of_the_command_line(option):
+    usual = PRESETS["standard"]().options()[option.name]
+    given = [str(value) for value in (usual if isinstance(usual, list) else [usual])]
+    parsed = options_of(f"--{option.name.replace('_', '-')}", *given)
+    assert getattr(parsed, option.name) == (tuple(usual) if isinstance(usual, list) else usual)
+    assert parsed.config() == PRESETS["standard"]()
+
+
+def test_a_policy_goes_by_a_methods_name_or_its_own():
+    def policies(*arguments):
+        given = cli.parse(["evaluate", "first-light", "--out", "out", *arguments]).keywords
+        return tuple(options.chosen_policies("evaluate", given["method"], given["policy"]))
+
+    assert policies() == ("search-for-grasp",)
+    assert policies("--method", "search-and-grasp", "search-for-grasp") == ("search-and-grasp", "search-for-grasp")
+    assert policies("--policy", "random", "my_lab.policies:Mine") == ("random", "my_lab.policies:Mine")
+
+
+def test_help_names_options_with_their_defaults(capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.parse(["bench", "plan", "--help"])
+    assert not end.value.code
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "--gamma FLOAT" in shown
+    assert "(default: 0.7 in preset standard, 0.0 in preset paper)" in shown
+    assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)
+
+
+def test_help_on_what_has_no_such_options_does_without_the_planner():
+    code = (
+        "import sys; from mechsearch_jax.commands import main\n"
+        "try: main.parse(sys.argv[1:])\n"
+        "except SystemExit: print('jax' in sys.modules)"
+    )
+    for arguments in (["--help"], ["scenarios", "generate", "--help"], ["bench", "--help"]):
+        answer = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+        assert answer.stdout.endswith("False\n"), answer.stderr
 
 
 def test_a_report_is_printed_and_written(folder, monkeypatch, capsys):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import json
 import sys
 
 import pyarrow.parquet
@@ -12,20 +11,26 @@ from rich.console import Console
 from mechsearch_jax import versions
 from mechsearch_jax.benchmarks import evaluate as benchmark
 from mechsearch_jax.benchmarks import tables
-from mechsearch_jax.benchmarks.evaluate import Job, evaluate, make_jobs, present_code
+from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs, present_code
 from mechsearch_jax.benchmarks.processes import Processes
 from mechsearch_jax.benchmarks.rates import summarise
-from mechsearch_jax.benchmarks.rows import configuration, identity, read_code, read_rows, write_rows
-from mechsearch_jax.benchmarks.worker import parse_config
+from mechsearch_jax.benchmarks.rows import identity, read_code, read_rows, write_rows
+from mechsearch_jax.envs.method import Method
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 
+standard = PRESETS["standard"]
 TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
 
 # Stands in for the real worker: says what a scenario's name asks for.
 FAKE = """
 import json, os, pathlib, sys
+
+def settings(config):
+    for name, value in config.items():
+        yield from settings(value) if isinstance(value, dict) else [(name, value)]
+
 for line in sys.stdin:
     job = json.loads(line)
     name = json.loads(pathlib.Path(job["path"]).read_text())["name"]
@@ -34,14 +39,13 @@ for line in sys.stdin:
     if name == "crash":
         print("out of luck", file=sys.stderr, flush=True)
         os._exit(3)
-    config = job["config"]
-    row = dict(scenario=name, objects=0, target="cylinder", method=config["method"], recognition="oracle",
-               gamma=config["gamma"], horizon=config["horizon"], sequences=config["sequences"],
-               actions=config["actions"], seed=job["seed"], found_step=1, graspable_step=2, retrieved=True, steps=3,
-               failure=None, planning_seconds=1.0, simulation_seconds=0.5,
-               configuration=None)
-    options = dict(config, recognition="oracle", simulator="NativeSimulator")
-    row["configuration"] = json.dumps(options, sort_keys=True)
+    method = job["method"]
+    options = {k: v for k, v in settings(method["config"]) if k in os.environ["OPTIONS"].split()}
+    options.update(policy=method["name"], recognition="oracle", simulator="NativeSimulator")
+    columns = ("policy", "recognition", "gamma", "horizon", "sequences", "actions")
+    row = dict({column: options[column] for column in columns}, scenario=name, objects=0, target="cylinder",
+               seed=job["seed"], found_step=1, graspable_step=2, retrieved=True, steps=3, failure=None,
+               planning_seconds=1.0, simulation_seconds=0.5, configuration=json.dumps(options, sort_keys=True))
     if name == "confused":
         row["gamma"] = 0.123
     print(json.dumps({"error": "ValueError: no"} if name == "raise" else {"row": row}), flush=True)
@@ -59,6 +63,7 @@ def files(tmp_path):
 @pytest.fixture
 def command(tmp_path, monkeypatch):
     monkeypatch.setenv("LOG", str(tmp_path / "log"))
+    monkeypatch.setenv("OPTIONS", " ".join(option.name for option in OPTIONS))
     return (sys.executable, "-c", FAKE)
 
 
@@ -67,15 +72,14 @@ def ran(tmp_path):
 
 
 def test_all_combinations_become_rows(tmp_path, files, command):
-    configs = [PlannerConfig(), PlannerConfig(method="search-and-grasp")]
-    jobs = make_jobs([files[0], files[1]], configs, (0, 1))
+    jobs = make_jobs([files[0], files[1]], [Method(), Method("search-and-grasp")], (0, 1))
     rows = evaluate(jobs, tmp_path / "rows.parquet", Processes(2, command))
     assert len(rows) == len({identity(row) for row in rows}) == 8
     assert sorted(map(identity, read_rows(tmp_path / "rows.parquet"))) == sorted(map(identity, rows))
 
 
 def test_failures_are_rows_with_their_reason_and_do_not_end_the_run(tmp_path, files, command):
-    rows = evaluate(make_jobs(files, [PlannerConfig()], (0,)), tmp_path / "rows.parquet", Processes(1, command))
+    rows = evaluate(make_jobs(files, [Method()], (0,)), tmp_path / "rows.parquet", Processes(1, command))
     reasons = {row.scenario: row.failure for row in rows}
     assert reasons == {
         "one": None,
@@ -88,7 +92,7 @@ def test_failures_are_rows_with_their_reason_and_do_not_end_the_run(tmp_path, fi
 
 def test_a_stopped_run_goes_on_where_it_was(tmp_path, files, command):
     out = tmp_path / "rows.parquet"
-    jobs = make_jobs(files, [PlannerConfig()], (0,))
+    jobs = make_jobs(files, [Method()], (0,))
 
     def stop(row, rows):
         if len(rows) == 2:
@@ -109,7 +113,7 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path, files, command):
 def test_rows_of_other_options_stay(tmp_path, files, command):
     out = tmp_path / "rows.parquet"
     for gamma in (0.9, 0.5):
-        rows = evaluate(make_jobs(files[:1], [PlannerConfig(gamma=gamma)], (0,)), out, Processes(1, command))
+        rows = evaluate(make_jobs(files[:1], [Method(config=standard(gamma=gamma))], (0,)), out, Processes(1, command))
         assert [row.gamma for row in rows] == [gamma]
     assert sorted(row.gamma for row in read_rows(out)) == [0.5, 0.9]
 
@@ -119,7 +123,7 @@ def test_rows_of_other_options_stay(tmp_path, files, command):
     [
         {"criterion": "depth-mse"},
         {"max_steps": 5},
-        {"caution": 0.5},
+        {"unseen_contact_penalty": 0.5},
         {"push_distances": (0.1,)},
         {"push_model": "physics"},
         {"topple_charge": 0.5},
@@ -128,8 +132,8 @@ def test_rows_of_other_options_stay(tmp_path, files, command):
 )
 def test_every_option_tells_rows_apart(tmp_path, files, command, other):
     out = tmp_path / "rows.parquet"
-    for config in (PlannerConfig(), PlannerConfig(**other), PlannerConfig()):
-        rows = evaluate(make_jobs(files[:1], [config], (0,)), out, Processes(1, command))
+    for method in (Method(), Method(config=standard(**other)), Method()):
+        rows = evaluate(make_jobs(files[:1], [method], (0,)), out, Processes(1, command))
         assert len(rows) == 1
     assert ran(tmp_path) == ["one", "one"]
     both = read_rows(out)
@@ -140,7 +144,7 @@ def test_every_option_tells_rows_apart(tmp_path, files, command, other):
 
 def test_rows_that_do_not_say_how_they_ran_are_kept_but_not_believed(tmp_path, files, command):
     out = tmp_path / "rows.parquet"
-    jobs = make_jobs(files[:1], [PlannerConfig()], (0,))
+    jobs = make_jobs(files[:1], [Method()], (0,))
     (row,) = evaluate(jobs, out, Processes(1, command))
     table = pyarrow.parquet.read_table(out)
     pyarrow.parquet.write_table(table.drop_columns(["configuration"]), out)
@@ -151,19 +155,19 @@ def test_rows_that_do_not_say_how_they_ran_are_kept_but_not_believed(tmp_path, f
 
 def test_rows_of_other_code_are_not_added_to(tmp_path, files, command, monkeypatch):
     out = tmp_path / "rows.parquet"
-    evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), out, Processes(1, command))
+    evaluate(make_jobs(files[:1], [Method()], (0,)), out, Processes(1, command))
     assert read_code(out) == present_code()
     before = out.read_bytes()
     monkeypatch.setattr(benchmark, "present_code", lambda: "mechsearch-jax 9.9 (abc)")
     with pytest.raises(InputError, match=r"rows.parquet: .* run by mechsearch-jax 0.* is mechsearch-jax 9.9 \(abc\);"):
-        evaluate(make_jobs(files[:2], [PlannerConfig()], (0,)), out, Processes(1, command))
+        evaluate(make_jobs(files[:2], [Method()], (0,)), out, Processes(1, command))
     assert out.read_bytes() == before
     assert ran(tmp_path) == ["one"]
 
     # A table that does not say what ran it may be anything.
     write_rows(read_rows(out), out)
     with pytest.raises(InputError, match="does not say which"):
-        evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), out, Processes(1, command))
+        evaluate(make_jobs(files[:1], [Method()], (0,)), out, Processes(1, command))
 
 
 def test_the_code_is_that_of_planner_perception_and_environment(tmp_path, monkeypatch):
@@ -190,43 +194,40 @@ def test_the_code_is_that_of_planner_perception_and_environment(tmp_path, monkey
 
 
 def test_a_worker_that_cannot_be_started_makes_rows_too(tmp_path, files):
-    jobs = make_jobs(files[:2], [PlannerConfig()], (0,))
+    jobs = make_jobs(files[:2], [Method()], (0,))
     rows = evaluate(jobs, tmp_path / "rows.parquet", Processes(1, (str(tmp_path / "nothing"),)))
     assert all("FileNotFoundError" in str(row.failure) for row in rows)
 
 
 def test_a_worker_that_ran_something_else_is_not_believed(tmp_path, command):
     save_scenario(Scenario("confused", (), TARGET), tmp_path / "confused.json")
-    jobs = make_jobs([tmp_path / "confused.json"], [PlannerConfig()], (0,))
+    jobs = make_jobs([tmp_path / "confused.json"], [Method()], (0,))
     (row,) = evaluate(jobs, tmp_path / "rows.parquet", Processes(1, command))
     assert row.failure == "error: the worker ran the episode with other options than those asked for"
 
 
-def test_the_row_of_a_job_is_that_of_its_episode(problem):
-    from mechsearch_jax.envs.episode import describe
-
-    config = PlannerConfig(push_distances=(0.05, 0.2))
-    job = Job("", Scenario("one", (), TARGET), config, 3)
-    assert job.configuration == configuration(describe(3, problem, config, "oracle", "NativeSimulator"))
+def test_a_method_that_cannot_be_used_is_told_of_before_any_episode(tmp_path, files):
+    for method, message in (
+        (Method("guess"), 'policy "guess" is unknown'),
+        (Method("nobody.there:Mine"), "nobody"),
+        (Method(recognition="fog"), 'recognition "fog" is unknown'),
+    ):
+        with pytest.raises(InputError, match=message):
+            make_jobs(files[:1], [Method(), method], (0,))
 
 
 def test_another_table_is_not_overwritten(tmp_path, files, command):
     (tmp_path / "rows.parquet").write_text("mine")
     with pytest.raises(InputError):
-        evaluate(make_jobs(files[:1], [PlannerConfig()], (0,)), tmp_path / "rows.parquet", Processes(1, command))
+        evaluate(make_jobs(files[:1], [Method()], (0,)), tmp_path / "rows.parquet", Processes(1, command))
     assert (tmp_path / "rows.parquet").read_text() == "mine"
-
-
-def test_a_configuration_survives_the_way_to_the_worker():
-    config = PlannerConfig(gamma=0.7, push_distances=(0.05, 0.2))
-    assert parse_config(json.loads(json.dumps(dataclasses.asdict(config)))) == config
 
 
 def test_progress_and_rates_are_shown(tmp_path, files, command):
     screen = io.StringIO()
     console = Console(file=screen, width=100)
     with tables.EpisodeProgress(console, 3) as progress:
-        jobs = make_jobs([files[0], files[1], files[3]], [PlannerConfig()], (0,))
+        jobs = make_jobs([files[0], files[1], files[3]], [Method()], (0,))
         rows = evaluate(jobs, tmp_path / "rows.parquet", Processes(1, command), ended=progress.ended)
     console.print(tables.rates_table(rows))
     text = screen.getvalue()

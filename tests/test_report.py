@@ -20,7 +20,7 @@ BROKEN = LOST.__class__(
     "c", 8, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0,
     None, None, False, 0, "error: a | b\nc", 0.0, 0.0,
 )  # fmt: skip
-OTHER = dataclasses.replace(WON, method="search-and-grasp")
+OTHER = dataclasses.replace(WON, policy="search-and-grasp")
 ROWS = [WON, LOST, BROKEN, OTHER]
 
 

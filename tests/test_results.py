@@ -13,8 +13,18 @@ import pytest
 
 from mechsearch_jax.actions import ActionKind, no_action
 from mechsearch_jax.benchmarks.rates import summarise, wilson
-from mechsearch_jax.benchmarks.rows import SCHEMA, Row, configuration, identity, label_variants, read_rows, write_rows
-from mechsearch_jax.envs.records import EARLIER, Episode, Step, load_episode, record_action, save_episode
+from mechsearch_jax.benchmarks.rows import (
+    SCHEMA,
+    Row,
+    configuration,
+    identity,
+    label_variants,
+    read_code,
+    read_rows,
+    write_rows,
+)
+from mechsearch_jax.envs.earlier import EARLIER, RENAMED
+from mechsearch_jax.envs.records import Episode, Step, load_episode, record_action, save_episode
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import check_writable, replacing
 from mechsearch_jax.geometry import superquadric
@@ -32,7 +42,7 @@ ROW = Row(
     scenario="two-things",
     objects=2,
     target="cylinder",
-    method="search-for-grasp",
+    policy="search-for-grasp",
     recognition="oracle",
     gamma=0.9,
     horizon=3,
@@ -168,6 +178,85 @@ def test_a_configuration_that_is_none_is_one_line(tmp_path, text):
         read_rows(tmp_path / "rows.parquet")
 
 
+OLD = {
+    "actions": "both", "caution": 0.5, "criterion": "detector", "focus": 0.7, "gamma": 0.9, "horizon": 3,
+    "max_steps": 10, "method": "search-and-grasp", "push_distances": [0.05, 0.1], "recognition": "oracle",
+    "sequences": 30, "simulator": "NativeSimulator",
+}  # fmt: skip
+# The columns of the tables that were written when a policy was called a method.
+OLD_SCHEMA = pyarrow.schema(
+    [
+        ("scenario", pyarrow.string()),
+        ("objects", pyarrow.int64()),
+        ("target", pyarrow.string()),
+        ("method", pyarrow.string()),
+        ("recognition", pyarrow.string()),
+        ("gamma", pyarrow.float64()),
+        ("horizon", pyarrow.int64()),
+        ("sequences", pyarrow.int64()),
+        ("actions", pyarrow.string()),
+        ("seed", pyarrow.int64()),
+        ("found_step", pyarrow.int64()),
+        ("graspable_step", pyarrow.int64()),
+        ("retrieved", pyarrow.bool_()),
+        ("steps", pyarrow.int64()),
+        ("failure", pyarrow.string()),
+        ("planning_seconds", pyarrow.float64()),
+        ("simulation_seconds", pyarrow.float64()),
+        ("configuration", pyarrow.string()),
+    ]
+)
+OLD_VALUES = {
+    "scenario": "two-things", "objects": 2, "target": "cylinder", "method": "search-and-grasp",
+    "recognition": "oracle", "gamma": 0.9, "horizon": 3, "sequences": 30, "actions": "both", "seed": 0,
+    "found_step": 1, "graspable_step": None, "retrieved": False, "steps": 2, "failure": "no grasp after 2 actions",
+    "planning_seconds": 1.5, "simulation_seconds": 3.0,
+}  # fmt: skip
+
+
+def old_table(path, *configurations):
+    rows = [{**OLD_VALUES, "configuration": json.dumps(value, sort_keys=True)} for value in configurations]
+    schema = OLD_SCHEMA.with_metadata({b"mechsearch_code": b"mechsearch-jax 0.1.0 (0123456789ab)"})
+    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), path)
+
+
+def test_tables_with_earlier_names_of_options_are_read(tmp_path):
+    old_table(tmp_path / "rows.parquet", OLD, {**OLD, "push_model": "learned", "topple_charge": 0.5})
+    before = (tmp_path / "rows.parquet").read_bytes()
+    first, second = read_rows(tmp_path / "rows.parquet")
+    now = {**OLD, **EARLIER, "policy": OLD["method"], "unseen_contact_penalty": 0.5, "guided_fraction": 0.7}
+    for name in ("method", "caution", "focus"):
+        del now[name]
+    assert first == dataclasses.replace(ROW, policy="search-and-grasp", configuration=configuration(now))
+    assert json.loads(second.configuration) == {**now, "push_model": "learned", "topple_charge": 0.5}
+    assert (tmp_path / "rows.parquet").read_bytes() == before
+    assert read_code(tmp_path / "rows.parquet") == "mechsearch-jax 0.1.0 (0123456789ab)"
+    assert not set(RENAMED) & set(SCHEMA.names)
+
+
+def test_tables_of_the_first_version_with_earlier_columns_are_read(tmp_path):
+    table = pyarrow.Table.from_pylist([OLD_VALUES], schema=pyarrow.schema(list(OLD_SCHEMA)[:-1]))
+    pyarrow.parquet.write_table(table, tmp_path / "rows.parquet")
+    assert read_rows(tmp_path / "rows.parquet") == [dataclasses.replace(ROW, policy="search-and-grasp")]
+
+
+def test_what_differs_goes_by_the_present_names_of_options(tmp_path):
+    old_table(tmp_path / "rows.parquet", OLD, {**OLD, "caution": 1.0, "focus": 0.0})
+    assert label_variants(read_rows(tmp_path / "rows.parquet")) == [
+        "search-and-grasp, guided fraction 0.7, unseen contact penalty 0.5",
+        "search-and-grasp, guided fraction 0.0, unseen contact penalty 1.0",
+    ]
+
+
+def test_an_episode_with_earlier_names_of_options_is_read(tmp_path):
+    save_episode(dataclasses.replace(EPISODE, config={**OLD, "target": "box", "seed": 3}), tmp_path / "episode.json")
+    config = load_episode(tmp_path / "episode.json").config
+    assert config["policy"] == "search-and-grasp"
+    assert (config["unseen_contact_penalty"], config["guided_fraction"]) == (0.5, 0.7)
+    assert not set(RENAMED) & set(config)
+    assert Row.of_episode(load_episode(tmp_path / "episode.json")).policy == "search-and-grasp"
+
+
 def test_options_that_differ_tell_rows_apart():
     full = configuration({"gamma": 0.9, "push_distances": [0.05, 0.1], "seed": 3, "target": "box"})
     assert json.loads(full) == {"gamma": 0.9, "push_distances": [0.05, 0.1]}
@@ -206,7 +295,19 @@ def test_confidence_intervals_are_wilsons():
     assert wilson(0, 0) == (0.0, 1.0)
 
 
-def test_the_schema_is_the_row():
+def test_confidence_intervals_are_those_of_the_formula():
+    z = 1.959963984540054
+    for count in (1, 2, 7, 100):
+        for successes in range(count + 1):
+            share = successes / count
+            middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
+            half = z / (1 + z**2 / count) * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
+            assert wilson(successes, count) == pytest.approx((middle - half, middle + half), abs=1e-12)
+
+
+def test_the_columns_are_those_of_earlier_tables_but_for_names():
+    assert SCHEMA.types == OLD_SCHEMA.types
+    assert SCHEMA.names == [RENAMED.get(name, name) for name in OLD_SCHEMA.names]
     assert SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
 
 
@@ -224,7 +325,7 @@ def test_rows_are_summarised_by_method_and_number_of_objects():
         ROW,
         dataclasses.replace(ROW, seed=1, graspable_step=2, retrieved=True, steps=4),
         dataclasses.replace(ROW, objects=8, found_step=None, steps=10),
-        dataclasses.replace(ROW, method="search-and-grasp"),
+        dataclasses.replace(ROW, policy="search-and-grasp"),
     ]
     summary = summarise(rows)
     assert [(r.method, r.objects, r.episodes) for r in summary] == [

@@ -35,7 +35,7 @@ class PushOutcome(flax.struct.PyTreeNode):
 
 
 class PushModel(Protocol):
-    """Predicts a push; interchangeable (DESIGN.md section 5)."""
+    """Predicts a push; interchangeable (docs/method.md, "Pushes")."""
 
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array

@@ -7,8 +7,11 @@ changing it compiles nothing.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import Any, get_type_hints
+
+import jax
 
 from mechsearch_jax.actions.config import ActionConfig
 from mechsearch_jax.dynamics.named import PushModelName, check_name
@@ -18,9 +21,14 @@ from mechsearch_jax.graspability import GraspConfig
 from mechsearch_jax.options import option
 
 
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("gamma", "unseen_contact_penalty", "topple_charge", "guided_fraction", "crowding_weight"),
+    meta_fields=("horizon", "sequences", "draws", "move_again", "predicted_collisions"),
+)
 @dataclasses.dataclass(frozen=True)
 class PlannerConfig:
-    """How the planner decides.
+    """How the planner decides: a pytree whose leaves are the settings that are not static.
 
     Attributes:
       gamma: discount of equation 2, in (0, 1]. The paper gives none; 0.9 is ours.

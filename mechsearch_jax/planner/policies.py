@@ -75,7 +75,7 @@ class Search(flax.struct.PyTreeNode):
       propose, predict, objective: the slots; static.
     """
 
-    config: PlannerConfig = flax.struct.field(pytree_node=False)
+    config: PlannerConfig
     propose: Propose = flax.struct.field(pytree_node=False)
     predict: Predict = flax.struct.field(pytree_node=False)
     objective: Objective = flax.struct.field(pytree_node=False)

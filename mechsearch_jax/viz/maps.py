@@ -130,7 +130,7 @@ _SCENE_FIELDS = tuple(field.name for field in dataclasses.fields(Superquadrics))
 
 
 def save_maps(maps: Maps, path: PathLike) -> None:
-    """Write maps as a compressed npz file (DESIGN.md section 8).
+    """Write maps as a compressed npz file (docs/method.md, "Files").
 
     Raises:
       InputError: the file cannot be written.

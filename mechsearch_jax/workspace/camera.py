@@ -14,7 +14,8 @@ from mechsearch_jax.geometry.transforms import rotate
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """A fixed pinhole camera; its frame has x right, y down, z forward. Defaults: DESIGN.md section 4.
+    """A fixed pinhole camera; its frame has x right, y down, z forward. Defaults: docs/method.md,
+    "Facts of the scene".
 
     Attributes:
       width, height: image size in pixels.

@@ -147,7 +147,7 @@ def parse_scenario(value: Any, where: str, shelf: Shelf | None = None) -> Scenar
 
 
 def load_scenario(path: str | os.PathLike[str], shelf: Shelf | None = None) -> Scenario:
-    """Read a scenario file (JSON, DESIGN.md section 8).
+    """Read a scenario file (JSON; docs/method.md, "Files").
 
     Raises:
       InputError: the file cannot be read, is not JSON, or fails a check of `parse_scenario`.

@@ -12,7 +12,8 @@ from mechsearch_jax.errors import InputError
 
 @dataclasses.dataclass(frozen=True)
 class Shelf:
-    """Inner faces of the shelf in the robot's base frame [m]; +x points into the shelf, z up (DESIGN.md section 4).
+    """Inner faces of the shelf in the robot's base frame [m]; +x points into the shelf, z up (docs/method.md,
+    "Facts of the scene").
 
     Attributes:
       front: x of the board's front edge.
