@@ -72,7 +72,7 @@ def test_a_search_goes_on_until_the_target_is_out(problem, tmp_path, policy):
     assert diary.decided_at == [0, 1]
     assert [moment.record.action.kind for moment in diary.moments][-1] == "retrieve"
     for moment in diary.moments:
-        assert kind_of(moment.decision.action.kind).name == moment.record.action.kind
+        assert kind_of(int(moment.decision.action.kind)).name == moment.record.action.kind
     assert [bool(moment.outcome.retrieved) for moment in diary.moments] == [False, True]
     assert diary.stages == ["recognise", "plan", "simulate", "recognise", "plan", "judge", "simulate"]
     save_episode(episode, tmp_path / "episode.json")
