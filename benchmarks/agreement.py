@@ -19,10 +19,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mechsearch_jax import planner
-from mechsearch_jax.actions import Action, ActionKind, PossibleSpace, candidates, sample_action
+from mechsearch_jax.actions import Action, ActionKind, PossibleSpace, candidates, kind_of, sample_action
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
-from mechsearch_jax.envs.records import ACTION_NAMES
 from mechsearch_jax.envs.simulator import NativeSimulator, Outcome
 from mechsearch_jax.envs.world import CYLINDER, World, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
@@ -105,7 +104,8 @@ class Agreement:
 
     def summary(self) -> dict[str, Measures]:
         """By kind of action and for all: shares, quantiles of the differences [m, degrees] and displacements [m]."""
-        rows = {ACTION_NAMES[kind]: [c for c in self.cases if c.kind == ACTION_NAMES[kind]] for kind in KINDS}
+        names = [kind_of(kind).name for kind in KINDS]
+        rows = {name: [c for c in self.cases if c.kind == name] for name in names}
         return {name: _summary(cases) for name, cases in {**rows, "all": list(self.cases)}.items() if cases}
 
 
@@ -305,7 +305,7 @@ def agreement(cases: Sequence[tuple[Scenario, Action]], config: MjxConfig | None
         Case(
             scenario=scene.name,
             objects=len(scene.objects),
-            kind=ACTION_NAMES[ActionKind(int(action.kind))],
+            kind=kind_of(int(action.kind)).name,
             object=int(action.object),
             native_failure=records[i].failure,
             batch_failure=outcomes.reason(i),

@@ -154,7 +154,8 @@ def label_variants(rows: Sequence[Row]) -> list[str]:
 
     def said(options: dict[str, Any], name: str) -> str:
         value = options.get(name, "unknown")
-        shown = "/".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value) if isinstance(value, list) else value
+        values = value if isinstance(value, list) else [value]
+        shown = "/".join(f"{v:g}" if isinstance(v, float) else str(v) for v in values)
         return f"{name.replace('_', ' ')} {shown}"
 
     return [", ".join([str(o["policy"]), *(said(o, name) for name in differing)]) for o in each]

@@ -31,7 +31,7 @@ def _shares(clean, dirty):
     return usable / jnp.maximum(jnp.sum(usable, axis=-1, keepdims=True), 1)
 
 
-def _stacked(rows: Sequence[Bool[Array, "n v d"]]) -> Bool[Array, "rows width"]:
+def _stacked(rows: Sequence[Bool[Array, "n _ _"]]) -> Bool[Array, "rows width"]:
     """The ways of all objects by all kinds, padded to the same number."""
     width = max(a.shape[1] * a.shape[2] for a in rows)
     flat = [a.reshape(a.shape[0], -1) for a in rows]
