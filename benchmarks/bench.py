@@ -22,7 +22,7 @@ from mechsearch_jax.actions import Action
 from mechsearch_jax.benchmarks.push import named_model, weights_of
 from mechsearch_jax.dynamics.named import PushModelName
 from mechsearch_jax.dynamics.push_model import PushOutcome
-from mechsearch_jax.envs.episode import Snapshot, objects_on_the_board
+from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator, commands

@@ -23,7 +23,7 @@ from mechsearch_jax.benchmarks.agreement import NUDGE
 from mechsearch_jax.dynamics.learned import NAME, LearnedPush
 from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
 from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.mjx_simulator import Failure
+from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, push_tables, toppled
 from mechsearch_jax.envs.simulator import Simulator

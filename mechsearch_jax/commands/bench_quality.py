@@ -58,7 +58,7 @@ def bench_agreement(
 
     from mechsearch_jax.benchmarks.agreement import agreement, draw_actions, generated_scenes, save_agreement
     from mechsearch_jax.benchmarks.tables import agreement_table
-    from mechsearch_jax.envs.mjx_simulator import import_mjx
+    from mechsearch_jax.envs.mjx_model import import_mjx
     from mechsearch_jax.planner.cache import keep_compilations
 
     at_least_one("bench agreement", actions=actions, scenes=scenes)

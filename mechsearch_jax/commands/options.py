@@ -72,7 +72,7 @@ class EpisodeOptions:
         Raises:
           InputError: it is not installed.
         """
-        from mechsearch_jax.envs.mjx_simulator import import_mjx
+        from mechsearch_jax.envs.mjx_model import import_mjx
 
         if self.simulator == "native" or (self.simulator == "auto" and not has_gpu()):
             return "NativeSimulator"
