@@ -8,6 +8,8 @@ from typing import Any
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import KINDS, Action, ActionKind, Kind
@@ -192,9 +194,11 @@ def taken_over(shelf: Shelf, world: World, qpos: Array, moves: Bool[Array, " wor
     poses = qpos[:, ROBOT:].reshape(-1, BODIES, 7)
     fallen = world.valid & ((poses[..., 0] < shelf.front) | (poses[..., 2] < shelf.board))
     changed = moves[:, None] & world.valid
+    quaternion = poses[..., np.array([4, 5, 6, 3])].reshape(-1, 4)
+    rotation = Rotation.from_quat(quaternion).as_matrix().reshape(world.rotation.shape)
     world = world.replace(
         position=jnp.where(changed[..., None], poses[..., :3], world.position),
-        rotation=jnp.where(changed[..., None, None], matrices(poses[..., 3:]), world.rotation),
+        rotation=jnp.where(changed[..., None, None], rotation, world.rotation),
     )
     return world, fallen
 
@@ -267,18 +271,6 @@ def _slip(progress: Progress, body: Int[Array, " worlds"]) -> Float[Array, " wor
         offset = position - T[:, :3, 3]
         places.append(jnp.sum(T[:, :3, :3] * offset[:, :, None], axis=1))
     return jnp.sqrt(jnp.sum((places[1] - places[0]) ** 2, axis=1))
-
-
-def matrices(quaternion: Float[Array, "*batch 4"]) -> Float[Array, "*batch 3 3"]:
-    """Rotation matrices of quaternions (w, x, y, z), which are normalised first."""
-    norm = jnp.sqrt(jnp.sum(quaternion**2, axis=-1, keepdims=True))
-    w, x, y, z = jnp.moveaxis(quaternion / jnp.maximum(norm, 1e-12), -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def _finite(state: Array) -> Array:

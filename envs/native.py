@@ -260,7 +260,7 @@ class NativeWorld:
             return
         poses = self._data.qpos[ROBOT:].reshape(BODIES, 7)
         valid = np.array([body is not None for body in self._bodies])
-        rotation = np.stack([rotation_matrix(q) for q in poses[:, 3:]])
+        rotation = rotation_matrix(poses[:, 3:])
         self.world = self.world.replace(
             position=jnp.where(valid[:, None], jnp.asarray(poses[:, :3], jnp.float32), self.world.position),
             rotation=jnp.where(valid[:, None, None], jnp.asarray(rotation, jnp.float32), self.world.rotation),

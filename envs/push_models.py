@@ -1,4 +1,4 @@
-"""Push models by name, those that need a simulator too, as `planner.plan` takes them."""
+"""Push models by name, those that need a simulator too, as policies take them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mechsearch_jax.envs.physics_push import MjxPhysics, NativePhysics
 
 
 class PushModels(NamedTuple):
-    """What predicts pushes in a plan; the last two arguments of `planner.plan`.
+    """What predicts pushes in a plan: `push_model` and `later_push_model` of a `planner.PolicyFactory`.
 
     Attributes:
       first: predicts those that are the first action of a sequence.

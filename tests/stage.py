@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,37 +93,48 @@ class Stage:
         return self.world
 
 
-def grab(key, problem, belief, observation):
-    """Takes the target out as soon as it can be, and else pushes the first object, by a random distance."""
-    grasp = graspable_at(problem, observation.objects, belief.found_pose, belief.found)
-    able = belief.found & grasp.success
-    distance = jax.random.uniform(key, minval=0.05, maxval=0.15)
-    T = jnp.eye(4).at[:3, 3].set(jnp.array([0.5, 0.0, 0.5]))
-    push = Action(
-        kind=jnp.int32(ActionKind.PUSH),
-        object=jnp.int32(0),
-        T_world_gripper=T,
-        displacement=jnp.array([0.0, 1.0, 0.0]) * distance,
-        T_world_place=T.at[1, 3].add(distance),
-        q7=jnp.float32(0.7),
-        opening=jnp.float32(0.0),
-    )
-    cost = jnp.where(able, 1.0, jnp.sum(belief.exists) + 1.0)
-    tried = jnp.where(able, jnp.inf, -1.0)[None]
-    return Decision(
-        action=jax.tree.map(lambda a, b: jnp.where(able, a, b), grasp.action, push),
-        value=tried[0],
-        cost=cost,
-        predicted_cost=jnp.where(able, jnp.nan, cost - 1.0),
-        predicted=observation.objects,
-        sequences=Sequences(
-            actions=jax.tree.map(lambda a: a[None, None], push),
-            cost=cost[None, None] - 1.0,
-            value=tried,
-            length=jnp.ones(1, jnp.int32),
-        ),
-        overflow=jnp.array(False),
-    )
+class Grab(flax.struct.PyTreeNode):
+    """A policy: takes the target out as soon as it can be, and else pushes the first object, by a random distance.
+
+    Attributes:
+      charge: is added to the cost before the target is found.
+    """
+
+    charge: float = 1.0
+
+    def __call__(self, key, problem, belief, observation):
+        grasp = graspable_at(problem, observation.objects, belief.found_pose, belief.found)
+        able = belief.found & grasp.success
+        distance = jax.random.uniform(key, minval=0.05, maxval=0.15)
+        T = jnp.eye(4).at[:3, 3].set(jnp.array([0.5, 0.0, 0.5]))
+        push = Action(
+            kind=jnp.int32(ActionKind.PUSH),
+            object=jnp.int32(0),
+            T_world_gripper=T,
+            displacement=jnp.array([0.0, 1.0, 0.0]) * distance,
+            T_world_place=T.at[1, 3].add(distance),
+            q7=jnp.float32(0.7),
+            opening=jnp.float32(0.0),
+        )
+        cost = jnp.where(able, 1.0, jnp.sum(belief.exists) + jnp.where(belief.found, 1.0, self.charge))
+        tried = jnp.where(able, jnp.inf, -1.0)[None]
+        return Decision(
+            action=jax.tree.map(lambda a, b: jnp.where(able, a, b), grasp.action, push),
+            value=tried[0],
+            cost=cost,
+            predicted_cost=jnp.where(able, jnp.nan, cost - 1.0),
+            predicted=observation.objects,
+            sequences=Sequences(
+                actions=jax.tree.map(lambda a: a[None, None], push),
+                cost=cost[None, None] - 1.0,
+                value=tried,
+                length=jnp.ones(1, jnp.int32),
+            ),
+            overflow=jnp.array(False),
+        )
+
+
+grab = Grab()
 
 
 def idle(key, problem, belief, observation):

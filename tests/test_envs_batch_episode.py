@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stage import HIDDEN, OPEN, TWO, Stage, grab, reveal, topple
+from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, reveal, topple
 
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.envs.episode_log import Choice, EpisodeLog, distrust, record
@@ -118,13 +118,8 @@ def test_decisions_that_cannot_be_trusted_are_named():
 
 def test_a_decision_that_cannot_be_trusted_is_not_executed(problem):
     """One that is not finite ends its own episode, and the others go on."""
-
-    def lost(key, problem, belief, observation):
-        decision = grab(key, problem, belief, observation)
-        return decision.replace(cost=jnp.where(belief.found, decision.cost, jnp.nan))
-
     stage = Stage()
-    episodes, _ = run(problem, [OPEN, HIDDEN], stage, 2, lost)
+    episodes, _ = run(problem, [OPEN, HIDDEN], stage, 2, Grab(charge=float("nan")))
     assert [e.failure for e in episodes] == [None, "error: the decision is not finite"]
     assert stage.executed == [["open", None]]
 

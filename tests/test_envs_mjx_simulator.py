@@ -6,6 +6,7 @@ The first call compiles for about a minute, of which Warp's part is kept on disk
 import dataclasses
 import math
 import sys
+import types
 
 import jax
 import jax.numpy as jnp
@@ -84,6 +85,27 @@ def test_actions_of_two_kinds_are_mixed_by_world():
     assert mixed.kind.tolist() == [ActionKind.RETRIEVE, ActionKind.NONE, ActionKind.RETRIEVE]
     np.testing.assert_array_equal(mixed.T_world_gripper[1], np.eye(4))
     np.testing.assert_array_equal(mixed.T_world_gripper[2], taken.T_world_gripper[2])
+
+
+def test_where_kinds_are_traced_an_unknown_one_fails_in_its_own_row():
+    """What the compiled functions make of the kinds, without stepping anything."""
+    world = stack(*[from_scenario(scene(BOX))] * 4)
+    fields = {"ctrl": jnp.zeros((4, 9)), "qpos": jnp.zeros((4, 9 + 7 * 9))}
+    kinds = jnp.int32([ActionKind.NONE, 9, ActionKind.PUSH, -1])
+    actions = stack(no_action(), sideways(), sideways(), sideways()).replace(kind=kinds)
+
+    @jax.jit
+    def told(actions, world):
+        data, config = types.SimpleNamespace(**fields), SimulatorConfig()
+        task, _ = mjx_step.acting(data, actions, jnp.ones(4, bool), jnp.zeros(9), config)
+        progress = mjx_step.begin(task, data)
+        in_hand = jnp.ones(4, bool)
+        return task.moves, mjx_step.verdicts(Shelf(), config, task, progress, world, data.qpos, in_hand)[1]
+
+    moves, outcome = told(actions, world)
+    assert moves.tolist() == [False, False, True, False]
+    assert [outcome.reason(i) for i in range(4)] == [None, "unknown", None, "unknown"]
+    assert not outcome.retrieved.any()
 
 
 def test_without_warp_one_line_tells_what_to_install(monkeypatch):

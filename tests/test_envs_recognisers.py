@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.envs.episode import target_of
+from mechsearch_jax.envs.episodes import target_of
 from mechsearch_jax.envs.recognisers import numbered, recogniser, true_labels
 from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Snapshot, oracle

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from published import published_scenarios
 
-from mechsearch_jax.actions import Action, ActionKind, no_action, retrieve_action
+from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action, retrieve_action
 from mechsearch_jax.envs import model, simulator, world
 from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.world import BODIES, TARGET
@@ -249,6 +249,20 @@ def test_an_unknown_kind_of_action_is_refused(sim):
     with pytest.raises(InputError, match="kind 7 is unknown"):
         sim.execute(no_action().replace(kind=jnp.int32(7)))
     np.testing.assert_array_equal(sim.world.position, before.position)
+
+
+def test_a_new_kind_of_action_needs_no_simulator(sim, monkeypatch):
+    """Registered under another number, a push is still one."""
+    nudge = dataclasses.replace(KINDS[ActionKind.PUSH], code=7, name="nudge")
+    monkeypatch.setitem(KINDS, 7, nudge)
+    action = push(pose(0.595, 0.1 - 0.1375, 0.04, tilt=math.radians(30)), (0.0, 0.1, 0.0))
+    ends = []
+    for kind in (ActionKind.PUSH, 7):
+        before = sim.reset(scene(standing("box", (0.054, 0.025, 0.054), 0.55, 0.1)))
+        assert sim.execute(action.replace(kind=jnp.int32(kind))).reason() is None
+        ends.append(np.asarray(sim.world.position))
+    assert np.abs(ends[0] - np.asarray(before.position)).max() > 0.05
+    np.testing.assert_array_equal(*ends)
 
 
 def test_no_action_does_nothing(sim):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from test_envs_simulator import pose, push, scene, standing
 
-from mechsearch_jax import planner
 from mechsearch_jax.dynamics import named as push_models
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs import physics_push
@@ -21,7 +20,8 @@ from mechsearch_jax.envs.pushes import push_simulation
 from mechsearch_jax.envs.world import BOX, CYLINDER, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
-from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import Config, PlannerConfig, initial_belief, prediction, search_for_grasp, update_belief
 from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
@@ -141,7 +141,7 @@ def test_only_the_first_action_of_a_sequence_is_simulated(monkeypatch):
 
     # As `plan` does it: a scan over time, and within it a map over sequences.
     def step(scenes, time):
-        model = planner._either(time == 0, first, later)
+        model = prediction._either(time == 0, first, later)
 
         def one(scene, action):
             return model(SHELF, scene, PUSHER, action.T_world_gripper, action.displacement, action.q7).scene
@@ -152,7 +152,7 @@ def test_only_the_first_action_of_a_sequence_is_simulated(monkeypatch):
     for count in (1, 2):
         jax.block_until_ready(plan(copies(SCENE)))
         assert calls == [(4,)] * count
-    assert planner._either(jnp.array(True), later, QuasiStatic()) is later
+    assert prediction._either(jnp.array(True), later, QuasiStatic()) is later
 
 
 def test_an_error_stays_in_its_row(outcome, tmp_path, monkeypatch):
@@ -225,7 +225,7 @@ def test_every_name_stands_for_models(monkeypatch):
     physics = all_push_models.push_models("physics")
     assert physics.first == NativePhysics()
     assert physics.later == push_models.own_push_model("learned")
-    assert PlannerConfig().push_model == "learned"
+    assert Config().push_model == "learned"
     # The same objects, so that nothing is compiled twice.
     assert all_push_models.push_models("physics") is physics
     with pytest.raises(InputError, match="needs a simulator"):
@@ -268,6 +268,12 @@ def test_the_batch_simulator_predicts_what_the_native_one_does(outcome):
     np.testing.assert_array_equal(told.scene.position[1], nan.position[None].repeat(2, 0))
 
 
+def seen(problem):
+    """The belief and the observation where the objects of `SCENE` are seen, and the target is not."""
+    observation = Observation(jax.tree.map(lambda a: a[:8], SCENE), jnp.array(False), jnp.zeros(3))
+    return update_belief(problem, initial_belief(problem), observation), observation
+
+
 @pytest.mark.slow
 def test_a_decision_simulates_once(problem, monkeypatch):
     simulate, calls = physics_push._simulate, []
@@ -277,30 +283,23 @@ def test_a_decision_simulates_once(problem, monkeypatch):
         return simulate(*arguments)
 
     monkeypatch.setattr(physics_push, "_simulate", counted)
-    config = PlannerConfig(sequences=6, horizon=2, push_model="physics")
-    models = (NativePhysics(threads=5), all_push_models.push_models("physics").later)
-    objects = jax.tree.map(lambda a: a[:8], SCENE)
-    belief = planner.observe_belief(
-        problem, planner.initial_belief(problem), objects, jnp.array(False), jnp.zeros(3), config
-    )
-    plans = [planner.plan(jax.random.key(i), problem, belief, objects, config, *models) for i in (0, 0, 1)]
+    config, later = PlannerConfig(sequences=6, horizon=2), all_push_models.push_models("physics").later
+    policy = search_for_grasp(config, push_model=NativePhysics(threads=5), later_push_model=later)
+    plans = [policy(jax.random.key(i), problem, *seen(problem)) for i in (0, 0, 1)]
     jax.block_until_ready(plans)
     assert calls == [(6,)] * 3
     jax.tree.map(np.testing.assert_array_equal, plans[0], plans[1])
     assert np.isfinite(plans[0].value)
-    with pytest.raises(InputError, match="needs a simulator"):
-        planner.plan(jax.random.key(0), problem, belief, objects, dataclasses.replace(config, sequences=5))
 
 
 @pytest.mark.slow
 def test_a_decision_simulates_all_its_pushes_in_the_batch_simulator(problem):
-    config = PlannerConfig(sequences=2, horizon=2, actions="push", push_model="physics")
-    objects = jax.tree.map(lambda a: a[:8], SCENE)
-    belief = planner.observe_belief(
-        problem, planner.initial_belief(problem), objects, jnp.array(False), jnp.zeros(3), config
+    actions = dataclasses.replace(problem.config.actions, actions=("push",))
+    pushing = problem.replace(config=dataclasses.replace(problem.config, actions=actions))
+    plan, native = (
+        search_for_grasp(push_model=model, sequences=2, horizon=2)(jax.random.key(0), pushing, *seen(pushing))
+        for model in (MjxPhysics(), NativePhysics())
     )
-    plan = planner.plan(jax.random.key(0), problem, belief, objects, config, MjxPhysics())
-    native = planner.plan(jax.random.key(0), problem, belief, objects, config, NativePhysics())
     assert (plan.sequences.actions.kind[:, 0] == native.sequences.actions.kind[:, 0]).all()
     assert np.isfinite(plan.value)
     np.testing.assert_allclose(plan.value, native.value, rtol=0.1)

@@ -16,6 +16,7 @@ from mechsearch_jax.benchmarks.push import repeated
 from mechsearch_jax.dynamics import push_model
 from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.native import NativeSimulator
+from mechsearch_jax.envs.push_portions import portions
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
 from mechsearch_jax.envs.world import BOX, CYLINDER, TARGET, World, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
@@ -234,29 +235,27 @@ def test_a_world_is_simulated_as_its_scenario_is():
 def test_pushes_are_made_once_and_read_again(tmp_path):
     generation = Generation(seed=1, pushes=3, worlds=WORLDS, rounds=1)
     counts = []
-    made = list(
-        generator.portions(generation, tmp_path, lambda: NativeSimulator(2), DRAW_WORLD, "here", CONFIG, counts.append)
-    )
+    made = list(portions(generation, tmp_path, lambda: NativeSimulator(2), DRAW_WORLD, "here", CONFIG, counts.append))
 
     def simulate():
         raise AssertionError("all there is lies there already")
 
     where = tmp_path, simulate, DRAW_WORLD, "here", CONFIG
-    read = list(generator.portions(generation, *where))
+    read = list(portions(generation, *where))
     assert counts[-1] == sum(len(part.object) for part in made) >= 3
     for a, b in zip(jax.tree.leaves(made), jax.tree.leaves(read), strict=True):
         np.testing.assert_array_equal(a, b)
     # What only other actions depend on may have changed since.
     later = dataclasses.replace(CONFIG, actions=dataclasses.replace(CONFIG.actions, clearance=0.01))
-    list(generator.portions(generation, tmp_path, simulate, DRAW_WORLD, "here", later))
+    list(portions(generation, tmp_path, simulate, DRAW_WORLD, "here", later))
     # Another portion would be needed now: scenes of one seed are none of another's.
     with pytest.raises(InputError, match="made otherwise"):
-        list(generator.portions(dataclasses.replace(generation, seed=2), *where))
+        list(portions(dataclasses.replace(generation, seed=2), *where))
     with pytest.raises(InputError, match="made otherwise"):
-        list(generator.portions(generation, tmp_path, simulate, DRAW_WORLD, "elsewhere", CONFIG))
+        list(portions(generation, tmp_path, simulate, DRAW_WORLD, "elsewhere", CONFIG))
     (tmp_path / "pushes-000.npz").write_bytes(b"PK nothing of the kind")
     with pytest.raises(InputError, match="is damaged") as refused:
-        list(generator.portions(generation, *where))
+        list(portions(generation, *where))
     assert "\n" not in str(refused.value)
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import replacing
@@ -61,16 +62,9 @@ class Scenario:
     target: Body
 
 
-def rotation_matrix(quaternion: Sequence[float] | np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """The rotation matrix of a quaternion (w, x, y, z), which is normalised first."""
-    w, x, y, z = np.asarray(quaternion, float) / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+def rotation_matrix(quaternion: Sequence[float] | Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Rotation matrices of quaternions (w, x, y, z), which are normalised first; at most one leading axis."""
+    return Rotation.from_quat(np.roll(np.asarray(quaternion, float), -1, axis=-1)).as_matrix()
 
 
 def _numbers(value: Any, count: int, where: str) -> tuple[float, ...]:
