@@ -38,7 +38,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Belief, Problem
+from mechsearch_jax.planner import Belief, Config, Decision, Problem
 from mechsearch_jax.robot import motion
 from mechsearch_jax.train.push import push_scenes
 from mechsearch_jax.train.scenes import random_world
@@ -62,7 +62,7 @@ class Timing:
       shapes: sizes that the time depends on; for "simulate" also what was seen of overflows and divergence.
       compile_seconds: of tracing and compiling [s]; honest only if compilations are not kept on disk.
       seconds: of every call afterwards, results awaited [s].
-      versions: as `results.versions` returns them; for "plan" also the "push model", for "predict: learned" also
+      versions: as `versions` returns them; for "plan" also the "push model", for "predict: learned" also
         "weights", their SHA-256.
     """
 
@@ -164,59 +164,89 @@ def g_of(problem: Problem, belief: Belief, scene: Superquadrics) -> Int[Array, "
     return graspability(problem.grasps, belief.grasps, hits)[:-1]
 
 
-def bench(
-    subject: Literal["existence", "graspability", "plan"],
+def bench_part(
+    subject: Literal["existence", "graspability"],
     objects: int,
-    method: Method,
+    config: Config,
     batch: int = 1,
     scenes: int = 5,
     repeats: int = 20,
 ) -> Timing:
-    """Time f, g or a decision on generated scenes.
+    """Time f or g on generated scenes.
 
     Args:
       subject: what is timed.
       objects: number of objects in a scene.
-      method: what decides, and with which settings.
+      config: how the problem is built.
       batch: number of scenes in one call; 1 times the function itself, without a batch axis.
       scenes: number of different scenes, taken in turn.
       repeats: number of timed calls.
 
     Raises:
-      InputError: the number of objects does not fit, or the push model cannot be used.
+      InputError: the number of objects does not fit.
     """
+    problem, states, shapes = _states(objects, config, batch, scenes)
+    functions: dict[str, Callable[..., Any]] = {
+        "existence": lambda problem, key, belief, seen: f_of(problem, seen.objects),
+        "graspability": lambda problem, key, belief, seen: g_of(problem, belief, seen.objects),
+    }
+    if subject == "graspability":
+        shapes["median_possible_poses"] = int(statistics.median(int(belief.exists.sum()) for _, belief, _ in states))
+    function, calls = functions[subject], [(problem, *state) for state in states]
+    if batch > 1:
+        function, calls = jax.vmap(function, in_axes=(None, 0, 0, 0)), [(problem, *_batch_of(states, batch))]
+    compile_seconds, seconds = measure(function, calls, repeats)
+    return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions())
+
+
+def bench_plan(objects: int, method: Method, batch: int = 1, scenes: int = 5, repeats: int = 20) -> Timing:
+    """Time a decision on generated scenes, whose targets are not found yet.
+
+    Args:
+      objects: number of objects in a scene.
+      method: what decides, and with which settings.
+      batch, scenes, repeats: as in `bench_part`.
+
+    Raises:
+      InputError: the number of objects does not fit, or the method cannot be used.
+    """
+    policy = method.policy()
+    problem, states, shapes = _states(objects, method.config, batch, scenes)
+    shapes |= {"sequences": method.config.planner.sequences, "horizon": method.config.planner.horizon}
+
+    def decide(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
+        return policy(key, problem, belief, seen)
+
+    if batch > 1:
+        several = [(problem, *_batch_of(states, batch))]
+        compile_seconds, seconds = measure(jax.vmap(decide, in_axes=(None, 0, 0, 0)), several, repeats)
+    else:
+        # As in an episode alone: a policy compiles what it needs, and computes only what the belief asks for.
+        compile_seconds, seconds = measure_first(decide, [(problem, *state) for state in states], repeats)
+    told = versions() | {"push model": method.config.push_model}
+    return Timing("plan", objects, shapes, compile_seconds, tuple(seconds), told)
+
+
+def _states(
+    objects: int, config: Config, batch: int, scenes: int
+) -> tuple[Problem, list[tuple[Array, Belief, Observation]], dict[str, int]]:
+    """The problem, what is known and seen at the start of generated scenes with a key each, and the sizes."""
     generator = ScenarioGenerator()
-    problem = planner.build_problem(target=generator.target, config=method.config.problem)
-    policy, states = method.policy(), []
+    problem = planner.build_problem(target=generator.target, config=config.problem)
+    states = []
     for seed in range(scenes):
         world = from_scenario(generator.generate(seed, objects))
         scene = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
         observation = Observation(scene, jnp.array(False), jnp.zeros(3))
         belief = planner.update_belief(problem, planner.initial_belief(problem), observation)
         states.append((jax.random.key(seed), belief, observation))
-    poses = [int(belief.exists.sum()) for _, belief, _ in states]
     capacity = states[0][2].objects.capacity
-    shapes = {"poses": problem.poses.shape[0], "capacity": capacity, "scenes": scenes, "batch": batch}
-    functions: dict[str, Callable[..., Any]] = {
-        "existence": lambda policy, problem, key, belief, seen: f_of(problem, seen.objects),
-        "graspability": lambda policy, problem, key, belief, seen: g_of(problem, belief, seen.objects),
-        "plan": lambda policy, problem, key, belief, seen: policy(key, problem, belief, seen),
-    }
-    if subject == "graspability":
-        shapes["median_possible_poses"] = int(statistics.median(poses))
-    elif subject == "plan":
-        shapes |= {"sequences": method.config.planner.sequences, "horizon": method.config.planner.horizon}
-    function, calls = functions[subject], [(policy, problem, *state) for state in states]
-    if batch > 1:
-        function = jax.vmap(function, in_axes=(None, None, 0, 0, 0))
-        several = jax.tree.map(lambda *leaves: jnp.stack([leaves[i % scenes] for i in range(batch)]), *states)
-        calls = [(policy, problem, *several)]
-    # In an episode alone, a policy is called as it is, and computes only what the belief asks for.
-    timed = measure_first if subject == "plan" and batch == 1 else measure
-    compile_seconds, seconds = timed(function, calls, repeats)
-    # f and g predict no push.
-    told = {"push model": method.config.push_model} if subject == "plan" else {}
-    return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions() | told)
+    return problem, states, {"poses": len(problem.poses), "capacity": capacity, "scenes": scenes, "batch": batch}
+
+
+def _batch_of(states: Sequence[Any], batch: int) -> Any:
+    """So many of the states, in turn, with a leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack([leaves[i % len(states)] for i in range(batch)]), *states)
 
 
 def bench_perceive(
@@ -229,7 +259,7 @@ def bench_perceive(
     Args:
       recognition: "masks" or "full".
       objects: number of objects in a scene, all of which are recognised at once.
-      batch, scenes, repeats: as in `bench`.
+      batch, scenes, repeats: as in `bench_part`.
 
     Raises:
       InputError: the oracle recognises nothing, the number of objects does not fit, or the weights are damaged.
@@ -248,7 +278,7 @@ def bench_perceive(
     function, calls = perceive, states
     if batch > 1:
         function = jax.vmap(perceive)
-        calls = [jax.tree.map(lambda *leaves: jnp.stack([leaves[i % scenes] for i in range(batch)]), *states)]
+        calls = [_batch_of(states, batch)]
     compile_seconds, seconds = measure(function, calls, repeats)
     shapes = {"scenes": scenes, "batch": batch, "recognitions": batch * objects}
     return Timing(f"perceive: {recognition}", objects, shapes, compile_seconds, tuple(seconds), versions())

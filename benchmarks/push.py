@@ -39,6 +39,8 @@ from mechsearch_jax.versions import versions
 
 RowName = Literal["no motion", "quasi-static", "learned", "physics", "nudged"]
 ROWS: tuple[str, ...] = get_args(RowName)
+# The row that is no model.
+NUDGED: RowName = "nudged"
 
 
 def named_model(name: str, weights: Path | None = None) -> PushModel:
@@ -92,7 +94,7 @@ class Measured:
       scores: for each row the groups of `train.push.outcome_scores`.
       weights: as `weights_of` tells of the learned model; None if it was not measured.
       settings: how the pushes were made.
-      versions: as `results.versions` returns them.
+      versions: as `versions` returns them.
     """
 
     scores: dict[str, dict[str, Any]]
@@ -105,7 +107,7 @@ class Measured:
         """The learned model, or else the one whose pushed objects end nearest to where they should."""
         if "learned" in self.scores:
             return "learned"
-        models = [name for name in self.scores if name != "nudged"] or list(self.scores)
+        models = [name for name in self.scores if name != NUDGED] or list(self.scores)
         errors = {name: self.scores[name]["all"]["pushed_mm"] for name in models}
         return min(models, key=lambda name: np.inf if errors[name] is None else errors[name])
 
@@ -140,7 +142,7 @@ class Bench:
     @functools.cached_property
     def models(self) -> dict[str, PushModel]:
         """What predicts: the rows without "nudged"."""
-        return {name: named_model(name, self.weights) for name in dict.fromkeys(self.rows) if name != "nudged"}
+        return {name: named_model(name, self.weights) for name in dict.fromkeys(self.rows) if name != NUDGED}
 
     @property
     def gpu(self) -> bool:
@@ -176,7 +178,7 @@ class Bench:
         scores = {}
         for name in dict.fromkeys(self.rows):
             seen = functools.partial(told, name)
-            if name == "nudged":
+            if name == NUDGED:
                 moved = nudged(pushes, self.generation.seed)
                 outcome = repeated(moved, self.simulator, self.generation.worlds, seen)
             else:

@@ -127,7 +127,7 @@ class Measured:
       after: of each method, the one that it begins with.
       times: of each method.
       settings: what scenes, noises and seed they come from.
-      versions: as `results.versions` returns them.
+      versions: as `versions` returns them.
     """
 
     rows: tuple[Row, ...]

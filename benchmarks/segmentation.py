@@ -64,7 +64,7 @@ class Measured:
       seconds: for each image, the time to label it [s].
       compile_seconds: of the first call, less the median of the others [s].
       settings: what scenes, noises and seed they come from.
-      versions: as `results.versions` returns them.
+      versions: as `versions` returns them.
     """
 
     rows: tuple[Row, ...]

@@ -237,3 +237,20 @@ def test_progress_and_rates_are_shown(tmp_path, files, command):
     assert "3/3 raise: error: ValueError: no" in text
     everything = next(line for line in text.splitlines() if " all " in line)
     assert everything.split()[:6] == ["search-for-grasp", "all", "3", "0.67", "0.67", "0.67"]
+
+
+def test_a_policy_of_another_module_reaches_the_worker(tmp_path, files, monkeypatch):
+    source = (
+        "import os",
+        "def Mine(config, **push_models):",
+        "    if 'PJRT_NPROC' in os.environ:",
+        "        raise RuntimeError(f'gamma {config.gamma} arrived')",
+        "    return print",
+    )
+    (tmp_path / "their_lab.py").write_text("\n".join(source))
+    monkeypatch.delenv("PJRT_NPROC", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    method = Method("their_lab:Mine", standard(gamma=0.25))
+    (row,) = evaluate(make_jobs(files[:1], [method], (0,)), tmp_path / "rows.parquet", Processes(1))
+    assert (row.policy, row.gamma) == ("their_lab:Mine", 0.25)
+    assert row.failure == "error: RuntimeError: gamma 0.25 arrived"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -59,7 +59,11 @@ def _timing_of(subject: Literal["existence", "graspability"], what: str) -> Call
         out: JsonFile = None,
         options: EpisodeOptions = DEFAULTS,
     ) -> None:
-        _time_planner(subject, options, chosen_policies(subject, None, None), objects, batch, repeats, out)
+        from mechsearch_jax.benchmarks import bench as benches
+
+        at_least_one(f"bench {subject}", repeats=repeats, batch=batch)
+        config = options.config()
+        _print_timing(subject, out, lambda: benches.bench_part(subject, objects, config, batch, repeats=repeats))
 
     command.__name__ = subject
     command.__doc__ = f"""Time {what}: compilation, median and spread.
@@ -95,24 +99,11 @@ def bench_plan(
       out: JSON file for the result.
       options: how the planner decides.
     """
-    chosen = chosen_policies("bench plan", method and (method,), policy and (policy,))
-    _time_planner("plan", options, chosen, objects, batch, repeats, out)
+    from mechsearch_jax.benchmarks import bench as benches
 
-
-def _time_planner(
-    subject: Literal["existence", "graspability", "plan"],
-    options: EpisodeOptions,
-    policies: Sequence[str],
-    objects: int,
-    batch: int,
-    repeats: int,
-    out: Path | None,
-) -> None:
-    from mechsearch_jax.benchmarks.bench import bench
-
-    at_least_one(f"bench {subject}", repeats=repeats, batch=batch)
-    (method,) = options.methods(policies)
-    _print_timing(subject, out, lambda: bench(subject, objects, method, batch=batch, repeats=repeats))
+    at_least_one("bench plan", repeats=repeats, batch=batch)
+    (chosen,) = options.methods(chosen_policies("bench plan", method and (method,), policy and (policy,)))
+    _print_timing("plan", out, lambda: benches.bench_plan(objects, chosen, batch, repeats=repeats))
 
 
 def bench_perceive(
