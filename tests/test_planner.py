@@ -192,6 +192,17 @@ def test_nothing_is_compiled_anew_when_objects_come_go_or_move(decision, problem
     assert after[2] <= counts[2] + 1
 
 
+def test_continuous_settings_are_data_and_compile_nothing(decision, problem):
+    objects, belief, usual = decision
+    count = policies._plan._cache_size()
+    changes = {"gamma": 0.5, "unseen_contact_penalty": 0.0, "topple_charge": 0.3, "guided_fraction": 0.1}
+    other = planner.search_for_grasp(**changes, crowding_weight=0.0)
+    told = other(jax.random.key(0), problem, belief, seen(objects))
+    assert policies._plan._cache_size() == count
+    assert float(told.cost) != float(usual.cost)
+    assert not np.array_equal(np.asarray(told.sequences.value), np.asarray(usual.sequences.value))
+
+
 def test_a_found_target_is_one_pose_and_stays_found(problem):
     _, objects = load("first-light")
     belief = look(problem, objects, True, (0.7, 0.2, 0.0))

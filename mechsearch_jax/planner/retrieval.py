@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS
 from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics, gauge, to_object_frame
 from mechsearch_jax.geometry.transforms import compose, upright_pose
 from mechsearch_jax.graspability import find_grasps, grasp_hits
@@ -42,28 +43,45 @@ class GraspChoice(flax.struct.PyTreeNode):
 
 
 def _leaves_shelf(
-    problem: Problem, T_world_gripper: Float[Array, "g 4 4"], q7: Float[Array, " g"]
+    problem: Problem, T_world_gripper: Float[Array, "g 4 4"], q7: Float[Array, " g"], feasible: Bool[Array, " g"]
 ) -> Bool[Array, " g"]:
-    """Whether the arm can go on from the end of a retreat, along -x, until what it holds is outside the shelf."""
-    n = CLOSE_WAYPOINTS
-    back = line_poses(T_world_gripper, jnp.full(q7.shape, problem.gripper.approach), n)
-    step = jnp.minimum(problem.shelf.front - OUTSIDE - back[:, 0, 0, 3], 0.0)
-    out = jnp.broadcast_to(back[:, :1], (q7.shape[0], n - 1, 4, 4))
-    out = out.at[..., 0, 3].add(step[:, None] * jnp.linspace(1.0, 0.0, n)[None, :-1])
-    return path_kinematics(jnp.concatenate([out, back], axis=1), q7)[1]
+    """Whether the arm can go on from the end of a retreat, along -x, until what it holds is outside the shelf.
+
+    Looked at for feasible grasps only.
+    """
+    n, gripper, shelf = CLOSE_WAYPOINTS, problem.gripper, problem.shelf
+
+    def leaves(_, row, i):
+        T, q7 = row[0][i], row[1][i]
+        back = line_poses(T, jnp.float32(gripper.approach), n)
+        step = jnp.minimum(shelf.front - OUTSIDE - back[0, 0, 3], 0.0)
+        out = jnp.broadcast_to(back[:1], (n - 1, 4, 4))
+        out = out.at[:, 0, 3].add(step * jnp.linspace(1.0, 0.0, n)[:-1])
+        return path_kinematics(jnp.concatenate([out, back]), q7)[1]
+
+    return masked_vmap(leaves, feasible, None, (T_world_gripper, q7), block=64)
 
 
 def _arm_touches(
-    problem: Problem, scene: Superquadrics, T_world_gripper: Float[Array, "g 4 4"], q7: Float[Array, " g"]
+    problem: Problem,
+    scene: Superquadrics,
+    T_world_gripper: Float[Array, "g 4 4"],
+    q7: Float[Array, " g"],
+    feasible: Bool[Array, " g"],
 ) -> Int[Array, " g"]:
-    """How many objects links 2 to 5 run into on the approach to each grasp."""
-    approach = jnp.full(q7.shape, problem.gripper.approach)
-    q, _ = line_kinematics(T_world_gripper, approach, q7, ARM_WAYPOINTS)
-    points, radius = arm_points(q, ARM_POINTS)
-    size = scene.size[None] + radius[:, None, None]
-    # A superquadric that is larger by the radius on every side holds all that is nearer than that to the object.
-    near = gauge(size, scene.exponents[None], to_object_frame(scene, points)) < 1.0
-    return jnp.sum(jnp.any(near, axis=(1, 2)) & scene.valid[None], axis=1)
+    """How many objects links 2 to 5 run into on the approach to each grasp; looked at for feasible grasps only."""
+    approach = jnp.float32(problem.gripper.approach)
+
+    def touches(_, row, i):
+        scene = jax.tree.map(lambda a: a[...], row[2])
+        q, _ = line_kinematics(row[0][i], approach, row[1][i], ARM_WAYPOINTS)
+        points, radius = arm_points(q, ARM_POINTS)
+        # A superquadric that is larger by the radius on every side holds all that is nearer than that to the object.
+        size = scene.size[None] + radius[:, None, None]
+        near = gauge(size, scene.exponents[None], to_object_frame(scene, points)) < 1.0
+        return jnp.sum(jnp.any(near, axis=(0, 1)) & scene.valid)
+
+    return masked_vmap(touches, feasible, None, (T_world_gripper, q7, scene), block=16)
 
 
 @jax.jit
@@ -89,8 +107,8 @@ def graspable_at(
 
     counts = jax.lax.map(count, jnp.float32(CLEARANCES))
     T = compose(T_world_target[None], tables.T_target_gripper)
-    leaves = _leaves_shelf(problem, T, tables.q7)
-    touches = _arm_touches(problem, scene, T, tables.q7)
+    leaves = _leaves_shelf(problem, T, tables.q7, found.feasible)
+    touches = _arm_touches(problem, scene, T, tables.q7, found.feasible)
     order = ((counts[0] * 2 + ~leaves) * 10 + touches) * 100 + jnp.sum(counts[1:], axis=0)
     best = jnp.argmin(order)
     return GraspChoice(
