@@ -9,10 +9,11 @@ import jax
 
 from mechsearch_jax.benchmarks.evaluate import Job
 from mechsearch_jax.benchmarks.rows import Row
-from mechsearch_jax.envs.episodes import Simulator, Start, run_episodes, target_of
+from mechsearch_jax.envs.episodes import Start, run_episodes, target_of
 from mechsearch_jax.envs.method import EngineName, Method
 from mechsearch_jax.envs.recognisers import recogniser
 from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner.cache import cached_problem
 from mechsearch_jax.workspace.target import Target

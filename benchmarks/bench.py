@@ -22,12 +22,14 @@ from mechsearch_jax.actions import Action
 from mechsearch_jax.benchmarks.push import named_model, weights_of
 from mechsearch_jax.dynamics.named import PushModelName
 from mechsearch_jax.dynamics.push_model import PushOutcome
-from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.envs.method import Method
-from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator, commands
+from mechsearch_jax.envs.mjx_model import MjxConfig
+from mechsearch_jax.envs.mjx_simulator import MjxSimulator
+from mechsearch_jax.envs.mjx_step import commands
 from mechsearch_jax.envs.pushes import PushesConfig, draw_push, push_tables
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
+from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.world import TARGET, World, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import existence, object_views

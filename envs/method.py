@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
@@ -52,7 +53,7 @@ class Method:
         kinds = [kind.name for kind in SAMPLED_KINDS]
         unknown = [name for name in self.config.problem.actions.actions if name not in kinds]
         if unknown:
-            raise InputError(f"actions '{unknown[0]}' are unknown; use one or more of {', '.join(kinds)}")
+            raise InputError(f'actions: "{unknown[0]}" is unknown; use one or more of {", ".join(kinds)}')
         self.policy()
         recogniser(self.recognition, Target.cylinder())
 
@@ -60,11 +61,7 @@ class Method:
         """What tells this method from others, flat and as JSON values: the policy, the recognition, every option of the
         configuration by its name, and other settings that are not the preset `standard`'s by their path."""
         usual, named = dict(_settings(PRESETS["standard"]())), {".".join(option.path) for option in OPTIONS}
-        unusual = {
-            path: list(value) if isinstance(value, tuple) else value
-            for path, value in _settings(self.config)
-            if value != usual[path] and path not in named
-        }
+        unusual = {path: value for path, value in _settings(self.config) if value != usual[path] and path not in named}
         return {"policy": self.name, "recognition": self.recognition, **self.config.options(), **unusual}
 
     def to_json(self) -> dict[str, Any]:
@@ -81,18 +78,25 @@ class Method:
         return _restored(cls(), value)
 
 
-def _settings(config: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every field of a configuration, and of those within it, by its path: "problem.grasps.tilts"."""
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if dataclasses.is_dataclass(value):
-            yield from _settings(value, f"{path}{field.name}.")
-        else:
-            yield f"{path}{field.name}", value
+def _settings(config: Config) -> Iterator[tuple[str, Any]]:
+    """Every setting, as JSON has it, by its path: "problem.grasps.wrists"."""
+
+    def inside(value: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+        for name, part in value.items():
+            if isinstance(part, dict):
+                yield from inside(part, f"{path}{name}.")
+            else:
+                yield f"{path}{name}", part
+
+    return inside(json.loads(json.dumps(dataclasses.asdict(config))), "")
 
 
 def _restored(like: Any, value: Any) -> Any:
-    """A dataclass and those within it from dictionaries, and tuples from lists; `like` says what is a dataclass."""
+    """What `dataclasses.asdict` and JSON made of something like `like`: dataclasses from dictionaries, tuples from
+    lists."""
     if dataclasses.is_dataclass(like):
         return type(like)(**{name: _restored(getattr(like, name), part) for name, part in value.items()})
-    return tuple(_restored(None, part) for part in value) if isinstance(value, list | tuple) else value
+    if isinstance(value, list | tuple):
+        first = like[0] if isinstance(like, tuple) and like else None
+        return tuple(_restored(first, part) for part in value)
+    return value

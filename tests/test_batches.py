@@ -4,7 +4,7 @@ import dataclasses
 
 import jax
 import pytest
-from test_envs_episode import HIDDEN, OPEN
+from stage import HIDDEN, OPEN
 
 from mechsearch_jax.benchmarks import batches
 from mechsearch_jax.benchmarks.batches import Batches, fitting_worlds

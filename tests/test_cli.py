@@ -71,7 +71,7 @@ WRONG = {
     "no command": ([], "Expected one of"),
     "unknown command": (["sweep"], "sweep"),
     "unknown option": (["search", "good.json", "--out", "out", "--speed", "3"], "--speed"),
-    "unknown choice": (["search", "good.json", "--out", "out", "--actions", "fly"], "'fly'"),
+    "unknown choice": (["search", "good.json", "--out", "out", "--actions", "fly"], '"fly" is unknown'),
     "no number": (["search", "good.json", "--out", "out", "--gamma", "high"], "--gamma"),
     "unknown push model": (["search", "good.json", "--out", "out", "--push-model", "guess"], "'guess'"),
     "impossible gamma": (["search", "good.json", "--out", "out", "--gamma", "1.5"], "gamma 1.5 is outside (0, 1]"),
@@ -231,7 +231,7 @@ def options_of(*arguments):
 def test_what_is_given_goes_before_the_preset(preset):
     assert options_of("--preset", preset).config() == PRESETS[preset]()
     given = options_of("--preset", preset, "--gamma", "0.5", "--actions", "push", "--push-distances", "0.1", "0.2")
-    assert given.config() == PRESETS[preset](gamma=0.5, actions="push", push_distances=(0.1, 0.2))
+    assert given.config() == PRESETS[preset](gamma=0.5, actions=("push",), push_distances=(0.1, 0.2))
 
 
 def test_the_default_preset_is_the_standard():

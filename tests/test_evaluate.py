@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import json
 import sys
 
 import pyarrow.parquet
@@ -27,10 +28,11 @@ TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0
 FAKE = """
 import json, os, pathlib, sys
 
-def settings(config):
+def settings(config, path=""):
     for name, value in config.items():
-        yield from settings(value) if isinstance(value, dict) else [(name, value)]
+        yield from settings(value, path + name + ".") if isinstance(value, dict) else [(path + name, value)]
 
+names = json.loads(os.environ["OPTIONS"])
 for line in sys.stdin:
     job = json.loads(line)
     name = json.loads(pathlib.Path(job["path"]).read_text())["name"]
@@ -40,12 +42,13 @@ for line in sys.stdin:
         print("out of luck", file=sys.stderr, flush=True)
         os._exit(3)
     method = job["method"]
-    options = {k: v for k, v in settings(method["config"]) if k in os.environ["OPTIONS"].split()}
+    options = {names[path]: value for path, value in settings(method["config"]) if path in names}
     options.update(policy=method["name"], recognition="oracle", simulator="NativeSimulator")
-    columns = ("policy", "recognition", "gamma", "horizon", "sequences", "actions")
-    row = dict({column: options[column] for column in columns}, scenario=name, objects=0, target="cylinder",
-               seed=job["seed"], found_step=1, graspable_step=2, retrieved=True, steps=3, failure=None,
-               planning_seconds=1.0, simulation_seconds=0.5, configuration=json.dumps(options, sort_keys=True))
+    columns = ("policy", "recognition", "gamma", "horizon", "sequences")
+    row = dict({column: options[column] for column in columns}, actions="+".join(options["actions"]), scenario=name,
+               objects=0, target="cylinder", seed=job["seed"], found_step=1, graspable_step=2, retrieved=True, steps=3,
+               failure=None, planning_seconds=1.0, simulation_seconds=0.5)
+    row["configuration"] = json.dumps(options, sort_keys=True)
     if name == "confused":
         row["gamma"] = 0.123
     print(json.dumps({"error": "ValueError: no"} if name == "raise" else {"row": row}), flush=True)
@@ -63,7 +66,7 @@ def files(tmp_path):
 @pytest.fixture
 def command(tmp_path, monkeypatch):
     monkeypatch.setenv("LOG", str(tmp_path / "log"))
-    monkeypatch.setenv("OPTIONS", " ".join(option.name for option in OPTIONS))
+    monkeypatch.setenv("OPTIONS", json.dumps({".".join(option.path): option.name for option in OPTIONS}))
     return (sys.executable, "-c", FAKE)
 
 

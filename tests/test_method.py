@@ -7,8 +7,11 @@ import pytest
 
 from mechsearch_jax.benchmarks.evaluate import Job
 from mechsearch_jax.benchmarks.rows import Row
+from mechsearch_jax.envs.earlier import present_options
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.existence import ExistenceConfig
+from mechsearch_jax.graspability import GraspConfig
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.workspace.scenario import Body, Scenario
 
@@ -37,7 +40,29 @@ def test_options_are_flat_and_complete():
     assert options["policy"] == "my_lab.policies:Mine"
     assert options["push_distances"] == [0.05, 0.2]
     assert json.loads(json.dumps(options)) == options
+    assert not any("." in name for name in options)
     assert set(Method().options()) == {"policy", "recognition", *(option.name for option in OPTIONS)}
+
+
+def test_what_is_no_option_tells_methods_apart_too():
+    problem = dataclasses.replace(
+        METHODS[0].config.problem, existence=ExistenceConfig(spread=((0.0, 0.0),)), retrieval=GraspConfig(yaws=5)
+    )
+    method = Method(config=dataclasses.replace(METHODS[0].config, problem=problem))
+    unusual = {name: value for name, value in method.options().items() if "." in name}
+    assert unusual.pop("problem.existence.spread") == [[0.0, 0.0]]
+    assert unusual.pop("problem.retrieval.yaws") == 5
+    assert set(unusual) == {"problem.retrieval.wrists"}
+    assert Method.from_json(json.loads(json.dumps(method.to_json()))) == method
+
+
+def test_the_default_is_what_earlier_files_ran_with_by_default():
+    earlier = {
+        "method": "search-for-grasp", "gamma": 0.9, "horizon": 3, "sequences": 30, "actions": "both",
+        "criterion": "detector", "push_distances": [0.05, 0.10, 0.15], "caution": 1.0, "topple_charge": 0.0,
+        "push_model": "learned", "focus": 0.7, "max_steps": 10, "recognition": "oracle",
+    }  # fmt: skip
+    assert present_options(earlier) == Method().options()
 
 
 def test_the_row_of_a_job_is_that_of_its_episode():

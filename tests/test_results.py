@@ -47,7 +47,7 @@ ROW = Row(
     gamma=0.9,
     horizon=3,
     sequences=30,
-    actions="both",
+    actions="push+pick-and-place",
     seed=0,
     found_step=1,
     graspable_step=None,
@@ -224,7 +224,14 @@ def test_tables_with_earlier_names_of_options_are_read(tmp_path):
     old_table(tmp_path / "rows.parquet", OLD, {**OLD, "push_model": "learned", "topple_charge": 0.5})
     before = (tmp_path / "rows.parquet").read_bytes()
     first, second = read_rows(tmp_path / "rows.parquet")
-    now = {**OLD, **EARLIER, "policy": OLD["method"], "unseen_contact_penalty": 0.5, "guided_fraction": 0.7}
+    now = {
+        **OLD,
+        **EARLIER,
+        "policy": OLD["method"],
+        "actions": ["push", "pick-and-place"],
+        "unseen_contact_penalty": 0.5,
+        "guided_fraction": 0.7,
+    }
     for name in ("method", "caution", "focus"):
         del now[name]
     assert first == dataclasses.replace(ROW, policy="search-and-grasp", configuration=configuration(now))
@@ -244,7 +251,7 @@ def test_what_differs_goes_by_the_present_names_of_options(tmp_path):
     old_table(tmp_path / "rows.parquet", OLD, {**OLD, "caution": 1.0, "focus": 0.0})
     assert label_variants(read_rows(tmp_path / "rows.parquet")) == [
         "search-and-grasp, guided fraction 0.7, unseen contact penalty 0.5",
-        "search-and-grasp, guided fraction 0.0, unseen contact penalty 1.0",
+        "search-and-grasp, guided fraction 0, unseen contact penalty 1",
     ]
 
 

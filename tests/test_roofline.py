@@ -15,6 +15,8 @@ from mechsearch_jax.benchmarks.ceilings import Ceiling
 from mechsearch_jax.benchmarks.tables import timings_table
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
 
 RESULTS = Path(__file__).parent.parent / "benchmarks" / "results"
 H200 = {"device": "gpu: NVIDIA H200", "jax": "0.11.2"}
@@ -132,8 +134,8 @@ def test_what_is_no_result_is_named(tmp_path, text):
 
 def test_the_bytes_of_a_world_are_the_simulators():
     pytest.importorskip("warp")
-    from mechsearch_jax.envs.mjx_simulator import MjxSimulator
+    from mechsearch_jax.envs.mjx_model import MjxConfig, MjxModel
 
-    data = MjxSimulator()._make_data(8)
+    data = MjxModel(Shelf(), Camera(), MjxConfig()).make_data(8)
     total = sum(leaf.nbytes for leaf in jax.tree.leaves(data))
     assert total / 8 == pytest.approx(roofline.WORLD_BYTES, rel=0.01)

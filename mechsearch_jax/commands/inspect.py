@@ -35,13 +35,15 @@ def inspect(
     from mechsearch_jax.workspace.scenario import load_scenario
 
     options.only_native("inspect")
-    config = options.config()
+    (method,) = options.methods(("search-for-grasp",))
     scenes = [load_scenario(file) for file in find_scenarios(scenarios)]
     check_writable(out)
     keep_compilations()
-    problems = {target: cached_problem(target, config.problem) for target in {target_of(scene) for scene in scenes}}
+    problems = {
+        target: cached_problem(target, method.config.problem) for target in {target_of(scene) for scene in scenes}
+    }
     for scene in track(scenes, "inspecting"):
-        see = recogniser(options.recognition, target_of(scene))
+        see = recogniser(method.recognition, target_of(scene))
         maps, figure = inspect_scenario(scene, problems[target_of(scene)], see, seed)
         save_maps(maps, out / f"{scene.name}.npz")
         save_figure(figure, out / f"{scene.name}.png")

@@ -99,20 +99,17 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     description = COMMANDS[group].__doc__ if group else "Find a hidden object on a cluttered shelf and take it out."
     rest = list(arguments[1:] if group else arguments)
     asked = rest[0] if rest else None
+    # What options there are takes long to find out, and is of no use to other commands.
+    known = {n: _deferred(c) if n == asked else _only_described(c.__doc__) for n, c in commands.items()}
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.extras.subcommand_cli_from_dict(
-                # What options there are takes long to find out, and is of no use to other commands.
-                {n: _deferred(c) if n == asked else _only_described(c.__doc__) for n, c in commands.items()},
-                prog=program,
-                description=description,
-                args=rest,
-            )
+            command: Any = tyro.extras.subcommand_cli_from_dict(known, prog=program, description=description, args=rest)
     except SystemExit as end:
         if not end.code:
             raise
         raise InputError(f"{one_line(complaint.getvalue())} ({program} --help tells more)") from None
+    return command
 
 
 def main() -> None:

@@ -74,7 +74,7 @@ def search(
         )
         wanted = target_of(scene)
         problem = cached_problem(wanted, chosen.config.problem)
-        narrator = Narrator(console, status, problem, chosen.config)
+        narrator = Narrator(console, status, problem)
         episode = run_episode(
             seed,
             scene,

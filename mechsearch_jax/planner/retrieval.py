@@ -70,11 +70,11 @@ def _arm_touches(
     feasible: Bool[Array, " g"],
 ) -> Int[Array, " g"]:
     """How many objects links 2 to 5 run into on the approach to each grasp; looked at for feasible grasps only."""
-    approach = jnp.float32(problem.gripper.approach)
+    gripper = problem.gripper
 
     def touches(_, row, i):
         scene = jax.tree.map(lambda a: a[...], row[2])
-        q, _ = line_kinematics(row[0][i], approach, row[1][i], ARM_WAYPOINTS)
+        q, _ = line_kinematics(row[0][i], jnp.float32(gripper.approach), row[1][i], ARM_WAYPOINTS)
         points, radius = arm_points(q, ARM_POINTS)
         # A superquadric that is larger by the radius on every side holds all that is nearer than that to the object.
         size = scene.size[None] + radius[:, None, None]
