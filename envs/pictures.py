@@ -35,9 +35,9 @@ def frame(moment: Moment, problem: Problem) -> Frame:
         decision, kind = moment.decision, kind_of(int(moment.decision.action.kind))
         after = jax.tree.map(np.asarray, decision.predicted)
         sketch, does = kind.sketch(objects, after, decision.action), kind.describe(decision.action)
-        why = f"cost {record.cost:.0f} → {record.predicted_cost:.0f} expected, best of {record.sequences} sequences"
-        if kind.takes_target:
-            why = "a grasp that hits nothing is known"
+        why = "a grasp that hits nothing is known"
+        if not kind.takes_target:
+            why = f"cost {record.cost:.0f} → {record.predicted_cost:.0f} expected, best of {record.sequences} sequences"
     known = "target found" if record.found else f"target can be at {record.belief_size} poses"
     outcome = f" · {record.failure}" if record.failure else ""
     nowhere = np.zeros(problem.poses.shape[0], bool)

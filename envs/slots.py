@@ -98,14 +98,16 @@ class OneSlot:
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, bool]:
         """See `Slots`."""
         here = self._snapshot(world)
-        return {r: bool(_graspable(self._problem, objects_on_the_board(here), here.world)) for r in rows}
+        objects, pose = objects_on_the_board(here), true_target_pose(here.world)
+        # Called as the policies call it, so that nothing is compiled twice.
+        return {r: bool(graspable_at(self._problem, objects, pose).success) for r in rows}
 
     def _snapshot(self, world: World) -> Snapshot:
         here = jax.tree.map(lambda a: a[0], world)
         return Snapshot(self._problem.camera, self._problem.shelf, here)
 
 
-def _graspable(problem: Problem, objects: Any, world: World, active: Bool[Array, ""] | bool = True) -> Array:
+def _graspable(problem: Problem, objects: Any, world: World, active: Bool[Array, ""]) -> Array:
     return graspable_at(problem, objects, true_target_pose(world), active).success
 
 
