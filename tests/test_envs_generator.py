@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs import generator, observation, world
+from mechsearch_jax.envs import generator, simulated_camera, world
 from mechsearch_jax.envs.generator import BOXES, CYLINDERS, GeneratorConfig, ScenarioGenerator, outline, separation
 from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.errors import InputError
@@ -44,7 +44,7 @@ def check(scene, objects, target, allowed):
     assert len(scene.objects) == objects
     assert all(tuple(round(s, 6) for s in b.half_size) in SIZES for b in scene.objects)
     assert scene.target.half_size == target.half_size
-    assert int(observation.target_pixels(Camera(), state)) == 0
+    assert int(simulated_camera.target_pixels(Camera(), state)) == 0
 
     yaw = 2 * np.arctan2(scene.target.quaternion[3], scene.target.quaternion[0])
     placed = np.array([*scene.target.position[:2], yaw])

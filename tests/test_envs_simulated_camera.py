@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs import observation, world
+from mechsearch_jax.envs import simulated_camera, world
 from mechsearch_jax.envs.model import shelf_boxes
 from mechsearch_jax.envs.world import CYLINDER, TARGET
 from mechsearch_jax.workspace.camera import Camera
@@ -64,14 +64,14 @@ def march(camera, scene, row, column, steps=20_000):
     for _ in range(40):
         middle = (near + far) / 2
         near, far = (near, middle) if owners(np.array([middle])).any() else (middle, far)
-    slots = [*range(len(scene.objects)), TARGET, observation.SHELF]
+    slots = [*range(len(scene.objects)), TARGET, simulated_camera.SHELF]
     return far, slots[int(owners(np.array([far]))[:, 0].argmax())]
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_depth_and_segmentation_are_those_of_a_ray_march(seed):
     scene = random_scenario(seed)
-    seen = observation.observe(CAMERA, world.from_scenario(scene))
+    seen = simulated_camera.observe(CAMERA, world.from_scenario(scene))
     rng = np.random.default_rng(seed)
     rows, columns = rng.integers(0, CAMERA.height, 150), rng.integers(0, CAMERA.width, 150)
     for row, column in zip(rows, columns, strict=True):
@@ -123,7 +123,7 @@ def test_depth_is_within_a_millimetre_of_the_renderer(tmp_path):
     else:
         pytest.skip("neither OSMesa nor EGL renders here")
     rendered = np.load(tmp_path / "depth.npy")
-    seen = observation.observe(Camera().scaled(4), world.from_scenario(scene))
+    seen = simulated_camera.observe(Camera().scaled(4), world.from_scenario(scene))
     owner = np.asarray(seen.segmentation)
     # Where neighbours show different things, or nothing, the two may differ by half a pixel on who is hit.
     shifts = [np.roll(owner, shift, axis) for shift in (-1, 1) for axis in (0, 1)]
@@ -135,11 +135,11 @@ def test_depth_is_within_a_millimetre_of_the_renderer(tmp_path):
 
 
 def test_colour_tells_bodies_apart_and_the_target_is_red():
-    seen = observation.observe(CAMERA, world.from_scenario(SCENE))
+    seen = simulated_camera.observe(CAMERA, world.from_scenario(SCENE))
     owner, colour = np.asarray(seen.segmentation), np.asarray(seen.colour)
     assert colour.min() >= 0.0
     assert colour.max() <= 1.0
-    assert set(np.unique(owner)) == {-1, 0, 1, TARGET, observation.SHELF}
+    assert set(np.unique(owner)) == {-1, 0, 1, TARGET, simulated_camera.SHELF}
     red = colour[owner == TARGET]
     assert (red[:, 0] > 2 * red[:, 1]).all()
     assert np.isinf(np.asarray(seen.depth)[owner == -1]).all()
@@ -152,37 +152,37 @@ def test_target_pixels_are_those_of_the_whole_image(seed):
     scene = Scenario("scene", random_scenario(seed).objects, Body("cylinder", (0.02, 0.02, 0.05), place, UPRIGHT))
     state = world.from_scenario(scene)
     camera = Camera().scaled(2)
-    whole = int(jnp.sum(observation.observe(camera, state).segmentation == TARGET))
-    assert int(observation.target_pixels(camera, state)) == whole
+    whole = int(jnp.sum(simulated_camera.observe(camera, state).segmentation == TARGET))
+    assert int(simulated_camera.target_pixels(camera, state)) == whole
 
 
 def test_the_detector_needs_more_than_100_pixels():
     camera = Camera()
     behind = Scenario("hidden", (Body("box", (0.02, 0.15, 0.1), (0.6, 0.0, 0.505), UPRIGHT),), TARGET_BODY)
-    assert not observation.is_found(camera, world.from_scenario(behind))
-    assert observation.is_found(camera, world.from_scenario(SCENE))
-    assert int(observation.target_pixels(camera, world.from_scenario(behind))) == 0
+    assert not simulated_camera.is_found(camera, world.from_scenario(behind))
+    assert simulated_camera.is_found(camera, world.from_scenario(SCENE))
+    assert int(simulated_camera.target_pixels(camera, world.from_scenario(behind))) == 0
 
 
 def test_eager_jit_and_vmap_agree():
     states = [world.from_scenario(random_scenario(seed, count)) for seed, count in ((0, 3), (1, 8))]
     stacked = jax.tree.map(lambda *a: jnp.stack(a), *states)
     camera = Camera().scaled(16)
-    batch = jax.vmap(lambda state: observation.observe(camera, state))(stacked)
+    batch = jax.vmap(lambda state: simulated_camera.observe(camera, state))(stacked)
     for i, state in enumerate(states):
-        single = observation.observe(camera, state)
+        single = simulated_camera.observe(camera, state)
         np.testing.assert_allclose(batch.depth[i], single.depth, atol=1e-6)
         np.testing.assert_array_equal(batch.segmentation[i], single.segmentation)
         with jax.disable_jit():
-            eager = observation.observe(camera, state)
+            eager = simulated_camera.observe(camera, state)
         np.testing.assert_allclose(eager.depth, single.depth, atol=1e-6)
 
 
 def test_adding_and_moving_objects_compiles_nothing_anew():
-    observation.observe(CAMERA, world.from_scenario(SCENE))
-    before = observation.observe._cache_size()
-    observation.observe(CAMERA, world.from_scenario(random_scenario(5, 8)))
-    assert observation.observe._cache_size() == before
+    simulated_camera.observe(CAMERA, world.from_scenario(SCENE))
+    before = simulated_camera.observe._cache_size()
+    simulated_camera.observe(CAMERA, world.from_scenario(random_scenario(5, 8)))
+    assert simulated_camera.observe._cache_size() == before
 
 
 def test_the_truth_as_superquadrics_leaves_the_target_out():

@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -149,6 +151,15 @@ def test_reset_keeps_the_scenario_exactly_and_rest_does_not_move_it(sim):
     again = sim.scenario("again")
     assert [b.shape for b in again.objects] == ["box", "cylinder"]
     np.testing.assert_allclose(again.target.position, start.target.position, atol=5e-4)
+
+
+def test_nothing_native_imports_the_batch_simulator():
+    code = """
+import sys
+import mechsearch_jax.envs.native, mechsearch_jax.envs.episodes, mechsearch_jax.envs.generator
+sys.exit(any(name.startswith(("mujoco.mjx", "warp", "mechsearch_jax.envs.mjx")) for name in sys.modules))
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_more_objects_than_slots_are_refused(sim):

@@ -9,7 +9,7 @@ import pytest
 from published import published_scenarios
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs import observation, world
+from mechsearch_jax.envs import simulated_camera, world
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import BOX_EXPONENTS, CYLINDER_EXPONENTS, sample_surface
 from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
@@ -55,7 +55,7 @@ def disturbed(truth, rng, size=0.07, position=0.004, yaw=5.0):
 def measured(scenarios, rng, noise):
     """Points, labels and depths of scenes, and the true superquadrics; noise along random directions, as in B.1."""
     worlds = [world.from_scenario(s) for s in scenarios]
-    images = [observation.observe(CAMERA, w) for w in worlds]
+    images = [simulated_camera.observe(CAMERA, w) for w in worlds]
     depth = np.stack([i.depth for i in images])
     labels = np.stack([i.segmentation for i in images]).reshape(len(worlds), -1).astype(np.int32)
     points = np.stack([back_project(CAMERA, i.depth) for i in images]).reshape(len(worlds), -1, 3)

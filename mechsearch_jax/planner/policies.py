@@ -81,7 +81,7 @@ class Search(flax.struct.PyTreeNode):
     objective: Objective = flax.struct.field(pytree_node=False)
 
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
-        """See `Policy`. Under `vmap` both ways are computed, each with little to do where it does not count."""
+        """See `Policy`."""
         if not isinstance(belief.found, jax.core.Tracer):
             # Outside of any transformation, what is not needed is neither computed nor compiled.
             if not belief.found:
@@ -90,15 +90,19 @@ class Search(flax.struct.PyTreeNode):
             if not grasp.success:
                 return _plan(self, key, problem, belief, observation)
             return _take_out(self, observation, grasp)
+        # Both are computed, each with next to nothing to do where it does not count. A `cond` would under `vmap` give
+        # every scene of a batch a problem of its own, and what they share could no longer be computed together.
         grasp = graspable_at(problem, observation.objects, belief.found_pose, belief.found)
         able = belief.found & grasp.success
-        hidden = belief.replace(exists=belief.exists & ~able)
-        rest = observation.replace(objects=observation.objects.replace(valid=observation.objects.valid & ~able))
-        return jax.lax.cond(
-            able,
-            lambda: _take_out(self, observation, grasp),
-            lambda: _plan(self, key, problem, hidden, rest),
+        rest = observation.objects.replace(valid=observation.objects.valid & ~able)
+        planned = _plan(
+            self,
+            key,
+            problem,
+            belief.replace(exists=belief.exists & ~able),
+            observation.replace(objects=rest),
         )
+        return jax.tree.map(lambda a, b: jnp.where(able, a, b), _take_out(self, observation, grasp), planned)
 
 
 @jax.jit
