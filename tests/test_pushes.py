@@ -22,7 +22,8 @@ from mechsearch_jax.envs.world import BOX, CYLINDER, TARGET, World, bodies_of, f
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.graspability import gripper_rotation
-from mechsearch_jax.networks.push import NORMALS, PushConfig, push_start, reach
+from mechsearch_jax.networks.push import PushConfig
+from mechsearch_jax.networks.push_geometry import NORMALS, push_start, reach
 from mechsearch_jax.train import push as training
 from mechsearch_jax.train.loop import TrainConfig, train
 from mechsearch_jax.train.push import PushTask, average_precision, model_scores, planar_turn, push_truth

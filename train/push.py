@@ -26,18 +26,8 @@ from mechsearch_jax.envs.world import CYLINDER, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import matmul
-from mechsearch_jax.networks.push import (
-    CHAIN,
-    NORMALS,
-    REACH,
-    PushConfig,
-    PushMotion,
-    PushNetwork,
-    PushStart,
-    apply_network,
-    push_start,
-    pusher_distance,
-)
+from mechsearch_jax.networks.push import PushConfig, PushMotion, PushNetwork, apply_network
+from mechsearch_jax.networks.push_geometry import CHAIN, NORMALS, REACH, PushStart, push_start, pusher_distance
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.train.scenes import SceneConfig, origin, random_world
 from mechsearch_jax.workspace.shelf import Shelf

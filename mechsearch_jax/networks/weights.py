@@ -24,7 +24,8 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.geometry.superquadric import empty
-from mechsearch_jax.networks.push import PushConfig, PushNetwork, push_start
+from mechsearch_jax.networks.push import PushConfig, PushNetwork
+from mechsearch_jax.networks.push_geometry import push_start
 from mechsearch_jax.networks.recognition import RecognitionConfig, RecognitionNetwork
 from mechsearch_jax.networks.segmentation import SegmentationConfig, SegmentationNetwork
 from mechsearch_jax.perception.segments import SegmentConfig
