@@ -14,6 +14,7 @@ from typing import Any, get_type_hints
 import jax
 
 from mechsearch_jax.actions.config import ActionConfig
+from mechsearch_jax.actions.object_grasps import ObjectGraspConfig
 from mechsearch_jax.dynamics.named import PushModelName, check_name
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
@@ -199,6 +200,7 @@ def _fields(kind: type, path: tuple[str, ...], prefix: str = "") -> tuple[Option
 OPTIONS: tuple[Option, ...] = (
     *_fields(PlannerConfig, ("planner",)),
     *_fields(ActionConfig, ("problem", "actions")),
+    *_fields(ObjectGraspConfig, ("problem", "actions", "grasps"), "object_grasp_"),
     *_fields(ExistenceConfig, ("problem", "existence")),
     *_fields(GraspConfig, ("problem", "grasps"), "grasp_"),
     *_fields(GraspConfig, ("problem", "retrieval"), "retrieval_"),
