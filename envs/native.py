@@ -342,7 +342,12 @@ class NativeSimulator:
         return self.replace(dict(enumerate(scenarios)))
 
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
-        """Start episodes in some of the worlds; the others stay as they are."""
+        """Start episodes in some of the worlds; see `Simulator.replace`.
+
+        Raises:
+          InputError: it was not reset before, or there are more objects in a scenario than slots.
+        """
+        self._check_reset()
         for i, scenario in scenarios.items():
             self._worlds[i].reset(scenario)
         return self._gather()
@@ -367,15 +372,25 @@ class NativeSimulator:
         """Execute an action in every active world; see `Simulator.execute`.
 
         Raises:
-          InputError: there are not as many actions as worlds, or a kind is unknown.
+          InputError: it was not reset before, there are not as many actions as worlds, or a kind is unknown.
         """
+        self._check_reset()
         check_actions(self.engine, actions, len(self._worlds))
         actions = jax.device_get(actions)
         return self._each(active, lambda i: self._worlds[i].execute(_row(actions, i)))
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
-        """Let time pass in every active world; see `Simulator.settle`."""
+        """Let time pass in every active world; see `Simulator.settle`.
+
+        Raises:
+          InputError: it was not reset before.
+        """
+        self._check_reset()
         return self._each(active, lambda i: self._worlds[i].settle())
+
+    def _check_reset(self) -> None:
+        if not self._worlds:
+            raise InputError("NativeSimulator: reset it before use")
 
     def _make(self, count: int) -> None:
         """Have so many worlds."""
