@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import jax
 
@@ -122,7 +122,7 @@ class Config:
     push_model: PushModelName = option(
         "learned",
         "what predicts pushes: a network, geometry, or simulating them, on a CPU only those that come first",
-        ("quasi-static", "learned", "physics"),
+        get_args(PushModelName),
     )
     max_steps: int = option(10, "actions in an episode")
 
