@@ -144,14 +144,15 @@ class NativeWorld:
 
     def scenario(self, name: str) -> Scenario:
         """The present state as a scenario, its numbers rounded to a micrometre."""
-        found = []
+        found: dict[int, Body] = {}
         for i, body in enumerate(self._bodies):
             if body is not None:
                 position, quaternion = np.split(self._data.joint(f"body{i}").qpos, [3])
                 place = tuple(round(float(p), 6) for p in position)
                 turn = tuple(round(float(q), 9) for q in quaternion / np.linalg.norm(quaternion))
-                found.append(dataclasses.replace(body, position=place, quaternion=turn))
-        return Scenario(name, tuple(found[:-1]), found[-1])
+                found[i] = dataclasses.replace(body, position=place, quaternion=turn)
+        target = found.pop(TARGET)
+        return Scenario(name, tuple(found.values()), target)
 
     def _begin(self, bodies: list[Body | None], world: World) -> World:
         self._bodies = bodies
