@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from typing import get_args
 
 import jax
 
@@ -32,8 +33,10 @@ def new_simulator(engine: EngineName) -> Simulator:
     """A simulator of an engine; MJX takes long to import and is not always installed.
 
     Raises:
-      InputError: it cannot be imported.
+      InputError: it is unknown, or cannot be imported.
     """
+    if engine not in get_args(EngineName):
+        raise InputError(f'simulator "{engine}" is unknown; use {" or ".join(get_args(EngineName))}')
     if engine == "NativeSimulator":
         from mechsearch_jax.envs.native import NativeSimulator
 

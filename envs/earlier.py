@@ -26,6 +26,7 @@ EARLIER: Mapping[str, Any] = {
     "avoid_unseen": True,
     "grasp_tilts": [math.radians(angle) for angle in (20, 25, 30)],
     "retrieval_tilts": [math.radians(angle) for angle in (20, 22.5, 25, 27.5, 30)],
+    "object_grasp_tilts": [math.radians(angle) for angle in (20, 30)],
 }
 # When there were two kinds of action, their set was a word.
 _KINDS: Mapping[str, list[str]] = {

@@ -96,7 +96,9 @@ def record(found: bool, belief_size: int, graspable: bool, choice: Choice | None
     if choice is not None:
         action, cost = record_action(choice.action), float(choice.cost)
         if not takes_target(choice):
-            predicted, sequences = float(choice.predicted_cost), int(choice.sequences)
+            # A policy need not say what it expects.
+            predicted = float(choice.predicted_cost) if np.isfinite(choice.predicted_cost) else None
+            sequences = int(choice.sequences)
     return Step(
         belief_size=belief_size,
         found=found,

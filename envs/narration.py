@@ -48,7 +48,7 @@ class Narrator:
         self._line("does", kind.describe(moment.decision.action))
         if kind.takes_target:
             self._line("why", "a grasp that hits nothing is known")
-        elif record.sequences:
+        elif record.sequences and record.predicted_cost is not None:
             length = int(moment.decision.sequences.length[0])
             self._line(
                 "why",

@@ -144,14 +144,15 @@ class NativeWorld:
 
     def scenario(self, name: str) -> Scenario:
         """The present state as a scenario, its numbers rounded to a micrometre."""
-        found = []
+        found: dict[int, Body] = {}
         for i, body in enumerate(self._bodies):
             if body is not None:
                 position, quaternion = np.split(self._data.joint(f"body{i}").qpos, [3])
                 place = tuple(round(float(p), 6) for p in position)
                 turn = tuple(round(float(q), 9) for q in quaternion / np.linalg.norm(quaternion))
-                found.append(dataclasses.replace(body, position=place, quaternion=turn))
-        return Scenario(name, tuple(found[:-1]), found[-1])
+                found[i] = dataclasses.replace(body, position=place, quaternion=turn)
+        target = found.pop(TARGET)
+        return Scenario(name, tuple(found.values()), target)
 
     def _begin(self, bodies: list[Body | None], world: World) -> World:
         self._bodies = bodies
@@ -342,7 +343,12 @@ class NativeSimulator:
         return self.replace(dict(enumerate(scenarios)))
 
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
-        """Start episodes in some of the worlds; the others stay as they are."""
+        """Start episodes in some of the worlds; see `Simulator.replace`.
+
+        Raises:
+          InputError: it was not reset before, or there are more objects in a scenario than slots.
+        """
+        self._check_reset()
         for i, scenario in scenarios.items():
             self._worlds[i].reset(scenario)
         return self._gather()
@@ -367,15 +373,25 @@ class NativeSimulator:
         """Execute an action in every active world; see `Simulator.execute`.
 
         Raises:
-          InputError: there are not as many actions as worlds, or a kind is unknown.
+          InputError: it was not reset before, there are not as many actions as worlds, or a kind is unknown.
         """
+        self._check_reset()
         check_actions(self.engine, actions, len(self._worlds))
         actions = jax.device_get(actions)
         return self._each(active, lambda i: self._worlds[i].execute(_row(actions, i)))
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
-        """Let time pass in every active world; see `Simulator.settle`."""
+        """Let time pass in every active world; see `Simulator.settle`.
+
+        Raises:
+          InputError: it was not reset before.
+        """
+        self._check_reset()
         return self._each(active, lambda i: self._worlds[i].settle())
+
+    def _check_reset(self) -> None:
+        if not self._worlds:
+            raise InputError("NativeSimulator: reset it before use")
 
     def _make(self, count: int) -> None:
         """Have so many worlds."""

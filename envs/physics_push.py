@@ -1,4 +1,4 @@
-"""Push models that simulate: `NativePhysics` on the CPU and `MjxPhysics` on a GPU, both `dynamics.PushModel`.
+"""Push models that simulate: `NativePhysics` on the CPU and `MjxPhysics` on a GPU, both `push_model.PushModel`.
 
 The recognised objects become the nearest boxes and cylinders, with the densities and frictions of the environment's
 own bodies, and the arm makes the push as `push_simulation` has it. Objects that are not at rest where they were
@@ -159,7 +159,7 @@ class NativePhysics:
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
     ) -> PushOutcome:
-        """See `dynamics.PushModel`."""
+        """See `push_model.PushModel`."""
         world = bodies(scene)
         reference, reachable = push_reference(T_world_gripper, displacement, q7, self.simulation.motion)
         pushes = jnp.any(displacement != 0.0)
@@ -191,7 +191,7 @@ class MjxPhysics:
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
     ) -> PushOutcome:
-        """See `dynamics.PushModel`."""
+        """See `push_model.PushModel`."""
         world = bodies(scene)
         pushes = jnp.any(displacement != 0.0)
         # Warp's worlds share what numbers they cannot make sense of, so that a scene that has any is not pushed in.

@@ -37,7 +37,8 @@ def frame(moment: Moment, problem: Problem) -> Frame:
         sketch, does = kind.sketch(objects, after, decision.action), kind.describe(decision.action)
         why = "a grasp that hits nothing is known"
         if not kind.takes_target:
-            why = f"cost {record.cost:.0f} → {record.predicted_cost:.0f} expected, best of {record.sequences} sequences"
+            expected = "" if record.predicted_cost is None else f" → {record.predicted_cost:.0f} expected"
+            why = f"cost {record.cost:.0f}{expected}, best of {record.sequences} sequences"
     known = "target found" if record.found else f"target can be at {record.belief_size} poses"
     outcome = f" · {record.failure}" if record.failure else ""
     nowhere = np.zeros(problem.poses.shape[0], bool)

@@ -1,9 +1,9 @@
 """Recognisers: what the planner sees the simulated world through, from its truth to nothing but a depth image.
 
 `oracle` knows the true shapes and poses. The others are shown the depth image of a camera with the noise of a sensor,
-and make superquadrics of it as `perception.Recogniser` does: `masks` is told which pixels are whose, `full` has to
-segment them too. Whether the target is seen is the detector's word, for all of them; where it is, only the oracle is
-told.
+and make superquadrics of it as `perception.recogniser.Recogniser` does: `masks` is told which pixels are whose, `full`
+has to segment them too. Whether the target is seen is the detector's word, for all of them; where it is, only the
+oracle is told.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ class Step:
       graspable: whether it has been found and a collision-free grasp of it exists in the true state.
       cost: J of the observed state; None where nothing was planned.
       action: what the robot did; None if the episode ended here.
-      predicted_cost: J that the plan expects right after the action; None where nothing was planned.
+      predicted_cost: J that the plan expects right after the action; None where nothing was planned or expected.
       observed_cost: J at the next observation; None if there was none.
       sequences: number of valid action sequences that the plan was chosen from.
       failure: why the action could not be carried out as planned; None if it was.

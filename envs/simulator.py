@@ -106,6 +106,9 @@ class Simulator(Protocol):
 
         Args:
           active: in which worlds; all by default.
+
+        Raises:
+          InputError: it was not reset before.
         """
         ...
 

@@ -116,6 +116,13 @@ def test_decisions_that_cannot_be_trusted_are_named():
     assert distrust(good.replace(cost=jnp.float32(jnp.inf))) == "error: the decision is not finite"
 
 
+def test_a_policy_need_not_say_what_it_expects():
+    silent = Choice(no_action(), jnp.float32(3.0), jnp.float32(jnp.nan), jnp.int32(1), jnp.array(False))
+    assert distrust(silent) is None
+    step = record(False, 5, False, silent)
+    assert (step.cost, step.predicted_cost, step.sequences) == (3.0, None, 1)
+
+
 def test_a_decision_that_cannot_be_trusted_is_not_executed(problem):
     """One that is not finite ends its own episode, and the others go on."""
     stage = Stage()

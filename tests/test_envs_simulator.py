@@ -14,7 +14,7 @@ from published import published_scenarios
 
 from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action, retrieve_action
 from mechsearch_jax.envs import model, simulator, world
-from mechsearch_jax.envs.native import NativeWorld
+from mechsearch_jax.envs.native import NativeSimulator, NativeWorld
 from mechsearch_jax.envs.world import BODIES, TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import make
@@ -274,6 +274,13 @@ def test_a_new_kind_of_action_needs_no_simulator(sim, monkeypatch):
         ends.append(np.asarray(sim.world.position))
     assert np.abs(ends[0] - np.asarray(before.position)).max() > 0.05
     np.testing.assert_array_equal(*ends)
+
+
+def test_worlds_that_were_never_reset_are_refused():
+    worlds = NativeSimulator(threads=1)
+    for call in (lambda: worlds.replace({}), worlds.settle):
+        with pytest.raises(InputError, match="reset it before use"):
+            call()
 
 
 def test_no_action_does_nothing(sim):

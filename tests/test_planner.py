@@ -70,6 +70,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "actions": ["push", "pick-and-place"],
         "push_distances": [0.05, 0.1, 0.15],
         "avoid_unseen": True,
+        "object_grasp_tilts": pytest.approx([np.radians(20), np.radians(30)]),
         "criterion": "detector",
         "grasp_tilts": pytest.approx([np.radians(20), np.radians(25), np.radians(30)]),
         "retrieval_tilts": pytest.approx(np.radians([20, 22.5, 25, 27.5, 30]).tolist()),
@@ -96,6 +97,7 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     assert (config.problem.existence.criterion, actions.avoid_unseen) == ("depth-mse", False)
     assert (actions.push_distances, set(actions.actions)) == ((0.05, 0.10, 0.15), {"push", "pick-and-place"})
     assert config.problem.grasps.tilts == config.problem.retrieval.tilts == (np.radians(20),)
+    assert actions.grasps.tilts == (np.radians(20),)
     # Where the paper is silent.
     assert search.gamma == planner.standard().planner.gamma
     assert planner.paper(gamma=0.5).planner.gamma == 0.5

@@ -13,6 +13,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.footprints import QUARTER_TURN, Footprints
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import gripper_rotation
+from mechsearch_jax.options import option
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -71,7 +72,10 @@ class ObjectGraspConfig:
         BoxGrasp(face=1, turn=1.0),
     )
     round_drops: tuple[float, ...] = (0.03, 0.04)
-    tilts: tuple[float, ...] = (math.radians(20), math.radians(30))
+    tilts: tuple[float, ...] = option(
+        (math.radians(20), math.radians(30)),
+        "angles by which the gripper points downwards as it grasps an object [rad]; the paper's is 0.35",
+    )
     max_turn: float = math.radians(22)
     min_turn: float = math.radians(5)
     turn_gap: float = 0.004

@@ -72,10 +72,10 @@ class EpisodeOptions:
         Raises:
           InputError: it is not installed.
         """
-        from mechsearch_jax.envs.mjx_model import import_mjx
-
         if self.simulator == "native" or (self.simulator == "auto" and not has_gpu()):
             return "NativeSimulator"
+        from mechsearch_jax.envs.mjx_model import import_mjx
+
         if self.simulator == "mjx":
             import_mjx()
             return "MjxSimulator"

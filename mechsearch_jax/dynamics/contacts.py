@@ -40,6 +40,7 @@ def deepest(depth, points):
 
 
 def outline_points(prints):
+    """Points on the outline of every footprint, in the world seen from above, shape (N, BOUNDARY_POINTS, 2) [m]."""
     angle = np.arange(BOUNDARY_POINTS) * 2 * np.pi / BOUNDARY_POINTS
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     square = circle / np.abs(circle).max(axis=-1, keepdims=True)
@@ -74,6 +75,7 @@ def pair_contacts(prints):
 
 
 def wall_depth(shelf, prints):
+    """How deep outlines are in the back, right and left walls, shape (N, BOUNDARY_POINTS, 3) [m]; and the outlines."""
     outline = outline_points(prints)
     x, y = outline[..., 0], outline[..., 1]
     return jnp.stack([x - shelf.back, shelf.right - y, y - shelf.left], axis=-1), outline

@@ -1,4 +1,4 @@
-"""The push model that was learnt from simulated pushes (paper section 4.3); a `dynamics.PushModel`."""
+"""The push model that was learnt from simulated pushes (paper section 4.3); a `push_model.PushModel`."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class LearnedPush:
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
     ) -> PushOutcome:
-        """See `dynamics.PushModel`."""
+        """See `push_model.PushModel`."""
         assert self.path is not None
         weights = _weights(self.path, self.digest)
         network = weights.network
@@ -93,7 +93,7 @@ def predicted(
     displacement: Array,
     q7: Array,
 ) -> PushOutcome:
-    """What a network predicts of a push; see `LearnedPush` and `dynamics.PushModel` for the arguments."""
+    """What a network predicts of a push; see `LearnedPush` and `push_model.PushModel` for the arguments."""
     start = push_start(shelf, scene, pusher, T_world_gripper, displacement)
     told = apply_network(network, parameters, start)
     moves = scene.valid & (jax.nn.sigmoid(told.moves) > likely)

@@ -35,7 +35,7 @@ def own_push_model(name: str) -> PushModel:
     check_name(name)
     if name == "physics":
         raise InputError(
-            'push model "physics" needs a simulator; give `plan` those of mechsearch_jax.envs.push_models.push_models'
+            'push model "physics" needs a simulator; give the policy those of mechsearch_jax.envs.push_models'
         )
     if name == "quasi-static":
         return QuasiStatic()

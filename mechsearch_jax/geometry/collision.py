@@ -1,4 +1,4 @@
-"""Points against superquadrics, and points against the shelf.
+"""Points against superquadrics.
 
 A cloud collides with an object if one of its points is inside it (paper equations 14 to 17). Powers are by far the most
 expensive part of that test, and almost never needed: the p-norms of the gauge lie between norms without powers, which

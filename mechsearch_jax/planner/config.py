@@ -9,11 +9,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import jax
 
 from mechsearch_jax.actions.config import ActionConfig
+from mechsearch_jax.actions.object_grasps import ObjectGraspConfig
 from mechsearch_jax.dynamics.named import PushModelName, check_name
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
@@ -121,7 +122,7 @@ class Config:
     push_model: PushModelName = option(
         "learned",
         "what predicts pushes: a network, geometry, or simulating them, on a CPU only those that come first",
-        ("quasi-static", "learned", "physics"),
+        get_args(PushModelName),
     )
     max_steps: int = option(10, "actions in an episode")
 
@@ -199,6 +200,7 @@ def _fields(kind: type, path: tuple[str, ...], prefix: str = "") -> tuple[Option
 OPTIONS: tuple[Option, ...] = (
     *_fields(PlannerConfig, ("planner",)),
     *_fields(ActionConfig, ("problem", "actions")),
+    *_fields(ObjectGraspConfig, ("problem", "actions", "grasps"), "object_grasp_"),
     *_fields(ExistenceConfig, ("problem", "existence")),
     *_fields(GraspConfig, ("problem", "grasps"), "grasp_"),
     *_fields(GraspConfig, ("problem", "retrieval"), "retrieval_"),

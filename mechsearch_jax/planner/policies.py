@@ -87,9 +87,11 @@ class Search(flax.struct.PyTreeNode):
             if not belief.found:
                 return _plan(self, key, problem, belief, observation)
             grasp = graspable_at(problem, observation.objects, belief.found_pose)
-            if not grasp.success:
-                return _plan(self, key, problem, belief, observation)
-            return _take_out(self, observation, grasp)
+            # The belief may be known where the observation is traced.
+            if not isinstance(grasp.success, jax.core.Tracer):
+                if not grasp.success:
+                    return _plan(self, key, problem, belief, observation)
+                return _take_out(self, observation, grasp)
         # Both are computed, each with next to nothing to do where it does not count. A `cond` would under `vmap` give
         # every scene of a batch a problem of its own, and what they share could no longer be computed together.
         grasp = graspable_at(problem, observation.objects, belief.found_pose, belief.found)
@@ -124,6 +126,17 @@ def _take_out(search: Search, observation: Observation, grasp: GraspChoice) -> D
     )
 
 
+def _planner_config(config: PlannerConfig | None) -> PlannerConfig:
+    """The configuration, or the default.
+
+    Raises:
+      InputError: it is something else, such as a whole preset.
+    """
+    if config is not None and not isinstance(config, PlannerConfig):
+        raise InputError(f"config: is a {type(config).__name__}; give a PlannerConfig, such as paper().planner")
+    return config or PlannerConfig()
+
+
 def search(
     config: PlannerConfig | None = None,
     *,
@@ -147,7 +160,7 @@ def search(
     """
     push_model = push_model or own_push_model("learned")
     return Search(
-        config=dataclasses.replace(config or PlannerConfig(), **changes),
+        config=dataclasses.replace(_planner_config(config), **changes),
         propose=propose,
         predict=PredictByKind(push_model, later_push_model or push_model),
         objective=objective,
@@ -163,7 +176,7 @@ search_and_grasp = functools.partial(search, objective=SearchAndGrasp())
 def random_action(config: PlannerConfig | None = None, **options: Any) -> Search:
     """A baseline: a uniformly random possible action, without any preference, until the target can be taken out."""
     even = dataclasses.replace(
-        config or PlannerConfig(), horizon=1, guided_fraction=0.0, unseen_contact_penalty=0.0, topple_charge=0.0
+        _planner_config(config), horizon=1, guided_fraction=0.0, unseen_contact_penalty=0.0, topple_charge=0.0
     )
     return search(even, objective=Indifferent(), **options)
 

@@ -36,6 +36,7 @@ def paper(**changes: Any) -> Config:
         "predicted_collisions": True,
         "grasp_tilts": tilt,
         "retrieval_tilts": tilt,
+        "object_grasp_tilts": tilt,
         "push_distances": (0.05, 0.10, 0.15),
         "actions": ("push", "pick-and-place"),
         "avoid_unseen": False,

@@ -64,10 +64,13 @@ def build_problem(
     Takes seconds; what is left out takes its default. Not to be called inside `jit`.
 
     Raises:
-      InputError: the target cannot be grasped by the gripper, or a kind of action cannot be sampled.
+      InputError: the target cannot be grasped by the gripper, a kind of action cannot be sampled, or `config` is of
+        something else.
     """
     target, camera, shelf = target or Target(), camera or Camera(), shelf or Shelf()
-    gripper, config = gripper or Gripper(), config or ProblemConfig()
+    gripper, config = gripper or Gripper(), ProblemConfig() if config is None else config
+    if not isinstance(config, ProblemConfig):
+        raise InputError(f"config: is a {type(config).__name__}; give a ProblemConfig, such as paper().problem")
     known = [kind.name for kind in SAMPLED_KINDS]
     for name in config.actions.actions:
         if name not in known:
