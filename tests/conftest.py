@@ -21,18 +21,24 @@ CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or os.path.join(tempfile.get
 # A compiled function holds dozens of memory mappings, of which Linux allows a process 65,530; past that XLA crashes.
 MAPPINGS = 35_000
 
-# Files whose tests make decisions with the default problem stay in one process, so that a plan is traced once. The
-# others are groups of their own. Those that take long come first, so that both processes end at the same time.
-PLANNING = ("test_planner", "test_readme", "test_docs", "test_envs_episode", "test_envs_batch_episode", "test_batches")
+# Files that trace the same functions stay in one process, so that they are traced once; every other file is a group of
+# its own. Those that take long come first, so that all processes end at the same time.
+GROUPS = {
+    "planning": ("test_planner", "test_envs_episode", "test_envs_batch_episode", "test_readme", "test_docs"),
+    "pushing": ("test_bench_push", "test_pushes"),
+    "recognising": ("test_envs_recognisers", "test_perception_recogniser", "test_bench_recognition"),
+}
 LONG_FIRST = (
-    *PLANNING,
+    *GROUPS["planning"],
+    *GROUPS["pushing"],
     "test_push_network",
-    "test_bench_push",
-    "test_pushes",
-    "test_perception_refinement",
+    *GROUPS["recognising"],
+    "test_dynamics_actions",
     "test_train_networks",
     "test_envs_mjx_simulator",
-    "test_dynamics_actions",
+    "test_perception_refinement",
+    "test_physics_push",
+    "test_existence",
 )
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -76,9 +82,10 @@ def pytest_collection_modifyitems(config, items):
         left_out = [i for i in items if i.get_closest_marker("slow") and part_of(i.nodeid, parts) != part]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in set(left_out)]
+    group_of = {file: group for group, files in GROUPS.items() for file in files}
     for item in items:
         file = Path(item.path).stem
-        item.add_marker(pytest.mark.xdist_group("planning" if file in PLANNING else file))
+        item.add_marker(pytest.mark.xdist_group(group_of.get(file, file)))
     rank = {name: i for i, name in enumerate(LONG_FIRST)}
     items.sort(key=lambda item: rank.get(Path(item.path).stem, len(rank)))
 
