@@ -346,7 +346,7 @@ def test_poses_are_blurred_and_nothing_else(pushes):
     start = task_of(pushes).start(jax.tree.map(lambda a: jnp.asarray(a[:1]), pushes))
     start = jax.tree.map(lambda a: a[0], start)
     keys = jax.random.split(jax.random.key(3), 2000)
-    blurred = jax.jit(jax.vmap(training.blurred, in_axes=(0, None, None)))(keys, start, 1e-3)
+    blurred = jax.vmap(training.blurred, in_axes=(0, None, None))(keys, start, 1e-3)
     off = np.asarray(blurred.prints.position - start.prints.position[None])
     turn = np.asarray(blurred.prints.yaw - start.prints.yaw[None])
     np.testing.assert_allclose(off.std(axis=0), 1e-3, rtol=0.1)
