@@ -277,6 +277,7 @@ def drawn(decision, root, problem):
     return jax.device_get(draw(problem, belief, root, jax.random.split(jax.random.key(0), 30)))
 
 
+@pytest.mark.slow
 def test_pushes_may_topple_what_they_move(drawn):
     sample, (possible, topples) = drawn
     sure, nothing, possible, topples = possible[:, 0], topples[:, 0], possible[:, 1], topples[:, 1]
@@ -332,6 +333,7 @@ def test_what_is_dear_is_not_chosen():
         assert int(np.argmin(value)) == best
 
 
+@pytest.mark.slow
 def test_a_push_that_likely_topples_something_or_is_not_understood_is_ruled_out(drawn):
     sample, (possible, _) = drawn
     for row in range(2, 6):

@@ -415,6 +415,7 @@ def test_eager_and_jit_agree():
     assert_same(told(*case), eager, shift=1e-6, other=1e-4)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_also_where_things_touch_or_nothing_moves():
     aligned = standing(
         ((0.03, 0.03, 0.05), BOX, 0.6, 0.1, 0.0),

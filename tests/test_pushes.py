@@ -74,6 +74,7 @@ def drawn():
 # --- what is drawn ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pushes_of_all_directions_and_lengths_are_found(drawn):
     (world, action, found), _ = drawn
     assert found[world.valid.any(axis=1)].mean() > 0.6
@@ -101,6 +102,7 @@ def in_body(world, k, i, points, share=1.0):
     return flat & (np.abs(local[:, 2]) < half[2])
 
 
+@pytest.mark.slow
 def test_the_gripper_starts_beside_the_object_and_inside_of_nothing(drawn):
     (world, action, found), tables = drawn
     pusher = np.asarray(tables.pusher, float)
@@ -120,6 +122,7 @@ def test_the_gripper_starts_beside_the_object_and_inside_of_nothing(drawn):
     assert np.median(gaps) == pytest.approx(0.5 * sum(CONFIG.gap), abs=4e-3)
 
 
+@pytest.mark.slow
 def test_where_there_is_nothing_to_push_nothing_is_drawn(drawn):
     (world, action, found), _ = drawn
     empty = ~world.valid.any(axis=1)
