@@ -61,7 +61,7 @@ def pushes(comparison, folder):
 @pytest.fixture(scope="module")
 def measured(weights, pushes):
     """Of few models."""
-    return Bench(GENERATION, ("no motion", "learned"), weights=weights, make_simulator=simulator).run(pushes)
+    return Bench(GENERATION, ("no motion", "learned", "nudged"), weights=weights, make_simulator=simulator).run(pushes)
 
 
 @pytest.fixture(scope="module")
