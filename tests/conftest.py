@@ -25,19 +25,19 @@ MAPPINGS = 35_000
 # its own. Those that take long come first, so that all processes end at the same time.
 GROUPS = {
     "planning": ("test_planner", "test_envs_episode", "test_envs_batch_episode", "test_readme", "test_docs"),
-    "pushing": ("test_bench_push", "test_pushes"),
-    "recognising": ("test_envs_recognisers", "test_perception_recogniser", "test_bench_recognition"),
+    "pushing": ("test_benchmarks_push", "test_envs_pushes"),
+    "recognising": ("test_envs_recognisers", "test_perception_recogniser", "test_benchmarks_recognition"),
 }
 LONG_FIRST = (
     *GROUPS["planning"],
     *GROUPS["pushing"],
-    "test_push_network",
+    "test_networks_push",
     *GROUPS["recognising"],
     "test_dynamics_actions",
     "test_train_networks",
     "test_envs_mjx_simulator",
     "test_perception_refinement",
-    "test_physics_push",
+    "test_envs_physics_push",
     "test_existence",
 )
 

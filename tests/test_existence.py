@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from published import published_scenarios
-from test_camera_render import reference_superquadric_depth
+from test_workspace_camera_render import reference_superquadric_depth
 
 from mechsearch_jax import existence, planner
 from mechsearch_jax.envs.generator import ScenarioGenerator
