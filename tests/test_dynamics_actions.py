@@ -22,6 +22,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
 PUSH = jax.jit(quasi_static.QuasiStatic(), static_argnums=0)
+CANDIDATES = jax.jit(actions.candidates, static_argnums=0)
 Q7 = jnp.zeros(())
 
 
@@ -148,17 +149,20 @@ def draw(problem):
     observation = Observation(objects, jnp.array(False), jnp.zeros(3))
     belief = planner.update_belief(problem, planner.initial_belief(problem), observation)
 
+    possible = possible_space(problem, belief, belief.exists)
+    options = CANDIDATES(problem.space, problem.actions, objects, possible)
+
     @jax.jit
-    def drawn(problem, belief, objects, weights, keys):
-        possible = possible_space(problem, belief, belief.exists)
-        options = actions.candidates(problem.space, problem.actions, objects, possible)
+    def drawn(problem, possible, objects, options, weights, keys):
         sample = lambda key: actions.sample_action(  # noqa: E731
             key, problem.space, problem.actions, objects, possible, options, objects.valid, weights
         )
         return options, jax.vmap(sample)(keys)
 
     keys = jax.random.split(jax.random.key(0), 200)
-    draw = lambda weights: jax.tree.map(np.asarray, drawn(problem, belief, objects, weights, keys))  # noqa: E731
+    draw = lambda weights: jax.tree.map(  # noqa: E731
+        np.asarray, drawn(problem, possible, objects, options, weights, keys)
+    )
     draw.objects = objects
     return draw
 
@@ -169,7 +173,7 @@ def test_neighbours_that_are_recognised_as_overlapping_do_not_lock_each_other_in
     pair = on_board((*body, 0.6, 0.05, 0.0), (*body, 0.6, 0.114 - deep, 0.0))
     belief = planner.initial_belief(problem)
     nowhere = possible_space(problem, belief, jnp.zeros_like(belief.exists))
-    options = jax.jit(actions.candidates, static_argnums=0)(problem.space, problem.actions, pair, nowhere)
+    options = CANDIDATES(problem.space, problem.actions, pair, nowhere)
     grasps = of_kind(options, "pick-and-place")
     assert grasps.reached[0].any()
     assert actions.free_ways(grasps)[0].any() != locked
@@ -223,9 +227,10 @@ def test_pushes_go_left_and_right_by_the_given_distances(sampled, problem):
 def test_placed_objects_stand_clear_of_each_other_on_the_board(sampled, problem):
     objects, _, samples = sampled
     action = samples.action
+    place = jax.jit(rigid.pick_and_place)
     for i in np.flatnonzero(action.kind == ActionKind.PICK_AND_PLACE)[:25]:
         k = int(action.object[i])
-        after = rigid.pick_and_place(
+        after = place(
             objects, jnp.int32(k), jnp.asarray(action.T_world_gripper[i]), jnp.asarray(action.T_world_place[i])
         )
         np.testing.assert_allclose(after.position[k, 2], objects.position[k, 2], atol=1e-5)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from published import published_scenarios
-from test_camera_render import reference_superquadric_depth
+from test_workspace_camera_render import reference_superquadric_depth
 
 from mechsearch_jax import existence, planner
 from mechsearch_jax.envs.generator import ScenarioGenerator
@@ -92,6 +92,7 @@ def test_f_never_loses_the_true_pose_at_the_start(problem):
         assert exists[nearest], one.name
 
 
+@pytest.mark.slow
 def test_f_grows_the_possible_set_by_no_more_than_a_third(problem):
     """Against one place a cell, without margins, at a third of the camera's resolution instead of a seventh."""
     exact = ExistenceConfig(spread=((0.0, 0.0),), erosion=0.0, depth_margin=0.0, downscale=3, window=(110, 110))
@@ -194,7 +195,7 @@ def test_collisions_need_not_count(problem):
     np.testing.assert_array_equal(existence.existence(tables, problem.camera, without, some, config), hidden & some)
 
 
-@pytest.mark.parametrize("criterion", ["depth-mse", "depth-norm"])
+@pytest.mark.parametrize("criterion", ["depth-mse", pytest.param("depth-norm", marks=pytest.mark.slow)])
 def test_other_criteria_are_selectable(problem, criterion):
     one = scenario.load_scenario(scenario.example_scenarios()["first-light"])
     objects = scenario.superquadrics(one.objects)

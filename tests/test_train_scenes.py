@@ -116,7 +116,8 @@ def quaternion(rotation):
 
 def test_scenes_are_as_configured():
     config = dataclasses.replace(CLEAN, objects=(3, 3), known=1.0, lying=0.0, leaning=0.0, target=0.0)
-    worlds = jax.vmap(lambda k: scenes.random_world(k, config, SHELF))(jax.random.split(jax.random.key(4), 8))
+    draw = jax.jit(jax.vmap(lambda k: scenes.random_world(k, config, SHELF)))
+    worlds = draw(jax.random.split(jax.random.key(4), 8))
     assert not worlds.valid[:, 3:].any()
     assert worlds.valid[:, :3].mean() > 0.9
     assert jax.vmap(scenes.is_known)(worlds)[:, :3].all()

@@ -162,6 +162,7 @@ def test_depth_has_the_gradient_of_finite_differences():
     aim = scene.position[0] + jnp.float32([0.0, 0.01, 0.012]) - origin
     one = jax.tree.map(lambda a: a[0], scene)
 
+    @jax.jit
     def depth(shift, grow):
         moved = one.replace(position=one.position + shift, size=one.size * grow)
         return render.object_depth(moved, origin, aim)

@@ -59,8 +59,9 @@ def pushes(comparison, folder):
 
 
 @pytest.fixture(scope="module")
-def measured(comparison, pushes):
-    return comparison.run(pushes)
+def measured(weights, pushes):
+    """Of few models."""
+    return Bench(GENERATION, ("no motion", "learned", "nudged"), weights=weights, make_simulator=simulator).run(pushes)
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +157,9 @@ def test_predictions_that_are_no_numbers_are_refused(pushes):
 # --- what comes of it ------------------------------------------------------------------------------------------------
 
 
-def test_simulating_is_better_than_guessing(measured, pushes):
+@pytest.mark.slow
+def test_simulating_is_better_than_guessing(comparison, pushes):
+    measured = comparison.run(pushes)
     assert list(measured.scores) == list(push.ROWS)
     every = {name: groups["all"] for name, groups in measured.scores.items()}
     assert {line["pushes"] for line in every.values()} == {len(pushes.object)}
@@ -246,7 +249,10 @@ def test_the_learned_model_is_looked_at_closely_if_there_is_one():
     assert told.best == "learned"
 
 
-@pytest.mark.parametrize("model", ["quasi-static", "learned", "physics"])
+@pytest.mark.parametrize(
+    "model",
+    ["learned", *(pytest.param(name, marks=pytest.mark.slow) for name in ("quasi-static", "physics"))],
+)
 def test_predicting_is_timed(model, drawn, weights, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "drawn_pushes", lambda count, objects: jax.tree.map(lambda a: a[:count], drawn))
     timing = bench.bench_predict(model, 3, batch=4, repeats=2, weights=weights if model == "learned" else None)
