@@ -82,12 +82,6 @@ def said(cell):
     return WORDS.get(word.lower(), float(word) if word[0].isdigit() else word)
 
 
-def is_module(package, root, *names):
-    """Whether the names lead to a module or a folder."""
-    ends = (folder.joinpath(*names) for folder in (package, root))
-    return any(end.is_dir() or end.with_suffix(".py").is_file() for end in ends)
-
-
 @pytest.mark.parametrize("page", [page for page in PAGES if page.startswith("docs/")])
 def test_files_that_a_page_names_are_there(page):
     for path in re.findall(r"`([\w/]+\.py)`", read(page)):
@@ -100,10 +94,11 @@ def test_what_the_python_guide_names_of_modules_is_there():
     for path, name in re.findall(r"`(?:mechsearch_jax\.)?((?:\w+\.)+)(\w+)[`(]", read("docs/python.md")):
         folders = [folder for folder in path.strip(".").split(".") if folder != "mechsearch_jax"]
         if folders and folders[0] in rooms:
-            files = [root.joinpath(*folders).with_suffix(".py") for root in (package, ROOT)]
-            text = next((file.read_text(encoding="utf-8") for file in files if file.is_file()), None)
-            whole = is_module(package, ROOT, *folders, name)
-            assert whole or (text and re.search(rf"^(def|class) {name}\b", text, re.MULTILINE)), (path, name)
+            places = [root.joinpath(*folders) for root in (package, ROOT)]
+            modules = [file for place in places for file in (place.with_suffix(".py"), place / "__init__.py")]
+            text = "\n".join(file.read_text(encoding="utf-8") for file in modules if file.is_file())
+            within = any((place / name).is_dir() or (place / f"{name}.py").is_file() for place in places)
+            assert within or re.search(rf'^(def|class) {name}\b|^    "{name}",$', text, re.MULTILINE), (path, name)
             found += 1
     assert found > 15
 
