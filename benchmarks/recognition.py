@@ -7,7 +7,6 @@ by volumetric intersection over union and by their centres. Generated scenes com
 from __future__ import annotations
 
 import dataclasses
-import json
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -415,19 +414,3 @@ def save_recognition(measured: Measured, path: PathLike) -> None:
       InputError: the file cannot be written.
     """
     save_rows(measured.value(), measured.rows, path)
-
-
-def load_rows(path: PathLike) -> tuple[Row, ...]:
-    """The rows of a file that `save_recognition` wrote.
-
-    Raises:
-      InputError: it is none.
-    """
-    try:
-        with open(path, encoding="utf-8") as file:
-            value = json.load(file)
-        return tuple(Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"])
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except (ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: is no result of bench recognition") from None

@@ -32,8 +32,6 @@ BOXES = (
 # Radius and height [m].
 CYLINDERS = ((0.034, 0.214), (0.032, 0.134), (0.032, 0.122), (0.024, 0.134), (0.028, 0.06))
 
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-
 
 @dataclasses.dataclass(frozen=True)
 class GeneratorConfig:

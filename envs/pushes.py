@@ -36,8 +36,6 @@ from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 
 # An object whose vertical has turned by more than this has fallen over [rad].
 TOPPLED = math.radians(15)
-# The target was touched if it has moved by more than this [m].
-TOUCHED = 5e-4
 # From how far away the gripper is brought up to the object [m]: it then overlaps none.
 _AWAY = 0.6
 
@@ -106,12 +104,6 @@ class Pushes(flax.struct.PyTreeNode):
     toppled: jax.Array
     fallen: jax.Array
     lane: jax.Array
-
-    @property
-    def touched(self) -> Bool[Array, " n"]:
-        """Whether the target was touched."""
-        shift = jnp.abs(self.after.position[:, TARGET] - self.before.position[:, TARGET])
-        return self.before.valid[:, TARGET] & (jnp.max(shift, axis=-1) > TOUCHED)
 
 
 def push_simulation() -> SimulatorConfig:

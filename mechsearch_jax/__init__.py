@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.planner.state import Decision
     from mechsearch_jax.robot.gripper import Gripper
     from mechsearch_jax.workspace.camera import Camera
+    from mechsearch_jax.workspace.render import render_depth
     from mechsearch_jax.workspace.scenario import load_scenario
     from mechsearch_jax.workspace.shelf import Shelf
     from mechsearch_jax.workspace.target import Target
@@ -64,6 +65,7 @@ _ROOMS = {
     "load_scenario": "workspace.scenario",
     "paper": "planner.presets",
     "random_action": "planner.policies",
+    "render_depth": "workspace.render",
     "search_and_grasp": "planner.policies",
     "search_for_grasp": "planner.policies",
     "standard": "planner.presets",
@@ -95,6 +97,7 @@ __all__ = [
     "load_scenario",
     "paper",
     "random_action",
+    "render_depth",
     "search_and_grasp",
     "search_for_grasp",
     "standard",

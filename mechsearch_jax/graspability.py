@@ -88,7 +88,6 @@ class GraspTables(flax.struct.PyTreeNode):
       wrist: index of the wrist's swept gripper cloud, shape (G,).
       clouds: what each grasp sweeps, in the target's frame as rows of coordinates, shape (G, 3, P) [m].
       low, high: box around each cloud in the gripper's frame, shape (G, 3) [m].
-      gripper_clouds: what the open gripper sweeps in its own frame, by wrist, shape (W, 3, P') [m].
       T_world_target: candidate poses, shape (X, 4, 4).
       pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose.
       group_pose, group_pair: the pairs and, after them, the grasps of a target that has been found, in groups of at
@@ -103,7 +102,6 @@ class GraspTables(flax.struct.PyTreeNode):
     clouds: jax.Array
     low: jax.Array
     high: jax.Array
-    gripper_clouds: jax.Array
     T_world_target: jax.Array
     pair_pose: jax.Array
     pair_grasp: jax.Array
@@ -230,7 +228,6 @@ def grasp_tables(
         clouds=jnp.float32(np.stack(clouds)),
         low=jnp.float32(np.stack(low)),
         high=jnp.float32(np.stack(high)),
-        gripper_clouds=jnp.float32(np.stack([s.T for s in swept])),
         T_world_target=poses,
         pair_pose=jnp.zeros(0, jnp.int32),
         pair_grasp=jnp.zeros(0, jnp.int32),

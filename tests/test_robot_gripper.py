@@ -18,6 +18,8 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 GRIPPER = Gripper()
 Q7 = float(np.pi / 4)
+# z of the finger tips' ends in the gripper frame [m].
+TIP = 0.009
 MESHES = next(
     pathlib.Path(sys.prefix).glob("lib/python*/site-packages/cmeel.prefix/share/example-robot-data/robots"),
     pathlib.Path("absent"),
@@ -131,16 +133,24 @@ def test_clouds_cover_evenly_and_densely_in_front():
 
 
 def test_the_approach_ends_at_the_tips():
-    assert module.swept_cloud(GRIPPER, 0.08, Q7, 100)[:, 2].max() == pytest.approx(GRIPPER.tip, abs=1e-3)
+    assert module.swept_cloud(GRIPPER, 0.08, Q7, 100)[:, 2].max() == pytest.approx(TIP, abs=1e-3)
+
+
+def bounding_box(primitives: tuple[Primitive, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Half-extents and centre of the smallest upright box around primitives."""
+    bounds = np.array([module._mesh(primitive).bounds for primitive in primitives])
+    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    return (high - low) / 2, (high + low) / 2
 
 
 def test_boxes_hold_the_fingers_and_the_hand():
-    half_size, centre = module.finger_box(GRIPPER, 0.08)
+    primitives = module.primitives_in_gripper(GRIPPER, 0.08, 0.0)
+    half_size, centre = bounding_box(primitives[len(HAND) : len(HAND) + 2 * len(FINGER)])
     np.testing.assert_allclose(centre[:2], (0.0, 0.0), atol=1e-3)
-    assert centre[2] + half_size[2] == pytest.approx(GRIPPER.tip, abs=1e-3)
+    assert centre[2] + half_size[2] == pytest.approx(TIP, abs=1e-3)
     assert half_size[1] == pytest.approx(0.04 + 0.0267, abs=1e-3)
     cloud = module.gripper_cloud(GRIPPER, 0.08, Q7, 2000)
-    hand_half, hand_centre = module.hand_box(GRIPPER, 0.08)
+    hand_half, hand_centre = bounding_box(primitives[: len(HAND)])
     fingers = cloud[cloud[:, 2] > hand_centre[2] + hand_half[2] + 1e-3]
     assert (np.abs(fingers - centre) <= half_size + 1e-3).all()
     assert hand_half[1] > 0.1

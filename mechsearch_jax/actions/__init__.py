@@ -4,7 +4,7 @@ from mechsearch_jax.actions.candidates import Candidates, candidates, free_ways,
 from mechsearch_jax.actions.config import ActionConfig, ActionSpace, ActionTables, action_tables
 from mechsearch_jax.actions.kind import Kind, SampledKind
 from mechsearch_jax.actions.nothing import no_action
-from mechsearch_jax.actions.registry import KINDS, SAMPLED_KINDS, ActionKind, kind_named, kind_of
+from mechsearch_jax.actions.registry import KINDS, SAMPLED_KINDS, ActionKind, kind_of
 from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.actions.sampler import sample_action
 from mechsearch_jax.actions.sketch import Sketch
@@ -33,7 +33,6 @@ __all__ = [
     "candidates",
     "free_ways",
     "joint_trajectory",
-    "kind_named",
     "kind_of",
     "no_action",
     "no_candidates",

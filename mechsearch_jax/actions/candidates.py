@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
@@ -21,7 +19,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 Candidates = tuple[Ways, ...]
 
 
-def no_candidates(space: ActionSpace, capacity: int, kinds: Sequence[SampledKind] = SAMPLED_KINDS) -> Candidates:
+def no_candidates(space: ActionSpace, capacity: int) -> Candidates:
     """The candidates of so many objects that are yet to be looked at."""
 
     def none(kind: SampledKind) -> Ways:
@@ -33,7 +31,7 @@ def no_candidates(space: ActionSpace, capacity: int, kinds: Sequence[SampledKind
             enters=jnp.zeros((n, v, d), bool),
         )
 
-    return tuple(none(kind) for kind in kinds)
+    return tuple(none(kind) for kind in SAMPLED_KINDS)
 
 
 def candidates(
@@ -43,7 +41,6 @@ def candidates(
     possible: PossibleSpace,
     previous: Candidates | None = None,
     moved: Bool[Array, " n"] | None = None,
-    kinds: Sequence[SampledKind] = SAMPLED_KINDS,
 ) -> Candidates:
     """All ways to move all objects, and what stands in their way.
 
@@ -57,10 +54,9 @@ def candidates(
       possible: where the target may be.
       previous: candidates before some objects moved.
       moved: which moved since; only what concerns them is computed anew.
-      kinds: what is proposed; static.
     """
     n = scene.capacity
-    previous = no_candidates(space, n, kinds) if previous is None else previous
+    previous = no_candidates(space, n) if previous is None else previous
     fresh = scene.valid if moved is None else moved & scene.valid
     concerns = fresh[:, None] | fresh[None, :]
     others = concerns & scene.valid[:, None] & scene.valid[None, :]
@@ -68,7 +64,7 @@ def candidates(
 
     poses, wanted, wrists, openings, owners, parts = [], [], [], [], [], []
     first = 0
-    for kind, before in zip(kinds, previous, strict=True):
+    for kind, before in zip(SAMPLED_KINDS, previous, strict=True):
         T, plausible = kind.propose(space, tables, scene, prints, fresh)
         poses.append(jnp.where(fresh[:, None, None, None], T, before.T_world_gripper))
         wanted.append((plausible & (kind.name in space.config.actions) & fresh[:, None]).reshape(-1))
@@ -83,7 +79,7 @@ def candidates(
     near = approach_clear(space, tables, opening, wrist, flat, jnp.concatenate(wanted))
 
     reached, against = [], []
-    for kind, before, T, part, owner in zip(kinds, previous, poses, parts, owners, strict=True):
+    for kind, before, T, part, owner in zip(SAMPLED_KINDS, previous, poses, parts, owners, strict=True):
         travels = kind.travels(space, tables, flat[part], near[part]).reshape(*T.shape[:2], -1)
         reached.append(jnp.where(fresh[:, None, None], travels, before.reached))
         obstacles = others & ~jnp.eye(n, dtype=bool) if kind.surrounds_object else others
@@ -92,7 +88,7 @@ def candidates(
     by_hand = gripper_hits(tables, opening, wrist, flat, scene, mask)
 
     found = []
-    for kind, before, T, part, arrives in zip(kinds, previous, poses, parts, reached, strict=True):
+    for kind, before, T, part, arrives in zip(SAMPLED_KINDS, previous, poses, parts, reached, strict=True):
         hits = by_hand[part]
         hits |= kind.swept_hits(space, scene, flat[part], mask[part] & ~hits)
         hits = jnp.where(concerns[:, None, :], hits.reshape(*T.shape[:2], n), before.hits)

@@ -38,15 +38,3 @@ def kind_of(code: int) -> Kind:
             return kind
     known = ", ".join(f"{kind.code} ({kind.name})" for kind in KINDS.values())
     raise InputError(f"action kind {int(code)} is unknown; there are {known}")
-
-
-def kind_named(name: str) -> Kind:
-    """The kind that files and the command line call so.
-
-    Raises:
-      InputError: there is none.
-    """
-    for kind in KINDS.values():
-        if kind.name == name:
-            return kind
-    raise InputError(f'action kind "{name}" is unknown; there are {", ".join(kind.name for kind in KINDS.values())}')

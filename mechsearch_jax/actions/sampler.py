@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions.candidates import Candidates, free_ways
 from mechsearch_jax.actions.config import ActionSpace, ActionTables
-from mechsearch_jax.actions.kind import SampledKind
 from mechsearch_jax.actions.registry import SAMPLED_KINDS, ActionKind
 from mechsearch_jax.actions.types import Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace, risk
@@ -47,7 +46,6 @@ def sample_action(
     options: Candidates,
     available: Bool[Array, " n"],
     weights: Float[Array, " n"] | None = None,
-    kinds: Sequence[SampledKind] = SAMPLED_KINDS,
 ) -> Sample:
     """Draw an action: an object and a kind (the multi-set of B.5) by the object's weight, then one of its ways evenly.
 
@@ -60,28 +58,27 @@ def sample_action(
       options: of this scene, by kind.
       available: which objects may be moved.
       weights: sampling weights of the objects, positive; the paper's, and those left out, are equal.
-      kinds: what is sampled; static.
     """
     n = scene.capacity
     key_choice, key_place = jax.random.split(key)
     ways = _stacked([free_ways(w) & available[:, None, None] for w in options])
     enters = _stacked([w.enters for w in options])
     weights = jnp.ones(n) if weights is None else weights
-    weight = jnp.tile(weights, len(kinds))[:, None] * _shares(ways & ~enters, ways)
+    weight = jnp.tile(weights, len(SAMPLED_KINDS))[:, None] * _shares(ways & ~enters, ways)
     choice, possible_at_all = _choose(key_choice, weight.reshape(-1))
     row, way = choice // ways.shape[1], choice % ways.shape[1]
     chosen, index = row // n, row % n
 
     drafts = [
         kind.draft(key_place, space, tables, scene, possible, w, index, way)
-        for kind, w in zip(kinds, options, strict=True)
+        for kind, w in zip(SAMPLED_KINDS, options, strict=True)
     ]
     draft = drafts[-1]
     for i in reversed(range(len(drafts) - 1)):
         draft = jax.tree.map(lambda a, b, i=i: jnp.where(chosen == i, a, b), drafts[i], draft)
     able = possible_at_all & draft.possible
     kind = jnp.where(able, draft.action.kind, ActionKind.NONE).astype(jnp.int32)
-    opening = jnp.array([kind.opening for kind in kinds])[chosen]
+    opening = jnp.array([kind.opening for kind in SAMPLED_KINDS])[chosen]
     cloud = tables.clouds[opening, draft.wrist].T
     body = superquadric.sample_surface(scene.size[index], scene.exponents[index], space.config.object_points)
     swept = jnp.concatenate(

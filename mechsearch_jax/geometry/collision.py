@@ -12,11 +12,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.masked import block_size, for_each, merged, rows_of
-from mechsearch_jax.geometry.superquadric import Superquadrics
 
 
 def _transform_cloud(T, cloud):
@@ -140,10 +139,3 @@ def any_inside(
         return mark_hits(hits, mask.reshape(-1), make, lambda i: i, block_size(block)).reshape(mask.shape)
 
     return merged(run)(mask, shared, row)
-
-
-def points_inside(scene: Superquadrics, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch n"]:
-    """Whether world points lie inside each of the scene's objects; never inside an absent one."""
-    local = superquadric.to_object_frame(scene, points)
-    inside = superquadric.gauge(scene.size, scene.exponents, local) < 1.0
-    return inside & jnp.broadcast_to(scene.valid, inside.shape)

@@ -109,15 +109,6 @@ def gauge(
     return _norm2(_norm2(x[..., 0], x[..., 1], p), x[..., 2], r)
 
 
-def implicit(
-    size: Float[Array, "... 3"], exponents: Float[Array, "... 2"], points: Float[Array, "... 3"]
-) -> Float[Array, "..."]:
-    """`S` of equation 5: below 1 inside, 1 on the surface, above 1 outside. Arguments as in `gauge`."""
-    value = gauge(size, exponents, points)
-    value, e1 = align((value, 0), (exponents[..., 0], 0))
-    return _power(value, 2.0 / e1)
-
-
 def radial_distance(
     size: Float[Array, "... 3"], exponents: Float[Array, "... 2"], points: Float[Array, "... 3"]
 ) -> Float[Array, "..."]:

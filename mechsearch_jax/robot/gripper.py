@@ -38,22 +38,16 @@ class Gripper:
       max_opening: largest distance between the fingers.
       usable_opening: largest width of an object that may be grasped.
       approach: length of the straight approach and retreat along the gripper's z.
-      pad_width: width of the fingers' flat inner faces along x, at the tips.
-      pad_length: length of the part of those faces with that width, along z.
-      tip: z of the finger tips' ends in the gripper frame; the pads reach from there backwards.
       front: the clouds are dense where z in the gripper frame is above this.
     """
 
     max_opening: float = 0.08
     usable_opening: float = 0.075
     approach: float = 0.3
-    pad_width: float = 0.0175
-    pad_length: float = 0.018
-    tip: float = 0.009
     front: float = -0.08
 
     def __post_init__(self):
-        for field in ("max_opening", "usable_opening", "approach", "pad_width", "pad_length"):
+        for field in ("max_opening", "usable_opening", "approach"):
             if not getattr(self, field) > 0:
                 raise InputError(f"Gripper: {field} ({getattr(self, field)}) must be positive, in metres")
         if self.usable_opening > self.max_opening:
@@ -248,16 +242,6 @@ def _sampled(
     return candidates[_spread(candidates, spacing, count)].astype(np.float32)
 
 
-def finger_box(gripper: Gripper, opening: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    """Half-extents and centre in the gripper frame of the smallest upright box around both fingers [m]."""
-    return _bounding_box(primitives_in_gripper(gripper, opening, 0.0)[len(HAND) : len(HAND) + 2 * len(FINGER)])
-
-
-def hand_box(gripper: Gripper, opening: float) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
-    """Half-extents and centre in the gripper frame of the smallest upright box around the hand alone [m]."""
-    return _bounding_box(primitives_in_gripper(gripper, opening, 0.0)[: len(HAND)])
-
-
 def arm_points(q: Float[Numbers, "*batch 7"], count: int) -> tuple[Float[Array, "*batch n 3"], Float[Array, " n"]]:
     """Points along the axes of the capsules of links 2 to 5, in the base frame.
 
@@ -371,9 +355,3 @@ def _spread(points: np.ndarray, spacing: np.ndarray, count: int) -> np.ndarray:
         np.minimum(gap, distance, out=gap)
         chosen[i] = np.argmax(gap)
     return chosen
-
-
-def _bounding_box(primitives: tuple[Primitive, ...]) -> tuple[np.ndarray, np.ndarray]:
-    bounds = np.array([_mesh(primitive).bounds for primitive in primitives])
-    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
-    return ((high - low) / 2).astype(np.float32), ((high + low) / 2).astype(np.float32)
