@@ -165,8 +165,10 @@ def run_episodes(
       watcher: told of every step; for one slot only.
 
     Raises:
-      InputError: a watcher is given for several slots, or the policy decides on an unknown kind of action.
+      InputError: there is no slot, a watcher is given for several, or the policy decides on an unknown kind of action.
     """
+    if slots < 1:
+        raise InputError(f"run_episodes: {slots} slots run nothing; give at least 1")
     queue = enumerate(starts)
     first = [pair for _, pair in zip(range(slots), queue, strict=False)]
     if not first:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -28,13 +27,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, kind_of
+from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.outcome import Failure, Outcome
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, check_actions, controls
 from mechsearch_jax.envs.world import BODIES, TARGET, World, bodies_of, from_scenario, slots
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME
-from mechsearch_jax.robot.motion import MotionConfig, Reference
+from mechsearch_jax.robot.motion import Reference
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, rotation_matrix
 from mechsearch_jax.workspace.shelf import Shelf
@@ -57,12 +57,6 @@ class Trace:
     fingers: Float[np.ndarray, "frames 2"]
     position: Float[np.ndarray, "frames 9 3"]
     quaternion: Float[np.ndarray, "frames 9 4"]
-
-
-@functools.partial(jax.jit, static_argnames=("code", "config"))
-def _reference(code: int, action: Action, config: MotionConfig):
-    """The motion of an action of this kind and whether the arm reaches all of it, or None where there is none."""
-    return kind_of(code).reference(action, config)
 
 
 class NativeWorld:
@@ -113,7 +107,7 @@ class NativeWorld:
         """
         kind = kind_of(int(action.kind))
         self._recorder = _Recorder(self._data, self.config.trace_every)
-        motion = _reference(int(kind.code), action, self.config.motion)
+        motion = reference_motion(kind, action, self.config.motion)
         if motion is None:
             return self._finish(Failure.NONE, True)
         reference, reachable = motion

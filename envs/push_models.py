@@ -9,7 +9,6 @@ import jax
 
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
-from mechsearch_jax.envs.physics_push import MjxPhysics, NativePhysics
 
 
 class PushModels(NamedTuple):
@@ -39,6 +38,9 @@ def push_models(name: str) -> PushModels:
     """
     if name != "physics":
         return PushModels(own_push_model(name), own_push_model(name))
+    # What is not asked for, the batch simulator among it, is not imported.
+    from mechsearch_jax.envs.physics_push import MjxPhysics, NativePhysics
+
     if jax.default_backend() == "cpu":
         return PushModels(NativePhysics(), own_push_model("learned"))
     return PushModels(MjxPhysics(), MjxPhysics())

@@ -7,12 +7,14 @@ import functools
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
+from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME
-from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.robot.motion import MotionConfig, Reference
 
 
 class JointTrajectory(flax.struct.PyTreeNode):
@@ -35,7 +37,14 @@ class JointTrajectory(flax.struct.PyTreeNode):
 
 
 @functools.partial(jax.jit, static_argnames=("kind", "config"))
-def _reference(kind, action: Action, config: MotionConfig):
+def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:
+    """`Kind.reference`, compiled: the motion of an action and whether the arm reaches all of it, or None.
+
+    Args:
+      kind: of the action; static.
+      action: a single action.
+      config: lengths and durations; static.
+    """
     return kind.reference(action, config)
 
 
@@ -55,7 +64,7 @@ def joint_trajectory(problem, action: Action, config: MotionConfig | None = None
     """
     config = config or MotionConfig(approach=problem.gripper.approach)
     kind = kind_of(int(action.kind))
-    found = _reference(kind, action, config)
+    found = reference_motion(kind, action, config)
     if found is None:
         still = jnp.float32(HOME)[None]
         return JointTrajectory(jnp.zeros(1), still, jnp.zeros_like(still), jnp.zeros(1))

@@ -307,7 +307,7 @@ def push_start(
     T_world_gripper: Float[Array, "4 4"],
     displacement: Float[Array, "3"],
 ) -> PushStart:
-    """The start of a push; see `dynamics.PushModel` for the arguments.
+    """The start of a push; see `push_model.PushModel` for the arguments.
 
     Args:
       shelf: walls; one of which is farther than `REACH` from an object does not exist for it.

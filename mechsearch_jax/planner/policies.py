@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import flax.struct
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array
 
 from mechsearch_jax.dynamics.named import own_push_model
@@ -82,13 +83,13 @@ class Search(flax.struct.PyTreeNode):
 
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """See `Policy`."""
-        if not isinstance(belief.found, jax.core.Tracer):
+        if not isinstance(belief.found, Tracer):
             # Outside of any transformation, what is not needed is neither computed nor compiled.
             if not belief.found:
                 return _plan(self, key, problem, belief, observation)
             grasp = graspable_at(problem, observation.objects, belief.found_pose)
             # The belief may be known where the observation is traced.
-            if not isinstance(grasp.success, jax.core.Tracer):
+            if not isinstance(grasp.success, Tracer):
                 if not grasp.success:
                     return _plan(self, key, problem, belief, observation)
                 return _take_out(self, observation, grasp)
@@ -174,7 +175,10 @@ search_and_grasp = functools.partial(search, objective=SearchAndGrasp())
 
 
 def random_action(config: PlannerConfig | None = None, **options: Any) -> Search:
-    """A baseline: a uniformly random possible action, without any preference, until the target can be taken out."""
+    """A baseline: a random possible action, by the sampler's even draw, until the target can be taken out.
+
+    It plans no further: of `config`, the horizon, the guided fraction and all charges are not used.
+    """
     even = dataclasses.replace(
         _planner_config(config), horizon=1, guided_fraction=0.0, unseen_contact_penalty=0.0, topple_charge=0.0
     )

@@ -64,7 +64,8 @@ class Rollout:
         """The present state, of which nothing is computed yet: as if every object had just moved."""
         problem = self.problem
         scene, is_target = with_target(problem, self.belief, objects)
-        places = problem.existence.T_world_target.shape[:2] if self.config.predicted_collisions else None
+        candidates, spread = problem.existence.T_world_target.shape[:2]
+        places = (candidates, spread) if self.config.predicted_collisions else None
         return State(
             scene=scene,
             is_target=is_target,
