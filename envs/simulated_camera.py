@@ -220,4 +220,5 @@ def target_pixels(camera: Camera, world: World, window: int | None = None) -> In
 def is_found(camera: Camera, world: World) -> Bool[Array, ""]:
     """Whether the detector sees the target: more than 100 pixels of it at 1280 x 720."""
     share = camera.width * camera.height / (1280 * 720)
-    return target_pixels(camera, world) > FOUND_PIXELS * share
+    # Of no weak type, so that what takes it is compiled once.
+    return jnp.asarray(target_pixels(camera, world) > FOUND_PIXELS * share, bool)
