@@ -18,23 +18,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax import planner
-from mechsearch_jax.actions import Action, ActionKind, PossibleSpace, candidates, sample_action
+from mechsearch_jax.actions import SAMPLED_KINDS, Action, PossibleSpace, candidates, kind_of, sample_action
 from mechsearch_jax.envs.generator import ScenarioGenerator
-from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
-from mechsearch_jax.envs.simulator import NativeSimulator, Outcome
+from mechsearch_jax.envs.mjx_model import MjxConfig
+from mechsearch_jax.envs.mjx_simulator import MjxSimulator
+from mechsearch_jax.envs.native import NativeWorld
+from mechsearch_jax.envs.outcome import Outcome
 from mechsearch_jax.envs.world import CYLINDER, World, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, save_json
-from mechsearch_jax.planner import PlannerConfig, Problem
-from mechsearch_jax.results import ACTION_NAMES, versions
-from mechsearch_jax.scenario import MAX_OBJECTS, Scenario
+from mechsearch_jax.planner import Problem, build_problem
+from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Scenario
 
 # What counts as the same final pose [m, degrees].
 NEAR, ALIGNED = 5e-3, 3.0
 # Standard deviation of the nudge, along x and y [m].
 NUDGE = 1e-5
-KINDS = (ActionKind.PUSH, ActionKind.PICK_AND_PLACE)
+KINDS = tuple(sorted(SAMPLED_KINDS, key=lambda kind: kind.code))
 
 Measures = dict[str, int | float]
 
@@ -45,7 +46,7 @@ class Case:
 
     Attributes:
       scenario, objects: name of the scene, and number of objects in it.
-      kind: "push" or "pick-and-place".
+      kind: name of the kind of action.
       object: index of the object that it is about.
       native_failure, batch_failure: why it was not executed as commanded, or None.
       native_moved, batch_moved: how far the object was displaced [m].
@@ -53,7 +54,7 @@ class Case:
       position_difference: between the final positions of a body, the largest of all bodies [m].
       rotation_difference: between the final rotations, likewise [degrees]; a cylinder's spin about its axis is nothing.
       spin_difference: the same with the spin.
-      overflow: flags of `mjx_simulator.Overflow`.
+      overflow: flags of `outcome.Overflow`.
       nudged_position_difference, nudged_rotation_difference: between the native simulator and itself with the objects
         nudged, the largest where it was nudged more than once.
     """
@@ -94,7 +95,7 @@ class Agreement:
       cases: one for each action.
       native_seconds: of all actions, one after the other, with compilation [s].
       batch_seconds: of all actions at once, with compilation [s].
-      versions: as `results.versions` returns them, with those of MJX and Warp.
+      versions: as `versions` returns them, with those of MJX and Warp.
     """
 
     cases: tuple[Case, ...]
@@ -104,7 +105,7 @@ class Agreement:
 
     def summary(self) -> dict[str, Measures]:
         """By kind of action and for all: shares, quantiles of the differences [m, degrees] and displacements [m]."""
-        rows = {ACTION_NAMES[kind]: [c for c in self.cases if c.kind == ACTION_NAMES[kind]] for kind in KINDS}
+        rows = {kind.name: [c for c in self.cases if c.kind == kind.name] for kind in KINDS}
         return {name: _summary(cases) for name, cases in {**rows, "all": list(self.cases)}.items() if cases}
 
 
@@ -153,9 +154,8 @@ def generated_scenes(count: int, seed: int = 0) -> list[Scenario]:
     return [generator.generate(seed + i // MAX_OBJECTS, 1 + i % MAX_OBJECTS) for i in range(count)]
 
 
-def _sampler(problem: Problem, config: PlannerConfig) -> Callable[[Array, World], Action]:
+def _sampler(problem: Problem) -> Callable[[Array, World], Action]:
     """A compiled function that draws one valid action for every key, wherever the target may be."""
-    space = planner.action_space(problem, config)
     grid = problem.target.grid[:2]
     nowhere = PossibleSpace(
         occupied=jnp.zeros(grid, bool),
@@ -167,10 +167,10 @@ def _sampler(problem: Problem, config: PlannerConfig) -> Callable[[Array, World]
 
     def draw(keys: Array, world: World, problem: Problem) -> Action:
         scene = true_superquadrics(world)
-        options = candidates(space, problem.actions, scene, nowhere)
+        options = candidates(problem.space, problem.actions, scene, nowhere)
 
         def one(key: Array) -> Action:
-            return sample_action(key, space, problem.actions, scene, nowhere, options, scene.valid).action
+            return sample_action(key, problem.space, problem.actions, scene, nowhere, options, scene.valid).action
 
         return jax.vmap(one)(keys)
 
@@ -181,7 +181,7 @@ def _sampler(problem: Problem, config: PlannerConfig) -> Callable[[Array, World]
 def draw_actions(
     scenes: Sequence[Scenario], count: int, seed: int = 0, tries: int = 16
 ) -> list[tuple[Scenario, Action]]:
-    """Random valid actions in scenes: the scenes in turn, and pushes and pick-and-places in turn where there are both.
+    """Random valid actions in scenes: the scenes in turn, and the kinds of action in turn where there are several.
 
     Args:
       scenes: where.
@@ -192,21 +192,20 @@ def draw_actions(
     Raises:
       InputError: the scenes do not have so many.
     """
-    sample = _sampler(planner.build_problem(), PlannerConfig.paper())
-    drawn: list[dict[ActionKind, list[Action]]] = []
+    sample = _sampler(build_problem())
+    drawn: list[dict[int, list[Action]]] = []
     for i, scene in enumerate(scenes):
         keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), i), tries)
         actions = jax.device_get(sample(keys, from_scenario(scene)))
         split = [jax.tree.map(lambda leaf, j=j: leaf[j], actions) for j in range(tries)]
         # Where little is possible, the same push is drawn again and again.
         different = list({b"".join(leaf.tobytes() for leaf in jax.tree.leaves(a)): a for a in split}.values())
-        drawn.append({kind: [action for action in different if action.kind == kind] for kind in KINDS})
+        drawn.append({kind.code: [action for action in different if action.kind == kind.code] for kind in KINDS})
     cases: list[tuple[Scenario, Action]] = []
-    for round_ in range(2 * tries):
+    for round_ in range(len(KINDS) * tries):
         for i, (scene, found) in enumerate(zip(scenes, drawn, strict=True)):
-            wanted = KINDS[(round_ + i) % 2]
-            other = KINDS[(round_ + i + 1) % 2]
-            usable = found[wanted] or found[other]
+            in_turn = [KINDS[(round_ + i + k) % len(KINDS)].code for k in range(len(KINDS))]
+            usable = next((found[code] for code in in_turn if found[code]), [])
             if usable and len(cases) < count:
                 cases.append((scene, usable.pop(0)))
     if len(cases) < count:
@@ -245,7 +244,7 @@ def _stack(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *trees)
 
 
-def _native(simulator: NativeSimulator, cases: Sequence[tuple[Scenario, Action]]) -> tuple[list[Outcome], World]:
+def _native(simulator: NativeWorld, cases: Sequence[tuple[Scenario, Action]]) -> tuple[list[Outcome], World]:
     """What the native simulator makes of every action: outcomes, and the worlds with a leading axis for the actions."""
     outcomes, worlds = [], []
     for scene, action in cases:
@@ -286,7 +285,7 @@ def agreement(cases: Sequence[tuple[Scenario, Action]], config: MjxConfig | None
     outcomes, after = jax.device_get((outcomes, simulator.world))
     batch_seconds = time.perf_counter() - start
 
-    native = NativeSimulator(config=config.simulator)
+    native = NativeWorld(config=config.simulator)
     start = time.perf_counter()
     records, expected = _native(native, cases)
     native_seconds = time.perf_counter() - start
@@ -304,13 +303,13 @@ def agreement(cases: Sequence[tuple[Scenario, Action]], config: MjxConfig | None
         Case(
             scenario=scene.name,
             objects=len(scene.objects),
-            kind=ACTION_NAMES[ActionKind(int(action.kind))],
+            kind=kind_of(int(action.kind)).name,
             object=int(action.object),
-            native_failure=records[i].failure,
+            native_failure=records[i].reason(),
             batch_failure=outcomes.reason(i),
             native_moved=float(native_moved[i]),
             batch_moved=float(batch_moved[i]),
-            native_steps=records[i].steps,
+            native_steps=int(records[i].steps),
             batch_steps=int(outcomes.steps[i]),
             position_difference=float(distance[i]),
             rotation_difference=float(angle[i]),

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from typing import get_args
 
 import jax
 
 from mechsearch_jax.benchmarks.evaluate import Job
-from mechsearch_jax.cache import kept_problem
-from mechsearch_jax.envs.batch_episode import BatchSimulator, Start, run_episodes
-from mechsearch_jax.envs.episode import row, target_of
-from mechsearch_jax.envs.mjx_simulator import MjxSimulator
-from mechsearch_jax.envs.native_worlds import NativeWorlds
-from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
+from mechsearch_jax.benchmarks.rows import Row
+from mechsearch_jax.envs.episodes import Start, run_episodes, target_of
+from mechsearch_jax.envs.method import EngineName, Method
+from mechsearch_jax.envs.recognisers import recogniser
+from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.results import Episode, Row
-from mechsearch_jax.target import Target
+from mechsearch_jax.planner.cache import cached_problem
+from mechsearch_jax.workspace.target import Target
 
-ENGINES: dict[str, Callable[[], BatchSimulator]] = {
-    NativeWorlds.engine: NativeWorlds,
-    MjxSimulator.engine: MjxSimulator,
-}
-_Group = tuple[Target, PlannerConfig, str, RecognitionName]
 # More worlds at once are no faster per world, but every round takes longer.
 MOST_WORLDS = 1024
 # Without a GPU a batch only shares the overhead.
@@ -32,6 +27,23 @@ MOST_WORLDS_ON_CPU = 16
 SHARE_OF_WORLDS = 0.4
 # How many slots look or decide in one computation.
 AT_ONCE, AT_ONCE_ON_CPU = 64, 4
+
+
+def new_simulator(engine: EngineName) -> Simulator:
+    """A simulator of an engine; MJX takes long to import and is not always installed.
+
+    Raises:
+      InputError: it is unknown, or cannot be imported.
+    """
+    if engine not in get_args(EngineName):
+        raise InputError(f'simulator "{engine}" is unknown; use {" or ".join(get_args(EngineName))}')
+    if engine == "NativeSimulator":
+        from mechsearch_jax.envs.native import NativeSimulator
+
+        return NativeSimulator()
+    from mechsearch_jax.envs.mjx_simulator import MjxSimulator
+
+    return MjxSimulator()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,15 +68,15 @@ class Batches:
           Exception: whatever failed, if no episode has ended since the start or the last failure, or if the memory
             does not suffice for a single world.
         """
-        for (target, config, engine, recognition), group in _groups(jobs):
-            simulator = ENGINES[engine]()
+        for (target, method), group in _groups(jobs):
+            simulator = new_simulator(method.engine)
             worlds = self.worlds or fitting_worlds(simulator)
             # Those that take longest come first, so that none of them begins when all others are over.
             todo = sorted(group, key=lambda job: -len(job.scenario.objects))
             while todo:
                 attempt = _Attempt(todo, ended)
                 try:
-                    self._run(attempt, target, config, recognition, simulator, worlds)
+                    self._run(attempt, target, method, simulator, worlds)
                 except jax.errors.JaxRuntimeError as error:
                     used = min(worlds, len(todo))
                     if "RESOURCE_EXHAUSTED" not in str(error):
@@ -73,35 +85,26 @@ class Batches:
                         raise
                     else:
                         worlds = used // 2
-                    simulator = ENGINES[engine]()
+                    simulator = new_simulator(method.engine)
                 except InputError:
                     raise
                 except Exception as error:
                     attempt.fail(error)
-                    simulator = ENGINES[engine]()
+                    simulator = new_simulator(method.engine)
                 todo = attempt.left
 
-    def _run(
-        self,
-        attempt: _Attempt,
-        target: Target,
-        config: PlannerConfig,
-        recognition: RecognitionName,
-        simulator: BatchSimulator,
-        worlds: int,
-    ) -> None:
-        at_once = AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE
-        problem = kept_problem(target)
+    def _run(self, attempt: _Attempt, target: Target, method: Method, simulator: Simulator, worlds: int) -> None:
         run_episodes(
             attempt.starts(),
-            problem,
-            config,
+            cached_problem(target, method.config.problem),
+            method.policy(),
             simulator,
             worlds,
             attempt.take,
-            at_once=at_once,
-            recogniser=recogniser(recognition, target),
-            recognition=recognition,
+            recogniser=recogniser(method.recognition, target),
+            max_steps=method.config.max_steps,
+            options=method.options(),
+            at_once=AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE,
             busy=self.busy,
         )
 
@@ -124,7 +127,7 @@ class _Attempt:
     def take(self, episodes: Sequence[tuple[int, Episode]]) -> None:
         """Hand on the rows of episodes that ended."""
         self._over |= {place for place, _ in episodes}
-        self._ended([row(episode) for _, episode in episodes])
+        self._ended([Row.of_episode(episode) for _, episode in episodes])
 
     def fail(self, error: Exception) -> None:
         """Make a row of every episode that was running when an error came.
@@ -145,22 +148,22 @@ class _Attempt:
         return [job for place, job in enumerate(self._jobs) if place not in self._over]
 
 
-def _groups(jobs: Sequence[Job]) -> list[tuple[_Group, list[Job]]]:
+def _groups(jobs: Sequence[Job]) -> list[tuple[tuple[Target, Method], list[Job]]]:
     """The jobs by what is compiled for them."""
-    groups: dict[_Group, list[Job]] = {}
+    groups: dict[tuple[Target, Method], list[Job]] = {}
     for job in jobs:
-        groups.setdefault((target_of(job.scenario), job.config, job.engine, job.recognition), []).append(job)
+        groups.setdefault((target_of(job.scenario), job.method), []).append(job)
     return list(groups.items())
 
 
-def fitting_worlds(simulator: BatchSimulator) -> int:
+def fitting_worlds(simulator: Simulator) -> int:
     """How many worlds fit the memory of the device."""
     if jax.default_backend() == "cpu":
         return MOST_WORLDS_ON_CPU
-    if not isinstance(simulator, MjxSimulator):
-        return MOST_WORLDS
+    # The native simulator's worlds are not on the device.
+    bytes_per_world = getattr(simulator, "bytes_per_world", None)
     stats = jax.local_devices()[0].memory_stats() or {}
-    if "bytes_limit" not in stats:
+    if bytes_per_world is None or "bytes_limit" not in stats:
         return MOST_WORLDS
     room = SHARE_OF_WORLDS * stats["bytes_limit"]
-    return max(min(int(room // simulator.bytes_per_world()), MOST_WORLDS), 1)
+    return max(min(int(room // bytes_per_world()), MOST_WORLDS), 1)

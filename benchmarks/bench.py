@@ -6,7 +6,6 @@ Compilation is timed apart from the steady state.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -21,29 +20,32 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax import planner
 from mechsearch_jax.actions import Action
 from mechsearch_jax.benchmarks.push import named_model, weights_of
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.dynamics import PushOutcome
-from mechsearch_jax.envs import motion
-from mechsearch_jax.envs.episode import Snapshot, objects_on_the_board
+from mechsearch_jax.dynamics.named import PushModelName
+from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.envs.generator import ScenarioGenerator
-from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator, commands
-from mechsearch_jax.envs.push_models import push_models
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.mjx_model import MjxConfig
+from mechsearch_jax.envs.mjx_simulator import MjxSimulator
+from mechsearch_jax.envs.mjx_step import commands
 from mechsearch_jax.envs.pushes import PushesConfig, draw_push, push_tables
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
+from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.world import TARGET, World, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.files import PathLike, save_json
-from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation
-from mechsearch_jax.planner import Belief, PlannerConfig, Problem
-from mechsearch_jax.push_models import PushModelName
-from mechsearch_jax.results import versions
-from mechsearch_jax.scenario import MAX_OBJECTS
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import make
+from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation, split_found
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import Belief, Config, Decision, Problem
+from mechsearch_jax.robot import motion
 from mechsearch_jax.train.push import push_scenes
 from mechsearch_jax.train.scenes import random_world
-from mechsearch_jax.transforms import make
+from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS
+from mechsearch_jax.workspace.shelf import Shelf
 
 # What a call does many of; how many is in `Timing.shapes`.
 COUNTED = ("evaluations", "operations", "bytes", "recognitions", "predictions")
@@ -60,7 +62,7 @@ class Timing:
       shapes: sizes that the time depends on; for "simulate" also what was seen of overflows and divergence.
       compile_seconds: of tracing and compiling [s]; honest only if compilations are not kept on disk.
       seconds: of every call afterwards, results awaited [s].
-      versions: as `results.versions` returns them; for "plan" also the "push model", for "predict: learned" also
+      versions: as `versions` returns them; for "plan" also the "push model", for "predict: learned" also
         "weights", their SHA-256.
     """
 
@@ -128,78 +130,123 @@ def measure(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repe
     compiled = jax.jit(function).lower(*calls[0]).compile()
     compile_seconds = time.perf_counter() - start
     jax.block_until_ready(compiled(*calls[0]))
+    return compile_seconds, _timed(compiled, calls, repeats)
+
+
+def measure_first(
+    function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repeats: int
+) -> tuple[float, list[float]]:
+    """The same of a function that compiles what it needs by itself: how much longer its first call takes."""
+    first = _timed(function, calls, 1)[0]
+    seconds = _timed(function, calls, repeats)
+    return max(first - statistics.median(seconds), 0.0), seconds
+
+
+def _timed(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repeats: int) -> list[float]:
     seconds = []
     for i in range(repeats):
         start = time.perf_counter()
-        jax.block_until_ready(compiled(*calls[i % len(calls)]))
+        jax.block_until_ready(function(*calls[i % len(calls)]))
         seconds.append(time.perf_counter() - start)
-    return compile_seconds, seconds
+    return seconds
 
 
 def f_of(problem: Problem, scene: Superquadrics) -> Bool[Array, " x"]:
     """f of a single state, for all poses."""
     everywhere = jnp.ones(problem.poses.shape[0], bool)
-    views = object_views(problem.existence, problem.camera, scene, everywhere, problem.existence_config)
-    return existence(problem.existence, problem.camera, views, everywhere, problem.existence_config)
+    views = object_views(problem.existence, problem.camera, scene, everywhere, problem.config.existence)
+    return existence(problem.existence, problem.camera, views, everywhere, problem.config.existence)
 
 
 def g_of(problem: Problem, belief: Belief, scene: Superquadrics) -> Int[Array, " x"]:
     """g of a single state, where f = 1."""
     hits = grasp_hits(problem.grasps, belief.grasps, scene, jnp.append(belief.exists, False))
-    return graspability(problem.grasps, belief.grasps, hits)[:-1]
+    return split_found(graspability(problem.grasps, belief.grasps, hits))[0]
 
 
-def bench(
-    subject: Literal["existence", "graspability", "plan"],
+def bench_part(
+    subject: Literal["existence", "graspability"],
     objects: int,
-    config: PlannerConfig,
+    config: Config,
     batch: int = 1,
     scenes: int = 5,
     repeats: int = 20,
 ) -> Timing:
-    """Time f, g or a decision on generated scenes.
+    """Time f or g on generated scenes.
 
     Args:
       subject: what is timed.
       objects: number of objects in a scene.
-      config: the planner's options.
+      config: how the problem is built.
       batch: number of scenes in one call; 1 times the function itself, without a batch axis.
       scenes: number of different scenes, taken in turn.
       repeats: number of timed calls.
 
     Raises:
-      InputError: the number of objects does not fit, or the push model cannot be used.
+      InputError: the number of objects does not fit.
     """
+    problem, states, shapes = _states(objects, config, batch, scenes)
+    functions: dict[str, Callable[..., Any]] = {
+        "existence": lambda problem, key, belief, seen: f_of(problem, seen.objects),
+        "graspability": lambda problem, key, belief, seen: g_of(problem, belief, seen.objects),
+    }
+    if subject == "graspability":
+        shapes["median_possible_poses"] = int(statistics.median(int(belief.exists.sum()) for _, belief, _ in states))
+    function, calls = functions[subject], [(problem, *state) for state in states]
+    if batch > 1:
+        function, calls = jax.vmap(function, in_axes=(None, 0, 0, 0)), [(problem, *_batch_of(states, batch))]
+    compile_seconds, seconds = measure(function, calls, repeats)
+    return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions())
+
+
+def bench_plan(objects: int, method: Method, batch: int = 1, scenes: int = 5, repeats: int = 20) -> Timing:
+    """Time a decision on generated scenes, whose targets are not found yet.
+
+    Args:
+      objects: number of objects in a scene.
+      method: what decides, and with which settings.
+      batch, scenes, repeats: as in `bench_part`.
+
+    Raises:
+      InputError: the number of objects does not fit, or the method cannot be used.
+    """
+    policy = method.policy()
+    problem, states, shapes = _states(objects, method.config, batch, scenes)
+    shapes |= {"sequences": method.config.planner.sequences, "horizon": method.config.planner.horizon}
+
+    def decide(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
+        return policy(key, problem, belief, seen)
+
+    if batch > 1:
+        several = [(problem, *_batch_of(states, batch))]
+        compile_seconds, seconds = measure(jax.vmap(decide, in_axes=(None, 0, 0, 0)), several, repeats)
+    else:
+        # As in an episode alone: a policy compiles what it needs, and computes only what the belief asks for.
+        compile_seconds, seconds = measure_first(decide, [(problem, *state) for state in states], repeats)
+    told = versions() | {"push model": method.config.push_model}
+    return Timing("plan", objects, shapes, compile_seconds, tuple(seconds), told)
+
+
+def _states(
+    objects: int, config: Config, batch: int, scenes: int
+) -> tuple[Problem, list[tuple[Array, Belief, Observation]], dict[str, int]]:
+    """The problem, what is known and seen at the start of generated scenes with a key each, and the sizes."""
     generator = ScenarioGenerator()
-    problem = planner.build_problem(target=generator.target)
-    observe = jax.jit(functools.partial(planner.observe_belief, config=config))
+    problem = planner.build_problem(target=generator.target, config=config.problem)
     states = []
     for seed in range(scenes):
         world = from_scenario(generator.generate(seed, objects))
         scene = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-        belief = observe(problem, planner.initial_belief(problem), scene, jnp.array(False), jnp.zeros(3))
-        states.append((jax.random.key(seed), belief, scene))
-    poses = [int(belief.exists.sum()) for _, belief, _ in states]
-    shapes = {"poses": problem.poses.shape[0], "capacity": states[0][2].capacity, "scenes": scenes, "batch": batch}
-    models = push_models(config.push_model)
-    functions: dict[str, Callable[..., Any]] = {
-        "existence": lambda problem, key, belief, scene: f_of(problem, scene),
-        "graspability": lambda problem, key, belief, scene: g_of(problem, belief, scene),
-        "plan": lambda problem, key, belief, scene: planner.plan(key, problem, belief, scene, config, *models),
-    }
-    if subject == "graspability":
-        shapes["median_possible_poses"] = int(statistics.median(poses))
-    elif subject == "plan":
-        shapes |= {"sequences": config.sequences, "horizon": config.horizon}
-    function, calls = functions[subject], [(problem, *state) for state in states]
-    if batch > 1:
-        function = jax.vmap(function, in_axes=(None, 0, 0, 0))
-        several = jax.tree.map(lambda *leaves: jnp.stack([leaves[i % scenes] for i in range(batch)]), *states)
-        calls = [(problem, *several)]
-    compile_seconds, seconds = measure(function, calls, repeats)
-    # f and g predict no push.
-    told = {"push model": config.push_model} if subject == "plan" else {}
-    return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions() | told)
+        observation = Observation(scene, jnp.array(False), jnp.zeros(3))
+        belief = planner.update_belief(problem, planner.initial_belief(problem), observation)
+        states.append((jax.random.key(seed), belief, observation))
+    capacity = states[0][2].objects.capacity
+    return problem, states, {"poses": len(problem.poses), "capacity": capacity, "scenes": scenes, "batch": batch}
+
+
+def _batch_of(states: Sequence[Any], batch: int) -> Any:
+    """So many of the states, in turn, with a leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack([leaves[i % len(states)] for i in range(batch)]), *states)
 
 
 def bench_perceive(
@@ -212,7 +259,7 @@ def bench_perceive(
     Args:
       recognition: "masks" or "full".
       objects: number of objects in a scene, all of which are recognised at once.
-      batch, scenes, repeats: as in `bench`.
+      batch, scenes, repeats: as in `bench_part`.
 
     Raises:
       InputError: the oracle recognises nothing, the number of objects does not fit, or the weights are damaged.
@@ -226,12 +273,12 @@ def bench_perceive(
     states = [(jax.random.key(seed), world) for seed, world in enumerate(worlds)]
 
     def perceive(key: Array, world: World) -> Superquadrics:
-        return see(key, Snapshot(camera, shelf, world)).scene
+        return see(key, Snapshot(camera, shelf, world)).objects
 
     function, calls = perceive, states
     if batch > 1:
         function = jax.vmap(perceive)
-        calls = [jax.tree.map(lambda *leaves: jnp.stack([leaves[i % scenes] for i in range(batch)]), *states)]
+        calls = [_batch_of(states, batch)]
     compile_seconds, seconds = measure(function, calls, repeats)
     shapes = {"scenes": scenes, "batch": batch, "recognitions": batch * objects}
     return Timing(f"perceive: {recognition}", objects, shapes, compile_seconds, tuple(seconds), versions())

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mechsearch_jax.dense import kernel_available
+from mechsearch_jax.benchmarks.dense import kernel_available
 
 # Operations in a row in the body of a kernel's loop: enough that the loop itself does not count.
 CHAIN = 32

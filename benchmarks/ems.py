@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.geometry.superquadric import Superquadrics
 
 EXPONENTS = (0.05, 2.0)
 LEAST_POINTS = 11
@@ -87,7 +87,7 @@ def _norm2(a: np.ndarray, b: np.ndarray, p: float) -> np.ndarray:
 
 
 def _radial(shape: Recovered, points: np.ndarray) -> np.ndarray:
-    """Signed radial distances, positive outside (the paper's and DESIGN's equation 6, with its sign)."""
+    """Signed radial distances, positive outside (the paper's equation 6, with its sign)."""
     local = (points - shape.position) @ shape.rotation
     x, y, z = np.abs(local.T) / shape.size[:, None]
     gauge = _norm2(_norm2(x, y, 2.0 / shape.exponents[1]), z, 2.0 / shape.exponents[0])

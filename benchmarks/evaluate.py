@@ -9,19 +9,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import importlib.metadata
 from collections.abc import Callable, Sequence
-from importlib import resources
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-from mechsearch_jax.envs.recognisers import RecognitionName
+from mechsearch_jax.benchmarks.rows import Row, identity, read_code, read_rows, write_rows
+from mechsearch_jax.envs.method import Method
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
-from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.results import Row, configuration, identity, read_code, read_rows, write_rows
-from mechsearch_jax.scenario import Scenario, load_scenario
+from mechsearch_jax.versions import source_digest
+from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,61 +29,38 @@ class Job:
     Attributes:
       path: file of the scenario.
       scenario: what is in it.
-      config: the planner's options.
+      method: everything else that decides about it, but for the seed.
       seed: of the episode.
-      engine: class of what steps its world.
-      recognition: what the planner sees the world through.
     """
 
     path: str
     scenario: Scenario
-    config: PlannerConfig
+    method: Method
     seed: int
-    engine: str = "NativeSimulator"
-    recognition: RecognitionName = "oracle"
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """As in `Episode.config`."""
+        asked = {"target": self.scenario.target.shape, "simulator": self.method.engine, "seed": self.seed}
+        return {**self.method.options(), **asked}
 
     def failed(self, reason: str) -> Row:
         """The row of an episode that could not be run to its end."""
-        return Row(
-            scenario=self.scenario.name,
-            objects=len(self.scenario.objects),
-            target=self.scenario.target.shape,
-            method=self.config.method,
-            recognition=self.recognition,
-            gamma=self.config.gamma,
-            horizon=self.config.horizon,
-            sequences=self.config.sequences,
-            actions=self.config.actions,
-            seed=self.seed,
-            found_step=None,
-            graspable_step=None,
-            retrieved=False,
-            steps=0,
-            failure=f"error: {reason}",
-            planning_seconds=0.0,
-            simulation_seconds=0.0,
-            configuration=self.configuration,
-        )
-
-    @property
-    def configuration(self) -> str:
-        """As in the row of the episode."""
-        options = {**dataclasses.asdict(self.config), "recognition": self.recognition, "simulator": self.engine}
-        return configuration(options)
+        return Row.failed(self.scenario, self.options, reason)
 
 
 def make_jobs(
     files: Sequence[PathLike],
-    configs: Sequence[PlannerConfig],
+    methods: Sequence[Method],
     seeds: Sequence[int],
-    engine: str = "NativeSimulator",
-    recognition: RecognitionName = "oracle",
 ) -> list[Job]:
-    """All combinations of scenario files, configurations and seeds.
+    """All combinations of scenario files, methods and seeds.
 
     Raises:
-      InputError: a file is not a scenario, or two of them have the same name.
+      InputError: a file is not a scenario, two of them have the same name, or a method cannot be used.
     """
+    for method in methods:
+        method.check()
     jobs: list[Job] = []
     names: dict[str, str] = {}
     for file in files:
@@ -96,7 +71,7 @@ def make_jobs(
                 f"{file}: has the name {scenario.name!r} as {names[scenario.name]} has; rename one of them"
             )
         names[scenario.name] = str(file)
-        jobs += [Job(path, scenario, config, seed, engine, recognition) for config in configs for seed in seeds]
+        jobs += [Job(path, scenario, method, seed) for method in methods for seed in seeds]
     return jobs
 
 
@@ -105,15 +80,10 @@ def present_code() -> str:
     """The code that decides about an episode: the package's version, and a digest of planner, perception (with its
     weights) and environment.
 
-    The version alone would not tell a checkout from the next commit. The command line decides nothing.
+    The version alone would not tell a checkout from the next commit. The command line and pictures decide nothing.
     """
-    digest = hashlib.sha256()
-    for package in ("", ".perception", ".models", ".envs"):
-        for file in sorted(resources.files(f"mechsearch_jax{package}").iterdir(), key=lambda file: file.name):
-            if file.name.endswith((".py", ".npz")) and file.name != "cli.py":
-                source = file.read_bytes()
-                digest.update(f"{package} {file.name} {len(source)} ".encode() + source)
-    return f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')} ({digest.hexdigest()[:12]})"
+    digest = source_digest((".py", ".npz"), ("mechsearch_jax", "mechsearch_jax.envs"))
+    return f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')} ({digest[:12]})"
 
 
 def _check_code(path: PathLike, rows: Sequence[Row]) -> None:

@@ -6,26 +6,25 @@ import dataclasses
 import functools
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.envs.recognisers import measured_depth, true_labels
+from mechsearch_jax.envs.recognisers import true_labels
 from mechsearch_jax.envs.world import TARGET, World, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.perception.cloud import shelf_view
-from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
-from mechsearch_jax.scenario import Scenario
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, measured_depth, no_noise
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import cast_world, random_world
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
-NoiseName = Literal["clean", "gaussian", "time-of-flight"]
 NOISES: Mapping[str, NoiseModel] = {"clean": no_noise, "gaussian": RandomDirection(), "time-of-flight": TimeOfFlight()}
 
 

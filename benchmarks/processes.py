@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Sequence
 
 from mechsearch_jax.benchmarks.evaluate import Job
-from mechsearch_jax.results import Row, identity
+from mechsearch_jax.benchmarks.rows import Row, identity
 
 WORKER = (sys.executable, "-m", "mechsearch_jax.benchmarks.worker")
 # Several processes cannot share a GPU's memory, of which the first takes most.
@@ -47,18 +47,18 @@ class Processes:
         for job in jobs:
             todo.put(job)
         results: queue.SimpleQueue[Row] = queue.SimpleQueue()
-        crew = [_Crew(todo, results, self.command) for _ in range(min(self.workers, len(jobs)))]
+        feeders = [_Feeder(todo, results, self.command) for _ in range(min(self.workers, len(jobs)))]
         try:
-            for member in crew:
-                member.start()
+            for feeder in feeders:
+                feeder.start()
             for _ in jobs:
                 ended([results.get()])
         finally:
-            for member in crew:
-                member.stop()
+            for feeder in feeders:
+                feeder.stop()
 
 
-class _Crew(threading.Thread):
+class _Feeder(threading.Thread):
     """Feeds one worker process with jobs, and starts another one if it dies."""
 
     def __init__(self, todo: queue.SimpleQueue[Job], results: queue.SimpleQueue[Row], command: Sequence[str]):
@@ -95,12 +95,7 @@ class _Crew(threading.Thread):
             process = self._process = self._start()
         assert process.stdin is not None
         assert process.stdout is not None
-        question = {
-            "path": job.path,
-            "config": dataclasses.asdict(job.config),
-            "seed": job.seed,
-            "recognition": job.recognition,
-        }
+        question = {"path": job.path, "method": job.method.to_json(), "seed": job.seed}
         try:
             process.stdin.write(json.dumps(question) + "\n")
             process.stdin.flush()
@@ -127,7 +122,8 @@ class _Crew(threading.Thread):
             stdout=subprocess.PIPE,
             stderr=self._complaints,
             text=True,
-            env={**os.environ, **ENVIRONMENT},
+            # What this process can import, a user's policy among it, its workers can.
+            env={**os.environ, **ENVIRONMENT, "PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)},
             start_new_session=True,
         )
 

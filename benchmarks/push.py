@@ -20,24 +20,27 @@ import numpy as np
 
 from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.benchmarks.agreement import NUDGE
-from mechsearch_jax.dynamics import PushModel, PushOutcome
+from mechsearch_jax.dynamics.learned import NAME, LearnedPush
+from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
 from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.mjx_simulator import Failure
+from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.push_models import push_models
-from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, Worlds, push_tables, toppled
+from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, push_tables, toppled
+from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.envs.world import superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, save_json
-from mechsearch_jax.learned_push import NAME, LearnedPush
-from mechsearch_jax.models.weights import load_weights
-from mechsearch_jax.results import versions
+from mechsearch_jax.geometry.transforms import translate
+from mechsearch_jax.networks.weights import load_weights
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.push import no_motion, outcome_scores, predictions, push_scenes, random_pushes
 from mechsearch_jax.train.run import commit
-from mechsearch_jax.transforms import translate
+from mechsearch_jax.versions import versions
 
 RowName = Literal["no motion", "quasi-static", "learned", "physics", "nudged"]
 ROWS: tuple[str, ...] = get_args(RowName)
+# The row that is no model.
+NUDGED: RowName = "nudged"
 
 
 def named_model(name: str, weights: Path | None = None) -> PushModel:
@@ -91,7 +94,7 @@ class Measured:
       scores: for each row the groups of `train.push.outcome_scores`.
       weights: as `weights_of` tells of the learned model; None if it was not measured.
       settings: how the pushes were made.
-      versions: as `results.versions` returns them.
+      versions: as `versions` returns them.
     """
 
     scores: dict[str, dict[str, Any]]
@@ -104,7 +107,7 @@ class Measured:
         """The learned model, or else the one whose pushed objects end nearest to where they should."""
         if "learned" in self.scores:
             return "learned"
-        models = [name for name in self.scores if name != "nudged"] or list(self.scores)
+        models = [name for name in self.scores if name != NUDGED] or list(self.scores)
         errors = {name: self.scores[name]["all"]["pushed_mm"] for name in models}
         return min(models, key=lambda name: np.inf if errors[name] is None else errors[name])
 
@@ -123,7 +126,7 @@ class Bench:
     generation: Generation
     rows: Sequence[str] = ROWS
     weights: Path | None = None
-    make_simulator: Callable[[], Worlds] | None = None
+    make_simulator: Callable[[], Simulator] | None = None
 
     def __post_init__(self):
         unknown = next((name for name in self.rows if name not in ROWS), None)
@@ -139,7 +142,7 @@ class Bench:
     @functools.cached_property
     def models(self) -> dict[str, PushModel]:
         """What predicts: the rows without "nudged"."""
-        return {name: named_model(name, self.weights) for name in dict.fromkeys(self.rows) if name != "nudged"}
+        return {name: named_model(name, self.weights) for name in dict.fromkeys(self.rows) if name != NUDGED}
 
     @property
     def gpu(self) -> bool:
@@ -147,7 +150,7 @@ class Bench:
         return jax.default_backend() != "cpu"
 
     @functools.cached_property
-    def simulator(self) -> Worlds:
+    def simulator(self) -> Simulator:
         """What simulates the pushes."""
         return (self.make_simulator or functools.partial(generator.engine, self.gpu))()
 
@@ -175,7 +178,7 @@ class Bench:
         scores = {}
         for name in dict.fromkeys(self.rows):
             seen = functools.partial(told, name)
-            if name == "nudged":
+            if name == NUDGED:
                 moved = nudged(pushes, self.generation.seed)
                 outcome = repeated(moved, self.simulator, self.generation.worlds, seen)
             else:
@@ -204,7 +207,7 @@ def nudged(pushes: Pushes, seed: int = 0) -> Pushes:
 
 
 def repeated(
-    pushes: Pushes, simulator: Worlds, worlds: int, told: Callable[[int], None] = lambda pushes: None
+    pushes: Pushes, simulator: Simulator, worlds: int, told: Callable[[int], None] = lambda pushes: None
 ) -> PushOutcome:
     """What becomes of pushes if each is simulated by itself from where it began.
 

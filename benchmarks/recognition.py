@@ -7,7 +7,6 @@ by volumetric intersection over union and by their centres. Generated scenes com
 from __future__ import annotations
 
 import dataclasses
-import json
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,25 +17,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
-from matplotlib.figure import Figure
 
 from mechsearch_jax.benchmarks import ems
 from mechsearch_jax.benchmarks.images import NOISES, Look, Scene, Shown, image_of, named, save_rows
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs.world import CYLINDER, TARGET, World, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
-from mechsearch_jax.models.recognition import RecognitionNetwork
-from mechsearch_jax.models.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import shelf_view
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.networks.recognition import RecognitionNetwork
+from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.perception.recognition import recognise
 from mechsearch_jax.perception.refinement import RefinementConfig, refine, select
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
-from mechsearch_jax.results import versions
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
 from mechsearch_jax.train.scenes import PIXELS
-from mechsearch_jax.viz import drawing
+from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
 
 MethodName = Literal["network", "network-refined", "ems", "ems-refined"]
 # Visible shares by which figures are broken down: name, from, to below.
@@ -130,7 +126,7 @@ class Measured:
       after: of each method, the one that it begins with.
       times: of each method.
       settings: what scenes, noises and seed they come from.
-      versions: as `results.versions` returns them.
+      versions: as `versions` returns them.
     """
 
     rows: tuple[Row, ...]
@@ -418,110 +414,3 @@ def save_recognition(measured: Measured, path: PathLike) -> None:
       InputError: the file cannot be written.
     """
     save_rows(measured.value(), measured.rows, path)
-
-
-def load_rows(path: PathLike) -> tuple[Row, ...]:
-    """The rows of a file that `save_recognition` wrote.
-
-    Raises:
-      InputError: it is none.
-    """
-    try:
-        with open(path, encoding="utf-8") as file:
-            value = json.load(file)
-        return tuple(Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"])
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except (ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: is no result of bench recognition") from None
-
-
-def worst(rows: Sequence[Row], method: str, count: int) -> list[Row]:
-    """The `count` answers of a method with the least intersection over union, the worst first.
-
-    Raises:
-      InputError: there are none.
-    """
-    own = sorted((row for row in rows if row.method == method), key=lambda row: row.iou)
-    if not own or count < 1:
-        raise InputError(
-            f"bench recognition: there are no {count} answers of {method} to draw; measure it, count from 1"
-        )
-    return own[:count]
-
-
-def worst_figure(bench: Bench, rows: Sequence[Row]) -> Figure:
-    """Answers beside the truth: for each a part of the depth image, and the segment's points from above.
-
-    Args:
-      bench: where the rows come from.
-      rows: one panel each.
-    """
-    index = {(scene.source, scene.name): i for i, scene in enumerate(bench.scenes)}
-    camera = shelf_view(shelf=bench.shelf).camera
-    columns = min(4, len(rows))
-    lines = -(-len(rows) // columns)
-    figure = Figure(figsize=(3.4 * columns, 4.9 * lines + 0.7), layout="constrained")
-    grid = figure.subfigures(lines, columns, squeeze=False)
-    for row, panel in zip(rows, grid.reshape(-1), strict=False):
-        i = index[row.source, row.scene]
-        image, found, _ = bench.answers(i, row.noise)
-        truth = sharpened(true_superquadrics(bench.scenes[i].world))
-        both = {"true": truth, "recognised": found[row.method]}
-        drawn = {name: _slot(scene, row.object) for name, scene in both.items()}
-        if row.outcome != "answered":
-            del drawn["recognised"]
-        _draw_panel(panel, row, image.shown, camera, drawn)
-    marks = figure.axes[1].get_legend_handles_labels()
-    figure.legend(*marks, loc="outside lower center", ncols=len(marks[0]), frameon=False, fontsize=9)
-    return figure
-
-
-def _slot(scene: Superquadrics, index: int) -> Superquadrics:
-    return jax.tree.map(lambda a: np.asarray(a)[index : index + 1], scene)
-
-
-STYLES = {"true": (drawing.GRASPABLE, "solid"), "recognised": (drawing.TARGET, (0, (4, 1.6)))}
-
-
-def _draw_panel(panel: Any, row: Row, shown: Shown, camera: Camera, drawn: Mapping[str, Superquadrics]) -> None:
-    """The camera's view and the view from above, for one object."""
-    depth, own = np.asarray(shown.depth), np.asarray(shown.labels) == row.object
-    panel.suptitle(
-        f"{row.scene}, object {row.object} ({row.shape})\n{row.noise}, {row.visible:.0%} visible: IoU {row.iou:.2f}",
-        fontsize=8.5, color=drawing.INK,
-    )  # fmt: skip
-    view, above = panel.subplots(2, 1, height_ratios=(1.25, 1.0))
-    in_view = {name: drawing.outlines_in_view(one, camera)[0] for name, one in drawn.items()}
-    from_above = {
-        name: 1e3 * outline[:, ::-1] for name, one in drawn.items() if (outline := drawing.outlines(one)[0]) is not None
-    }
-
-    rows, columns = np.nonzero(own)
-    corners = np.concatenate([np.stack([columns, rows], axis=1), *(o for o in in_view.values() if o is not None)])
-    low, high = corners.min(axis=0) - 6, corners.max(axis=0) + 6
-    middle, half = (low + high) / 2, max(*(high - low)) / 2
-    near = np.where(np.isfinite(depth), depth, np.nan)
-    part = near[own] if own.any() else near
-    view.imshow(near, cmap="gray", vmin=np.nanmin(part) - 0.15, vmax=np.nanmax(part) + 0.15, interpolation="nearest")
-    tint = np.zeros((*own.shape, 4))
-    tint[own] = (*drawing.rgb(drawing.ACTION), 0.35)
-    view.imshow(tint, interpolation="nearest")
-    view.set_xlim(middle[0] - half, middle[0] + half)
-    view.set_ylim(middle[1] + half, middle[1] - half)
-
-    points = 1e3 * np.asarray(shown.points)[own][:, :2]
-    above.scatter(points[:, 1], points[:, 0], s=1.5, color=drawing.ACTION, linewidths=0, label="the object's points")
-    for axes, outlines in ((view, in_view), (above, from_above)):
-        for name, outline in outlines.items():
-            if outline is not None:
-                colour, dashes = STYLES[name]
-                axes.plot(*np.concatenate([outline, outline[:1]]).T, color=colour, lw=1.6, linestyle=dashes, label=name)
-    # From above as the robot sees the shelf: +y to the left.
-    above.set_aspect("equal", adjustable="datalim")
-    above.invert_xaxis()
-    above.tick_params(labelsize=6.5, colors=drawing.MUTED)
-    above.set_xlabel("y [mm]", fontsize=7, color=drawing.MUTED)
-    above.set_ylabel("x [mm]", fontsize=7, color=drawing.MUTED)
-    view.set_xticks([])
-    view.set_yticks([])

@@ -15,20 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from mechsearch_jax.benchmarks.rates import Rates, summarise, wilson
+from mechsearch_jax.benchmarks.rows import Row, identity, label_variants, read_rows
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
-from mechsearch_jax.results import (
-    Rates,
-    Row,
-    check_writable,
-    identity,
-    label_variants,
-    read_rows,
-    summarise,
-    wilson,
-)
+from mechsearch_jax.files import PathLike, check_writable, replacing
 from mechsearch_jax.viz.drawing import INK, MUTED, save_figure
 
+# What a report consists of.
 FILES = ("report.md", "rates.csv", "rates.json", "failures.csv", "success.png")
 GOALS = {"found": "found", "graspable": "found and graspable", "retrieved": "retrieved"}
 # Told apart without colour vision too (Okabe and Ito).
@@ -202,7 +195,7 @@ def success_figure(rows: Sequence[Row]) -> Figure:
 
 
 def write_report(rows: Sequence[Row], out: PathLike) -> None:
-    """Write `report.md`, `rates.csv`, `rates.json`, `failures.csv` and `success.png` into a folder.
+    """Write a report, the files `FILES`, into a folder.
 
     Args:
       rows: at least one.
@@ -216,13 +209,14 @@ def write_report(rows: Sequence[Row], out: PathLike) -> None:
     figure = success_figure(rows)
     flat = [_flat(rates) for rates in summarise(rows)]
     reasons = [dataclasses.asdict(f) for f in failures(rows)]
-    texts = {
-        "report.md": markdown(rows),
-        "rates.csv": _csv(flat, list(flat[0])),
-        "rates.json": json.dumps({"rates": flat, "failures": reasons}, indent=1, allow_nan=False) + "\n",
-        "failures.csv": _csv(reasons, [field.name for field in dataclasses.fields(Failures)]),
-    }
-    for name, text in texts.items():
-        with replacing(folder / name) as file:
+    texts = (
+        markdown(rows),
+        _csv(flat, list(flat[0])),
+        json.dumps({"rates": flat, "failures": reasons}, indent=1, allow_nan=False) + "\n",
+        _csv(reasons, [field.name for field in dataclasses.fields(Failures)]),
+    )
+    *written, picture = (folder / name for name in FILES)
+    for path, text in zip(written, texts, strict=True):
+        with replacing(path) as file:
             file.write(text.encode())
-    save_figure(figure, folder / "success.png")
+    save_figure(figure, picture)

@@ -16,15 +16,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mechsearch_jax import dense, superquadric
+from mechsearch_jax.benchmarks import dense
 from mechsearch_jax.benchmarks.bench import Timing, measure
 from mechsearch_jax.benchmarks.ceilings import CEILINGS, has_kernels
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
-from mechsearch_jax.masked import block_size
-from mechsearch_jax.results import versions
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import compose, inverse, make, transform
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.masked import block_size
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
+from mechsearch_jax.versions import versions
 
 # Grasps that the planner has of a cylinder, each with a cloud of its own.
 CLOUDS = 63

@@ -22,11 +22,11 @@ from mechsearch_jax.envs.recognisers import Labeller, Segmenter
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
-from mechsearch_jax.models.weights import shipped_weights
-from mechsearch_jax.results import versions
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.networks.weights import shipped_weights
 from mechsearch_jax.train.scenes import PIXELS
+from mechsearch_jax.versions import versions
 from mechsearch_jax.viz import drawing
+from mechsearch_jax.workspace.shelf import Shelf
 
 # Colours of up to eight objects, told apart with red-green blindness too.
 _COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#ee8866", "#8c8c8c")
@@ -64,7 +64,7 @@ class Measured:
       seconds: for each image, the time to label it [s].
       compile_seconds: of the first call, less the median of the others [s].
       settings: what scenes, noises and seed they come from.
-      versions: as `results.versions` returns them.
+      versions: as `versions` returns them.
     """
 
     rows: tuple[Row, ...]

@@ -13,8 +13,9 @@ from rich.text import Text
 from mechsearch_jax.benchmarks import push, segmentation
 from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
+from mechsearch_jax.benchmarks.rates import summarise
 from mechsearch_jax.benchmarks.recognition import SHARES, Measured
-from mechsearch_jax.results import Row, summarise
+from mechsearch_jax.benchmarks.rows import Row
 
 
 def rates_table(rows: Sequence[Row]) -> Table:

@@ -6,43 +6,48 @@ It is started as `python -m mechsearch_jax.benchmarks.worker` and ends when its 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import sys
-from typing import Any, TextIO
+from typing import TextIO
 
-from mechsearch_jax.cache import keep_compilations, kept_problem
-from mechsearch_jax.envs.episode import row as row_of
-from mechsearch_jax.envs.episode import run_episode, target_of
-from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
-from mechsearch_jax.envs.simulator import NativeSimulator
-from mechsearch_jax.planner import PlannerConfig, Problem
-from mechsearch_jax.results import Row
-from mechsearch_jax.scenario import load_scenario
-from mechsearch_jax.target import Target
+from mechsearch_jax.benchmarks.rows import Row
+from mechsearch_jax.envs.episodes import run_episode, target_of
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.native import NativeSimulator
+from mechsearch_jax.envs.recognisers import recogniser
+from mechsearch_jax.planner.cache import cached_problem, keep_compilations
+from mechsearch_jax.workspace.scenario import load_scenario
 
 
 class Worker:
     """Runs episodes, and keeps what does not change between them."""
 
     def __init__(self) -> None:
-        self._problems: dict[Target, Problem] = {}
         self._simulator = NativeSimulator()
+        self._problem = functools.cache(cached_problem)
+        self._policy = functools.cache(Method.policy)
 
-    def run(self, path: str, config: PlannerConfig, seed: int, recognition: RecognitionName) -> Row:
-        """Run one episode of a scenario file."""
+    def run(self, path: str, method: Method, seed: int) -> Row:
+        """Run one episode of a scenario file.
+
+        Raises:
+          InputError: the file is no scenario, or the method cannot be used.
+        """
         scenario = load_scenario(path)
         target = target_of(scenario)
-        if target not in self._problems:
-            self._problems[target] = kept_problem(target)
-        eyes = recogniser(recognition, target)
-        episode = run_episode(seed, scenario, self._problems[target], config, self._simulator, eyes, recognition)
-        return row_of(episode)
-
-
-def parse_config(value: dict[str, Any]) -> PlannerConfig:
-    """A configuration that went through JSON."""
-    return PlannerConfig(**{**value, "push_distances": tuple(value["push_distances"])})
+        episode = run_episode(
+            seed,
+            scenario,
+            self._problem(target, method.config.problem),
+            self._policy(method),
+            self._simulator,
+            recogniser(method.recognition, target),
+            method.config.max_steps,
+            method.options(),
+        )
+        return Row.of_episode(episode)
 
 
 def serve(jobs: TextIO, answers: TextIO) -> None:
@@ -51,11 +56,8 @@ def serve(jobs: TextIO, answers: TextIO) -> None:
     for line in jobs:
         job = json.loads(line)
         try:
-            answer = {
-                "row": dataclasses.asdict(
-                    worker.run(job["path"], parse_config(job["config"]), job["seed"], job["recognition"])
-                )
-            }
+            row = worker.run(job["path"], Method.from_json(job["method"]), job["seed"])
+            answer = {"row": dataclasses.asdict(row)}
         except Exception as error:  # Whatever fails in one episode must not end the run.
             answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"[:500]}
         print(json.dumps(answer), file=answers, flush=True)

@@ -9,16 +9,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
 
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.envs.observation import target_pixels
-from mechsearch_jax.envs.simulator import NativeSimulator
+from mechsearch_jax.envs.native import NativeWorld
+from mechsearch_jax.envs.simulated_camera import target_pixels
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.graspability import GraspConfig, grasp_tables
-from mechsearch_jax.gripper import Gripper
-from mechsearch_jax.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 # Full sizes [m]; a box's x and y may be swapped.
 BOXES = (
@@ -31,8 +31,6 @@ BOXES = (
 )
 # Radius and height [m].
 CYLINDERS = ((0.034, 0.214), (0.032, 0.134), (0.032, 0.122), (0.024, 0.134), (0.028, 0.06))
-
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +116,7 @@ class ScenarioGenerator:
         self.config = config or GeneratorConfig()
         self._shelf = shelf or Shelf()
         self._camera = camera or Camera()
-        self._simulator = NativeSimulator(self._shelf, self._camera)
+        self._simulator = NativeWorld(self._shelf, self._camera)
         poses = self.target.candidate_poses(self._shelf).astype(float)
         if graspable is None:
             allowed = graspable_alone(self._shelf, self.target)

@@ -1,4 +1,5 @@
-"""The MuJoCo model: a Panda in front of a shelf with eight object slots and the target (DESIGN.md section 6).
+"""The MuJoCo model: a Panda in front of a shelf with eight object slots and the target (docs/method.md,
+"The simulator").
 
 One MJCF serves every scenario. Each slot is a free body with a box and a cylinder; the one that is not in use is shrunk
 into the inside of the other, and an unused slot is parked in front of the shelf as a weightless millimetre. Sizes,
@@ -20,12 +21,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.envs.world import BODIES
-from mechsearch_jax.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
-from mechsearch_jax.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINT_LOWER, JOINT_UPPER, JOINTS
-from mechsearch_jax.scenario import Body
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
+from mechsearch_jax.robot.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINT_LOWER, JOINT_UPPER, JOINTS
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body
+from mechsearch_jax.workspace.shelf import Shelf
 
 BOX_DENSITY, CYLINDER_DENSITY = 737.0, 585.0
 # Torsional friction of a rubber pad of about 18 x 18 mm that is pressed evenly: two thirds of its mean radius [m].

@@ -7,17 +7,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.status import Status
 
+from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs import pictures
-from mechsearch_jax.envs.episode import Moment
-from mechsearch_jax.planner import PlannerConfig, Problem
-from mechsearch_jax.results import Episode
+from mechsearch_jax.envs.episodes import Moment
+from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.planner import Problem
 from mechsearch_jax.viz.filmstrip import Frame
 
 STAGES = {
-    "recognise": "looking",
-    "believe": "working out where the target can be",
-    "grasp": "looking for a grasp",
+    "recognise": "looking, and working out where the target can be",
     "plan": "planning",
+    "judge": "judging whether the target can be grasped",
     "simulate": "acting",
 }
 
@@ -29,12 +29,11 @@ class Narrator:
       frames: of the steps so far.
     """
 
-    def __init__(self, console: Console, status: Status, problem: Problem, config: PlannerConfig):
+    def __init__(self, console: Console, status: Status, problem: Problem):
         self.frames: list[Frame] = []
         self._console = console
         self._status = status
         self._problem = problem
-        self._config = config
 
     def busy(self, stage: str) -> None:
         patience = " (compiling first, once)" if stage == "plan" and not self.frames else ""
@@ -43,16 +42,18 @@ class Narrator:
     def decided(self, moment: Moment) -> None:
         record = moment.record
         self._sees(moment)
-        if moment.plan is None:
-            self._line("does", "take the target out: a grasp that hits nothing is known")
+        if moment.decision is None:
             return
-        lengths = np.asarray(moment.plan.sequences.length)
-        self._line("does", pictures.describe_action(moment.plan.action))
-        if record.sequences:
+        kind = kind_of(int(moment.decision.action.kind))
+        self._line("does", kind.describe(moment.decision.action))
+        if kind.takes_target:
+            self._line("why", "a grasp that hits nothing is known")
+        elif record.sequences and record.predicted_cost is not None:
+            length = int(moment.decision.sequences.length[0])
             self._line(
                 "why",
                 f"cost {record.cost:.0f} now, {record.predicted_cost:.0f} expected after it; the best of "
-                f"{record.sequences} sequences, {lengths[0]} action{'s' if lengths[0] > 1 else ''} long",
+                f"{record.sequences} sequences, {length} action{'s' if length > 1 else ''} long",
             )
 
     def acted(self, moment: Moment) -> None:
@@ -64,15 +65,15 @@ class Narrator:
         stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in record.timings.items())
         self._line("time", stages, "dim")
         self._status.update("drawing")
-        self.frames.append(pictures.frame(moment, self._problem, self._config))
+        self.frames.append(pictures.frame(moment, self._problem))
 
     def ended(self, episode: Episode) -> None:
         """Say how it ended."""
         self._console.print(f"\n[bold]{escape(verdict(episode))}[/bold]", soft_wrap=True)
 
     def _sees(self, moment: Moment) -> None:
-        shown = np.unique(np.asarray(moment.snapshot.observation.segmentation))
-        objects = np.flatnonzero(np.asarray(moment.scene.valid))
+        shown = np.unique(np.asarray(moment.snapshot.image.segmentation))
+        objects = np.flatnonzero(np.asarray(moment.observation.objects.valid))
         seen = int(np.isin(objects, shown).sum())
         if moment.record.found:
             x, y, _ = np.asarray(moment.belief.found_pose)

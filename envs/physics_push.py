@@ -1,4 +1,4 @@
-"""Push models that simulate: `NativePhysics` on the CPU and `MjxPhysics` on a GPU, both `dynamics.PushModel`.
+"""Push models that simulate: `NativePhysics` on the CPU and `MjxPhysics` on a GPU, both `push_model.PushModel`.
 
 The recognised objects become the nearest boxes and cylinders, with the densities and frictions of the environment's
 own bodies, and the arm makes the push as `push_simulation` has it. Objects that are not at rest where they were
@@ -32,19 +32,21 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.dynamics import ROUND_EXPONENT, PushOutcome
+from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.envs import model as models
-from mechsearch_jax.envs.mjx_simulator import WAIT, Failure, MjxConfig, MjxSimulator, Overflow
-from mechsearch_jax.envs.motion import Reference, push_reference
+from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
+from mechsearch_jax.envs.outcome import Failure, Overflow
 from mechsearch_jax.envs.pushes import push_simulation, toppled
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, controls
 from mechsearch_jax.envs.world import BODIES, BOX, CYLINDER, World, bodies_of
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.kinematics import HOME
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics, pad
-from mechsearch_jax.transforms import matmul, rotate
+from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
+from mechsearch_jax.geometry.superquadric import Superquadrics, pad
+from mechsearch_jax.geometry.transforms import matmul, rotate
+from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.robot.motion import Reference, push_reference
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
 
 # An object that has moved by less than this [m], and turned by less than this [rad], was not pushed.
 STILL, STILL_TURN = 1e-3, 0.02
@@ -157,7 +159,7 @@ class NativePhysics:
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
     ) -> PushOutcome:
-        """See `dynamics.PushModel`."""
+        """See `push_model.PushModel`."""
         world = bodies(scene)
         reference, reachable = push_reference(T_world_gripper, displacement, q7, self.simulation.motion)
         pushes = jnp.any(displacement != 0.0)
@@ -189,7 +191,7 @@ class MjxPhysics:
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
     ) -> PushOutcome:
-        """See `dynamics.PushModel`."""
+        """See `push_model.PushModel`."""
         world = bodies(scene)
         pushes = jnp.any(displacement != 0.0)
         # Warp's worlds share what numbers they cannot make sense of, so that a scene that has any is not pushed in.
@@ -222,12 +224,12 @@ def _batched(shelf: Shelf, config: MjxConfig) -> Callable[[World, Action], Simul
 
     @jax.custom_batching.custom_vmap
     def simulate(world: World, action: Action) -> Simulated:
-        rested, waited = simulator.simulate(world, action.replace(kind=jnp.full_like(action.kind, WAIT)))
+        rested, waited = simulator.simulate(world, None)
         loose = _differ(_poses(world), _poses(rested), LOOSE, LOOSE_TURN).any(axis=-1)
         world = jax.tree.map(lambda a, b: jnp.where(loose.reshape(-1, *[1] * (a.ndim - 1)), a, b), rested, world)
-        after, outcomes = simulator.simulate(world, action)
-        failed = (waited.failure != Failure.NONE) | (outcomes.failure != Failure.NONE)
-        failed |= (waited.overflow | outcomes.overflow) != Overflow.NONE
+        after, pushed = simulator.simulate(world, action)
+        failed = (waited.failure != Failure.NONE) | (pushed.failure != Failure.NONE)
+        failed |= (waited.overflow | pushed.overflow) != Overflow.NONE
         return Simulated(_poses(world), _poses(after), failed)
 
     @simulate.def_vmap

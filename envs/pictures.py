@@ -9,90 +9,80 @@ from jaxtyping import UInt8
 from matplotlib.figure import Figure
 
 from mechsearch_jax import planner
-from mechsearch_jax.actions import Action, ActionKind
-from mechsearch_jax.envs.episode import Moment, Recogniser, Snapshot, oracle, true_target_pose
-from mechsearch_jax.envs.observation import Observation
+from mechsearch_jax.actions import kind_of
+from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.envs.episodes import Moment
+from mechsearch_jax.envs.simulated_camera import Image
+from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle, true_target_pose
 from mechsearch_jax.envs.world import from_scenario
-from mechsearch_jax.planner import PlannerConfig, Problem
-from mechsearch_jax.results import Maps
-from mechsearch_jax.scenario import Scenario
+from mechsearch_jax.planner import Problem
 from mechsearch_jax.viz.filmstrip import Frame
-from mechsearch_jax.viz.maps import maps_figure
+from mechsearch_jax.viz.maps import Maps, maps_figure
+from mechsearch_jax.workspace.scenario import Scenario
 
 
-def colour_image(observation: Observation) -> UInt8[np.ndarray, "h w 3"]:
+def colour_image(image: Image) -> UInt8[np.ndarray, "h w 3"]:
     """The camera's image with 8 bits a channel."""
-    return np.asarray(jnp.round(observation.colour * 255)).astype(np.uint8)
+    return np.asarray(jnp.round(image.colour * 255)).astype(np.uint8)
 
 
-def describe_action(action: Action) -> str:
-    """An action in words, for example "push object 2 by 10 cm to the left", as the robot sees it."""
-    kind, i = ActionKind(int(action.kind)), int(action.object)
-    if kind is ActionKind.NONE:
-        return "do nothing: no action is possible"
-    if kind is ActionKind.PICK_AND_PLACE:
-        shift = np.asarray(action.T_world_place - action.T_world_gripper)[:2, 3]
-        return f"pick object {i} and place it {100 * np.linalg.norm(shift):.0f} cm away"
-    d = np.asarray(action.displacement)
-    side = "to the left" if d[1] > 0 else "to the right"
-    return f"push object {i} by {100 * np.linalg.norm(d):.0f} cm {side}"
-
-
-def frame(moment: Moment, problem: Problem, config: PlannerConfig) -> Frame:
+def frame(moment: Moment, problem: Problem) -> Frame:
     """A step of an episode, ready to be drawn."""
-    record, belief, observation = moment.record, moment.belief, moment.snapshot.observation
-    nowhere = np.zeros(problem.poses.shape[0], bool)
-    retrieves = record.action is not None and record.action.kind == "retrieve"
-    if moment.plan is not None:
-        deed = describe_action(moment.plan.action)
-        why = f"cost {record.cost:.0f} → {record.predicted_cost:.0f} expected, best of {record.sequences} sequences"
-    else:
-        deed = "take the target out" if retrieves else "give up"
-        why = "a grasp that hits nothing is known" if retrieves else "no actions are left"
+    record, belief, image = moment.record, moment.belief, moment.snapshot.image
+    objects = jax.tree.map(np.asarray, moment.observation.objects)
+    sketch, after, does, why = Sketch(), objects, "give up", "no actions are left"
+    if moment.decision is not None and record.action is not None:
+        decision, kind = moment.decision, kind_of(int(moment.decision.action.kind))
+        after = jax.tree.map(np.asarray, decision.predicted)
+        sketch, does = kind.sketch(objects, after, decision.action), kind.describe(decision.action)
+        why = "a grasp that hits nothing is known"
+        if not kind.takes_target:
+            expected = "" if record.predicted_cost is None else f" → {record.predicted_cost:.0f} expected"
+            why = f"cost {record.cost:.0f}{expected}, best of {record.sequences} sequences"
     known = "target found" if record.found else f"target can be at {record.belief_size} poses"
     outcome = f" · {record.failure}" if record.failure else ""
+    nowhere = np.zeros(problem.poses.shape[0], bool)
     return Frame(
-        title=f"{moment.index + 1}  {deed}",
+        title=f"{moment.index + 1}  {does}",
         caption=f"{known} · {why}{outcome}",
-        image=colour_image(observation),
-        owner=np.asarray(observation.segmentation),
-        scene=jax.tree.map(np.asarray, moment.scene),
+        image=colour_image(image),
+        owner=np.asarray(image.segmentation),
+        scene=objects,
         existence=nowhere if record.found else np.asarray(belief.exists),
-        graspability=np.asarray(planner.graspability_map(problem, belief, moment.scene, config)),
+        graspability=np.asarray(planner.graspability_map(problem, belief, moment.observation.objects)),
         target_pose=np.asarray(true_target_pose(moment.snapshot.world)),
         found=record.found,
-        action=None if moment.plan is None else jax.tree.map(np.asarray, moment.plan.action),
-        retrieval=np.asarray(moment.grasp.T_world_gripper) if retrieves and moment.grasp is not None else None,
+        after=after,
+        sketch=sketch,
     )
 
 
 def inspect_scenario(
-    scenario: Scenario, problem: Problem, config: PlannerConfig, recogniser: Recogniser = oracle, seed: int = 0
+    scenario: Scenario, problem: Problem, recogniser: Recogniser = oracle, seed: int = 0
 ) -> tuple[Maps, Figure]:
     """Maps of f and g at the start of an episode, and their picture.
 
     Args:
       scenario: where everything stands.
       problem: built for the scenario's target.
-      config: the planner's options.
       recogniser: what the planner sees the world through.
       seed: of the recogniser's random numbers.
     """
     snapshot = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))
-    scene = recogniser(jax.random.key(seed), snapshot).scene
-    belief = planner.initial_belief(problem)
-    belief = planner.observe_belief(problem, belief, scene, jnp.array(False), jnp.zeros(3), config)
+    # f is shown as if the target were hidden, also where it is not.
+    seen = recogniser(jax.random.key(seed), snapshot).replace(target_visible=jnp.array(False))
+    belief = planner.update_belief(problem, planner.initial_belief(problem), seen)
     maps = Maps(
         poses=np.asarray(problem.poses),
         existence=np.asarray(belief.exists),
-        graspability=np.asarray(planner.graspability_map(problem, belief, scene, config)),
-        scene=jax.tree.map(np.asarray, scene),
+        graspability=np.asarray(planner.graspability_map(problem, belief, seen.objects)),
+        scene=jax.tree.map(np.asarray, seen.objects),
     )
-    observation = snapshot.observation
+    image = snapshot.image
     figure = maps_figure(
         maps,
-        colour_image(observation),
-        np.asarray(observation.segmentation),
+        colour_image(image),
+        np.asarray(image.segmentation),
         np.asarray(true_target_pose(snapshot.world)),
         problem.camera,
         problem.shelf,

@@ -1,4 +1,4 @@
-"""Push models by name, those that need a simulator too, as `planner.plan` takes them."""
+"""Push models by name, those that need a simulator too, as policies take them."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 import jax
 
-from mechsearch_jax.dynamics import PushModel
-from mechsearch_jax.envs.physics_push import MjxPhysics, NativePhysics
-from mechsearch_jax.push_models import own_push_model
+from mechsearch_jax.dynamics.named import own_push_model
+from mechsearch_jax.dynamics.push_model import PushModel
 
 
 class PushModels(NamedTuple):
-    """What predicts pushes in a plan; the last two arguments of `planner.plan`.
+    """What predicts pushes in a plan: `push_model` and `later_push_model` of a `planner.PolicyFactory`.
 
     Attributes:
       first: predicts those that are the first action of a sequence.
@@ -39,6 +38,9 @@ def push_models(name: str) -> PushModels:
     """
     if name != "physics":
         return PushModels(own_push_model(name), own_push_model(name))
+    # What is not asked for, the batch simulator among it, is not imported.
+    from mechsearch_jax.envs.physics_push import MjxPhysics, NativePhysics
+
     if jax.default_backend() == "cpu":
         return PushModels(NativePhysics(), own_push_model("learned"))
     return PushModels(MjxPhysics(), MjxPhysics())

@@ -2,7 +2,7 @@
 
 A few pushes follow each other in a world before it is drawn anew, so that scenes drift into what physics makes of them:
 objects that touch, lean on walls, or lie. Worlds are simulated all at once, by `MjxSimulator` on a GPU or by
-`NativeWorlds` on a CPU.
+`NativeSimulator` on a CPU.
 """
 
 from __future__ import annotations
@@ -10,40 +10,32 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import zipfile
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any, Protocol
+from collections.abc import Callable
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import serialization
-from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Bool, Key
 
-from mechsearch_jax import superquadric
 from mechsearch_jax.actions import Action, ActionConfig, ActionKind, ActionTables, action_tables
-from mechsearch_jax.collision import hits_shelf
-from mechsearch_jax.dynamics import LOW_CONTACT, bounding_half_extents, footprints
-from mechsearch_jax.envs.mjx_simulator import Failure, Outcomes
-from mechsearch_jax.envs.motion import MotionConfig
-from mechsearch_jax.envs.simulator import SimulatorConfig
+from mechsearch_jax.dynamics.push_model import LOW_CONTACT
+from mechsearch_jax.envs.outcome import Failure
+from mechsearch_jax.envs.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import CYLINDER, TARGET, World, superquadrics
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import replacing
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.footprints import bounding_half_extents, footprints
+from mechsearch_jax.geometry.transforms import back_off, inverse, make, transform, translate
 from mechsearch_jax.graspability import gripper_rotation
-from mechsearch_jax.gripper import Gripper, arm_hits_shelf
-from mechsearch_jax.kinematics import path_kinematics
-from mechsearch_jax.models.push import pusher_distance
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.transforms import back_off, inverse, make, transform, translate
+from mechsearch_jax.networks.push_geometry import pusher_distance
+from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
+from mechsearch_jax.robot.kinematics import path_kinematics
+from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 
 # An object whose vertical has turned by more than this has fallen over [rad].
 TOPPLED = math.radians(15)
-# The target was touched if it has moved by more than this [m].
-TOUCHED = 5e-4
 # From how far away the gripper is brought up to the object [m]: it then overlaps none.
 _AWAY = 0.6
 
@@ -112,26 +104,6 @@ class Pushes(flax.struct.PyTreeNode):
     toppled: jax.Array
     fallen: jax.Array
     lane: jax.Array
-
-    @property
-    def touched(self) -> Bool[Array, " n"]:
-        """Whether the target was touched."""
-        shift = jnp.abs(self.after.position[:, TARGET] - self.before.position[:, TARGET])
-        return self.before.valid[:, TARGET] & (jnp.max(shift, axis=-1) > TOUCHED)
-
-
-class Worlds(Protocol):
-    """Simulates many worlds: `MjxSimulator`, `NativeWorlds`."""
-
-    world: World | None
-
-    def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
-        """Take over the state of all worlds, or of some."""
-        ...
-
-    def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcomes:
-        """Execute an action in every active world."""
-        ...
 
 
 def push_simulation() -> SimulatorConfig:
@@ -271,7 +243,7 @@ def generate_pushes(
     key: Key[Array, ""],
     worlds: int,
     rounds: int,
-    simulator: Worlds,
+    simulator: Simulator,
     draw_world: Callable[[Array], World],
     config: PushesConfig | None = None,
     shelf: Shelf | None = None,
@@ -280,7 +252,7 @@ def generate_pushes(
     """Push in many worlds, several times one after the other.
 
     Args:
-      key: PRNG key; with `NativeWorlds` the same key gives the same pushes.
+      key: PRNG key; with `NativeSimulator` the same key gives the same pushes.
       worlds: how many at once; each is a lane of its own.
       rounds: how many pushes follow each other, less those of which none was possible.
       simulator: simulates them.
@@ -312,14 +284,14 @@ def generate_pushes(
         assert before is not None
         before = jax.tree.map(jnp.copy, before)
         action, possible = draw(jax.random.split(push_key, worlds), before)
-        outcomes = simulator.execute(action, possible)
+        outcome = simulator.execute(action, possible)
         after = simulator.world
         assert after is not None
-        fallen = outcomes.fallen & before.valid
+        fallen = outcome.fallen & before.valid
         over = fell_over(before, after) | fallen
-        sound = np.asarray(possible & (outcomes.failure == int(Failure.NONE)) & (outcomes.overflow == 0))
+        sound = np.asarray(possible & (outcome.failure == int(Failure.NONE)) & (outcome.overflow == 0))
         # What is stopped in its fall would go on falling in the next push.
-        lost = np.asarray(jnp.any(fallen, axis=1) | ~outcomes.settled) | ~sound
+        lost = np.asarray(jnp.any(fallen, axis=1) | ~outcome.settled) | ~sound
         chance = np.where(np.asarray(jnp.any(over, axis=1)), config.renewed_toppled, config.renewed)
         renew = lost | (np.asarray(jax.random.uniform(renew_key, (worlds,))) < chance)
         pushes = Pushes(
@@ -342,40 +314,6 @@ def generate_pushes(
 def joined(parts: list[Pushes]) -> Pushes:
     """Pushes one after the other; their lanes stay as they are."""
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)
-
-
-def save_pushes(path: Path, pushes: Pushes, identity: str) -> None:
-    """Write pushes and how they were made.
-
-    Raises:
-      InputError: the file cannot be written.
-    """
-    arrays = flatten_dict(serialization.to_state_dict(pushes), sep="/")
-    with replacing(path) as file:
-        np.savez(file, identity=np.array(identity), **arrays)  # pyright: ignore[reportArgumentType]
-
-
-def load_pushes(path: Path, identity: str) -> Pushes:
-    """Read pushes that were made in a certain way.
-
-    Raises:
-      InputError: the file is damaged, or its pushes were made otherwise.
-    """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        found = str(arrays.pop("identity"))
-        tree: dict[str, Any] = unflatten_dict(arrays, sep="/")
-        worlds = {name: World(**tree.pop(name)) for name in ("before", "after")}
-        pushes = Pushes(**worlds, **tree)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); choose another --data") from None
-    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile):
-        complaint = "is damaged, or was written by another version; remove it or choose another --data"
-        raise InputError(f"{path}: {complaint}") from None
-    if found != identity:
-        raise InputError(f"{path}: was made otherwise ({found}); repeat that or choose another --data")
-    return pushes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -402,83 +340,21 @@ class Generation:
             raise InputError(f"train push: --seed {self.seed} must not be negative")
 
 
-def _drawn_from(config: PushesConfig) -> dict[str, Any]:
-    """The settings on which pushes depend; of those of a planner's actions, most concern others."""
-    pushing = ("push_wrists", "push_tilt", "push_depths", "push_height", "push_leverage")
-    pushing += ("cloud_points", "pusher_points")
-    settings = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
-    return settings | {"actions": {name: getattr(config.actions, name) for name in pushing}}
-
-
-def portions(
-    generation: Generation,
-    folder: Path,
-    make_simulator: Callable[[], Worlds],
-    draw_world: Callable[[Array], World],
-    source: str = "",
-    config: PushesConfig | None = None,
-    told: Callable[[int], None] = lambda pushes: None,
-) -> Iterator[Pushes]:
-    """Portions of pushes until there are enough; those that lie in the folder already are read instead of made.
-
-    Args:
-      generation: how many.
-      folder: for one file for each portion.
-      make_simulator: called if anything has to be simulated.
-      draw_world: see `generate_pushes`.
-      source: names the simulator and the scenes; what lies in the folder must have been made with the same.
-      config: which pushes.
-      told: is told how many pushes there are.
-
-    Raises:
-      InputError: what lies in the folder is damaged or was made otherwise, or the folder cannot be written.
-    """
-    config = config or PushesConfig()
-    simulator: Worlds | None = None
-    count = number = 0
-    while count < generation.pushes:
-        path = folder / f"pushes-{number:03d}.npz"
-        identity = repr((generation.seed, generation.worlds, generation.rounds, number, _drawn_from(config), source))
-        if path.exists():
-            part = load_pushes(path, identity)
-        else:
-            simulator = simulator or make_simulator()
-            key = jax.random.fold_in(jax.random.key(generation.seed), number)
-            base = count
-            part = generate_pushes(
-                key,
-                generation.worlds,
-                generation.rounds,
-                simulator,
-                draw_world,
-                config,
-                told=lambda _, pushes, base=base: told(base + pushes),
-            )
-            part = part.replace(lane=part.lane + number * generation.worlds)
-            save_pushes(path, part, identity)
-        count += len(part.object)
-        if not len(part.object):
-            raise InputError(f"no push was possible in {generation.worlds} worlds; give more --worlds")
-        told(count)
-        number += 1
-        yield part
-
-
 def engine_name(gpu: bool) -> str:
     """The name of what `engine` returns."""
-    return "MjxSimulator" if gpu else "NativeWorlds"
+    return "MjxSimulator" if gpu else "NativeSimulator"
 
 
-def engine(gpu: bool, threads: int | None = None) -> Worlds:
+def engine(gpu: bool, threads: int | None = None) -> Simulator:
     """The simulator of pushes for a machine with or without a GPU.
 
     Raises:
       InputError: the batch simulator needs Warp, which cannot be imported.
     """
     if not gpu:
-        from mechsearch_jax.envs.native_worlds import NativeWorlds
+        from mechsearch_jax.envs.native import NativeSimulator
 
-        return NativeWorlds(threads, push_simulation())
+        return NativeSimulator(threads, push_simulation())
     from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
 
     return MjxSimulator(config=MjxConfig(simulator=push_simulation()))

@@ -1,43 +1,39 @@
 """Recognisers: what the planner sees the simulated world through, from its truth to nothing but a depth image.
 
 `oracle` knows the true shapes and poses. The others are shown the depth image of a camera with the noise of a sensor,
-and make superquadrics of it: `masks` is told which pixels are whose, `full` has to segment them too. Whether the target
-is seen is the detector's word, for all of them; where it is, only the oracle is told.
+and make superquadrics of it as `perception.recogniser.Recogniser` does: `masks` is told which pixels are whose, `full`
+has to segment them too. Whether the target is seen is the detector's word, for all of them; where it is, only the
+oracle is told.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Literal, Protocol, cast, get_args
+from typing import Literal, Protocol, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.assignment import assign
-from mechsearch_jax.camera import Camera, project
-from mechsearch_jax.envs.episode import Recogniser, Recognition, Snapshot, oracle
-from mechsearch_jax.envs.observation import observe
+from mechsearch_jax.envs.simulated_camera import observe
+from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models.recognition import RecognitionNetwork
-from mechsearch_jax.models.segmentation import SegmentationNetwork, told_by
-from mechsearch_jax.models.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import MARGIN, View, above_board, cloud_of, draw, resample, shelf_view
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.networks.weights import Weights, shipped_weights
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.assignment import assign
+from mechsearch_jax.perception.cloud import MARGIN, View, above_board, shelf_view
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
-from mechsearch_jax.perception.noise import NoiseModel, RandomDirection
-from mechsearch_jax.perception.recognition import recognise
-from mechsearch_jax.perception.refinement import RefinementConfig, refine
-from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
-from mechsearch_jax.perception.target_pose import target_pose
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics, standard_edges
-from mechsearch_jax.target import Target
+from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, measured_depth
+from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
+from mechsearch_jax.perception.refinement import RefinementConfig
+from mechsearch_jax.perception.segmentation import NetworkSegmenter
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 RecognitionName = Literal["oracle", "masks", "full"]
-# Points of the target that its pose is fitted to.
-TARGET_POINTS = 256
 
 
 def true_labels(
@@ -82,7 +78,7 @@ def true_masks(key: Array, shelf: Shelf, points: Array, of_target: Array, masks:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Segmenter:
-    """The `Labeller` that segments a cloud of the image's points with a network.
+    """The `Labeller` that segments the image with a network, and names the segments after the true objects.
 
     Attributes:
       weights: of the segmentation network.
@@ -91,13 +87,7 @@ class Segmenter:
     weights: Weights
 
     def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array) -> Array:
-        objects = above_board(shelf, points) & ~of_target
-        cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)))
-        network = cast(SegmentationNetwork, self.weights.network)
-        told = told_by(network, self.weights.parameters, cloud.points[None])
-        labels = clean_up(cloud.points, labels_of(told.logits[-1, 0]), cloud.valid)
-        found = spread_labels(points, objects, cloud.points, labels)
-        return numbered(jnp.where(of_target & (found != MISSING), OTHER, found), masks)
+        return numbered(NetworkSegmenter.of(self.weights)(key, shelf, points, of_target), masks)
 
 
 def numbered(found: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "h w"]:
@@ -134,10 +124,10 @@ class ImageRecogniser:
     noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
     refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
 
-    def __call__(self, key: Array, snapshot: Snapshot) -> Recognition:
+    def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
         view = shelf_view(snapshot.camera, snapshot.shelf)
-        scene, pose = _recognise(key, self, view, snapshot.shelf, snapshot.world)
-        return Recognition(scene, snapshot.target_seen, pose)
+        objects, pose = _recognise(key, self, view, snapshot.shelf, snapshot.world)
+        return Observation(objects, snapshot.target_seen, pose)
 
 
 @functools.partial(jax.jit, static_argnames=("recogniser", "view", "shelf"))
@@ -145,29 +135,14 @@ def _recognise(
     key: Array, recogniser: ImageRecogniser, view: View, shelf: Shelf, world: World
 ) -> tuple[Superquadrics, Float[Array, " 3"]]:
     """The objects, and where the target would be if it was seen."""
-    sensing, labelling, drawing, choosing = jax.random.split(key, 4)
-    camera = view.camera
-    image = observe(camera, world, shelf)
-    points = recogniser.noise(sensing, camera, image.depth)
+    keys = jax.random.split(key, 4)
+    image = observe(view.camera, world, shelf)
+    points = recogniser.noise(keys[0], view.camera, image.depth)
     masks = true_labels(points, image.segmentation, shelf)
-    of_target = image.segmentation == TARGET
-    labels = recogniser.labeller(labelling, shelf, points, of_target, masks)
-    network = cast(RecognitionNetwork, recogniser.weights.network)
-    scene = recognise(drawing, network, recogniser.weights.parameters, camera, points, labels, shelf)
-    depth = measured_depth(camera, image.depth, points)
-    refined = refine(camera, shelf, scene, points.reshape(-1, 3), labels.reshape(-1), depth, recogniser.refinement)
-
-    index, count = draw(choosing, (masks == TARGET).reshape(-1), TARGET_POINTS)
-    seen = jnp.broadcast_to(count > 0, TARGET_POINTS)
-    pose = target_pose(recogniser.target, shelf, jnp.array(camera.position), points.reshape(-1, 3)[index], seen)
-    return standard_edges(refined.scene), pose
-
-
-def measured_depth(camera: Camera, depth: Float[Array, "h w"], points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
-    """The depth of measured points [m]: infinite where nothing is, NaN where nothing was measured."""
-    finite: Bool[Array, "h w"] = jnp.isfinite(points).all(axis=-1)
-    _, measured = project(camera, jnp.where(finite[..., None], points, 0.0))
-    return jnp.where(finite, measured, jnp.where(jnp.isfinite(depth), jnp.nan, jnp.inf))
+    labels = recogniser.labeller(keys[1], shelf, points, image.segmentation == TARGET, masks)
+    seen = LabelledImage(points, measured_depth(view.camera, image.depth, points), labels, masks == TARGET)
+    shapes = ShapeNetwork.of(recogniser.weights)
+    return recognise_image(keys[2:], seen, shapes, view.camera, shelf, recogniser.target, recogniser.refinement)
 
 
 @functools.cache

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax import superquadric
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
 
 BOX, CYLINDER = 0, 1
 TARGET = MAX_OBJECTS

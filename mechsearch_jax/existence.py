@@ -1,4 +1,5 @@
-"""The existence function f: where can the target still be? (paper section 4.2 and appendix B.2, DESIGN.md section 5)
+"""The existence function f: where can the target still be? (paper section 4.2 and appendix B.2;
+docs/method.md, "Existence")
 
 A candidate pose stands for its whole grid cell, so the target is tried at several places of the cell. At each it must
 be hidden (it would show no more pixels than the detector needs) and free of collision. f is 1 if any of the places
@@ -21,15 +22,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from mechsearch_jax import render, superquadric
-from mechsearch_jax.camera import Camera, project
-from mechsearch_jax.collision import Pair, any_inside
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.masked import masked_vmap
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.target import Target
-from mechsearch_jax.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.collision import Pair, any_inside
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.options import option
+from mechsearch_jax.workspace import render
+from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 FAR = 1.5
 
@@ -52,7 +55,11 @@ class ExistenceConfig:
       points: points on the target's surface for the collision test.
     """
 
-    criterion: Literal["detector", "depth-mse", "depth-norm"] = "detector"
+    criterion: Literal["detector", "depth-mse", "depth-norm"] = option(
+        "detector",
+        "what makes a target visible: its pixels, as the detector counts them, or the depth image, as in the paper",
+        ("detector", "depth-mse", "depth-norm"),
+    )
     found_pixels: int = 100
     depth_threshold: float = 0.001
     downscale: int = 7
@@ -142,12 +149,18 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     return ExistenceTables(T, depth, corner, nearest, cloud.T, jnp.float32(np.linalg.norm(half)))
 
 
-def no_views(capacity: int, config: ExistenceConfig) -> ObjectViews:
-    """Views, without collisions, of so many objects that are yet to be looked at."""
+def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | None = None) -> ObjectViews:
+    """Views of so many objects that are yet to be looked at.
+
+    Args:
+      capacity: how many.
+      config: static.
+      places: number of candidate poses, and of places at each, if collisions count; None if they do not.
+    """
     return ObjectViews(
         depth=jnp.zeros((capacity, *config.window)),
         corner=jnp.zeros((capacity, 2), jnp.int32),
-        collides=None,
+        collides=None if places is None else jnp.zeros((*places, capacity), bool),
         overflow=jnp.zeros(capacity, bool),
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import tempfile
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -45,3 +46,17 @@ def save_json(value: dict[str, Any], path: PathLike) -> None:
     """
     with replacing(path) as file:
         file.write((json.dumps(value, indent=1, allow_nan=False) + "\n").encode())
+
+
+def check_writable(folder: PathLike) -> None:
+    """Fail before the work begins rather than after it, if files cannot be written into a folder.
+
+    Raises:
+      InputError: the folder does not exist and cannot be made, or nothing can be written into it.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written to ({error.strerror or error})") from error

@@ -1,4 +1,5 @@
-"""The graspability function g: could the target be grasped where it is? (paper appendix B.3, DESIGN.md section 5)
+"""The graspability function g: could the target be grasped where it is? (paper appendix B.3; docs/method.md,
+"Graspability")
 
 Everything that a grasp sweeps (hand, fingers, links 7 and 6 on their straight way in, and the target on its way out) is
 a constant point cloud in the target's frame. Which grasps the arm can make at a candidate pose, and which the shelf
@@ -17,17 +18,18 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.spatial
 import trimesh
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from mechsearch_jax.collision import Pair, hits_shelf, mark_hits
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.gripper import Gripper, arm_hits_shelf, swept_cloud
-from mechsearch_jax.kinematics import line_kinematics
-from mechsearch_jax.masked import block_size, for_each, masked_vmap, merged, rows_of
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.target import Target
-from mechsearch_jax.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.geometry.collision import Pair, mark_hits
+from mechsearch_jax.geometry.masked import block_size, for_each, masked_vmap, merged, rows_of
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.options import option
+from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf, swept_cloud
+from mechsearch_jax.robot.kinematics import line_kinematics
+from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
+from mechsearch_jax.workspace.target import Target
 
 WRIST_ORIGIN = math.pi / 4
 # So many grasps of a pose are looked at together, and so many points of a cloud first.
@@ -53,7 +55,10 @@ class GraspConfig:
 
     yaws: int = 7
     max_yaw: float = math.radians(45)
-    tilts: tuple[float, ...] = (math.radians(20), math.radians(25), math.radians(30))
+    tilts: tuple[float, ...] = option(
+        (math.radians(20), math.radians(25), math.radians(30)),
+        "angles by which the gripper points downwards as it grasps the target [rad]; the paper's is 0.35",
+    )
     wrists: tuple[float, ...] = (math.radians(-60), 0.0, math.radians(60))
     height: float = 0.03
     points: int = 2048
@@ -83,7 +88,6 @@ class GraspTables(flax.struct.PyTreeNode):
       wrist: index of the wrist's swept gripper cloud, shape (G,).
       clouds: what each grasp sweeps, in the target's frame as rows of coordinates, shape (G, 3, P) [m].
       low, high: box around each cloud in the gripper's frame, shape (G, 3) [m].
-      gripper_clouds: what the open gripper sweeps in its own frame, by wrist, shape (W, 3, P') [m].
       T_world_target: candidate poses, shape (X, 4, 4).
       pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose.
       group_pose, group_pair: the pairs and, after them, the grasps of a target that has been found, in groups of at
@@ -98,7 +102,6 @@ class GraspTables(flax.struct.PyTreeNode):
     clouds: jax.Array
     low: jax.Array
     high: jax.Array
-    gripper_clouds: jax.Array
     T_world_target: jax.Array
     pair_pose: jax.Array
     pair_grasp: jax.Array
@@ -152,16 +155,22 @@ def swept_target(target: Target, direction: np.ndarray, distance: float, count: 
 
 
 def feasible_grasps(
-    tables: GraspTables, shelf: Shelf, gripper: Gripper, config: GraspConfig, T_world_target: Float[Array, "n 4 4"]
+    tables: GraspTables,
+    shelf: Shelf,
+    gripper: Gripper,
+    config: GraspConfig,
+    T_world_target: Float[Array, "n 4 4"],
+    active: Bool[Array, ""] | bool = True,
 ) -> Bool[Array, "n g"]:
     """Which grasps the arm can make at target poses and the shelf leaves room for, whatever the objects.
 
     The approach has to be within `max_yaw` of +x, reachable along its whole length, and neither the arm nor anything
-    that is swept may touch the shelf.
+    that is swept may touch the shelf. None is, and next to nothing is computed, where `active` is false.
     """
     n, g = T_world_target.shape[0], tables.q7.shape[0]
     T = compose(T_world_target[:, None], tables.T_target_gripper[None])
     ahead = T[..., 0, 2] >= jnp.cos(config.max_yaw + 1e-4) * jnp.sqrt(T[..., 0, 2] ** 2 + T[..., 1, 2] ** 2)
+    ahead &= active
 
     def reach(_, row, i):
         T, q7 = row[0][i], row[1][i % g]
@@ -219,7 +228,6 @@ def grasp_tables(
         clouds=jnp.float32(np.stack(clouds)),
         low=jnp.float32(np.stack(low)),
         high=jnp.float32(np.stack(high)),
-        gripper_clouds=jnp.float32(np.stack([s.T for s in swept])),
         T_world_target=poses,
         pair_pose=jnp.zeros(0, jnp.int32),
         pair_grasp=jnp.zeros(0, jnp.int32),
@@ -401,8 +409,19 @@ def crowding(tables: GraspTables, found: FoundGrasps, hits: Bool[Array, "k n"]) 
     return total / jnp.maximum(grasps, 1.0)
 
 
+def split_found(values: Shaped[Array, " y"]) -> tuple[Shaped[Array, " x"], Shaped[Array, ""]]:
+    """What belongs to the candidate poses and what to the found target, in the order of `pairs`."""
+    return values[:-1], values[-1]
+
+
 def find_grasps(
-    tables: GraspTables, shelf: Shelf, gripper: Gripper, config: GraspConfig, T_world_target: Float[Array, "4 4"]
+    tables: GraspTables,
+    shelf: Shelf,
+    gripper: Gripper,
+    config: GraspConfig,
+    T_world_target: Float[Array, "4 4"],
+    active: Bool[Array, ""] | bool = True,
 ) -> FoundGrasps:
-    """The feasible grasps of a target at any pose."""
-    return FoundGrasps(T_world_target, feasible_grasps(tables, shelf, gripper, config, T_world_target[None])[0])
+    """The feasible grasps of a target at any pose; none where `active` is false."""
+    feasible = feasible_grasps(tables, shelf, gripper, config, T_world_target[None], active)
+    return FoundGrasps(T_world_target, feasible[0])

@@ -1,7 +1,13 @@
-"""What all tests share: annotations checked at run time, strict broadcasting, kept compilations, one problem."""
+"""What all tests share: annotations checked at run time, strict broadcasting, kept compilations, one problem.
+
+`--slow-share K/N` selects the K-th of N parts of the slow tests, `--slow-share auto/N` the part whose turn it is today.
+"""
 
 import os
 import tempfile
+import time
+import zlib
+from pathlib import Path
 
 import jaxtyping
 
@@ -12,25 +18,90 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 
 CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR") or os.path.join(tempfile.gettempdir(), "mechsearch-jax-tests")
+# A compiled function holds dozens of memory mappings, of which Linux allows a process 65,530; past that XLA crashes.
+MAPPINGS = 35_000
+
+# Files that trace the same functions stay in one process, so that they are traced once; every other file is a group of
+# its own. Those that take long come first, so that all processes end at the same time.
+GROUPS = {
+    "planning": ("test_planner", "test_envs_episode", "test_envs_batch_episode", "test_readme", "test_docs"),
+    "pushing": ("test_benchmarks_push", "test_envs_pushes"),
+    "recognising": ("test_envs_recognisers", "test_perception_recogniser", "test_benchmarks_recognition"),
+}
+LONG_FIRST = (
+    *GROUPS["planning"],
+    *GROUPS["pushing"],
+    "test_networks_push",
+    *GROUPS["recognising"],
+    "test_dynamics_actions",
+    "test_train_networks",
+    "test_envs_mjx_simulator",
+    "test_perception_refinement",
+    "test_envs_physics_push",
+    "test_existence",
+)
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_compilation_cache_dir", CACHE)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
+def pytest_addoption(parser):
+    parser.addoption("--slow-share", metavar="K/N", help="of the slow tests only the K-th of N parts; auto/N: today's")
+
+
+def share_of(text):
+    """The part and the number of parts that `--slow-share` asks for."""
+    part, _, parts = text.partition("/")
+    known = parts.isdigit() and (part == "auto" or part.isdigit())
+    if not known or int(parts) < 1 or not (part == "auto" or 1 <= int(part) <= int(parts)):
+        raise pytest.UsageError(f'--slow-share "{text}" is neither K/N with K from 1 to N nor auto/N')
+    return (int(time.time() // 86400) % int(parts) + 1 if part == "auto" else int(part)), int(parts)
+
+
+def part_of(nodeid, parts):
+    """To which of the parts, counted from 1, a slow test belongs."""
+    return zlib.crc32(nodeid.encode()) % parts + 1
+
+
+def pytest_configure(config):
+    if config.getoption("slow_share"):
+        # Every process has to select the same tests, so that the part is chosen once.
+        part, parts = share_of(config.getoption("slow_share"))
+        config.option.slow_share = f"{part}/{parts}"
+
+
+def pytest_report_header(config):
+    share = config.getoption("slow_share")
+    return f"slow tests: part {share}" if share else None
+
+
+def pytest_collection_modifyitems(config, items):
+    if config.getoption("slow_share"):
+        part, parts = share_of(config.getoption("slow_share"))
+        left_out = [i for i in items if i.get_closest_marker("slow") and part_of(i.nodeid, parts) != part]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in set(left_out)]
+    group_of = {file: group for group, files in GROUPS.items() for file in files}
+    for item in items:
+        file = Path(item.path).stem
+        item.add_marker(pytest.mark.xdist_group(group_of.get(file, file)))
+    rank = {name: i for i, name in enumerate(LONG_FIRST)}
+    items.sort(key=lambda item: rank.get(Path(item.path).stem, len(rank)))
+
+
 @pytest.fixture(scope="session")
 def problem():
     """The default problem: the paper's shelf, camera and gripper, and the cylinder as the target."""
-    from mechsearch_jax import planner
+    from mechsearch_jax.planner import build_problem
 
-    return planner.build_problem()
+    return build_problem()
 
 
 @pytest.fixture(scope="module", autouse=True)
 def forget_compilations():
-    """Drop a file's compiled functions after it; what another file needs again comes from the persistent cache.
-
-    Each holds dozens of memory mappings, of which Linux allows a process 65,530; past that XLA crashes.
-    """
+    """Drop compiled functions between files where the process holds many of their memory mappings."""
     yield
-    jax.clear_caches()
+    maps = Path("/proc/self/maps")
+    if not maps.exists() or maps.read_bytes().count(b"\n") > MAPPINGS:
+        jax.clear_caches()

@@ -4,10 +4,10 @@ for the robot's shape."""
 import mujoco
 import numpy as np
 
-from mechsearch_jax.camera import rays
 from mechsearch_jax.envs.model import compile_model, initial_state, with_bodies
-from mechsearch_jax.envs.observation import AMBIENT, BACKGROUND_COLOUR, LIGHT, PALETTE, SHELF
+from mechsearch_jax.envs.simulated_camera import AMBIENT, BACKGROUND_COLOUR, LIGHT, PALETTE, SHELF
 from mechsearch_jax.envs.world import slots
+from mechsearch_jax.workspace.camera import rays
 
 ROBOT = SHELF + 1
 ROBOT_COLOUR = (0.93, 0.93, 0.95)

@@ -7,15 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import actions, dynamics, planner, scenario, superquadric, transforms
-from mechsearch_jax.actions import ActionConfig, ActionKind
+from mechsearch_jax import actions, planner
+from mechsearch_jax.actions import SAMPLED_KINDS, ActionConfig, ActionKind
+from mechsearch_jax.actions.push import push_variants
+from mechsearch_jax.dynamics import quasi_static, rigid
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.graspability import gripper_rotation
-from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner.belief import possible_space
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace import scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
-PUSH = jax.jit(dynamics.QuasiStatic(), static_argnums=0)
+PUSH = jax.jit(quasi_static.QuasiStatic(), static_argnums=0)
+CANDIDATES = jax.jit(actions.candidates, static_argnums=0)
 Q7 = jnp.zeros(())
 
 
@@ -84,7 +91,7 @@ def test_a_pushed_object_pushes_its_neighbour_and_nothing_else_moves():
     scene = on_board((*BOX, 0.6, 0.1, 0.0), (*BOX, 0.6, 0.18, 0.0), (*BOX, 0.72, -0.2, 0.0))
     pusher, T = finger_at(0.6, 0.05)
     after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7).scene
-    moved = np.asarray(dynamics.changed(scene, after))
+    moved = np.asarray(rigid.moved_objects(scene, after))
     assert moved.tolist() == [True, True] + [False] * 6
     assert float(after.position[1, 1] - after.position[0, 1]) >= 0.06 - 2e-3
 
@@ -93,14 +100,14 @@ def test_an_object_against_the_wall_is_jammed():
     scene = on_board((*BOX, 0.6, SHELF.left - 0.03, 0.0))
     pusher, T = finger_at(0.6, SHELF.left - 0.08)
     after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7)
-    assert float(after.residual) > ActionConfig().jam
+    assert float(after.residual) > ActionConfig().max_penetration
 
 
 def test_a_push_that_misses_moves_nothing():
     scene = on_board((*BOX, 0.6, 0.1, 0.0))
     pusher, T = finger_at(0.5, 0.05)
     after = PUSH(SHELF, scene, pusher, T, jnp.float32([0.0, 0.1, 0.0]), Q7).scene
-    assert not np.any(dynamics.changed(scene, after))
+    assert not np.any(rigid.moved_objects(scene, after))
 
 
 def side_grasp(x, y, yaw):
@@ -114,7 +121,7 @@ def test_pick_and_place_turns_flat_sides_into_the_hand_and_then_moves_rigidly(bo
     yaw = expected - 0.5 + 0.1 * (body == BOX)
     scene = on_board((*body, 0.6, 0.1, yaw), (*ROUND, 0.55, -0.1, 0.0))
     grasp, place = side_grasp(0.6, 0.1, 0.1), side_grasp(0.7, -0.05, 0.6)
-    after = jax.jit(dynamics.pick_and_place)(scene, jnp.int32(0), grasp, place)
+    after = jax.jit(rigid.pick_and_place)(scene, jnp.int32(0), grasp, place)
     np.testing.assert_allclose(after.position[0], [0.7, -0.05, scene.position[0, 2]], atol=1e-6)
     np.testing.assert_allclose(yaw_of(np.asarray(after.rotation[0])), expected, atol=1e-5)
     np.testing.assert_array_equal(after.position[1:], scene.position[1:])
@@ -123,10 +130,15 @@ def test_pick_and_place_turns_flat_sides_into_the_hand_and_then_moves_rigidly(bo
 def test_footprints_of_objects_on_their_side():
     scene = on_board((*ROUND, 0.6, 0.1, 0.0))
     lying = scene.replace(rotation=scene.rotation.at[0].set(jnp.float32([[1, 0, 0], [0, 0, -1], [0, 1, 0]])))
-    prints = dynamics.footprints(lying)
+    prints = footprints.footprints(lying)
     assert not bool(prints.round[0])
     np.testing.assert_allclose(np.sort(prints.half[0]), [0.03, 0.06], rtol=1e-5)
     np.testing.assert_allclose(prints.high[0] - prints.low[0], 0.06, rtol=1e-5)
+
+
+def of_kind(options, name):
+    """The ways of one kind among all candidates."""
+    return options[[kind.name for kind in SAMPLED_KINDS].index(name)]
 
 
 @pytest.fixture(scope="module")
@@ -134,23 +146,23 @@ def draw(problem):
     """Samples many actions by the objects' weights in a shipped scene whose target is still hidden."""
     loaded = scenario.load_scenario(scenario.example_scenarios()["first-light"])
     objects = scenario.superquadrics(loaded.objects)
-    config = PlannerConfig.paper()
-    belief = planner.observe_belief(
-        problem, planner.initial_belief(problem), objects, jnp.array(False), jnp.zeros(3), config
-    )
-    space = planner.action_space(problem, config)
+    observation = Observation(objects, jnp.array(False), jnp.zeros(3))
+    belief = planner.update_belief(problem, planner.initial_belief(problem), observation)
+
+    possible = possible_space(problem, belief, belief.exists)
+    options = CANDIDATES(problem.space, problem.actions, objects, possible)
 
     @jax.jit
-    def drawn(problem, belief, objects, weights, keys):
-        possible = planner._possible_space(problem, belief, belief.exists)
-        options = actions.candidates(space, problem.actions, objects, possible)
+    def drawn(problem, possible, objects, options, weights, keys):
         sample = lambda key: actions.sample_action(  # noqa: E731
-            key, space, problem.actions, objects, possible, options, objects.valid, weights
+            key, problem.space, problem.actions, objects, possible, options, objects.valid, weights
         )
         return options, jax.vmap(sample)(keys)
 
     keys = jax.random.split(jax.random.key(0), 200)
-    draw = lambda weights: jax.tree.map(np.asarray, drawn(problem, belief, objects, weights, keys))  # noqa: E731
+    draw = lambda weights: jax.tree.map(  # noqa: E731
+        np.asarray, drawn(problem, possible, objects, options, weights, keys)
+    )
     draw.objects = objects
     return draw
 
@@ -159,12 +171,12 @@ def draw(problem):
 def test_neighbours_that_are_recognised_as_overlapping_do_not_lock_each_other_in(problem, deep, locked):
     body = ((0.032, 0.032, 0.06), ROUND[1])
     pair = on_board((*body, 0.6, 0.05, 0.0), (*body, 0.6, 0.114 - deep, 0.0))
-    space = planner.action_space(problem, PlannerConfig.paper())
     belief = planner.initial_belief(problem)
-    nowhere = planner._possible_space(problem, belief, jnp.zeros_like(belief.exists))
-    options = jax.jit(actions.candidates, static_argnums=0)(space, problem.actions, pair, nowhere)
-    assert options.grasp_reached[0].any()
-    assert actions.free_ways(options)[0][0].any() != locked
+    nowhere = possible_space(problem, belief, jnp.zeros_like(belief.exists))
+    options = CANDIDATES(problem.space, problem.actions, pair, nowhere)
+    grasps = of_kind(options, "pick-and-place")
+    assert grasps.reached[0].any()
+    assert actions.free_ways(grasps)[0].any() != locked
 
 
 @pytest.fixture(scope="module")
@@ -204,9 +216,9 @@ def test_pushes_go_left_and_right_by_the_given_distances(sampled, problem):
     np.testing.assert_array_equal(d[:, [0, 2]], 0.0)
     assert set(np.rint(np.abs(d[:, 1]) * 1000)) <= {50, 100, 150}
     # They start on the other side of the object.
-    side, _ = actions.push_variants(problem.action_config, problem.actions.q7.shape[1])
+    side, _ = push_variants(problem.config.actions, problem.space.wrists)
     assert set(side) == {-1.0, 1.0}
-    from_object = np.asarray(options.push[..., 1, 3] - objects.position[:, None, 1])
+    from_object = np.asarray(of_kind(options, "push").T_world_gripper[..., 1, 3] - objects.position[:, None, 1])
     assert np.all((from_object * side < 0)[np.asarray(objects.valid)])
     y = action.T_world_gripper[:, 1, 3] - np.asarray(objects.position)[action.object, 1]
     assert np.all((y * action.displacement[:, 1])[action.kind == ActionKind.PUSH] < 0)
@@ -215,9 +227,10 @@ def test_pushes_go_left_and_right_by_the_given_distances(sampled, problem):
 def test_placed_objects_stand_clear_of_each_other_on_the_board(sampled, problem):
     objects, _, samples = sampled
     action = samples.action
+    place = jax.jit(rigid.pick_and_place)
     for i in np.flatnonzero(action.kind == ActionKind.PICK_AND_PLACE)[:25]:
         k = int(action.object[i])
-        after = dynamics.pick_and_place(
+        after = place(
             objects, jnp.int32(k), jnp.asarray(action.T_world_gripper[i]), jnp.asarray(action.T_world_place[i])
         )
         np.testing.assert_allclose(after.position[k, 2], objects.position[k, 2], atol=1e-5)
@@ -232,18 +245,20 @@ def test_placed_objects_stand_clear_of_each_other_on_the_board(sampled, problem)
 
 def test_grasped_objects_fit_between_the_fingers(sampled, problem):
     objects, options, _ = sampled
-    prints = dynamics.footprints(objects)
+    prints = footprints.footprints(objects)
     narrow = 2 * np.min(np.asarray(prints.half), axis=1)
-    graspable = np.asarray(options.grasp_reached).any(axis=1)
+    graspable = np.asarray(of_kind(options, "pick-and-place").reached).any(axis=(1, 2))
     assert np.all(narrow[graspable] <= problem.gripper.usable_opening + 1e-5)
 
 
 def test_settings_that_make_no_sense_are_refused():
-    with pytest.raises(InputError, match='use "both", "push" or "pick-and-place"'):
-        ActionConfig(kinds="throw")
+    with pytest.raises(InputError, match="a tuple of one or more kinds"):
+        ActionConfig(actions="push")
+    with pytest.raises(InputError, match='"throw" is unknown; use pick-and-place or push'):
+        planner.build_problem(config=planner.standard(actions=("throw",)).problem)
     with pytest.raises(InputError, match="push_distances"):
         ActionConfig(push_distances=())
-    with pytest.raises(InputError, match="give"):
-        ActionConfig(give=-0.001)
+    with pytest.raises(InputError, match="contact_tolerance"):
+        ActionConfig(contact_tolerance=-0.001)
     with pytest.raises(InputError, match="give as many each"):
-        actions.action_tables(planner.Gripper(), (0.0,), dataclasses.replace(ActionConfig()))
+        actions.action_tables(Gripper(), (0.0,), dataclasses.replace(ActionConfig()))

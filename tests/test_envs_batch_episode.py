@@ -6,66 +6,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_envs_episode import BOX, CONFIG, CYLINDER, HIDDEN, OPEN, reveal, topple
+from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, reveal, topple
 
-from mechsearch_jax.envs import batch_episode
-from mechsearch_jax.envs.batch_episode import Start, run_episodes
-from mechsearch_jax.envs.episode import Choice, EpisodeLog, distrust, run_episode
-from mechsearch_jax.envs.mjx_simulator import RETRIEVE, Failure, MjxSimulator, Outcomes, Overflow
-from mechsearch_jax.envs.native_worlds import NativeWorlds
-from mechsearch_jax.envs.simulator import NativeSimulator
-from mechsearch_jax.envs.world import BODIES, from_scenario
+from mechsearch_jax.actions import no_action
+from mechsearch_jax.envs.episode_log import Choice, EpisodeLog, distrust, record
+from mechsearch_jax.envs.episodes import Start, run_episode, run_episodes
+from mechsearch_jax.envs.mjx_simulator import MjxSimulator
+from mechsearch_jax.envs.native import NativeSimulator
+from mechsearch_jax.envs.outcome import Failure, Overflow
+from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.scenario import Scenario
+from mechsearch_jax.planner import search_for_grasp
 
-TWO = Scenario("two", (BOX, dataclasses.replace(BOX, position=(0.6, -0.15, 0.4845))), CYLINDER)
 AT_ONCE = 2
 
 
-class Troupe:
-    """A batch simulator in which actions do what a test says, by the scenario that a world began with."""
-
-    engine = "Troupe"
-
-    def __init__(self, acts, failures=None, overflows=None):
-        self.world = None
-        self.executed = []
-        self.names = []
-        self._acts, self._failures, self._overflows = acts, failures or {}, overflows or {}
-
-    def reset(self, scenarios):
-        self.names = [None] * len(scenarios)
-        self._worlds = [None] * len(scenarios)
-        return self.replace(dict(enumerate(scenarios)))
-
-    def replace(self, scenarios):
-        for i, scenario in scenarios.items():
-            self.names[i], self._worlds[i] = scenario.name, from_scenario(scenario)
-        self.world = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self._worlds)
-        return self.world
-
-    def execute(self, actions, active):
-        count = len(self.names)
-        self.executed.append([self.names[i] if active[i] else None for i in range(count)])
-        outcomes = Outcomes(
-            *(np.zeros(count, np.int32), np.zeros(count, np.int32), np.ones(count, bool)),
-            *(np.zeros((count, BODIES), bool), np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, bool)),
-            np.zeros(count, np.int32),
-        )
-        for i, name in enumerate(self.names):
-            if not active[i]:
-                continue
-            outcomes.failure[i] = self._failures.get(name, Failure.NONE)
-            outcomes.overflow[i] = self._overflows.get(name, Overflow.NONE)
-            if actions.kind[i] == RETRIEVE:
-                outcomes.retrieved[i] = outcomes.failure[i] == Failure.NONE
-            else:
-                self._worlds[i] = self._acts.get(name, lambda world: world)(self._worlds[i])
-        self.world = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self._worlds)
-        return jax.tree.map(jnp.asarray, outcomes)
-
-
-def run(problem, scenarios, simulator, slots, config=CONFIG, seeds=None, **options):
+def run(problem, scenarios, simulator, slots, policy=grab, seeds=None, **options):
     """The episodes in the order of the scenarios, and how many ended together."""
     found, together = {}, []
 
@@ -76,7 +32,7 @@ def run(problem, scenarios, simulator, slots, config=CONFIG, seeds=None, **optio
             found[place] = episode
 
     starts = [Start(s, seed) for s, seed in zip(scenarios, seeds or [0] * len(scenarios), strict=True)]
-    run_episodes(starts, problem, config, simulator, slots, ended, at_once=AT_ONCE, **options)
+    run_episodes(starts, problem, policy, simulator, slots, ended, max_steps=2, at_once=AT_ONCE, **options)
     return [found[i] for i in range(len(scenarios))], together
 
 
@@ -87,20 +43,27 @@ def without_times(episode):
     return value
 
 
-def test_episodes_are_the_same_alone_and_in_a_batch_whatever_their_slot(problem):
+@pytest.mark.parametrize(
+    "policy", ["grab", pytest.param("search-for-grasp", marks=pytest.mark.slow)], ids=["grab", "search"]
+)
+def test_episodes_are_the_same_alone_and_in_a_batch_whatever_their_slot(problem, policy):
     """More episodes than slots; and in the native simulator."""
+    decides = grab if policy == "grab" else search_for_grasp()
     scenarios, seeds = [OPEN, HIDDEN, TWO, HIDDEN], [0, 0, 1, 2]
-    simulator = NativeWorlds(threads=2)
-    episodes, together = run(problem, scenarios, simulator, 2, seeds=seeds)
+    simulator = NativeSimulator(threads=2)
+    episodes, together = run(problem, scenarios, simulator, 2, decides, seeds)
     assert sum(together) == 4
-    alone = [run_episode(seed, s, problem, CONFIG, NativeSimulator()) for s, seed in zip(scenarios, seeds, strict=True)]
+    alone = [
+        run_episode(seed, s, problem, decides, NativeSimulator(), max_steps=2)
+        for s, seed in zip(scenarios, seeds, strict=True)
+    ]
     assert [without_times(e) for e in episodes] == [without_times(e) for e in alone]
     assert {e.scenario for e in episodes if e.retrieved} >= {"open"}
     assert all(step.timings["recognise"] > 0 for e in episodes for step in e.steps)
 
 
 def test_a_slot_is_free_for_the_next_as_soon_as_its_episode_ends(problem):
-    stage = Troupe({"hidden": reveal}, failures={"two": Failure.DROPPED})
+    stage = Stage({"hidden": reveal}, failures={"two": Failure.DROPPED})
     names = ["two", "open", "hidden", "open again"]
     starts = [TWO, OPEN, HIDDEN, dataclasses.replace(OPEN, name="open again")]
     stages = []
@@ -116,8 +79,16 @@ def test_a_slot_is_free_for_the_next_as_soon_as_its_episode_ends(problem):
     assert ("plan", 1) in stages
 
 
+def test_one_slot_runs_episodes_one_after_the_other(problem):
+    stage = Stage({"hidden": reveal})
+    episodes, together = run(problem, [OPEN, HIDDEN, OPEN], stage, 1)
+    assert [e.retrieved for e in episodes] == [True, True, True]
+    assert together == [1, 1, 1]
+    assert stage.executed == [["open"], ["hidden"], ["hidden"], ["open"]]
+
+
 def test_what_fails_belongs_to_its_own_row(problem):
-    stage = Troupe({"hidden": reveal, "tipped": topple}, overflows={"two": Overflow.ROWS | Overflow.CONTACTS})
+    stage = Stage({"hidden": reveal, "tipped": topple}, overflows={"two": Overflow.ROWS | Overflow.CONTACTS})
     tipped = dataclasses.replace(HIDDEN, name="tipped")
     episodes, _ = run(problem, [TWO, HIDDEN, tipped], stage, 2)
     assert [e.failure for e in episodes] == [
@@ -129,17 +100,14 @@ def test_what_fails_belongs_to_its_own_row(problem):
 
 
 def test_a_success_that_cannot_be_trusted_is_none():
-    log = EpisodeLog(CONFIG)
-    log.decide(batch_episode.record(True, 1, True, None, None, CONFIG))
-    deed = batch_episode.Deed.of_retrieval(True, None)
-    assert log.act(deed, "error: no", {})
+    log = EpisodeLog(2)
+    log.decide(record(True, 1, True, None))
+    assert log.act(True, None, "error: no", {})
     episode = log.episode(OPEN, {})
     assert (episode.retrieved, episode.failure) == (False, "error: no")
 
 
-def test_decisions_that_cannot_be_trusted_are_named(problem):
-    from mechsearch_jax.actions import no_action
-
+def test_decisions_that_cannot_be_trusted_are_named():
     good = Choice(no_action(), jnp.float32(3.0), jnp.float32(2.0), jnp.int32(1), jnp.array(False))
     assert distrust(good) is None
     assert "outgrew" in distrust(good.replace(overflow=jnp.array(True)))
@@ -148,43 +116,61 @@ def test_decisions_that_cannot_be_trusted_are_named(problem):
     assert distrust(good.replace(cost=jnp.float32(jnp.inf))) == "error: the decision is not finite"
 
 
-def test_a_decision_that_cannot_be_trusted_is_not_executed(problem, monkeypatch):
+def test_a_policy_need_not_say_what_it_expects():
+    silent = Choice(no_action(), jnp.float32(3.0), jnp.float32(jnp.nan), jnp.int32(1), jnp.array(False))
+    assert distrust(silent) is None
+    step = record(False, 5, False, silent)
+    assert (step.cost, step.predicted_cost, step.sequences) == (3.0, None, 1)
+
+
+def test_a_decision_that_cannot_be_trusted_is_not_executed(problem):
     """One that is not finite ends its own episode, and the others go on."""
-
-    decide = batch_episode._decide
-
-    def lose(*arguments):
-        choice = decide(*arguments)
-        return choice.replace(cost=choice.cost * jnp.nan)
-
-    monkeypatch.setattr(batch_episode, "_decide", lose)
-    stage = Troupe({})
-    episodes, _ = run(problem, [OPEN, HIDDEN], stage, 2)
+    stage = Stage()
+    episodes, _ = run(problem, [OPEN, HIDDEN], stage, 2, Grab(charge=float("nan")))
     assert [e.failure for e in episodes] == [None, "error: the decision is not finite"]
     assert stage.executed == [["open", None]]
 
 
+def test_only_a_single_slot_can_be_watched(problem):
+    class Watching:
+        def busy(self, stage): ...
+
+        def decided(self, moment): ...
+
+        def acted(self, moment): ...
+
+    with pytest.raises(InputError, match="one slot, not at 2"):
+        run(problem, [OPEN, HIDDEN], Stage(), 2, watcher=Watching())
+
+
 def test_worlds_of_the_native_simulator_are_checked():
-    worlds = NativeWorlds()
+    worlds = NativeSimulator()
+    assert isinstance(worlds, Simulator)
     with pytest.raises(InputError, match="no scenarios"):
         worlds.reset([])
     worlds.reset([OPEN, HIDDEN])
-    from mechsearch_jax.actions import no_action
-
     with pytest.raises(InputError, match="for 2 worlds"):
         worlds.execute(jax.tree.map(lambda a: a[None], no_action()))
     idle = jax.tree.map(lambda a: jnp.stack([a, a]), no_action())
+    with pytest.raises(InputError, match="kind 5 is unknown"):
+        worlds.execute(idle.replace(kind=jnp.int32([0, 5])))
     before = worlds.world
     outcomes = worlds.execute(idle, jnp.array([True, False]))
     assert outcomes.steps.tolist() == [0, 0]
     jax.tree.map(np.testing.assert_array_equal, before, worlds.world)
+    settled = worlds.settle(jnp.array([False, True]))
+    assert settled.settled.all()
+    assert settled.steps[0] == 0
+    assert settled.steps[1] > 0
+    assert len(worlds.traces[0].time) == 0
 
 
 @pytest.mark.slow
 def test_the_batch_simulator_runs_whole_episodes(problem):
     simulator = MjxSimulator()
-    episodes, _ = run(problem, [OPEN, HIDDEN, dataclasses.replace(OPEN, name="open again")], simulator, 2)
+    scenarios, policy = [OPEN, HIDDEN, dataclasses.replace(OPEN, name="open again")], search_for_grasp()
+    episodes, _ = run(problem, scenarios, simulator, 2, policy)
     assert [e.retrieved for e in episodes] == [True, True, True]
     assert [e.config["simulator"] for e in episodes] == ["MjxSimulator"] * 3
-    alone = run_episode(0, HIDDEN, problem, CONFIG, NativeSimulator())
+    alone = run_episode(0, HIDDEN, problem, policy, NativeSimulator(), max_steps=2)
     assert [s.action.kind for s in episodes[1].steps] == [s.action.kind for s in alone.steps]

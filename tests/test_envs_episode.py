@@ -6,46 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stage import BOX, CYLINDER, HIDDEN, OPEN, UPRIGHT, Stage, grab, idle, reveal, topple
 
-from mechsearch_jax import results
-from mechsearch_jax.envs import episode as episodes
-from mechsearch_jax.envs.episode import Recognition, Snapshot, oracle, run_episode, target_of
-from mechsearch_jax.envs.simulator import NativeSimulator, Outcome, Retrieval, Trace
-from mechsearch_jax.envs.world import TARGET, from_scenario
-from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.scenario import Body, Scenario
-
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-BOX = Body("box", (0.048, 0.028, 0.08), (0.5, 0.135, 0.4845), UPRIGHT)
-CYLINDER = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), UPRIGHT)
-HIDDEN = Scenario("hidden", (BOX,), CYLINDER)
-OPEN = Scenario("open", (dataclasses.replace(BOX, position=(0.6, -0.2, 0.4845)),), CYLINDER)
-# What `plan` compiles to is that of the default, which other tests need too.
-CONFIG = PlannerConfig(max_steps=2)
-TRACE = Trace(np.zeros(0), np.zeros((0, 7)), np.zeros((0, 2)), np.zeros((0, 9, 3)), np.zeros((0, 9, 4)))
-STANDING = np.zeros(9, bool)
-
-
-class Stage:
-    """A simulator in which actions do what a test says."""
-
-    def __init__(self, act=lambda world: world, failure=None, retrieval=None):
-        self.world = None
-        self.actions = []
-        self._act, self._failure, self._retrieval = act, failure, retrieval
-
-    def reset(self, scenario):
-        self.world = from_scenario(scenario)
-        return self.world
-
-    def execute(self, action):
-        self.actions.append(action)
-        self.world = self._act(self.world)
-        return Outcome(self._failure, 1, True, STANDING, TRACE)
-
-    def retrieve(self, T_world_gripper, q7, opening):
-        failure = self._retrieval
-        return Retrieval(failure is None, failure is None, failure is None, failure, 1, STANDING, TRACE)
+from mechsearch_jax.actions import kind_of
+from mechsearch_jax.envs.episodes import run_episode, target_of
+from mechsearch_jax.envs.native import NativeSimulator
+from mechsearch_jax.envs.outcome import Failure
+from mechsearch_jax.envs.records import load_episode, save_episode
+from mechsearch_jax.envs.snapshot import Snapshot, oracle
+from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import search_for_grasp
+from mechsearch_jax.workspace.scenario import Body, Scenario
 
 
 class Diary:
@@ -62,28 +35,32 @@ class Diary:
         self.moments.append(moment)
 
 
-def reveal(world):
-    """Put the box out of the way."""
-    return world.replace(position=world.position.at[0].set(jnp.array([0.6, -0.2, 0.4845])))
-
-
-def topple(world):
-    lying = jnp.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    return reveal(world).replace(rotation=world.rotation.at[TARGET].set(lying))
+def run(problem, scenario, stage, policy=grab, **options):
+    return run_episode(0, scenario, problem, policy, stage, max_steps=2, **options)
 
 
 def test_a_target_in_sight_is_taken_out_at_once(problem):
-    episode = run_episode(0, OPEN, problem, CONFIG, NativeSimulator())
+    episode = run(problem, OPEN, NativeSimulator(), search_for_grasp(), options={"recognition": "oracle"})
     assert (episode.found_step, episode.graspable_step, episode.retrieved, episode.failure) == (0, 0, True, None)
     (step,) = episode.steps
     assert (step.found, step.graspable, step.belief_size, step.sequences) == (True, True, 1, 0)
+    assert (step.cost, step.predicted_cost) == (1.0, None)
     assert step.action.kind == "retrieve"
-    assert set(step.timings) == {"recognise", "believe", "grasp", "simulate"}
+    assert step.action.object is None
+    assert set(step.timings) == {"recognise", "plan", "judge", "simulate"}
+    assert episode.config == {
+        "recognition": "oracle",
+        "target": "cylinder",
+        "simulator": "NativeSimulator",
+        "seed": 0,
+    }
 
 
-def test_a_search_goes_on_until_the_target_is_out(problem, tmp_path):
+@pytest.mark.parametrize("policy", ["grab", "search-for-grasp"])
+def test_a_search_goes_on_until_the_target_is_out(problem, tmp_path, policy):
     diary = Diary()
-    episode = run_episode(0, HIDDEN, problem, CONFIG, Stage(reveal), watcher=diary)
+    decides = grab if policy == "grab" else search_for_grasp()
+    episode = run(problem, HIDDEN, Stage(reveal), decides, watcher=diary)
     assert (episode.found_step, episode.graspable_step, episode.retrieved) == (1, 1, True)
     first, second = episode.steps
     assert not first.found
@@ -94,39 +71,74 @@ def test_a_search_goes_on_until_the_target_is_out(problem, tmp_path):
     assert second.predicted_cost is None
     assert diary.decided_at == [0, 1]
     assert [moment.record.action.kind for moment in diary.moments][-1] == "retrieve"
-    assert "plan" in diary.stages
-    results.save_episode(episode, tmp_path / "episode.json")
-    assert results.load_episode(tmp_path / "episode.json") == episode
-    row = episodes.row(episode)
-    assert (row.steps, row.objects, row.seed, row.method) == (2, 1, 0, "search-for-grasp")
-    assert row.planning_seconds > 0
+    for moment in diary.moments:
+        assert kind_of(int(moment.decision.action.kind)).name == moment.record.action.kind
+    assert [bool(moment.outcome.retrieved) for moment in diary.moments] == [False, True]
+    assert diary.stages == ["recognise", "plan", "simulate", "recognise", "plan", "judge", "simulate"]
+    save_episode(episode, tmp_path / "episode.json")
+    assert load_episode(tmp_path / "episode.json").steps == episode.steps
 
 
 def test_failed_actions_cost_steps_and_nothing_is_rolled_back(problem):
-    stage = Stage(failure="dropped")
-    episode = run_episode(0, HIDDEN, problem, CONFIG, stage)
-    assert len(stage.actions) == CONFIG.max_steps
+    stage = Stage(failures=Failure.DROPPED)
+    diary = Diary()
+    episode = run(problem, HIDDEN, stage, watcher=diary)
+    assert len(stage.actions) == 2
     assert [step.failure for step in episode.steps] == ["dropped", "dropped", None]
     assert (episode.found_step, episode.graspable_step, episode.retrieved) == (None, None, False)
     assert episode.failure == "not found"
     sizes = [step.belief_size for step in episode.steps]
     assert sizes == sorted(sizes, reverse=True)
+    last = diary.moments[-1]
+    assert (last.index, last.decision, last.outcome, last.record.action) == (2, None, None, None)
+    assert diary.decided_at == [0, 1]
 
 
 def test_a_missed_retrieval_is_tried_again_while_steps_are_left(problem):
-    episode = run_episode(0, OPEN, problem, CONFIG, Stage(retrieval="missed"))
+    episode = run(problem, OPEN, Stage(retrievals=Failure.MISSED))
     assert [step.action.kind for step in episode.steps] == ["retrieve"] * 3
     assert (episode.graspable_step, episode.retrieved, episode.failure) == (0, False, "retrieval: missed")
 
 
-def test_an_unreachable_grasp_is_not_tried_again(problem):
-    episode = run_episode(0, OPEN, problem, CONFIG, Stage(retrieval="unreachable"))
+@pytest.mark.parametrize("failure", [Failure.UNREACHABLE, Failure.FALLEN])
+def test_what_trying_again_would_not_mend_is_not_tried_again(problem, failure):
+    episode = run(problem, OPEN, Stage(retrievals=failure))
     assert len(episode.steps) == 1
-    assert episode.failure == "retrieval: unreachable"
+    assert episode.failure == f"retrieval: {failure.name.lower()}"
+
+
+def test_after_the_last_action_only_a_retrieval_is_executed(problem):
+    def never(key, problem, belief, observation):
+        """Goes on pushing."""
+        return grab(key, problem, belief.replace(found=jnp.array(False)), observation)
+
+    stage = Stage()
+    episode = run(problem, OPEN, stage, never)
+    assert len(stage.actions) == 2
+    assert (episode.found_step, episode.graspable_step, episode.failure) == (0, 0, "found, but not graspable")
+    last = episode.steps[-1]
+    assert (last.cost, last.action, last.predicted_cost, last.sequences) == (None, None, None, 0)
+
+
+def test_where_no_action_is_possible_a_step_passes(problem):
+    stage = Stage()
+    episode = run(problem, HIDDEN, stage, idle)
+    assert [step.failure for step in episode.steps] == ["no action is possible"] * 2 + [None]
+    assert [step.action.kind for step in episode.steps[:2]] == ["none", "none"]
+    assert episode.failure == "not found"
+
+
+def test_an_unknown_kind_of_action_is_refused(problem):
+    def odd(key, problem, belief, observation):
+        decision = grab(key, problem, belief, observation)
+        return decision.replace(action=decision.action.replace(kind=jnp.int32(8)))
+
+    with pytest.raises(InputError, match="kind 8 is unknown"):
+        run(problem, HIDDEN, Stage(), odd)
 
 
 def test_a_target_that_fell_over_is_found_but_not_graspable(problem):
-    episode = run_episode(0, HIDDEN, problem, CONFIG, Stage(topple))
+    episode = run(problem, HIDDEN, Stage(topple))
     assert (episode.found_step, episode.graspable_step, episode.retrieved) == (1, None, False)
     assert episode.failure == "the target fell over"
     assert episode.steps[-1].action is None
@@ -136,10 +148,12 @@ def test_verdicts_are_passed_on_the_truth_and_not_on_what_was_recognised(problem
     def blind(key, snapshot):
         """Sees the target, but no object."""
         seen = oracle(key, snapshot)
-        return Recognition(seen.scene.replace(valid=jnp.zeros_like(seen.scene.valid)), True, seen.target_pose)
+        nothing = seen.objects.replace(valid=jnp.zeros_like(seen.objects.valid))
+        return Observation(nothing, jnp.array(True), seen.target_pose)
 
     front = dataclasses.replace(BOX, position=(0.52, 0.07, 0.4845))
-    episode = run_episode(0, Scenario("blocked", (front,), CYLINDER), problem, CONFIG, Stage(retrieval="missed"), blind)
+    stage = Stage(retrievals=Failure.MISSED)
+    episode = run(problem, Scenario("blocked", (front,), CYLINDER), stage, recogniser=blind)
     assert episode.steps[0].action.kind == "retrieve"
     assert episode.graspable_step is None
 
@@ -152,17 +166,20 @@ def test_the_same_seed_gives_the_same_decisions_whatever_the_recogniser_draws(pr
     chosen = []
     for recogniser in (oracle, drawing):
         stage = Stage()
-        run_episode(3, HIDDEN, problem, CONFIG, stage, recogniser)
-        chosen.append([np.asarray(action.T_world_gripper) for action in stage.actions])
+        run_episode(3, HIDDEN, problem, grab, stage, recogniser, max_steps=2)
+        chosen.append([np.asarray(action.displacement) for action in stage.actions])
     np.testing.assert_array_equal(*chosen)
+    planner_key, _ = jax.random.split(jax.random.key(3))
+    drawn = [jax.random.uniform(jax.random.fold_in(planner_key, i), minval=0.05, maxval=0.15) for i in range(2)]
+    np.testing.assert_array_equal([d[1] for d in chosen[0]], drawn)
 
 
 def test_the_oracle_leaves_out_what_fell_off_the_board(problem):
     world = from_scenario(OPEN)
     fallen = world.replace(position=world.position.at[0, 2].set(0.1))
     seen = oracle(jax.random.key(0), Snapshot(problem.camera, problem.shelf, fallen))
-    assert not seen.scene.valid.any()
-    assert seen.found
+    assert not seen.objects.valid.any()
+    assert seen.target_visible
     np.testing.assert_allclose(seen.target_pose, [0.62, 0.07, 0.0], atol=1e-6)
 
 

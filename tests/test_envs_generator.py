@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.envs import generator, observation, world
+from mechsearch_jax.envs import generator, simulated_camera, world
 from mechsearch_jax.envs.generator import BOXES, CYLINDERS, GeneratorConfig, ScenarioGenerator, outline, separation
-from mechsearch_jax.envs.simulator import NativeSimulator
+from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.scenario import Body, format_scenario, parse_scenario
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, format_scenario, parse_scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 SHELF = Shelf()
 SIZES = {tuple(round(s / 2, 6) for s in box) for box in BOXES}
@@ -44,13 +44,13 @@ def check(scene, objects, target, allowed):
     assert len(scene.objects) == objects
     assert all(tuple(round(s, 6) for s in b.half_size) in SIZES for b in scene.objects)
     assert scene.target.half_size == target.half_size
-    assert int(observation.target_pixels(Camera(), state)) == 0
+    assert int(simulated_camera.target_pixels(Camera(), state)) == 0
 
     yaw = 2 * np.arctan2(scene.target.quaternion[3], scene.target.quaternion[0])
     placed = np.array([*scene.target.position[:2], yaw])
     assert np.abs(allowed - placed).max(axis=1).min() < 1e-4
 
-    simulator = NativeSimulator()
+    simulator = NativeWorld()
     simulator.reset(scene)
     outcome = simulator.settle()
     assert outcome.settled

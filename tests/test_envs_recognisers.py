@@ -7,17 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import scenario, superquadric
-from mechsearch_jax.camera import Camera, back_project
-from mechsearch_jax.envs.episode import Snapshot, oracle, target_of
-from mechsearch_jax.envs.observation import observe
-from mechsearch_jax.envs.recognisers import measured_depth, numbered, recogniser, true_labels
+from mechsearch_jax.envs.episodes import target_of
+from mechsearch_jax.envs.recognisers import numbered, recogniser, true_labels
+from mechsearch_jax.envs.simulated_camera import observe
+from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
+from mechsearch_jax.perception.noise import measured_depth
 from mechsearch_jax.perception.scores import intersection_over_union, sharpened
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.workspace import scenario
+from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.shelf import Shelf
 
 CAMERA, SHELF = Camera(), Shelf()
 SCENE = scenario.load_scenario(scenario.example_scenarios()["first-light"])
@@ -44,29 +47,29 @@ def seen(world, masks):
 
 def test_true_masks_and_noisy_depth_give_the_shapes(world, seen):
     truth = sharpened(true_superquadrics(world))
-    overlap = np.asarray(intersection_over_union(truth, seen.scene))
-    both = np.asarray(truth.valid & seen.scene.valid)
+    overlap = np.asarray(intersection_over_union(truth, seen.objects))
+    both = np.asarray(truth.valid & seen.objects.valid)
     assert both.sum() >= np.asarray(truth.valid).sum() - 1
     assert overlap[both].mean() > 0.85
-    assert not np.asarray(seen.scene.valid & ~truth.valid).any()
-    assert not seen.found
+    assert not np.asarray(seen.objects.valid & ~truth.valid).any()
+    assert not seen.target_visible
     # As the oracle has them, whatever fits the image best.
-    np.testing.assert_array_equal(seen.scene.exponents[both, 0], np.float32(superquadric.BOX_EXPONENTS[0]))
+    np.testing.assert_array_equal(seen.objects.exponents[both, 0], np.float32(superquadric.BOX_EXPONENTS[0]))
 
 
 def test_the_same_key_gives_the_same_and_another_key_other_noise(world, masks, seen):
     again = masks(jax.random.key(0), Snapshot(CAMERA, SHELF, world))
     other = masks(jax.random.key(1), Snapshot(CAMERA, SHELF, world))
-    np.testing.assert_array_equal(again.scene.size, seen.scene.size)
-    assert np.abs(np.asarray(other.scene.size - seen.scene.size)).max() > 1e-5
+    np.testing.assert_array_equal(again.objects.size, seen.objects.size)
+    assert np.abs(np.asarray(other.objects.size - seen.objects.size)).max() > 1e-5
 
 
 def test_a_target_in_sight_is_found_where_it_stands_and_is_none_of_the_objects(world, masks, seen):
     place = [0.46, 0.3, SHELF.board + float(world.half_size[TARGET, 2])]
     plain = masks(jax.random.key(0), Snapshot(CAMERA, SHELF, moved(world, TARGET, place)))
-    assert plain.found
+    assert plain.target_visible
     assert np.linalg.norm(np.asarray(plain.target_pose)[:2] - place[:2]) < 0.004
-    np.testing.assert_array_equal(plain.scene.valid, seen.scene.valid)
+    np.testing.assert_array_equal(plain.objects.valid, seen.objects.valid)
 
 
 def test_labels_are_float64_geometry(world):
@@ -122,5 +125,5 @@ def test_names_stand_for_one_object_each(masks):
 def test_without_masks_most_visible_objects_are_told_apart(world):
     found = recogniser("full", target_of(SCENE))(jax.random.key(0), Snapshot(CAMERA, SHELF, world))
     truth = sharpened(true_superquadrics(world))
-    overlap = np.asarray(intersection_over_union(truth, found.scene))[np.asarray(truth.valid & found.scene.valid)]
+    overlap = np.asarray(intersection_over_union(truth, found.objects))[np.asarray(truth.valid & found.objects.valid)]
     assert (overlap > 0.5).sum() >= 2

@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -10,19 +12,27 @@ import numpy as np
 import pytest
 from published import published_scenarios
 
-from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.envs import model, motion, simulator, world
-from mechsearch_jax.envs.motion import MotionConfig
-from mechsearch_jax.envs.simulator import NativeSimulator
+from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action, retrieve_action
+from mechsearch_jax.envs import model, simulator, world
+from mechsearch_jax.envs.native import NativeSimulator, NativeWorld
 from mechsearch_jax.envs.world import BODIES, TARGET
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import gripper_rotation
-from mechsearch_jax.gripper import arm_hits_shelf
-from mechsearch_jax.kinematics import HOME, JOINT_LOWER, JOINT_UPPER, forward_kinematics, gripper_pose, line_kinematics
-from mechsearch_jax.scenario import Body, Scenario, load_scenario
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.transforms import make
+from mechsearch_jax.robot import motion
+from mechsearch_jax.robot.gripper import arm_hits_shelf
+from mechsearch_jax.robot.kinematics import (
+    HOME,
+    JOINT_LOWER,
+    JOINT_UPPER,
+    forward_kinematics,
+    gripper_pose,
+    line_kinematics,
+)
+from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 BOARD = Shelf().board
 WRISTS = tuple(math.pi / 4 + math.radians(a) for a in (15, -60, 60, -15, -45, 30, -30, 0, 45))
@@ -80,9 +90,13 @@ def pick_and_place(T, place, index=0):
     )
 
 
+def take_out(T, q7=None):
+    return retrieve_action(T, wrist_for(T) if q7 is None else jnp.float32(q7), jnp.float32(0.08))
+
+
 @pytest.fixture(scope="module")
 def sim():
-    return NativeSimulator()
+    return NativeWorld()
 
 
 def moved(sim, before, index=0):
@@ -139,6 +153,15 @@ def test_reset_keeps_the_scenario_exactly_and_rest_does_not_move_it(sim):
     np.testing.assert_allclose(again.target.position, start.target.position, atol=5e-4)
 
 
+def test_nothing_native_imports_the_batch_simulator():
+    code = """
+import sys
+import mechsearch_jax.envs.native, mechsearch_jax.envs.episodes, mechsearch_jax.envs.generator
+sys.exit(any(name.startswith(("mujoco.mjx", "warp", "mechsearch_jax.envs.mjx")) for name in sys.modules))
+"""
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
 def test_more_objects_than_slots_are_refused(sim):
     with pytest.raises(InputError, match="9 objects are too many"):
         sim.reset(scene(*[standing("box", (0.01, 0.01, 0.02), 0.45 + 0.03 * i, 0.1) for i in range(9)]))
@@ -160,7 +183,7 @@ def test_a_push_moves_the_object_by_the_distance_less_the_gap(sim, body, distanc
     start = pose(0.595, 0.1 - side * (body.half_size[1] + 0.1025 + gap), 0.04, tilt=math.radians(30))
     outcome = sim.execute(push(start, (0.0, distance, 0.0)))
     change = moved(sim, before)
-    assert outcome.failure is None
+    assert outcome.reason() is None
     assert not outcome.fallen.any()
     assert side * change[1] == pytest.approx(abs(distance) - gap, abs=0.012)
     assert abs(change[0]) < 0.02
@@ -186,7 +209,7 @@ def test_a_pick_and_place_puts_the_object_where_commanded(sim, body, depth, heig
     grasp = pose(0.6 - depth, 0.1, height, 0.0, math.radians(tilt))
     place = pose(goal[0] - depth * math.cos(turn), goal[1] - depth * math.sin(turn), height, turn, math.radians(tilt))
     outcome = sim.execute(pick_and_place(grasp, place))
-    assert outcome.failure is None
+    assert outcome.reason() is None
     assert outcome.settled
     assert np.linalg.norm(np.asarray(sim.world.position[0, :2]) - goal) < 0.01
     assert abs(float(sim.world.position[0, 2]) - body.position[2]) < 1e-3
@@ -200,9 +223,9 @@ def test_a_pick_and_place_puts_the_object_where_commanded(sim, body, depth, heig
 def test_a_held_object_stays_where_it_is_in_the_hand(sim):
     body = standing("cylinder", (0.032, 0.032, 0.067), 0.6, 0.1)
     sim.reset(scene(body))
-    outcome = sim.execute(pick_and_place(pose(0.59, 0.1, 0.1), pose(0.5, 0.2, 0.1)))
+    sim.execute(pick_and_place(pose(0.59, 0.1, 0.1), pose(0.5, 0.2, 0.1)))
     plan = sim.config.motion
-    trace = outcome.trace
+    trace = sim.trace
     held = (trace.time > plan.grasp_step * plan.timestep + 0.1) & (trace.time < plan.release_step * plan.timestep)
     T = np.asarray(gripper_pose(trace.q[held]))
     offset = trace.position[held, 0] - T[:, :3, 3]
@@ -214,7 +237,7 @@ def test_a_held_object_stays_where_it_is_in_the_hand(sim):
 def test_a_hand_that_closes_on_nothing_reports_a_drop(sim):
     before = sim.reset(scene(standing("cylinder", (0.024, 0.024, 0.067), 0.6, 0.1)))
     outcome = sim.execute(pick_and_place(pose(0.5, 0.3, 0.1), pose(0.55, 0.2, 0.1)))
-    assert outcome.failure == "dropped"
+    assert outcome.reason() == "dropped"
     assert np.abs(moved(sim, before)).max() < 1e-3
 
 
@@ -223,19 +246,47 @@ def test_what_is_out_of_reach_moves_nothing(sim):
     far = pose(1.3, 0.1, 0.1)
     action = dataclasses.replace(no_action(), kind=jnp.int32(ActionKind.PUSH), T_world_gripper=far)
     outcome = sim.execute(action)
-    assert outcome.failure == "unreachable"
+    assert outcome.reason() == "unreachable"
     assert outcome.steps == 0
-    assert len(outcome.trace.time) == 0
+    assert len(sim.trace.time) == 0
     np.testing.assert_array_equal(sim.world.position, before.position)
-    retrieval = sim.retrieve(far, math.pi / 4, 0.08)
-    assert retrieval.failure == "unreachable"
+    retrieval = sim.execute(take_out(far, math.pi / 4))
+    assert retrieval.reason() == "unreachable"
     assert not retrieval.retrieved
+
+
+def test_an_unknown_kind_of_action_is_refused(sim):
+    before = sim.reset(scene(standing("cylinder", (0.024, 0.024, 0.067), 0.6, 0.1)))
+    with pytest.raises(InputError, match="kind 7 is unknown"):
+        sim.execute(no_action().replace(kind=jnp.int32(7)))
+    np.testing.assert_array_equal(sim.world.position, before.position)
+
+
+def test_a_new_kind_of_action_needs_no_simulator(sim, monkeypatch):
+    """Registered under another number, a push is still one."""
+    nudge = dataclasses.replace(KINDS[ActionKind.PUSH], code=7, name="nudge")
+    monkeypatch.setitem(KINDS, 7, nudge)
+    action = push(pose(0.595, 0.1 - 0.1375, 0.04, tilt=math.radians(30)), (0.0, 0.1, 0.0))
+    ends = []
+    for kind in (ActionKind.PUSH, 7):
+        before = sim.reset(scene(standing("box", (0.054, 0.025, 0.054), 0.55, 0.1)))
+        assert sim.execute(action.replace(kind=jnp.int32(kind))).reason() is None
+        ends.append(np.asarray(sim.world.position))
+    assert np.abs(ends[0] - np.asarray(before.position)).max() > 0.05
+    np.testing.assert_array_equal(*ends)
+
+
+def test_worlds_that_were_never_reset_are_refused():
+    worlds = NativeSimulator(threads=1)
+    for call in (lambda: worlds.replace({}), worlds.settle):
+        with pytest.raises(InputError, match="reset it before use"):
+            call()
 
 
 def test_no_action_does_nothing(sim):
     before = sim.reset(scene(standing("cylinder", (0.024, 0.024, 0.067), 0.6, 0.1)))
     outcome = sim.execute(no_action())
-    assert outcome.failure is None
+    assert outcome.reason() is None
     assert outcome.steps == 0
     np.testing.assert_array_equal(sim.world.position, before.position)
 
@@ -255,9 +306,9 @@ def test_a_retrieval_takes_the_target_out(sim, shape, place):
     bystander = standing("box", (0.03, 0.012, 0.06), 0.65, -0.2)
     before = sim.reset(scene(bystander, target=standing(shape, half, *place)))
     grasp = pose(*place, 0.06, tilt=math.radians(30))
-    retrieval = sim.retrieve(grasp, wrist_for(grasp), 0.08)
+    retrieval = sim.execute(take_out(grasp))
     assert retrieval.retrieved
-    assert retrieval.failure is None
+    assert retrieval.reason() is None
     assert retrieval.held
     assert retrieval.outside
     assert not retrieval.fallen.any()
@@ -268,8 +319,8 @@ def test_a_retrieval_takes_the_target_out(sim, shape, place):
 def test_a_retrieval_that_grasps_beside_the_target_misses(sim):
     sim.reset(scene(target=standing("cylinder", (0.02, 0.02, 0.05), 0.6, 0.1)))
     grasp = pose(0.55, 0.3, 0.06)
-    retrieval = sim.retrieve(grasp, wrist_for(grasp), 0.08)
-    assert retrieval.failure == "missed"
+    retrieval = sim.execute(take_out(grasp))
+    assert retrieval.reason() == "missed"
     assert not retrieval.retrieved
 
 
@@ -279,10 +330,10 @@ def test_a_retrieval_that_throws_an_object_down_does_not_count(sim):
     sim.reset(scene(in_front, target=target))
     sim.execute(pick_and_place(pose(0.496, 0.1, 0.1), pose(0.39, 0.1, 0.1)))
     grasp = pose(0.6, 0.1, 0.06)
-    retrieval = sim.retrieve(grasp, wrist_for(grasp), 0.08)
+    retrieval = sim.execute(take_out(grasp))
     assert retrieval.held
     assert retrieval.fallen[0]
-    assert retrieval.failure == "fallen"
+    assert retrieval.reason() == "fallen"
     assert not retrieval.retrieved
 
 
@@ -291,17 +342,19 @@ def test_the_same_actions_give_the_same_world():
     action = push(pose(0.595, 0.1 - 0.1375, 0.04, tilt=math.radians(30)), (0.0, 0.15, 0.0))
     ends = []
     for _ in range(2):
-        fresh = NativeSimulator()
+        fresh = NativeWorld()
         fresh.reset(start)
         fresh.execute(action)
-        ends.append(fresh.execute(action).trace)
+        fresh.execute(action)
+        ends.append(fresh.trace)
     np.testing.assert_array_equal(ends[0].position, ends[1].position)
-    used = NativeSimulator()
+    used = NativeWorld()
     used.reset(scene())
     used.execute(action)
     used.reset(start)
     used.execute(action)
-    np.testing.assert_array_equal(used.execute(action).trace.position, ends[0].position)
+    used.execute(action)
+    np.testing.assert_array_equal(used.trace.position, ends[0].position)
 
 
 def test_the_arm_follows_its_reference(sim):
@@ -312,9 +365,10 @@ def test_the_arm_follows_its_reference(sim):
     plan = sim.config.motion
     reference, reachable = motion.pick_and_place_reference(grasp, place, action.q7, jnp.float32(0.08), plan)
     outcome = sim.execute(action)
-    steps = np.rint(outcome.trace.time / plan.timestep).astype(int)
+    assert outcome.reason() == "dropped"
+    steps = np.rint(sim.trace.time / plan.timestep).astype(int)
     inside = steps <= len(reference.q)
-    reached = np.asarray(gripper_pose(outcome.trace.q[inside]))[:, :3, 3]
+    reached = np.asarray(gripper_pose(sim.trace.q[inside]))[:, :3, 3]
     wanted = np.asarray(gripper_pose(reference.q[steps[inside] - 1]))[:, :3, 3]
     ahead = np.asarray(gripper_pose(reference.q[np.minimum(steps[inside], len(reference.q) - 1)]))[:, :3, 3]
     error = np.minimum(np.linalg.norm(reached - wanted, axis=1), np.linalg.norm(reached - ahead, axis=1))

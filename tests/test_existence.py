@@ -1,6 +1,5 @@
 """f against a brute-force reference in float64, and its promises on shipped and published scenes."""
 
-import dataclasses
 import itertools
 
 import jax
@@ -8,20 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from published import published_scenarios
-from test_camera_render import reference_superquadric_depth
+from test_workspace_camera_render import reference_superquadric_depth
 
-from mechsearch_jax import existence, planner, scenario, superquadric
+from mechsearch_jax import existence, planner
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
-from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.workspace import scenario
 
-CONFIG = PlannerConfig.paper()
 UNSEEN, NOWHERE = jnp.array(False), jnp.zeros(3)
 
 
-def look(problem, objects, belief=None, config=CONFIG):
-    return planner.observe_belief(problem, belief or planner.initial_belief(problem), objects, UNSEEN, NOWHERE, config)
+def look(problem, objects, belief=None):
+    seen = Observation(objects, UNSEEN, NOWHERE)
+    return planner.update_belief(problem, belief or planner.initial_belief(problem), seen)
 
 
 def every_scenario():
@@ -78,7 +79,7 @@ def test_f_is_that_of_a_brute_force_reference(problem):
     chosen = np.concatenate(
         [rng.choice(np.flatnonzero(exists), 12, False), rng.choice(np.flatnonzero(~exists), 12, False)]
     )
-    expected = reference_existence(problem, objects, np.asarray(problem.poses)[chosen], problem.existence_config)
+    expected = reference_existence(problem, objects, np.asarray(problem.poses)[chosen], problem.config.existence)
     # A ray that grazes a silhouette may count in one and not in the other.
     assert np.mean(exists[chosen] == expected) >= 0.95
 
@@ -91,6 +92,7 @@ def test_f_never_loses_the_true_pose_at_the_start(problem):
         assert exists[nearest], one.name
 
 
+@pytest.mark.slow
 def test_f_grows_the_possible_set_by_no_more_than_a_third(problem):
     """Against one place a cell, without margins, at a third of the camera's resolution instead of a seventh."""
     exact = ExistenceConfig(spread=((0.0, 0.0),), erosion=0.0, depth_margin=0.0, downscale=3, window=(110, 110))
@@ -146,7 +148,7 @@ def test_an_empty_shelf_hides_nothing(problem):
 def test_looking_again_at_moved_objects_alone_gives_the_same_views(problem):
     one = scenario.load_scenario(scenario.example_scenarios()["first-light"])
     objects = scenario.superquadrics(one.objects)
-    config, tables, everywhere = problem.existence_config, problem.existence, jnp.ones(problem.poses.shape[0], bool)
+    config, tables, everywhere = problem.config.existence, problem.existence, jnp.ones(problem.poses.shape[0], bool)
     before = existence.object_views(tables, problem.camera, objects, everywhere, config)
     moved = objects.replace(position=objects.position.at[1].add(jnp.float32([0.0, 0.04, 0.0])))
     which = jnp.arange(objects.capacity) == 1
@@ -158,7 +160,7 @@ def test_looking_again_at_moved_objects_alone_gives_the_same_views(problem):
 
 def test_occluders_are_those_of_a_reference(problem):
     objects = scenario.superquadrics(scenario.load_scenario(scenario.example_scenarios()["crowded-shelf"]).objects)
-    settings = problem.existence_config
+    settings = problem.config.existence
     tables, coarse = problem.existence, problem.camera.scaled(settings.downscale)
     views = existence.object_views(tables, problem.camera, objects, None, settings)
     told = np.asarray(existence.occluders(tables, views))
@@ -177,7 +179,7 @@ def test_occluders_are_those_of_a_reference(problem):
 def test_collisions_need_not_count(problem):
     one = scenario.load_scenario(scenario.example_scenarios()["crowded-shelf"])
     objects = scenario.superquadrics(one.objects)
-    config, tables, everywhere = problem.existence_config, problem.existence, jnp.ones(problem.poses.shape[0], bool)
+    config, tables, everywhere = problem.config.existence, problem.existence, jnp.ones(problem.poses.shape[0], bool)
     nowhere = jnp.zeros_like(everywhere)
     without = existence.object_views(tables, problem.camera, objects, None, config)
     assert without.collides is None
@@ -193,12 +195,12 @@ def test_collisions_need_not_count(problem):
     np.testing.assert_array_equal(existence.existence(tables, problem.camera, without, some, config), hidden & some)
 
 
-@pytest.mark.parametrize("criterion", ["depth-mse", "depth-norm"])
+@pytest.mark.parametrize("criterion", ["depth-mse", pytest.param("depth-norm", marks=pytest.mark.slow)])
 def test_other_criteria_are_selectable(problem, criterion):
     one = scenario.load_scenario(scenario.example_scenarios()["first-light"])
     objects = scenario.superquadrics(one.objects)
     ours = look(problem, objects).exists
-    other = look(problem, objects, config=dataclasses.replace(CONFIG, criterion=criterion)).exists
+    other = look(problem.replace(config=planner.standard(criterion=criterion).problem), objects).exists
     # A mean over the whole image lets visible targets pass, a norm almost none.
     assert (jnp.sum(other) > jnp.sum(ours)) == (criterion == "depth-mse")
 

@@ -4,12 +4,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import graspability, kinematics, planner, scenario, superquadric, transforms
+from mechsearch_jax import graspability, planner
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.graspability import GraspConfig
-from mechsearch_jax.gripper import Gripper
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.robot import kinematics
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace import scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +73,7 @@ def test_moving_one_object_recomputes_its_column_alone(problem, objects, nothing
 
 def test_nothing_is_in_the_way_on_an_empty_shelf(problem, nothing_found):
     belief = planner.initial_belief(problem)
-    g = np.asarray(planner.graspability_map(problem, belief, superquadric.empty(8), planner.PlannerConfig.paper()))
+    g = np.asarray(planner.graspability_map(problem, belief, superquadric.empty(8)))
     feasible = np.isin(np.arange(len(g)), np.asarray(problem.grasps.pair_pose))
     assert np.all(g[feasible] == 1)
     assert np.all(g[~feasible] == 1 - 9)
@@ -90,7 +93,7 @@ def test_the_arm_reaches_every_feasible_grasp_and_its_pregrasp(problem):
 
 def test_grasps_point_into_the_shelf_and_down(problem):
     approach = np.asarray(problem.grasps.T_target_gripper)[:, :3, 2]
-    assert np.all(approach[:, 0] >= np.cos(problem.grasp_config.max_yaw) * np.hypot(*approach[:, :2].T) - 1e-5)
+    assert np.all(approach[:, 0] >= np.cos(problem.config.grasps.max_yaw) * np.hypot(*approach[:, :2].T) - 1e-5)
     tilt = np.degrees(np.arcsin(-approach[:, 2]))
     assert tilt.min() >= 19.9
     assert tilt.max() <= 30.1
@@ -120,7 +123,7 @@ def test_a_found_target_in_the_open_is_grasped_and_one_behind_a_wall_of_boxes_is
     pose = jnp.float32([0.6, 0.1, 0.0])
     free = planner.graspable_at(problem, superquadric.empty(8), pose)
     assert bool(free.success)
-    np.testing.assert_allclose(free.T_world_gripper[:2, 3], pose[:2], atol=1e-5)
+    np.testing.assert_allclose(free.action.T_world_gripper[:2, 3], pose[:2], atol=1e-5)
     wall = superquadric.empty(8)
     for i, y in enumerate(np.linspace(-0.1, 0.3, 5)):
         wall = wall.replace(

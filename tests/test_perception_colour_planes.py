@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.camera import Camera, back_project
-from mechsearch_jax.envs import observation, world
-from mechsearch_jax.envs.observation import PALETTE
+from mechsearch_jax.envs import simulated_camera, world
+from mechsearch_jax.envs.simulated_camera import PALETTE
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception import colour, planes
 from mechsearch_jax.perception.colour import TargetColour
-from mechsearch_jax.scenario import Body, Scenario
+from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.scenario import Body, Scenario
 
 CAMERA = Camera().scaled(4)
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -25,7 +25,7 @@ SCENE = Scenario("scene", (BEHIND, POST, CAN), TARGET)
 
 @pytest.fixture(scope="module")
 def seen():
-    return observation.observe(CAMERA, world.from_scenario(SCENE))
+    return simulated_camera.observe(CAMERA, world.from_scenario(SCENE))
 
 
 def colours_of(*segments):
@@ -77,7 +77,7 @@ def test_clusters_of_a_rendered_image_are_its_bodies(seen):
     """The box behind the post is seen in two parts; in the noise of a sensor they still are one thing."""
     rng = np.random.default_rng(1)
     truth = np.array(seen.segmentation)
-    objects = (truth >= 0) & (truth < observation.SHELF)
+    objects = (truth >= 0) & (truth < simulated_camera.SHELF)
     depth = np.array(seen.depth) + rng.normal(0, 0.001, truth.shape).astype(np.float32)
     image = np.clip(np.array(seen.colour) + rng.normal(0, 0.01, (*truth.shape, 3)), 0, 1).astype(np.float32)
     points = np.array(back_project(CAMERA, jnp.asarray(depth)))

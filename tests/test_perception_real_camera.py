@@ -1,6 +1,7 @@
 """Rendered images with the robot in them, a wrong camera pose and sensor noise, to segments and points."""
 
 import dataclasses
+import types
 
 import jax
 import jax.numpy as jnp
@@ -9,17 +10,20 @@ import pytest
 from robot_images import ROBOT, robot_image
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.camera import Camera, back_project
-from mechsearch_jax.envs.observation import SHELF
+from mechsearch_jax.envs.simulated_camera import SHELF
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.kinematics import HOME
 from mechsearch_jax.perception import camera_pose, real_camera
 from mechsearch_jax.perception.camera_pose import PoseConfig, with_pose
 from mechsearch_jax.perception.colour import TargetColour
+from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.real_camera import RealCameraConfig
-from mechsearch_jax.scenario import Body, Scenario
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.scenario import Body, Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 CAMERA = Camera().scaled(4)
@@ -127,27 +131,55 @@ def test_segments_are_the_objects(images, seed, masked):
     assert np.degrees(np.arccos(min(1.0, float(prepared.floor.normal[2])))) < 0.6
     assert abs(float(prepared.floor.height(jnp.array([0.6, 0.1, Shelf().board])))) < 0.003
 
-    cloud = prepared.cloud
-    assert cloud.points.shape == (2048, 3)
-    assert jnp.all(cloud.valid)
-    assert set(np.unique(cloud.labels)) == set(segments)
+    points = np.array(back_project(prepared.camera, prepared.depth))[segmentation >= 0]
     truth = np.array(back_project(CAMERA, jnp.asarray(images[0])))[(owners <= TARGET) & (owners >= 0)]
     low, high = truth.min(axis=0) - 0.01, truth.max(axis=0) + 0.01
-    assert np.all((np.array(cloud.points) > low) & (np.array(cloud.points) < high))
+    assert np.all((points > low) & (points < high))
 
 
-def test_the_same_key_draws_the_same_points_and_few_are_repeated(images):
+def test_labels_are_those_that_a_recogniser_takes(images):
+    """The shelf is FREE, the robot OTHER, and what was not measured MISSING."""
+    owners = images[2]
+    depth, colour = sensed(CAMERA, *images[:2], 3)
+    prepared = real_camera.prepare(jax.random.key(0), CAMERA, Shelf(), depth, colour, None, JOINTS, OPENING)
+    labels = np.array(prepared.segmentation)
+    np.testing.assert_array_equal(labels == MISSING, depth == 0)
+    seen = depth > 0
+    assert np.mean(labels[seen & (owners == SHELF)] == FREE) > 0.97
+    points = np.array(back_project(CAMERA, jnp.asarray(images[0])))
+    robot = seen & (owners == ROBOT) & (points[..., 2] > Shelf().board + 0.01)
+    assert robot.sum() > 500
+    assert np.mean(labels[robot] == OTHER) > 0.98
+    assert prepared.target_id == prepared.detection.segment
+    assert np.mean(owners[labels == int(prepared.target_id)] == TARGET) > 0.95
+
+
+@pytest.mark.slow
+def test_a_recogniser_takes_the_segmentation_as_its_mask():
+    camera = Camera().scaled(2)
+    depth, colour = sensed(camera, *robot_image(camera, Shelf(), SCENE, JOINTS, OPENING)[:2], 0)
+    key = jax.random.key(0)
+    prepared = real_camera.prepare(key, wrong(camera, 0), Shelf(), depth, colour, None, JOINTS, OPENING)
+    problem = types.SimpleNamespace(camera=camera, shelf=Shelf(), target=Target.cylinder())
+    perceive = Recogniser(problem, camera=prepared.camera)
+    seen = perceive(key, prepared.depth, mask=prepared.segmentation, target_id=prepared.target_id)
+    assert seen.target_visible
+    assert np.linalg.norm(np.asarray(seen.target_pose)[:2] - SCENE.target.position[:2]) < 0.005
+    found = np.asarray(seen.objects.position)[np.asarray(seen.objects.valid)]
+    assert len(found) == len(SCENE.objects)
+    for body in SCENE.objects:
+        assert np.linalg.norm(found - body.position, axis=1).min() < 0.01
+
+
+def test_the_same_key_gives_the_same_and_the_given_pose_stays_without_joints(images):
     depth, colour = sensed(CAMERA, *images[:2], 5)
     mask = np.full(depth.shape, -1)
     mask[images[2] == 2] = 0
-    first, second, other = (
-        real_camera.prepare(jax.random.key(s), CAMERA, Shelf(), depth, colour, mask) for s in (0, 0, 1)
-    )
+    first, second = (real_camera.prepare(jax.random.key(0), CAMERA, Shelf(), depth, colour, mask) for _ in range(2))
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
         np.testing.assert_array_equal(a, b)
-    assert not jnp.array_equal(first.cloud.points, other.cloud.points)
-    distinct = np.unique(first.cloud.points, axis=0)
-    assert len(distinct) == np.sum(first.segmentation == 0) < 2048
+    assert 0 < np.sum(first.segmentation == 0) < 2048
+    assert first.target_id == OTHER
     assert first.pose is None
     assert first.camera == CAMERA
 
@@ -160,12 +192,11 @@ def test_too_little_of_the_robot_leaves_the_pose_as_it_was(images):
     np.testing.assert_allclose(prepared.pose.T_world_camera, pose_of(CAMERA), atol=1e-6)
 
 
-def test_an_empty_shelf_has_no_points(images):
+def test_an_empty_shelf_has_no_segments(images):
     depth, colour, owners = images
     depth = np.where(owners == SHELF, depth, 0.0).astype(np.float32)
     prepared = real_camera.prepare(jax.random.key(0), CAMERA, Shelf(), depth, colour)
-    assert not jnp.any(prepared.cloud.valid)
-    assert jnp.all(prepared.segmentation == -1)
+    np.testing.assert_array_equal(prepared.segmentation, np.where(depth > 0, FREE, MISSING))
     assert not prepared.detection.found
 
 
@@ -189,7 +220,7 @@ def test_bad_images_are_refused_in_one_line(images):
         with pytest.raises(InputError, match=word):
             call(**arguments)
     for wrong_config in (
-        lambda: RealCameraConfig(points=0),
+        lambda: RealCameraConfig(segments=10),
         lambda: RealCameraConfig(floor_clearance=-1.0),
         lambda: PoseConfig(stages=()),
         lambda: dataclasses.replace(PoseConfig(), minimum_points=3),

@@ -9,17 +9,16 @@ import pytest
 from published import published_scenarios
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.camera import Camera, back_project, pixel_rays, project
-from mechsearch_jax.envs import observation, world
-from mechsearch_jax.envs.recognisers import measured_depth
+from mechsearch_jax.envs import simulated_camera, world
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.superquadric import BOX_EXPONENTS, CYLINDER_EXPONENTS, sample_surface
+from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
 from mechsearch_jax.perception import refinement, scores
-from mechsearch_jax.perception.noise import TimeOfFlight
+from mechsearch_jax.perception.noise import TimeOfFlight, measured_depth
 from mechsearch_jax.perception.refinement import RefinementConfig
-from mechsearch_jax.scenario import Body, Scenario, load_scenario
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import BOX_EXPONENTS, CYLINDER_EXPONENTS, sample_surface
-from mechsearch_jax.transforms import matmul, yaw_rotation
+from mechsearch_jax.workspace.camera import Camera, back_project, pixel_rays, project
+from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 CAMERA, SHELF = Camera().scaled(3), Shelf()
 # For guesses as bad as `disturbed` makes them.
@@ -56,7 +55,7 @@ def disturbed(truth, rng, size=0.07, position=0.004, yaw=5.0):
 def measured(scenarios, rng, noise):
     """Points, labels and depths of scenes, and the true superquadrics; noise along random directions, as in B.1."""
     worlds = [world.from_scenario(s) for s in scenarios]
-    images = [observation.observe(CAMERA, w) for w in worlds]
+    images = [simulated_camera.observe(CAMERA, w) for w in worlds]
     depth = np.stack([i.depth for i in images])
     labels = np.stack([i.segmentation for i in images]).reshape(len(worlds), -1).astype(np.int32)
     points = np.stack([back_project(CAMERA, i.depth) for i in images]).reshape(len(worlds), -1, 3)
@@ -122,6 +121,7 @@ def test_published_scenes_with_noise():
     assert iou(refined.scene, truth)[seen].mean() > 0.88
 
 
+@pytest.mark.slow
 def test_stray_points_do_not_undo_a_good_guess():
     """A time-of-flight camera's pixels at edges measure a mixture of what is before and behind; the network knows."""
     rng = np.random.default_rng(10)
@@ -174,6 +174,7 @@ def test_absent_objects_and_those_without_points_stay_as_they_are():
     assert jnp.all(jnp.isfinite(blind.cost))
 
 
+@pytest.mark.slow
 def test_rays_bound_what_no_point_bounds():
     """A tall box is guessed 3 cm too high above what is hidden of nothing: its points end, and rays pass above."""
     rng = np.random.default_rng(4)

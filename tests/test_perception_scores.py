@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import gamma
 
-from mechsearch_jax import superquadric
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.perception import scores
-from mechsearch_jax.superquadric import Superquadrics
 
 BOX, CYLINDER = superquadric.BOX_EXPONENTS, superquadric.CYLINDER_EXPONENTS
 

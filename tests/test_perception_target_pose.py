@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.perception.target_pose import distance, target_pose
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 CAMERA, SHELF = Camera(), Shelf()
 TARGETS = {"cylinder": Target.cylinder(), "box": Target.box()}

@@ -1,19 +1,31 @@
 """The planner: equation 2, decisions that repeat, no retracing, and the rules of the two methods."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import masked, planner, scenario, superquadric
-from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.dynamics import QuasiStatic, changed
+from mechsearch_jax import planner
+from mechsearch_jax.actions import ActionConfig, ActionKind
+from mechsearch_jax.actions.types import Prediction, Sample
+from mechsearch_jax.dynamics.quasi_static import QuasiStatic
+from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner import PlannerConfig
+from mechsearch_jax.existence import ExistenceConfig
+from mechsearch_jax.geometry import masked, superquadric
+from mechsearch_jax.graspability import GraspConfig
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import PlannerConfig, policies
+from mechsearch_jax.planner.prediction import PredictByKind
+from mechsearch_jax.planner.proposal import ALONE, blame, sampling_weights
+from mechsearch_jax.planner.rollout import Rollout, prefix_values
+from mechsearch_jax.workspace import scenario
 
-CONFIG = PlannerConfig.paper()
+CONFIG = PlannerConfig()
+POLICY = planner.search_for_grasp()
 
 
 def load(name):
@@ -22,22 +34,95 @@ def load(name):
 
 
 def look(problem, objects, found=False, pose=(0.0, 0.0, 0.0)):
-    start = planner.initial_belief(problem)
-    return planner.observe_belief(problem, start, objects, jnp.array(found), jnp.float32(pose), CONFIG)
+    return planner.update_belief(problem, planner.initial_belief(problem), seen(objects, found, pose))
+
+
+def seen(objects, found=False, pose=(0.0, 0.0, 0.0)):
+    return Observation(objects, jnp.array(found), jnp.float32(pose))
+
+
+def rollout_of(problem, belief, policy=POLICY):
+    """What a decision of the engine begins with."""
+    return Rollout(problem, belief, policy.config, policy.propose, policy.predict, policy.objective)
 
 
 @pytest.fixture(scope="module")
 def decision(problem):
     _, objects = load("first-light")
     belief = look(problem, objects)
-    return objects, belief, planner.plan(jax.random.key(0), problem, belief, objects, CONFIG)
+    return objects, belief, POLICY(jax.random.key(0), problem, belief, seen(objects))
 
 
-def test_the_papers_settings():
-    config = PlannerConfig.paper()
-    assert (config.gamma, config.horizon, config.sequences, config.max_steps) == (0.9, 3, 30, 10)
-    assert config.push_distances == (0.05, 0.10, 0.15)
-    assert config.method == "search-for-grasp"
+@pytest.fixture(scope="module")
+def root(decision, problem):
+    """The first state of the decision, brought up to date, with what can be done in it."""
+    objects, belief, _ = decision
+
+    @jax.jit
+    def begin(problem, belief, objects):
+        rollout = rollout_of(problem, belief)
+        state = rollout.root(objects)
+        state = rollout.update(state, state.moved)
+        return state.replace(options=rollout.options(state, state.moved))
+
+    return begin(problem, belief, objects)
+
+
+def test_the_default_is_the_preset_standard_field_by_field():
+    assert planner.standard() == planner.Config()
+    assert planner.standard().options() == {
+        "gamma": 0.9,
+        "horizon": 3,
+        "sequences": 30,
+        "unseen_contact_penalty": 1.0,
+        "topple_charge": 0.0,
+        "guided_fraction": 0.7,
+        "crowding_weight": 0.02,
+        "draws": 1,
+        "move_again": False,
+        "predicted_collisions": False,
+        "actions": ["push", "pick-and-place"],
+        "push_distances": [0.05, 0.1, 0.15],
+        "avoid_unseen": True,
+        "object_grasp_tilts": pytest.approx([np.radians(20), np.radians(30)]),
+        "criterion": "detector",
+        "grasp_tilts": pytest.approx([np.radians(20), np.radians(25), np.radians(30)]),
+        "retrieval_tilts": pytest.approx(np.radians([20, 22.5, 25, 27.5, 30]).tolist()),
+        "push_model": "learned",
+        "max_steps": 10,
+    }
+    # What is no option.
+    assert (ActionConfig().contact_tolerance, ActionConfig().max_penetration, ActionConfig().topple) == (
+        0.003,
+        0.006,
+        0.5,
+    )
+    assert (GraspConfig().yaws, len(GraspConfig().wrists), GraspConfig.dense().yaws) == (7, 3, 25)
+    assert (ExistenceConfig().found_pixels, len(ExistenceConfig().spread)) == (100, 5)
+
+
+def test_the_papers_preset_is_as_the_paper_describes_it():
+    config = planner.paper()
+    search, actions = config.planner, config.problem.actions
+    assert (search.horizon, search.sequences, config.max_steps) == (3, 30, 10)
+    assert (search.guided_fraction, search.unseen_contact_penalty, search.crowding_weight) == (0.0, 0.0, 0.0)
+    assert (search.topple_charge, search.move_again, search.predicted_collisions) == (0.0, True, True)
+    assert search.draws > 1
+    assert (config.problem.existence.criterion, actions.avoid_unseen) == ("depth-mse", False)
+    assert (actions.push_distances, set(actions.actions)) == ((0.05, 0.10, 0.15), {"push", "pick-and-place"})
+    assert config.problem.grasps.tilts == config.problem.retrieval.tilts == (np.radians(20),)
+    assert actions.grasps.tilts == (np.radians(20),)
+    # Where the paper is silent.
+    assert search.gamma == planner.standard().planner.gamma
+    assert planner.paper(gamma=0.5).planner.gamma == 0.5
+
+
+def test_options_are_changed_by_name_and_survive_json():
+    config = planner.standard(gamma=0.5, criterion="depth-norm", push_distances=(0.05, 0.2), max_steps=3)
+    again = planner.Config().with_options(**json.loads(json.dumps(config.options())))
+    assert again == config
+    with pytest.raises(InputError, match="option focus is unknown; there are gamma, "):
+        planner.standard(focus=0.3)
 
 
 def test_prefix_values_are_equation_2():
@@ -48,10 +133,10 @@ def test_prefix_values_are_equation_2():
         for T in (1, 2, 3)
     ]
     for acted, best in (([True] * 3, np.argmin(expected)), ([True, False, False], 0)):
-        value, length = planner._prefix_values(jnp.float32(cost), jnp.zeros(3), jnp.array(acted), gamma)
+        value, length = prefix_values(jnp.float32(cost), jnp.zeros(3), jnp.array(acted), gamma)
         np.testing.assert_allclose(value, expected[best], rtol=1e-5)
         assert int(length) == best + 1
-    nothing, _ = planner._prefix_values(jnp.float32(cost), jnp.zeros(3), jnp.zeros(3, bool), gamma)
+    nothing, _ = prefix_values(jnp.float32(cost), jnp.zeros(3), jnp.zeros(3, bool), gamma)
     assert np.isinf(nothing)
 
 
@@ -61,26 +146,19 @@ def test_what_is_in_the_way_alone_matters_most():
     rows[:, 4] = False
     expected = np.zeros(6)
     for row in rows[counts]:
-        expected[row] += planner.ALONE ** (1.0 - row.sum())
-    share = np.asarray(planner._blame(jnp.asarray(rows), jnp.asarray(counts)))
+        expected[row] += ALONE ** (1.0 - row.sum())
+    share = np.asarray(blame(jnp.asarray(rows), jnp.asarray(counts)))
     np.testing.assert_allclose(share, expected / expected.sum(), rtol=1e-5)
     assert share[4] == 0
-    assert not np.asarray(planner._blame(jnp.asarray(rows), jnp.zeros(200, bool))).any()
+    assert not np.asarray(blame(jnp.asarray(rows), jnp.zeros(200, bool))).any()
 
 
-def test_draws_go_to_what_hides_the_target(decision, problem):
-    objects, belief, _ = decision
-    space = planner.action_space(problem, CONFIG)
-    root = planner._root(problem, belief, planner._with_target(problem, belief, objects), space)
-    weights_of = jax.jit(
-        lambda node: planner._object_weights(
-            problem, belief, CONFIG, planner._update(problem, belief, CONFIG, node, node.moved)
-        )
-    )
-    weights = np.asarray(weights_of(root))
-    valid = np.asarray(root.available)
+def test_draws_go_to_what_hides_the_target(decision, root, problem):
+    _, belief, _ = decision
+    weights_of = jax.jit(lambda *state: sampling_weights(*state[:2], POLICY.objective, 0.7, state[2]))
+    weights, valid = jax.device_get((weights_of(problem, belief, root), root.available))
     assert weights.sum() == pytest.approx(1.0, abs=1e-5)
-    np.testing.assert_allclose(weights[~valid], (1.0 - CONFIG.focus) / len(weights), rtol=1e-5)
+    np.testing.assert_allclose(weights[~valid], (1.0 - CONFIG.guided_fraction) / len(weights), rtol=1e-5)
     assert (weights[valid] > weights[~valid].max()).any()
 
 
@@ -103,57 +181,61 @@ def test_an_object_moves_at_most_once_in_a_sequence(decision):
 
 def test_the_same_key_and_state_give_the_same_decision(decision, problem):
     objects, belief, plan = decision
-    again = planner.plan(jax.random.key(0), problem, belief, objects, CONFIG)
+    again = POLICY(jax.random.key(0), problem, belief, seen(objects))
     jax.tree.map(np.testing.assert_array_equal, plan, again)
 
 
 def test_nothing_is_compiled_anew_when_objects_come_go_or_move(decision, problem):
     objects = decision[0]
-    counts = [f._cache_size() for f in (planner.plan, planner.observe_belief, planner.graspable_at)]
+    functions = (policies._plan, planner.update_belief, planner.graspable_at)
+    counts = [f._cache_size() for f in functions]
     fewer = objects.replace(valid=objects.valid.at[0].set(False))
     moved = objects.replace(position=objects.position.at[1].add(jnp.float32([0.01, 0.02, 0.0])))
     _, other = load("crowded-shelf")
     for scene in (fewer, moved, other):
-        seen = look(problem, scene)
-        planner.plan(jax.random.key(1), problem, seen, scene, CONFIG)
+        POLICY(jax.random.key(1), problem, look(problem, scene), seen(scene))
     found = look(problem, objects, True, (0.7, 0.2, 0.0))
-    plan = planner.plan(jax.random.key(1), problem, found, objects, CONFIG)
-    assert float(plan.cost) < superquadric.empty(8).capacity + 3
-    planner.graspable_at(problem, objects, jnp.float32([0.7, 0.2, 0.0]))
+    told = POLICY(jax.random.key(1), problem, found, seen(objects, True, (0.7, 0.2, 0.0)))
+    assert float(told.cost) < superquadric.empty(8).capacity + 3
     planner.graspable_at(problem, fewer, jnp.float32([0.6, 0.0, 0.0]))
-    after = [f._cache_size() for f in (planner.plan, planner.observe_belief, planner.graspable_at)]
+    after = [f._cache_size() for f in functions]
     assert after[:2] == counts[:2]
     assert after[2] <= counts[2] + 1
+
+
+def test_continuous_settings_are_data_and_compile_nothing(decision, problem):
+    objects, belief, usual = decision
+    count = policies._plan._cache_size()
+    changes = {"gamma": 0.5, "unseen_contact_penalty": 0.0, "topple_charge": 0.3, "guided_fraction": 0.1}
+    other = planner.search_for_grasp(**changes, crowding_weight=0.0)
+    told = other(jax.random.key(0), problem, belief, seen(objects))
+    assert policies._plan._cache_size() == count
+    assert float(told.cost) != float(usual.cost)
+    assert not np.array_equal(np.asarray(told.sequences.value), np.asarray(usual.sequences.value))
 
 
 def test_a_found_target_is_one_pose_and_stays_found(problem):
     _, objects = load("first-light")
     belief = look(problem, objects, True, (0.7, 0.2, 0.0))
     assert bool(belief.found)
-    hidden_again = planner.observe_belief(problem, belief, objects, jnp.array(False), jnp.zeros(3), CONFIG)
+    hidden_again = planner.update_belief(problem, belief, seen(objects))
     assert bool(hidden_again.found)
     np.testing.assert_allclose(hidden_again.found_pose, [0.7, 0.2, 0.0])
 
 
-def test_the_state_that_a_plan_begins_with_has_the_shapes_of_every_other(decision, problem):
+def test_the_state_that_a_plan_begins_with_has_the_shapes_of_every_other(decision, root, problem):
     objects, belief, _ = decision
-    space = planner.action_space(problem, CONFIG)
-    root = planner._root(problem, belief, planner._with_target(problem, belief, objects), space)
-
-    def known(node):
-        node = planner._update(problem, belief, CONFIG, node, node.moved)
-        return node.replace(options=planner.candidates(space, problem.actions, node.scene, possible))
-
-    possible = planner._possible_space(problem, belief, belief.exists)
     shapes = lambda tree: jax.tree.map(lambda a: (a.shape, a.dtype), tree)  # noqa: E731
-    assert shapes(jax.eval_shape(known, root)) == shapes(root)
+    assert shapes(root) == shapes(rollout_of(problem, belief).root(objects))
 
 
 @pytest.mark.slow
 def test_a_decision_is_the_same_in_the_blocks_of_a_gpu(decision, problem, monkeypatch):
     objects, belief, plan = decision
     monkeypatch.setattr(masked, "on_cpu", lambda: False)
-    again = jax.jit(lambda key: planner.plan.__wrapped__(key, problem, belief, objects, CONFIG))(jax.random.key(0))
+    again = jax.jit(lambda key: policies._plan.__wrapped__(POLICY, key, problem, belief, seen(objects)))(
+        jax.random.key(0)
+    )
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), plan, again)
 
 
@@ -166,47 +248,41 @@ class Shaky:
 
     def __call__(self, shelf, scene, pusher, T_world_gripper, displacement, q7):
         told = QuasiStatic()(shelf, scene, pusher, T_world_gripper, displacement, q7)
-        feared = jnp.where(changed(scene, told.scene), self.chance, 0.0)
+        feared = jnp.where(moved_objects(scene, told.scene), self.chance, 0.0)
         return told.replace(topples=jnp.maximum(told.topples, feared), residual=told.residual + self.residual)
 
 
-# The first is executed nevertheless.
-CHANCES = jnp.float32([0.4, 0.6, np.nan, 0.0, 0.0])
-RESIDUALS = jnp.float32([0.0, 0.0, 0.0, np.nan, np.inf])
+# The first is executed as ever, and the second nevertheless.
+CHANCES = jnp.float32([0.0, 0.4, 0.6, np.nan, 0.0, 0.0])
+RESIDUALS = jnp.float32([0.0, 0.0, 0.0, 0.0, np.nan, np.inf])
+
+
+def foreseen(model):
+    return PredictByKind(model, model)
 
 
 @pytest.fixture(scope="module")
-def drawn(decision, problem):
-    """What is drawn first in many sequences, what models say of it, and what is charged for it."""
-    objects, belief, _ = decision
-    space = planner.action_space(problem, CONFIG)
-    dear = dataclasses.replace(CONFIG, topple_charge=2.0)
+def drawn(decision, root, problem):
+    """What is drawn first in many sequences, and what models say of it."""
+    _, belief, _ = decision
 
     @jax.jit
-    def draw(keys):
-        root = planner._root(problem, belief, planner._with_target(problem, belief, objects), space)
-        root = planner._update(problem, belief, CONFIG, root, root.moved)
-        root = root.replace(options=planner._options(problem, belief, space, root, root.moved))
-        possible = planner._possible_space(problem, belief, root.exists)
-        weights = planner._object_weights(problem, belief, CONFIG, root)
-
+    def draw(problem, belief, root, keys):
         def one(key):
-            sample = planner.sample_action(
-                key, space, problem.actions, root.scene, possible, root.options, root.available, weights
-            )
-            predict = lambda *shaky: planner._predict(problem, space, Shaky(*shaky), root.scene, sample)[1:]  # noqa: E731
-            told = planner._predict(problem, space, QuasiStatic(), root.scene, sample)[1:]
-            shaky = jax.vmap(predict)(CHANCES, RESIDUALS)
-            return sample, told, shaky, planner._act(problem, belief, dear, space, Shaky(0.4, 0.0), root, key)[2]
+            sample = POLICY.propose(key, problem, belief, POLICY.objective, CONFIG.guided_fraction, root)
+            predict = lambda *shaky: foreseen(Shaky(*shaky))(problem, root, sample, jnp.array(True))  # noqa: E731
+            told = jax.vmap(predict)(CHANCES, RESIDUALS)
+            return sample, (told.possible, told.topples)
 
         return jax.vmap(one)(keys)
 
-    return jax.device_get(draw(jax.random.split(jax.random.key(0), 30)))
+    return jax.device_get(draw(problem, belief, root, jax.random.split(jax.random.key(0), 30)))
 
 
-def test_what_may_topple_is_charged_for(drawn):
-    sample, (sure, nothing), (possible, topples), dear = drawn
-    possible, topples = possible[:, 0], topples[:, 0]
+@pytest.mark.slow
+def test_pushes_may_topple_what_they_move(drawn):
+    sample, (possible, topples) = drawn
+    sure, nothing, possible, topples = possible[:, 0], topples[:, 0], possible[:, 1], topples[:, 1]
     pushes = sure & (sample.action.kind == ActionKind.PUSH)
     picks = sure & (sample.action.kind == ActionKind.PICK_AND_PLACE)
     assert pushes.any()
@@ -216,7 +292,38 @@ def test_what_may_topple_is_charged_for(drawn):
     # Every push moves one object at least.
     assert (topples[pushes] > 0.39).all()
     assert (topples[picks] == 0).all()
-    np.testing.assert_allclose(dear[sure], (CONFIG.caution * sample.risk + 2.0 * topples)[sure], rtol=1e-6)
+
+
+def charges_of(rollout, root, keys):
+    act = jax.jit(jax.vmap(lambda key: rollout.act(jnp.array(True), root, key)[2]))
+    return jax.device_get(act(keys))
+
+
+def test_what_may_topple_or_touch_the_target_is_charged_for(decision, root, problem):
+    action = jax.tree.map(lambda a: a[0, 0], decision[2].sequences.actions)
+    policy = dataclasses.replace(
+        POLICY,
+        config=dataclasses.replace(CONFIG, topple_charge=2.0, unseen_contact_penalty=0.5),
+        propose=lambda key, *_: Sample(action, jnp.int32(0), jax.random.uniform(key)),
+        predict=lambda problem, state, *_: Prediction(state.scene, jnp.array(True), jnp.float32(0.4)),
+    )
+    keys = jax.random.split(jax.random.key(0), 5)
+    risk = np.array([jax.random.uniform(key) for key in keys])
+    np.testing.assert_allclose(
+        charges_of(rollout_of(problem, decision[1], policy), root, keys), 0.5 * risk + 2.0 * 0.4, rtol=1e-6
+    )
+
+
+@pytest.mark.slow
+def test_what_may_topple_is_charged_for(drawn, decision, root, problem):
+    sample, (possible, topples) = drawn
+    dear = POLICY.replace(config=dataclasses.replace(CONFIG, topple_charge=2.0), predict=foreseen(Shaky(0.4, 0.0)))
+    keys = jax.random.split(jax.random.key(0), 30)
+    charges = charges_of(rollout_of(problem, decision[1], dear), root, keys)
+    sure = possible[:, 0]
+    np.testing.assert_allclose(
+        charges[sure], (CONFIG.unseen_contact_penalty * sample.risk + 2.0 * topples[:, 1])[sure], rtol=1e-6
+    )
 
 
 def test_what_is_dear_is_not_chosen():
@@ -224,19 +331,20 @@ def test_what_is_dear_is_not_chosen():
     cost = jnp.float32([[20.0, 10.0], [20.0, 15.0]])
     for price, best in ((0.0, 0), (0.5 * 0.4, 0), (2.0 * 0.4, 1)):
         charge = jnp.float32([[price * 20.0], [0.0]])
-        value = [planner._prefix_values(c, h, jnp.array([True]), 0.9)[0] for c, h in zip(cost, charge, strict=True)]
+        value = [prefix_values(c, h, jnp.array([True]), 0.9)[0] for c, h in zip(cost, charge, strict=True)]
         assert int(np.argmin(value)) == best
 
 
+@pytest.mark.slow
 def test_a_push_that_likely_topples_something_or_is_not_understood_is_ruled_out(drawn):
-    sample, _, (possible, _), _ = drawn
-    for row in range(1, 5):
+    sample, (possible, _) = drawn
+    for row in range(2, 6):
         assert set(sample.action.kind[possible[:, row]].tolist()) == {ActionKind.PICK_AND_PLACE}
 
 
 def test_an_empty_shelf_leaves_nothing_to_do(problem):
     empty = superquadric.empty(8)
-    plan = planner.plan(jax.random.key(0), problem, look(problem, empty), empty, CONFIG)
+    plan = POLICY(jax.random.key(0), problem, look(problem, empty), seen(empty))
     assert int(plan.action.kind) == ActionKind.NONE
     assert np.all(np.isinf(plan.sequences.value))
 
@@ -248,26 +356,89 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"gamma": 1.5}, "gamma 1.5"),
         ({"horizon": 0}, "horizon 0 must be at least 1"),
         ({"sequences": 0}, "sequences 0"),
-        ({"focus": 1.0}, r"focus 1.0 is outside \[0, 1\)"),
-        ({"focus": -0.1}, "0 draws evenly"),
+        ({"guided_fraction": 1.0}, r"guided_fraction 1.0 is outside \[0, 1\)"),
+        ({"guided_fraction": -0.1}, "0 draws evenly"),
         ({"topple_charge": -0.5}, "topple_charge -0.5 must be a number that is not negative"),
         ({"topple_charge": float("nan")}, "topple_charge nan"),
+        ({"unseen_contact_penalty": -1.0}, "unseen_contact_penalty -1.0"),
+        ({"draws": 0}, "draws 0 must be at least 1"),
+        ({"max_steps": 0}, "max_steps 0 must be at least 1"),
         ({"push_model": "guess"}, 'push model "guess" is unknown; use quasi-static, learned, physics'),
-        ({"method": "guess"}, 'use "search-for-grasp" or "search-and-grasp"'),
-        ({"actions": "throw"}, 'use "both", "push" or "pick-and-place"'),
         ({"criterion": "guess"}, 'criterion "guess" is unknown'),
+        ({"actions": ()}, "one or more kinds of action"),
     ],
 )
 def test_impossible_options_are_refused_with_what_would_do(changes, message):
     with pytest.raises(InputError, match=message):
-        PlannerConfig.paper(**changes)
+        planner.standard(**changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("guess", 'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, or an import path'),
+        ("no_such_lab.policies:Mine", "cannot be imported .*no_such_lab"),
+        ("mechsearch_jax.planner:Nobody", "cannot be imported .*Nobody"),
+        ("mechsearch_jax.planner:OPTIONS", "is not callable"),
+    ],
+)
+def test_policies_that_are_not_there_are_named(name, message):
+    with pytest.raises(InputError, match=message):
+        planner.policy_factory(name)
+
+
+def test_policies_are_found_by_name_and_by_import_path():
+    assert planner.policy_factory("search-and-grasp") is planner.search_and_grasp
+    assert planner.policy_factory("mechsearch_jax.planner.policies:random_action") is planner.random_action
+    for factory in planner.POLICIES.values():
+        assert factory(CONFIG, push_model=QuasiStatic()).predict.push_model == QuasiStatic()
+
+
+def test_a_found_target_that_nothing_blocks_is_taken_out(problem):
+    nothing, pose = superquadric.empty(8), (0.6, 0.1, 0.0)
+    belief = look(problem, nothing, True, pose)
+    for factory, cost in (
+        (planner.search_for_grasp, 1.0),
+        (planner.search_and_grasp, 0.0),
+        (planner.random_action, 0.0),
+    ):
+        decision = factory()(jax.random.key(0), problem, belief, seen(nothing, True, pose))
+        assert int(decision.action.kind) == ActionKind.RETRIEVE
+        assert float(decision.cost) == cost
+        np.testing.assert_allclose(decision.action.T_world_gripper[:2, 3], pose[:2], atol=1e-5)
+        assert np.isinf(decision.sequences.value).all()
+
+
+@pytest.mark.slow
+def test_a_random_policy_is_indifferent_and_its_actions_are_possible(decision, problem):
+    objects, belief, _ = decision
+    policy = planner.random_action()
+    chosen = [policy(jax.random.key(i), problem, belief, seen(objects)) for i in range(12)]
+    assert {float(one.cost) for one in chosen} == {0.0}
+    assert all(int(one.action.kind) != ActionKind.NONE for one in chosen)
+    assert len({(int(one.action.kind), int(one.action.object)) for one in chosen}) > 3
+
+
+@pytest.mark.slow
+def test_the_papers_preset_draws_until_an_action_is_possible_and_moves_objects_again(decision, problem):
+    objects, _, standard = decision
+    config = planner.paper()
+    paper = planner.build_problem(config=config.problem)
+    belief = planner.update_belief(paper, planner.initial_belief(paper), seen(objects))
+    told = planner.search_for_grasp(config.planner)(jax.random.key(0), paper, belief, seen(objects))
+    kinds = np.asarray(told.sequences.actions.kind)
+    lengths = (kinds != ActionKind.NONE).sum(axis=1)
+    assert lengths.mean() > (np.asarray(standard.sequences.actions.kind) != ActionKind.NONE).sum(axis=1).mean() + 0.5
+    moved = np.asarray(told.sequences.actions.object)
+    assert any(len(set(o[:n])) < n for o, n in zip(moved, lengths, strict=True))
+    assert float(told.value) < 0
 
 
 @pytest.mark.slow
 def test_a_decision_with_pushes_predicted_by_geometry_is_one_too(decision, problem):
     objects, belief, learned = decision
-    geometric = dataclasses.replace(CONFIG, push_model="quasi-static")
-    plan = planner.plan(jax.random.key(0), problem, belief, objects, geometric)
+    geometric = planner.search_for_grasp(push_model=QuasiStatic())
+    plan = geometric(jax.random.key(0), problem, belief, seen(objects))
     assert float(plan.value) < 0
     assert float(plan.predicted_cost) < float(plan.cost) == float(learned.cost)
     assert not np.array_equal(np.asarray(plan.sequences.cost), np.asarray(learned.sequences.cost))
@@ -280,10 +451,10 @@ def test_decisions_in_a_batch_are_those_made_alone(problem):
     scenes = jax.tree.map(lambda *a: jnp.stack(a), first, second)
     beliefs = jax.tree.map(lambda *a: jnp.stack(a), look(problem, first), look(problem, second))
     keys = jnp.stack([jax.random.key(3), jax.random.key(4)])
-    batch = jax.vmap(lambda k, b, s: planner.plan(k, problem, b, s, CONFIG))
-    together = jax.jit(batch)(keys, beliefs, scenes)
+    batch = jax.vmap(lambda k, b, s: POLICY(k, problem, b, s))
+    together = jax.jit(batch)(keys, beliefs, jax.vmap(seen)(scenes))
     for i, scene in enumerate((first, second)):
-        alone = planner.plan(keys[i], problem, look(problem, scene), scene, CONFIG)
+        alone = POLICY(keys[i], problem, look(problem, scene), seen(scene))
         assert int(together.action.kind[i]) == int(alone.action.kind)
         assert int(together.action.object[i]) == int(alone.action.object)
         np.testing.assert_allclose(together.action.T_world_gripper[i], alone.action.T_world_gripper, atol=1e-4)

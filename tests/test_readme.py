@@ -3,9 +3,10 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from mechsearch_jax.scenario import example_scenarios
+from mechsearch_jax.workspace.scenario import example_scenarios
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -13,6 +14,10 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 def blocks(language):
     return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+
+
+def test_it_fits_a_few_screens():
+    assert len(README.splitlines()) <= 120
 
 
 def test_there_are_two_commands():
@@ -26,13 +31,20 @@ def test_the_first_screen_has_the_picture():
     assert (ROOT / picture).read_bytes().startswith(b"\x89PNG")
 
 
-def test_ten_lines_of_python_decide_on_an_action(capsys):
+def test_the_lines_of_python_lead_from_images_to_a_joint_trajectory(capsys):
     (code,) = blocks("python")
-    assert code.count("\n") <= 10
-    exec(code, {})
-    kind, _, cost, predicted = capsys.readouterr().out.split()
-    assert int(kind) in (1, 2)
-    assert float(predicted) < float(cost)
+    names = {}
+    exec(code, names)
+    assert capsys.readouterr().out == ""
+    trajectory, decision = names["trajectory"], names["decision"]
+    kinds = names["ms"].ActionKind
+    kind = kinds(int(decision.action.kind))
+    assert kind in (kinds.PUSH, kinds.PICK_AND_PLACE, kinds.RETRIEVE)
+    assert kind == kinds.RETRIEVE or float(decision.predicted_cost) < float(decision.cost)
+    steps = trajectory.time.shape[0]
+    assert trajectory.position.shape == trajectory.velocity.shape == (steps, 7)
+    assert trajectory.gripper.shape == (steps,)
+    assert np.isfinite(trajectory.position).all()
 
 
 @pytest.mark.parametrize("file", ["LICENSE", "CHANGELOG.md", ".ci/run"])

@@ -14,30 +14,23 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.world import BOX, CYLINDER
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.models import recognition as model
-from mechsearch_jax.models import segmentation as layers
-from mechsearch_jax.models.recognition import BASE_ROTATIONS, HYPOTHESES, IS_CYLINDER, RecognitionConfig
-from mechsearch_jax.models.segmentation import (
+from mechsearch_jax.networks import recognition as model
+from mechsearch_jax.networks import segmentation as layers
+from mechsearch_jax.networks.recognition import BASE_ROTATIONS, HYPOTHESES, IS_CYLINDER, RecognitionConfig
+from mechsearch_jax.networks.segmentation import (
     SegmentationConfig,
     SegmentationNetwork,
     nearest_neighbours,
     strongest_neighbour,
 )
-from mechsearch_jax.models.weights import load_weights, save_weights
+from mechsearch_jax.networks.weights import load_weights, save_weights
 from mechsearch_jax.perception import segments as clouds
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
 from mechsearch_jax.perception.segments import CLEAR, CONTEXT, HIDDEN_EDGE, INNER, OUTLINE, segment_clouds
-from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train import loop, recognition, scenes, segmentation
-from mechsearch_jax.train.loop import (
-    CHECKPOINT,
-    SCALARS,
-    TrainConfig,
-    initial_state,
-    learning_rate,
-    train,
-)
+from mechsearch_jax.train.loop import CHECKPOINT, SCALARS, TrainConfig, initial_state, learning_rate, train
+from mechsearch_jax.workspace.shelf import Shelf
 
 RECOGNITION = RecognitionConfig(width=32, layers=1, heads=2)
 SEGMENTATION = SegmentationConfig(width=32, layers=2, heads=2, neighbours=8, latents=12)
@@ -305,9 +298,9 @@ def test_recognition_does_not_mind_the_order_of_the_points():
     task, (_, _, examples) = some_segments()
     segments = jax.tree.map(lambda a: a[0], examples.segments)
     order = jax.random.permutation(jax.random.key(0), task.segments.points)
-    told_by = jax.jit(functools.partial(model.told_by, model.RecognitionNetwork(RECOGNITION)))
-    told = told_by(parameters("recognition"), segments.points, segments.mark, segments.camera)
-    again = told_by(parameters("recognition"), segments.points[:, order], segments.mark[:, order], segments.camera)
+    network = jax.jit(functools.partial(model.apply_network, model.RecognitionNetwork(RECOGNITION)))
+    told = network(parameters("recognition"), segments.points, segments.mark, segments.camera)
+    again = network(parameters("recognition"), segments.points[:, order], segments.mark[:, order], segments.camera)
     for a, b in zip(jax.tree.leaves(told), jax.tree.leaves(again), strict=True):
         assert np.allclose(a, b, atol=1e-4)
     assert (np.asarray(told.size) > 0).all()

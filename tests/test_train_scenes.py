@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.camera import Camera, back_project, rays
 from mechsearch_jax.envs.generator import outline, separation
 from mechsearch_jax.envs.world import CYLINDER, TARGET
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.perception.cloud import above_board, cloud_of, draw, remove_shelf, resample, shelf_view, view
+from mechsearch_jax.perception.cloud import above_board, cloud_of, draw, resample, shelf_view, view
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.noise import RandomDirection, TimeOfFlight, no_noise
-from mechsearch_jax.scenario import Body
-from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train import scenes
+from mechsearch_jax.workspace.camera import Camera, back_project, rays
+from mechsearch_jax.workspace.scenario import Body
+from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
 VIEW = shelf_view(stride=4)
@@ -116,7 +116,8 @@ def quaternion(rotation):
 
 def test_scenes_are_as_configured():
     config = dataclasses.replace(CLEAN, objects=(3, 3), known=1.0, lying=0.0, leaning=0.0, target=0.0)
-    worlds = jax.vmap(lambda k: scenes.random_world(k, config, SHELF))(jax.random.split(jax.random.key(4), 8))
+    draw = jax.jit(jax.vmap(lambda k: scenes.random_world(k, config, SHELF)))
+    worlds = draw(jax.random.split(jax.random.key(4), 8))
     assert not worlds.valid[:, 3:].any()
     assert worlds.valid[:, :3].mean() > 0.9
     assert jax.vmap(scenes.is_known)(worlds)[:, :3].all()
@@ -173,7 +174,8 @@ def test_drawing_takes_true_elements_evenly():
 
 def test_the_cloud_is_the_image_without_the_shelf():
     _, seen = clean()
-    cloud = remove_shelf(cloud_of(jnp.asarray(seen.points[0])), SHELF)
+    points = jnp.asarray(seen.points[0])
+    cloud = cloud_of(jnp.where(above_board(SHELF, points)[..., None], points, jnp.nan))
     labels = seen.labels[0].reshape(-1)
     assert (np.asarray(cloud.valid) == (labels >= 0)).all()
     sample = resample(jax.random.key(0), cloud)

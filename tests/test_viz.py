@@ -9,18 +9,17 @@ import pytest
 from matplotlib.image import imread
 from matplotlib.patches import Circle, FancyArrowPatch, Polygon
 
-from mechsearch_jax import scenario as scenarios
-from mechsearch_jax import superquadric
-from mechsearch_jax.actions import ActionKind, no_action
-from mechsearch_jax.camera import Camera, project
+from mechsearch_jax.actions import ActionKind, kind_of, no_action, retrieve_action
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.results import Maps
-from mechsearch_jax.scenario import Body
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.viz.filmstrip import Frame, filmstrip
-from mechsearch_jax.viz.maps import maps_figure
+from mechsearch_jax.viz.maps import Maps, maps_figure
+from mechsearch_jax.workspace import scenario as scenarios
+from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.scenario import Body
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 CAMERA, SHELF = Camera(), Shelf()
 TURNED = (np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8))
@@ -45,6 +44,23 @@ PICK = no_action().replace(
     T_world_gripper=jnp.asarray(RIGHT),
     T_world_place=jnp.asarray(PLACE),
 )
+RETRIEVAL = retrieve_action(jnp.asarray(RIGHT), jnp.float32(0.8), jnp.float32(0.08))
+
+
+def moved_on(action):
+    """The objects after an action, as a planner may expect them: the moved one is 20 cm further left and turned."""
+    if int(action.kind) != ActionKind.PICK_AND_PLACE:
+        return SCENE
+    turn = jnp.asarray(scenarios.superquadrics(BODIES[:1]).rotation[0])
+    return SCENE.replace(
+        position=SCENE.position.at[1].add(jnp.float32([0.1, 0.2, 0.0])), rotation=SCENE.rotation.at[1].set(turn)
+    )
+
+
+def shown(action):
+    """What frames hold of an action."""
+    after = moved_on(action)
+    return {"after": after, "sketch": kind_of(int(action.kind)).sketch(SCENE, after, action)}
 
 
 def frame(target, **changes):
@@ -60,8 +76,7 @@ def frame(target, **changes):
         "graspability": np.arange(len(poses)) % 12 - 10,
         "target_pose": np.array([0.7, 0.1, 0.0], np.float32),
         "found": False,
-        "action": PUSH,
-        "retrieval": None,
+        **shown(PUSH),
     }
     return Frame(**{**fields, **changes})
 
@@ -91,10 +106,13 @@ def test_outlines_in_the_view_reach_as_far_as_the_projected_corners():
     np.testing.assert_allclose(outline.max(axis=0), pixels.max(axis=0), atol=1.5)
 
 
-def test_a_placed_object_moves_with_the_gripper():
-    after = drawing.placed_scene(SCENE, PICK)
-    np.testing.assert_allclose(after.position[1], np.add(BODIES[1].position, (0.1, 0.2, 0.0)), atol=1e-6)
-    np.testing.assert_array_equal(after.position[0], np.asarray(SCENE.position[0], float))
+def test_the_picture_shows_the_planners_own_prediction():
+    figure = filmstrip([frame(Target.cylinder(), **shown(PICK))], CAMERA, SHELF, Target.cylinder(), "one")
+    (ghost,) = [p for p in figure.axes[1].patches if isinstance(p, Polygon) and p.get_linestyle() != "solid"]
+    expected = drawing.outlines(moved_on(PICK))[1]
+    np.testing.assert_allclose(ghost.get_xy()[:-1], expected[:, ::-1], atol=1e-6)
+    (arrow,) = [p for p in figure.axes[1].patches if isinstance(p, FancyArrowPatch)]
+    np.testing.assert_allclose(arrow._path_original.vertices[0], np.array(BODIES[1].position)[1::-1], atol=1e-6)
 
 
 @pytest.mark.parametrize("target", [Target.cylinder(), Target.box()], ids=["cylinder", "box"])
@@ -133,9 +151,9 @@ def test_the_window_holds_the_shelf():
     assert 0 <= top < bottom <= CAMERA.height
 
 
-@pytest.mark.parametrize(("action", "arrows"), [(PUSH, 1), (PICK, 1), (no_action(), 0), (None, 0)])
+@pytest.mark.parametrize(("action", "arrows"), [(PUSH, 1), (PICK, 1), (RETRIEVAL, 1), (no_action(), 0)])
 def test_an_action_is_drawn_into_both_pictures(action, arrows):
-    figure = filmstrip([frame(Target.cylinder(), action=action)], CAMERA, SHELF, Target.cylinder(), "one")
+    figure = filmstrip([frame(Target.cylinder(), **shown(action))], CAMERA, SHELF, Target.cylinder(), "one")
     for axes in figure.axes:
         assert sum(isinstance(p, FancyArrowPatch) for p in axes.patches) == arrows
 
@@ -143,7 +161,8 @@ def test_an_action_is_drawn_into_both_pictures(action, arrows):
 def test_a_push_points_where_the_gripper_goes():
     figure = filmstrip([frame(Target.cylinder())], CAMERA, SHELF, Target.cylinder(), "one")
     above = figure.axes[1]
-    start, end = next(p for p in above.patches if isinstance(p, FancyArrowPatch))._posA_posB
+    way = next(p for p in above.patches if isinstance(p, FancyArrowPatch))._path_original.vertices
+    start, end = way[0], way[-1]
     np.testing.assert_allclose(start, RIGHT[[1, 0], 3], atol=1e-6)
     np.testing.assert_allclose(end, RIGHT[[1, 0], 3] + [0.1, 0.0], atol=1e-6)
     assert above.get_xlim()[0] > above.get_xlim()[1]
@@ -160,7 +179,7 @@ def test_objects_and_target_are_outlined():
 
 
 def test_a_long_episode_is_broken_into_lines(tmp_path):
-    frames = [frame(Target.box(), retrieval=RIGHT if i == 5 else None) for i in range(6)]
+    frames = [frame(Target.box(), **shown(RETRIEVAL if i == 5 else PUSH)) for i in range(6)]
     figure = filmstrip(frames, CAMERA, SHELF, Target.box(), "six")
     assert len(figure.axes) == 12
     drawing.save_figure(figure, tmp_path / "strip.png", dpi=40)
@@ -182,7 +201,7 @@ def test_maps_become_a_picture(tmp_path):
 
 def test_an_empty_scene_can_be_drawn(tmp_path):
     nothing = superquadric.empty(8)
-    one = frame(Target.cylinder(), scene=nothing, action=None, existence=np.zeros(792, bool))
+    one = frame(Target.cylinder(), scene=nothing, **shown(no_action()), existence=np.zeros(792, bool))
     drawing.save_figure(filmstrip([one], CAMERA, SHELF, Target.cylinder(), "none"), tmp_path / "none.png", dpi=40)
     maps = Maps(Target.cylinder().candidate_poses(SHELF), one.existence, one.graspability, nothing)
     maps_figure(maps, one.image, one.owner, one.target_pose, CAMERA, SHELF, Target.cylinder(), heading="none")

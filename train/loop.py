@@ -33,7 +33,6 @@ CHECKPOINT = "checkpoint.msgpack"
 SCALARS = "scalars.jsonl"
 
 Scalars = dict[str, Any]
-LossFunction = Callable[[Any, Any], tuple[jax.Array, Scalars]]
 
 
 @dataclasses.dataclass(frozen=True)

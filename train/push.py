@@ -15,29 +15,22 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from mechsearch_jax.dynamics import PushModel, PushOutcome, QuasiStatic
+from mechsearch_jax.dynamics.learned import LIKELY, NAME, SLACK, predicted
+from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
+from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, Worlds, joined, portions, push_tables
+from mechsearch_jax.envs.push_portions import portions
+from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, joined, push_tables
+from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.envs.world import CYLINDER, superquadrics
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.learned_push import LIKELY, NAME, SLACK, predicted
-from mechsearch_jax.models.push import (
-    CHAIN,
-    NORMALS,
-    REACH,
-    PushConfig,
-    PushMotion,
-    PushNetwork,
-    PushStart,
-    push_start,
-    pusher_distance,
-    told_by,
-)
-from mechsearch_jax.models.weights import save_weights
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import matmul
+from mechsearch_jax.networks.push import PushConfig, PushMotion, PushNetwork, apply_network
+from mechsearch_jax.networks.push_geometry import CHAIN, NORMALS, REACH, PushStart, push_start, pusher_distance
+from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.train.scenes import SceneConfig, origin, random_world
-from mechsearch_jax.transforms import matmul
+from mechsearch_jax.workspace.shelf import Shelf
 
 # Every so many lanes of pushes one is never trained on.
 HELD_OUT_LANES = 32
@@ -262,7 +255,7 @@ class PushTask:
 
     def loss(self, parameters: Any, examples: PushExample) -> tuple[Float[Array, ""], dict[str, Any]]:
         network = PushNetwork(self.network, self.precision)
-        told = jax.vmap(functools.partial(told_by, network, parameters))(examples.start)
+        told = jax.vmap(functools.partial(apply_network, network, parameters))(examples.start)
         terms = example_loss(told, examples.truth)
         loss = sum((weight * terms[name] for name, weight in LOSS_WEIGHTS.items()), jnp.zeros(()))
         return loss, terms
@@ -289,9 +282,9 @@ def random_pushes(
     gpu: bool,
     scenes: SceneConfig,
     told: Callable[[int], None] = lambda pushes: None,
-    make_simulator: Callable[[], Worlds] | None = None,
+    make_simulator: Callable[[], Simulator] | None = None,
 ) -> Pushes:
-    """Pushes in such scenes, simulated on a GPU or not; see `envs.pushes.portions` for the rest."""
+    """Pushes in such scenes, simulated on a GPU or not; see `envs.push_portions.portions` for the rest."""
     draw_world = functools.partial(random_world, config=scenes)
     simulate = make_simulator or functools.partial(generator.engine, gpu)
     source = repr((generator.engine_name(gpu), generator.push_simulation(), origin(scenes)))

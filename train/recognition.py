@@ -15,23 +15,23 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax import superquadric
 from mechsearch_jax.envs.world import CYLINDER, TARGET, World, true_superquadrics
-from mechsearch_jax.models.recognition import (
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.transforms import matmul, rotate
+from mechsearch_jax.networks.recognition import (
     BASE_ROTATIONS,
     HYPOTHESES,
     IS_CYLINDER,
     Hypotheses,
     RecognitionConfig,
     RecognitionNetwork,
-    told_by,
+    apply_network,
 )
-from mechsearch_jax.models.weights import save_weights
+from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.perception.cloud import View, shelf_view
 from mechsearch_jax.perception.recognition import best_hypothesis
 from mechsearch_jax.perception.scores import centre_error, intersection_over_union, sharpened
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
-from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import (
     PIXELS,
@@ -46,7 +46,7 @@ from mechsearch_jax.train.scenes import (
     visible_share,
     worth_seeing,
 )
-from mechsearch_jax.transforms import matmul, rotate
+from mechsearch_jax.workspace.shelf import Shelf
 
 # Points of the true surface that equation 7 is averaged over.
 SURFACE = 512
@@ -228,7 +228,7 @@ class RecognitionTask:
     def loss(self, parameters: Any, examples: Example) -> tuple[Float[Array, ""], dict[str, Any]]:
         segments = examples.segments
         network = RecognitionNetwork(self.network, self.precision)
-        told = told_by(network, parameters, segments.points, segments.mark, segments.camera)
+        told = apply_network(network, parameters, segments.points, segments.mark, segments.camera)
         terms = jax.vmap(example_loss)(told, examples.truth)
         total = jnp.maximum(jnp.sum(examples.weight), 1.0)
         means = jax.tree.map(lambda a: jnp.sum(a * examples.weight) / total, terms)
@@ -317,7 +317,7 @@ class _Scored(flax.struct.PyTreeNode):
 def _score_batch(task: RecognitionTask, parameters: Any, key: Array, batch: int) -> _Scored:
     worlds, seen, examples = jax.vmap(task.scene)(jax.random.split(key, batch))
     flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), examples.segments)
-    told = told_by(RecognitionNetwork(task.network), parameters, flat.points, flat.mark, flat.camera)
+    told = apply_network(RecognitionNetwork(task.network), parameters, flat.points, flat.mark, flat.camera)
     found = jax.tree.map(lambda a: a.reshape(batch, TARGET, *a.shape[1:]), best_hypothesis(told, flat))
     truth = sharpened(true_superquadrics(worlds))
     return _Scored(

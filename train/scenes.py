@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.camera import Camera, rays
 from mechsearch_jax.envs.generator import BOXES, CYLINDERS
-from mechsearch_jax.envs.observation import cast_body, cast_shelf
 from mechsearch_jax.envs.recognisers import true_labels
+from mechsearch_jax.envs.simulated_camera import cast_body, cast_shelf
 from mechsearch_jax.envs.world import BODIES, BOX, CYLINDER, TARGET, World
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
 from mechsearch_jax.perception.cloud import View, shelf_view
 from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.transforms import matmul, yaw_rotation
+from mechsearch_jax.workspace.camera import Camera, rays
+from mechsearch_jax.workspace.shelf import Shelf
 
 # Steps of `_slide`; each shortens the gap to at most about a third.
 _SLIDES = 8

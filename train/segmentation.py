@@ -14,16 +14,16 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.assignment import assign
 from mechsearch_jax.envs.world import TARGET
-from mechsearch_jax.models.segmentation import SegmentationConfig, SegmentationNetwork, told_by
-from mechsearch_jax.models.weights import save_weights
+from mechsearch_jax.networks.segmentation import SegmentationConfig, SegmentationNetwork, apply_network
+from mechsearch_jax.networks.weights import save_weights
+from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.perception.cloud import POINTS, View, cloud_of, resample, shelf_view
 from mechsearch_jax.perception.labels import INSTANCES, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of
-from mechsearch_jax.shelf import Shelf
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, origin, random_world, worth_seeing
+from mechsearch_jax.workspace.shelf import Shelf
 
 # What a layer's loss counts against the next one's.
 _EARLIER = 0.5
@@ -153,7 +153,7 @@ class SegmentationTask:
         return jax.vmap(self.scene)(jax.random.split(key, batch))
 
     def loss(self, parameters: Any, examples: Example) -> tuple[Float[Array, ""], dict[str, Any]]:
-        told = told_by(SegmentationNetwork(self.network, self.precision), parameters, examples.points)
+        told = apply_network(SegmentationNetwork(self.network, self.precision), parameters, examples.points)
         terms = jax.vmap(jax.vmap(segmentation_loss), in_axes=(0, None))(told.logits, examples.labels)
         total = jnp.maximum(jnp.sum(examples.weight), 1.0)
         layers = {name: jnp.sum(a * examples.weight[None], axis=1) / total for name, a in terms.items()}
@@ -193,7 +193,7 @@ def instance_overlaps(
 @functools.partial(jax.jit, static_argnames=("task", "batch"))
 def _score_batch(task: SegmentationTask, parameters: Any, key: Array, batch: int):
     examples = task.sample(key, batch)
-    told = told_by(SegmentationNetwork(task.network), parameters, examples.points)
+    told = apply_network(SegmentationNetwork(task.network), parameters, examples.points)
     raw = labels_of(told.logits[-1].reshape(-1, INSTANCES + 1)).reshape(batch, -1)
     valid = jnp.broadcast_to(examples.weight[:, None] > 0, raw.shape)
     clean = jax.vmap(clean_up)(examples.points, raw, valid)

@@ -22,11 +22,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax import kinematics
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
-from mechsearch_jax.transforms import compose, exponential, inverse, make, matmul, rotate, transform
+from mechsearch_jax.geometry.transforms import compose, exponential, inverse, make, matmul, rotate, transform
+from mechsearch_jax.robot import kinematics
+from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
+from mechsearch_jax.workspace.camera import Camera
 
 HAND_FRAME = 7
 # Keeps steps small in directions in which the robot's shape says nothing: as much as one point, at this distance [m].

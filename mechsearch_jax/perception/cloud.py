@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
-from mechsearch_jax.camera import Camera, project
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.shelf import Shelf
 
 POINTS = 2048
 STRIDE = 2
@@ -122,11 +122,6 @@ def above_board(shelf: Shelf, points: Float[Array, "*batch 3"], margin: float = 
     deep = (x > shelf.front - OVERHANG) & (x < shelf.back - margin)
     wide = (y > shelf.right + margin) & (y < shelf.left - margin)
     return deep & wide & (z > shelf.board + margin) & (z < shelf.ceiling - margin)
-
-
-def remove_shelf(cloud: PointCloud, shelf: Shelf, margin: float = MARGIN) -> PointCloud:
-    """The cloud without the points on the shelf, or outside it."""
-    return cloud.replace(valid=cloud.valid & above_board(shelf, cloud.points, margin))
 
 
 def draw(key: Key[Array, ""], chosen: Bool[Array, " p"], count: int) -> tuple[Int[Array, " count"], Int[Array, ""]]:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.perception.labels import OTHER
 
 # Maps colours (..., 3) and a reference colour (3,) to dissimilarities (...).
 ColourDifference = Callable[[Array, Array], Array]
@@ -67,7 +68,12 @@ class TargetColour:
 
     @classmethod
     def lit(cls, rgb: tuple[float, float, float] = (0.7282, 0.1558, 0.2099)) -> TargetColour:
+        """A measure that does not depend on the light: chromaticities, and a threshold between red and brown."""
         return cls(rgb, threshold=0.01, difference=chromatic)
+
+    def __call__(self, colours: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
+        """Which colours, of single pixels for example, are the target's; a `recogniser.TargetDetector`."""
+        return self.difference(colours, jnp.array(self.rgb)) < self.threshold
 
 
 class Detection(flax.struct.PyTreeNode):
@@ -153,7 +159,7 @@ def cluster_by_colour(
       config: the default if None.
 
     Returns:
-      segment of every pixel, the one with the most pixels first; -1 for none.
+      segment of every pixel, the one with the most pixels first; `labels.OTHER` for none, also off the foreground.
     """
     config = config or ClusterConfig()
     tint = np.array(chromaticity(jnp.asarray(colour, jnp.float32)))
@@ -173,7 +179,7 @@ def cluster_by_colour(
     large = np.flatnonzero(sizes >= config.minimum)
 
     if not large.size:
-        return np.full(foreground.shape, -1, np.int32)
+        return np.full(foreground.shape, OTHER, np.int32)
     flat, tints = points.reshape(-1, 3), tint.reshape(-1, 3)
     members = [np.flatnonzero(part == p) for p in large]
     means = np.array([tints[m].mean(axis=0) for m in members]).reshape(-1, 3)
@@ -186,10 +192,10 @@ def cluster_by_colour(
         and np.min(trees[i].query(flat[members[j]], distance_upper_bound=config.rejoin)[0]) <= config.rejoin
     ]
     whole = _components(len(large), *np.array(joined, int).reshape(-1, 2).T)
-    labels = np.full(foreground.size, -1, np.int32)
+    labels = np.full(foreground.size, OTHER, np.int32)
     for m, w in zip(members, whole, strict=True):
         labels[m] = w
     order = np.argsort(-np.bincount(whole, sizes[large], minlength=1), kind="stable")
     rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order))
-    return np.where(labels >= 0, rank[labels], -1).astype(np.int32).reshape(foreground.shape)
+    return np.where(labels >= 0, rank[labels], OTHER).astype(np.int32).reshape(foreground.shape)

@@ -7,10 +7,10 @@ from typing import Protocol
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
-from mechsearch_jax.camera import Camera, back_project
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.workspace.camera import Camera, back_project, project
 
 
 class NoiseModel(Protocol):
@@ -30,6 +30,19 @@ class NoiseModel(Protocol):
 def no_noise(key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
     """The `NoiseModel` of a perfect sensor."""
     return back_project(camera, depth)
+
+
+def measured_depth(camera: Camera, depth: Float[Array, "h w"], points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
+    """The depth of measured points [m]: infinite where nothing is, NaN where nothing was measured.
+
+    Args:
+      camera: static.
+      depth: the true one [m]; infinite where nothing is.
+      points: what a `NoiseModel` made of it.
+    """
+    finite: Bool[Array, "h w"] = jnp.isfinite(points).all(axis=-1)
+    _, measured = project(camera, jnp.where(finite[..., None], points, 0.0))
+    return jnp.where(finite, measured, jnp.where(jnp.isfinite(depth), jnp.nan, jnp.inf))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,9 +1,12 @@
-"""From the images of a real depth camera to a point cloud that recognition takes (appendices B.1, C.1 and C.3).
+"""From the images of a real depth camera to a mask that the `Recogniser` takes (appendices B.1, C.1 and C.3).
 
 The camera's pose is corrected on the robot that it sees; the shelf is removed by its known shape, and its floor, which
 touches every object, by the plane that is measured there; what is left is segmented by a given mask or by colour. All
-this happens once an image and on the host, so that images of any size and any number of points are fine; what comes out
-has fixed shapes.
+this happens once an image and on the host, so that images of any size are fine; what comes out has fixed shapes:
+
+    prepared = real_camera.prepare(key, problem.camera, problem.shelf, depth, colour, joints=joints)
+    perceive = Recogniser(problem, camera=prepared.camera)
+    observation = perceive(key, prepared.depth, mask=prepared.segmentation, target_id=prepared.target_id)
 """
 
 from __future__ import annotations
@@ -16,15 +19,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.camera import Camera, back_project
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.camera_pose import PoseConfig, PoseEstimate, estimate_pose
 from mechsearch_jax.perception.colour import ClusterConfig, Detection, TargetColour, cluster_by_colour, detect_target
+from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.planes import Plane, PlaneConfig, find_plane
-from mechsearch_jax.scenario import MAX_OBJECTS
-from mechsearch_jax.shelf import Shelf
+from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.shelf import Shelf
 
-BACKGROUND = -1
 # The plane of the floor and the camera's pose are found from at most so many points.
 FLOOR_POINTS = ROBOT_POINTS = 4096
 
@@ -34,7 +36,6 @@ class RealCameraConfig:
     """How images become a cloud; lengths in metres.
 
     Attributes:
-      points: number of points of the cloud.
       segments: number of segments that are kept, the largest first: eight objects and the target.
       overhang: how far before the shelf's front edge things on it are looked for.
       wall_clearance: points that are closer to the walls and the upper board than this are the shelf's.
@@ -49,8 +50,7 @@ class RealCameraConfig:
       target: the target's colour.
     """
 
-    points: int = 2048
-    segments: int = MAX_OBJECTS + 1
+    segments: int = INSTANCES
     overhang: float = 0.02
     wall_clearance: float = 0.012
     floor_search: float = 0.03
@@ -64,52 +64,40 @@ class RealCameraConfig:
     target: TargetColour = dataclasses.field(default_factory=TargetColour.lit)
 
     def __post_init__(self):
-        if min(self.points, self.segments) < 1:
-            raise InputError(
-                f"RealCameraConfig: points ({self.points}) and segments ({self.segments}) must be positive"
-            )
+        if not 1 <= self.segments <= INSTANCES:
+            raise InputError(f"RealCameraConfig: segments ({self.segments}) must be from 1 to {INSTANCES}")
         lengths = ("overhang", "wall_clearance", "floor_search", "floor_clearance", "robot_clearance", "robot_margin")
         for field in lengths:
             if not getattr(self, field) >= 0:
                 raise InputError(f"RealCameraConfig: {field} ({getattr(self, field)}) must not be negative, in metres")
 
 
-class ObjectCloud(flax.struct.PyTreeNode):
-    """Points of the objects on the shelf, ready for recognition.
-
-    Attributes:
-      points: in the world [m], float32, shape (P, 3); some are repeated where the camera saw fewer than P.
-      labels: the segment of each, int32, shape (P,).
-      colours: red, green and blue in 0 to 1, shape (P, 3).
-      valid: all true, or all false where no object was seen, shape (P,).
-    """
-
-    points: jax.Array
-    labels: jax.Array
-    colours: jax.Array
-    valid: jax.Array
-
-
 class PreparedImage(flax.struct.PyTreeNode):
     """What was made of a depth and a colour image.
 
     Attributes:
-      cloud: the objects' points.
-      segmentation: segment of every pixel, int32, shape (h, w); -1 for the shelf, the robot and all else.
-      depth: the depth image with NaN where nothing was measured, as `refinement.refine` takes it.
+      segmentation: what every pixel shows, as `perception.labels` has it, int32, shape (h, w): a segment's number, the
+        one with the most pixels first where they were clustered; FREE for the shelf and what is seen beside it; OTHER
+        for the robot, whatever else is before the shelf, and what is on it but in no segment; MISSING where nothing
+        was measured. It is a `mask` of the `Recogniser`.
+      depth: the depth image with NaN where nothing was measured, as the `Recogniser` takes it.
       detection: whether one of the segments is the target, by its colour.
       floor: the plane of the shelf's floor, in the world; its `support` is 0 where the known board was taken.
       pose: how the camera's pose was corrected; None where no joint angles were given.
       camera: the camera at its corrected pose.
     """
 
-    cloud: ObjectCloud
     segmentation: jax.Array
     depth: jax.Array
     detection: Detection
     floor: Plane
     pose: PoseEstimate | None
     camera: Camera = flax.struct.field(pytree_node=False)
+
+    @property
+    def target_id(self) -> jax.Array:
+        """The target's number in the segmentation, int32; OTHER where it was not detected."""
+        return jnp.where(self.detection.found, self.detection.segment, OTHER)
 
 
 def _checked(camera: Camera, depth: np.ndarray, colour: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
@@ -165,8 +153,8 @@ def _segment(colour, depth, points, foreground, mask, config) -> Int[np.ndarray,
     if mask is None:
         labels = cluster_by_colour(colour, depth, points, foreground, config.clusters)
     else:
-        labels = np.where(foreground, mask, BACKGROUND).astype(np.int32)
-    return np.where((labels >= 0) & (labels < config.segments), labels, BACKGROUND).astype(np.int32)
+        labels = np.where(foreground, mask, OTHER).astype(np.int32)
+    return np.where((labels >= 0) & (labels < config.segments), labels, OTHER).astype(np.int32)
 
 
 def _inside(shelf: Shelf, points: np.ndarray, config: RealCameraConfig) -> Bool[np.ndarray, "h w"]:
@@ -194,16 +182,16 @@ def prepare(
     opening: float = 0.0,
     config: RealCameraConfig | None = None,
 ) -> PreparedImage:
-    """The objects' points and segments in a depth and a colour image of the shelf.
+    """The objects' segments in a depth and a colour image of the shelf.
 
     Args:
-      key: which points are drawn.
+      key: which points the floor and the camera's pose are found from.
       camera: intrinsics, and the pose as far as it is known: to 2 cm and 2 degrees if joint angles are given.
       shelf: the shelf's shape.
       depth: along the camera's axis [m]; 0, infinite or NaN where nothing was measured.
       colour: red, green and blue in 0 to 1, registered to the depth image, float, shape (h, w, 3).
       mask: whole numbers, the segment of every pixel, 0 to `config.segments - 1`, others for none; clusters of like
-        colour if None.
+        colour if None. The shelf and the robot need not be told apart in it.
       joints: the robot's joint angles when the images were taken [rad]; without them the pose is taken as given, and
         the robot must be out of the way.
       opening: distance between its fingers [m].
@@ -226,26 +214,15 @@ def prepare(
     inside = _inside(shelf, points, config)
     floor = _find_floor(key, rng, shelf, points, inside, config)
     foreground = inside & (np.asarray(floor.height(jnp.asarray(points))) > config.floor_clearance)
+    # What is before the shelf hides what is in it.
+    other = (points[..., 0] <= shelf.front - config.overhang) & (points[..., 2] > shelf.board)
     if joints is not None:
         distance, _ = config.pose.robot_distance(jnp.asarray(points[foreground]), angles, fingers)
-        foreground[foreground] = np.asarray(distance) > config.robot_clearance
+        other[foreground] = np.asarray(distance) <= config.robot_clearance
+        foreground &= ~other
     labels = _segment(colour, depth, points, foreground, mask, config)
-
-    kept = np.flatnonzero(labels >= 0)
-    if len(kept):
-        drawn = kept[rng.permutation(len(kept))[: config.points]]
-        drawn = np.resize(drawn, config.points)
-        flat, tints, names = points.reshape(-1, 3)[drawn], colour.reshape(-1, 3)[drawn], labels.reshape(-1)[drawn]
-    else:
-        flat = tints = np.zeros((config.points, 3))
-        names = np.full(config.points, BACKGROUND)
-    cloud = ObjectCloud(
-        points=jnp.asarray(flat, jnp.float32),
-        labels=jnp.asarray(names, jnp.int32),
-        colours=jnp.asarray(tints, jnp.float32),
-        valid=jnp.full(config.points, bool(len(kept))),
-    )
+    labels = np.where(foreground | other, labels, np.where(np.isfinite(depth), FREE, MISSING)).astype(np.int32)
     image = jnp.asarray(labels)
     pixels = jnp.asarray(colour, jnp.float32).reshape(-1, 3)
     detection = detect_target(pixels, image.reshape(-1), config.segments, config.target)
-    return PreparedImage(cloud, image, jnp.asarray(depth), detection, floor, pose, camera)
+    return PreparedImage(image, jnp.asarray(depth), detection, floor, pose, camera)

@@ -1,35 +1,44 @@
-"""Recognition: from a labelled image of points to superquadrics, by the recognition network."""
+"""Recognition: from a labelled image of points to superquadrics and the target's pose."""
 
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, cast
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.models.recognition import Hypotheses, RecognitionNetwork, told_by
+from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
+from mechsearch_jax.geometry.transforms import matmul, transform
+from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
+from mechsearch_jax.networks.weights import Weights, shipped_weights
+from mechsearch_jax.perception.cloud import draw
+from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import matmul, transform
+from mechsearch_jax.perception.target_pose import target_pose
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+# Points of the target that its pose is fitted to.
+TARGET_POINTS = 256
 
 
-def best_hypothesis(told: Hypotheses, segments: Segments) -> Superquadrics:
+def best_hypothesis(hypotheses: Hypotheses, segments: Segments) -> Superquadrics:
     """The likeliest hypothesis of every segment, in the world; fields with leading axes (S,)."""
-    best = jnp.argmax(told.logit, axis=-1)
+    best = jnp.argmax(hypotheses.logit, axis=-1)
 
     def chosen(values):
         return jnp.take_along_axis(values, best.reshape(-1, *[1] * (values.ndim - 1)), axis=1)[:, 0]
 
     R_world_segment = segments.T_world_segment[:, :3, :3]
     return Superquadrics(
-        size=chosen(told.size),
-        exponents=chosen(told.exponents),
-        position=transform(segments.T_world_segment, chosen(told.position)),
-        rotation=matmul(R_world_segment, chosen(told.rotation)),
+        size=chosen(hypotheses.size),
+        exponents=chosen(hypotheses.exponents),
+        position=transform(segments.T_world_segment, chosen(hypotheses.position)),
+        rotation=matmul(R_world_segment, chosen(hypotheses.rotation)),
         valid=segments.valid,
     )
 
@@ -46,20 +55,91 @@ def recognise(
     count: int = 8,
     config: SegmentConfig | None = None,
 ) -> Superquadrics:
-    """The superquadrics of the segments 0 to `count - 1` of a labelled image of points.
+    """The superquadrics of the segments 0 to `count - 1` of a labelled image of points, as the network predicts them.
 
     Slot i is segment i; it is not valid where the segment has fewer than `config.minimum` pixels.
 
     Args:
       key: PRNG key of the points that are drawn.
-      network, parameters: as `models.weights` loads them; the network is static.
+      network, parameters: as `networks.weights` loads them; the network is static.
       camera: the camera of the image, a `View`'s as in training; static.
-      points: in the world [m]; NaN where nothing was measured.
+      points: in the world [m]; NaN invalidates the pixel, whose label is then MISSING.
       labels: a segment's number, or one of `perception.labels`.
       shelf: the shelf; static.
       count: number of slots; static.
       config: how segments' clouds are drawn; static.
     """
     segments = segment_clouds(key, camera, points, labels, shelf, count, config)
-    told = told_by(network, parameters, segments.points, segments.mark, segments.camera)
-    return best_hypothesis(told, segments)
+    hypotheses = apply_network(network, parameters, segments.points, segments.mark, segments.camera)
+    return best_hypothesis(hypotheses, segments)
+
+
+class ShapeNetwork(flax.struct.PyTreeNode):
+    """A trained recognition network.
+
+    Attributes:
+      parameters: of the network.
+      network: static.
+    """
+
+    parameters: Any
+    network: RecognitionNetwork = flax.struct.field(pytree_node=False)
+
+    @classmethod
+    def of(cls, weights: Weights | None = None) -> ShapeNetwork:
+        """The network with the given weights; with those that ship with the package if None."""
+        weights = weights or shipped_weights("recognition")
+        return cls(weights.parameters, cast(RecognitionNetwork, weights.network))
+
+
+class LabelledImage(flax.struct.PyTreeNode):
+    """An image of points of which is known what each pixel shows.
+
+    Attributes:
+      points: in the world [m], shape (h, w, 3); NaN invalidates the pixel: nothing was measured.
+      depth: of the points along the camera's axis [m], shape (h, w); infinite where nothing is, NaN where nothing was
+        measured.
+      labels: as `perception.labels` has them, shape (h, w).
+      of_target: which of the points the target's pose is fitted to, bool, shape (h, w).
+    """
+
+    points: jax.Array
+    depth: jax.Array
+    labels: jax.Array
+    of_target: jax.Array
+
+
+@functools.partial(jax.jit, static_argnames=("camera", "shelf", "target", "refinement"))
+def recognise_image(
+    keys: Key[Array, "2"],
+    image: LabelledImage,
+    shapes: ShapeNetwork,
+    camera: Camera,
+    shelf: Shelf,
+    target: Target,
+    refinement: RefinementConfig,
+) -> tuple[Superquadrics, Float[Array, " 3"]]:
+    """The objects of a labelled image, and the target's pose: network, refinement, `superquadric.standard_edges`.
+
+    Every recogniser of images comes down to this.
+
+    Args:
+      keys: of the points that are drawn from the objects, and from the target.
+      image: its pixels are the camera's.
+      shapes: the network.
+      camera: the camera of the image, a `View`'s as in training; static.
+      shelf, target, refinement: static.
+
+    Returns:
+      Eight slots, of which slot i is instance i; and x, y [m] and yaw [rad] of the target, which mean nothing, but are
+      finite, where no pixel is its.
+    """
+    drawing, choosing = keys
+    scene = recognise(drawing, shapes.network, shapes.parameters, camera, image.points, image.labels, shelf)
+    points, labels = image.points.reshape(-1, 3), image.labels.reshape(-1)
+    refined = refine(camera, shelf, scene, points, labels, image.depth, refinement)
+
+    index, count = draw(choosing, image.of_target.reshape(-1), TARGET_POINTS)
+    seen = jnp.broadcast_to(count > 0, TARGET_POINTS)
+    pose = target_pose(target, shelf, jnp.array(camera.position), points[index], seen)
+    return standard_edges(refined.scene), pose

@@ -25,13 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mechsearch_jax import superquadric
-from mechsearch_jax.camera import Camera, pixel_rays, project
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import exponential, make, matmul, rotate, transform, yaw_rotation
 from mechsearch_jax.perception.scores import EDGE
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import exponential, make, matmul, rotate, transform, yaw_rotation
+from mechsearch_jax.workspace.camera import Camera, pixel_rays, project
+from mechsearch_jax.workspace.shelf import Shelf
 
 PARAMETERS = 9
 BISECTIONS = 12

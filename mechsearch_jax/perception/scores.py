@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax import superquadric
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.transforms import rotate
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import rotate
 
 # A superquadric with these exponents differs from a box or a cylinder by less than 1e-4 of its volume.
 SHARP = 0.01

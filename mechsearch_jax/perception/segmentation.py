@@ -1,17 +1,43 @@
-"""From a network's answer to clean labels of points, and from them to labels of an image."""
+"""Labels of an image by the segmentation network: drawing a cloud, segmenting it, cleaning up, spreading the labels."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any, Protocol, cast
 
+import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.masked import masked_vmap
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.networks.segmentation import SegmentationNetwork, apply_network
+from mechsearch_jax.networks.weights import Weights, shipped_weights
+from mechsearch_jax.perception.cloud import above_board, cloud_of, resample
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.workspace.shelf import Shelf
+
+
+class Segmenter(Protocol):
+    """Says which pixels show which object; traceable by JAX, and a pytree where it holds arrays."""
+
+    def __call__(
+        self, key: Key[Array, ""], shelf: Shelf, points: Float[Array, "h w 3"], of_target: Bool[Array, "h w"]
+    ) -> Int[Array, "h w"]:
+        """Label an image.
+
+        Args:
+          key: PRNG key.
+          shelf: static.
+          points: in the world [m]; NaN invalidates the pixel.
+          of_target: where the detector sees the target.
+
+        Returns:
+          Labels as `perception.labels` has them; the target's pixels are OTHER.
+        """
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +120,7 @@ def spread_labels(
     """Labels of an image's pixels from those of a cloud drawn from it: each takes that of the nearest cloud point.
 
     Args:
-      points: of the pixels [m]; NaN where nothing was measured.
+      points: of the pixels [m]; NaN invalidates the pixel.
       candidates: which pixels show something on the shelf, not the shelf itself.
       cloud: [m].
       labels: of the cloud's points; OTHER points count as any.
@@ -116,3 +142,29 @@ def spread_labels(
     wanted = (measured & candidates).reshape(-1)
     found = masked_vmap(nearest, wanted, None, (pixels, cloud, labels)).reshape(measured.shape)
     return jnp.where(~measured, MISSING, jnp.where(candidates, found, FREE)).astype(jnp.int8)
+
+
+class NetworkSegmenter(flax.struct.PyTreeNode):
+    """The `Segmenter` that segments a cloud of the image's points with the segmentation network.
+
+    Attributes:
+      parameters: of the network.
+      network: static.
+    """
+
+    parameters: Any
+    network: SegmentationNetwork = flax.struct.field(pytree_node=False)
+
+    @classmethod
+    def of(cls, weights: Weights | None = None) -> NetworkSegmenter:
+        """The segmenter with the given weights; with those that ship with the package if None."""
+        weights = weights or shipped_weights("segmentation")
+        return cls(weights.parameters, cast(SegmentationNetwork, weights.network))
+
+    def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array) -> Array:
+        objects = above_board(shelf, points) & ~of_target
+        cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)))
+        output = apply_network(self.network, self.parameters, cloud.points[None])
+        labels = clean_up(cloud.points, labels_of(output.logits[-1, 0]), cloud.valid)
+        found = spread_labels(points, objects, cloud.points, labels)
+        return jnp.where(of_target & (found != MISSING), OTHER, found).astype(jnp.int8)

@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from mechsearch_jax.camera import Camera
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.transforms import inverse, make, transform
 from mechsearch_jax.perception.cloud import draw
 from mechsearch_jax.perception.labels import FREE, MISSING
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.transforms import inverse, make, transform
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
 
 # The fourth channel of a segment's cloud. CONTEXT is the paper's 0, the others but CLEAR divide its 1.
 CONTEXT, INNER, OUTLINE, HIDDEN_EDGE, CLEAR = range(5)

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
-from mechsearch_jax.transforms import yaw_rotation
+from mechsearch_jax.geometry.transforms import yaw_rotation
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 ITERATIONS = 12
 # Residuals beyond this count only in proportion: mixed pixels at edges, and points of others [m].
 OUTLIER = 0.003
-# Damping of a step, relative to what the points say, and how far one step may go [m, m, rad].
+# Damping of a step, relative to the normal equations' diagonal, and how far one step may go [m, m, rad].
 DAMPING = 1e-3
 LONGEST_STEP = (0.01, 0.01, 0.3)
 

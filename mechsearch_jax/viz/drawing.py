@@ -17,12 +17,12 @@ from matplotlib.path import Path
 from matplotlib.patheffects import Normal, Stroke
 from scipy.spatial import ConvexHull
 
-from mechsearch_jax.actions import Action, ActionKind
-from mechsearch_jax.camera import Camera, project
+from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.files import PathLike, replacing
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.target import Target
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 INK = "#22303c"
 MUTED = "#75828e"
@@ -35,8 +35,6 @@ TARGET = "#d1344b"
 GRASPABLE = "#2a9d78"
 BLOCKED = ("#f2c14e", "#ee9b3a", "#d9622b", "#9c3d2e")
 NO_GRASP = "#8d7b9c"
-
-_APPROACH = 0.12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,16 +100,6 @@ def outlines(scene: Superquadrics) -> list[Float[np.ndarray, "corners 2"] | None
 def outlines_in_view(scene: Superquadrics, camera: Camera) -> list[Float[np.ndarray, "corners 2"] | None]:
     """Each object's outline in the camera's image as columns and rows; None for absent objects."""
     return [_hull(None if points is None else _pixels(camera, points)) for points in _surfaces(scene)]
-
-
-def placed_scene(scene: Superquadrics, action: Action) -> Superquadrics:
-    """The scene after a pick-and-place has moved its object rigidly."""
-    T = np.asarray(action.T_world_place, float) @ np.linalg.inv(np.asarray(action.T_world_gripper, float))
-    i = int(action.object)
-    position, rotation = np.array(scene.position, float), np.array(scene.rotation, float)
-    position[i] = T[:3, :3] @ position[i] + T[:3, 3]
-    rotation[i] = T[:3, :3] @ rotation[i]
-    return dataclasses.replace(scene, position=position, rotation=rotation)
 
 
 def map_image(
@@ -205,73 +193,62 @@ def _halo(width: float) -> list:
     return [Stroke(linewidth=width + 2.6, foreground=PAPER), Normal()]
 
 
-def _arrow(axes: Axes, start, end, bend: float = 0.0, width: float = 2.4) -> None:
+def _arrow(axes: Axes, points: Float[np.ndarray, "points 2"]) -> None:
+    codes = [Path.MOVETO, *[Path.LINETO] * (len(points) - 1)]
     arrow = patches.FancyArrowPatch(
-        tuple(start),
-        tuple(end),
-        connectionstyle=f"arc3,rad={bend}",
+        path=Path(points, codes),
         arrowstyle="-|>",
         mutation_scale=13,
-        shrinkA=0,
-        shrinkB=0,
         color=ACTION,
-        linewidth=width,
+        linewidth=2.4,
+        fill=False,
         joinstyle="miter",
         zorder=8,
         clip_on=False,
     )
-    arrow.set_path_effects(_halo(width))
+    arrow.set_path_effects(_halo(2.4))
     axes.add_patch(arrow)
 
 
-def draw_action(axes: Axes, scene: Superquadrics, action: Action) -> None:
-    """An action from above: a push as an arrow with the hand's way in dotted, a pick-and-place with the new outline."""
-    kind = ActionKind(int(action.kind))
-    if kind is ActionKind.NONE:
-        return
-    T = np.asarray(action.T_world_gripper, float)
-    start, inward = T[:2, 3], T[:2, 2]
-    if kind is ActionKind.PUSH:
-        end = start + np.asarray(action.displacement, float)[:2]
-        before = start - _APPROACH * inward
-        axes.plot([before[1], start[1]], [before[0], start[0]], color=ACTION, lw=1.6, linestyle=(0, (1, 1.2)), zorder=7)
-        axes.plot(start[1], start[0], "o", color=ACTION, markersize=4, zorder=9)
-        _arrow(axes, start[::-1], end[::-1])
-        return
-    after = placed_scene(scene, action)
-    outline = outlines(after)[int(action.object)]
-    if outline is not None:
-        axes.add_patch(
-            patches.Polygon(outline[:, ::-1], closed=True, facecolor=(*rgb(ACTION), 0.12), edgecolor=ACTION, lw=1.4,
-                            linestyle=(0, (3, 2)), zorder=6)
-        )  # fmt: skip
-    begin, end = np.asarray(scene.position)[int(action.object), :2], after.position[int(action.object), :2]
-    _arrow(axes, begin[::-1], end[::-1], bend=0.25)
+def draw_sketch(axes: Axes, sketch: Sketch, after: Superquadrics) -> None:
+    """An action from above.
+
+    Args:
+      axes: where the shelf is drawn.
+      sketch: what there is to show.
+      after: the objects as they are predicted after the action.
+    """
+    if sketch.way_in is not None:
+        axes.plot(*sketch.way_in[:, 1::-1].T, color=ACTION, lw=1.6, linestyle=(0, (1, 1.2)), zorder=7)
+    if sketch.start is not None:
+        axes.plot(sketch.start[1], sketch.start[0], "o", color=ACTION, markersize=4, zorder=9)
+    if sketch.ghost is not None:
+        outline = outlines(after)[sketch.ghost]
+        if outline is not None:
+            axes.add_patch(
+                patches.Polygon(
+                    outline[:, ::-1], closed=True, facecolor=(*rgb(ACTION), 0.12), edgecolor=ACTION, lw=1.4,
+                    linestyle=(0, (3, 2)), zorder=6,
+                )
+            )  # fmt: skip
+    if sketch.path is not None:
+        _arrow(axes, sketch.path[:, 1::-1])
 
 
-def draw_retrieval(axes: Axes, T_world_gripper: Float[np.ndarray, "4 4"]) -> None:
-    """The hand taking the target out, from above."""
-    T = np.asarray(T_world_gripper, float)
-    _arrow(axes, T[:2, 3][::-1], (T[:2, 3] - 0.3 * T[:2, 2])[::-1])
+def draw_sketch_in_view(axes: Axes, sketch: Sketch, camera: Camera) -> None:
+    """An action in the camera's image."""
+    if sketch.way_in is not None:
+        axes.plot(*_pixels(camera, sketch.way_in).T, color=ACTION, lw=1.6, linestyle=(0, (1, 1.2)), zorder=7)
+    if sketch.start is not None:
+        axes.plot(*_pixels(camera, sketch.start), "o", color=ACTION, markersize=4, zorder=9)
+    if sketch.path is not None:
+        _arrow(axes, _pixels(camera, sketch.path))
 
 
 def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
     """(column, row) of world points."""
     pixels, _ = project(camera, jnp.asarray(points, jnp.float32))
     return np.asarray(pixels)[..., ::-1]
-
-
-def _path_in_view(axes: Axes, camera: Camera, points: np.ndarray, dotted: bool = False) -> None:
-    pixels = _pixels(camera, points)
-    if dotted:
-        axes.plot(*pixels.T, color=ACTION, lw=1.6, linestyle=(0, (1, 1.2)), zorder=7)
-        return
-    codes = [Path.MOVETO, *[Path.LINETO] * (len(pixels) - 1)]
-    arrow = patches.FancyArrowPatch(
-        path=Path(pixels, codes), arrowstyle="-|>", mutation_scale=13, color=ACTION, linewidth=2.4, fill=False, zorder=8
-    )
-    arrow.set_path_effects(_halo(2.4))
-    axes.add_patch(arrow)
 
 
 def view_window(camera: Camera, shelf: Shelf) -> tuple[int, int, int, int]:
@@ -314,31 +291,6 @@ def draw_numbers_in_view(axes: Axes, owner: Int[np.ndarray, "h w"], count: int) 
         rows, columns = np.nonzero(owner == i)
         if len(rows) > 200:
             _number(axes, (float(np.median(columns)), float(np.median(rows))), i)
-
-
-def draw_action_in_view(axes: Axes, scene: Superquadrics, action: Action, camera: Camera) -> None:
-    """An action in the camera's image: the way of the gripper in a push, the way of the object in a pick-and-place."""
-    kind = ActionKind(int(action.kind))
-    if kind is ActionKind.NONE:
-        return
-    T = np.asarray(action.T_world_gripper, float)
-    start = T[:3, 3]
-    share = np.linspace(0.0, 1.0, 40)[:, None]
-    if kind is ActionKind.PUSH:
-        _path_in_view(axes, camera, start - (1 - share) * _APPROACH * T[:3, 2], dotted=True)
-        axes.plot(*_pixels(camera, start), "o", color=ACTION, markersize=4, zorder=9)
-        _path_in_view(axes, camera, start + share * np.asarray(action.displacement, float))
-        return
-    begin = np.asarray(scene.position, float)[int(action.object)]
-    end = placed_scene(scene, action).position[int(action.object)]
-    arch = 4 * share * (1 - share) * np.array([-0.12, 0.0, 0.06])
-    _path_in_view(axes, camera, begin + share * (end - begin) + arch)
-
-
-def draw_retrieval_in_view(axes: Axes, T_world_gripper: Float[np.ndarray, "4 4"], camera: Camera) -> None:
-    """The hand taking the target out, in the camera's image."""
-    T = np.asarray(T_world_gripper, float)
-    _path_in_view(axes, camera, T[:3, 3] - np.linspace(0.0, 0.25, 40)[:, None] * T[:3, 2])
 
 
 def draw_legend(figure: Figure, capacity: int, y: float) -> None:

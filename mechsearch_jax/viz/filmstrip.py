@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.figure import Figure
 
-from mechsearch_jax.actions import Action
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.superquadric import Superquadrics
-from mechsearch_jax.target import Target
+from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.viz import drawing
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 _WIDTH = 4.6
 _CAPTION, _GAP, _LEGEND = 0.52, 0.16, 0.55
@@ -37,8 +37,8 @@ class Frame:
       graspability: g at the candidate poses.
       target_pose: x, y [m] and yaw [rad] of the true target.
       found: whether the robot knows that pose.
-      action: what the robot was about to do; None for nothing and for a retrieval.
-      retrieval: `T_world_gripper` of a retrieval, shape (4, 4); None if there was none.
+      after: the objects as the planner expects them after the action.
+      sketch: what there is to show of the action.
     """
 
     title: str
@@ -50,8 +50,8 @@ class Frame:
     graspability: Int[np.ndarray, " x"]
     target_pose: Float[np.ndarray, " 3"]
     found: bool
-    action: Action | None
-    retrieval: Float[np.ndarray, "4 4"] | None
+    after: Superquadrics
+    sketch: Sketch
 
 
 def filmstrip(
@@ -112,9 +112,5 @@ def _draw(view, above, frame: Frame, camera: Camera, shelf: Shelf, target: Targe
     drawing.draw_map(above, image, shelf, target)
     drawing.draw_objects(above, frame.scene)
     drawing.draw_target(above, frame.target_pose, target, frame.found)
-    if frame.action is not None:
-        drawing.draw_action_in_view(view, frame.scene, frame.action, camera)
-        drawing.draw_action(above, frame.scene, frame.action)
-    if frame.retrieval is not None:
-        drawing.draw_retrieval_in_view(view, frame.retrieval, camera)
-        drawing.draw_retrieval(above, frame.retrieval)
+    drawing.draw_sketch_in_view(view, frame.sketch, camera)
+    drawing.draw_sketch(above, frame.sketch, frame.after)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
+import zipfile
+
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mechsearch_jax.camera import Camera
-from mechsearch_jax.results import Maps
-from mechsearch_jax.shelf import Shelf
-from mechsearch_jax.target import Target
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.viz import drawing
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 _WIDTH, _GAP = 4.6, 0.2
 
@@ -102,3 +107,51 @@ def _draw_counts(axes: Axes, maps: Maps) -> None:
     axes.spines["left"].set_color(drawing.WALL)
     box = axes.get_position()
     axes.set_position((box.x0 + 0.2 * box.width, box.y0 + 0.12 * box.height, 0.78 * box.width, 0.82 * box.height))
+
+
+@dataclasses.dataclass(frozen=True)
+class Maps:
+    """f and g over all candidate poses, and the objects that they were computed from.
+
+    Attributes:
+      poses: x, y [m] and yaw [rad] of the candidate poses.
+      existence: where the target can be.
+      graspability: 1 where it could be grasped, else 1 minus the number of objects in the way.
+      scene: the objects, as NumPy arrays.
+    """
+
+    poses: Float[np.ndarray, "x 3"]
+    existence: Bool[np.ndarray, " x"]
+    graspability: Int[np.ndarray, " x"]
+    scene: Superquadrics
+
+
+_SCENE_FIELDS = tuple(field.name for field in dataclasses.fields(Superquadrics))
+
+
+def save_maps(maps: Maps, path: PathLike) -> None:
+    """Write maps as a compressed npz file (docs/method.md, "Files").
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    arrays = {"poses": maps.poses, "existence": maps.existence, "graspability": maps.graspability}
+    scene = {name: np.asarray(getattr(maps.scene, name)) for name in _SCENE_FIELDS}
+    with replacing(path) as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays, **scene)
+
+
+def load_maps(path: PathLike) -> Maps:
+    """Read what `save_maps` wrote.
+
+    Raises:
+      InputError: the file cannot be read or holds something else.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            scene = Superquadrics(**{name: file[name] for name in _SCENE_FIELDS})
+            return Maps(file["poses"], file["existence"], file["graspability"], scene)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (KeyError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: holds no maps ({error})") from error

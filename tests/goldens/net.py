@@ -43,7 +43,7 @@ RECOGNITIONS = ("oracle", "masks", "full")
 
 
 def scenario_files():
-    from mechsearch_jax.scenario import example_scenarios
+    from mechsearch_jax.workspace.scenario import example_scenarios
 
     return [*example_scenarios().values(), *sorted(PUBLISHED.glob("*.json"))[::8][:12]]
 
@@ -52,24 +52,19 @@ def scenario_files():
 
 
 def run_episode(path, method, recognition, seed=0):
-    from mechsearch_jax.cache import kept_problem
-    from mechsearch_jax.envs import episode as episodes
+    from mechsearch_jax.envs import episodes
+    from mechsearch_jax.envs.method import Method
+    from mechsearch_jax.envs.native import NativeSimulator
     from mechsearch_jax.envs.recognisers import recogniser
-    from mechsearch_jax.envs.simulator import NativeSimulator
-    from mechsearch_jax.planner import PlannerConfig
-    from mechsearch_jax.scenario import load_scenario
+    from mechsearch_jax.planner.cache import cached_problem
+    from mechsearch_jax.workspace.scenario import load_scenario
 
     scenario = load_scenario(path)
     target = episodes.target_of(scenario)
-    config = PlannerConfig(method=method)
+    chosen, see = Method(method, recognition=recognition), recogniser(recognition, target)
+    simulator = NativeSimulator(threads=1)
     return episodes.run_episode(
-        seed,
-        scenario,
-        kept_problem(target),
-        config,
-        NativeSimulator(),
-        recogniser(recognition, target),
-        recognition,
+        seed, scenario, cached_problem(target), chosen.policy(), simulator, see, options=chosen.options()
     )
 
 
@@ -83,7 +78,7 @@ def episode_answer(path, method, recognition):
 
 
 def some_episodes(share):
-    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.planner.cache import keep_compilations
 
     keep_compilations()
     found = {}
@@ -107,21 +102,19 @@ def episodes():
 
 
 def chosen_actions():
-    """An initial world and an action for each kind: none, a push, a pick-and-place, and taking the target out."""
+    """An action for each kind in the order of their codes: none, a push, a pick-and-place, taking the target out."""
     from mechsearch_jax import planner
     from mechsearch_jax.actions import ActionKind, no_action
-    from mechsearch_jax.cache import kept_problem
-    from mechsearch_jax.envs.mjx_simulator import retrievals
-    from mechsearch_jax.planner import PlannerConfig
-    from mechsearch_jax.scenario import example_scenarios, load_scenario, superquadrics
+    from mechsearch_jax.observation import Observation
+    from mechsearch_jax.planner.cache import cached_problem
+    from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 
     scenario = load_scenario(example_scenarios()["first-light"])
-    problem, config, objects = kept_problem(), PlannerConfig(), superquadrics(scenario.objects)
-    belief = planner.observe_belief(
-        problem, planner.initial_belief(problem), objects, jnp.array(False), jnp.zeros(3), config
-    )
-    plan = planner.plan(jax.random.key(0), problem, belief, objects, config)
-    firsts = jax.tree.map(lambda a: a[:, 0], plan.sequences.actions)
+    problem, objects = cached_problem(), superquadrics(scenario.objects)
+    observation = Observation(objects, jnp.array(False), jnp.zeros(3))
+    belief = planner.update_belief(problem, planner.initial_belief(problem), observation)
+    decision = planner.search_for_grasp()(jax.random.key(0), problem, belief, observation)
+    firsts = jax.tree.map(lambda a: a[:, 0], decision.sequences.actions)
     kinds = np.asarray(firsts.kind)
     found = [no_action()]
     for kind in (ActionKind.PUSH, ActionKind.PICK_AND_PLACE):
@@ -129,9 +122,7 @@ def chosen_actions():
         found.append(jax.tree.map(lambda a, i=first: a[i], firsts))
     clear = objects.replace(valid=jnp.zeros_like(objects.valid))
     x, y, _ = scenario.target.position
-    grasp = planner.graspable_at(problem, clear, jnp.float32([x, y, 0.0]))
-    out = retrievals(grasp.T_world_gripper[None], grasp.q7[None], grasp.opening[None])
-    found.append(jax.tree.map(lambda a: a[0], out))
+    found.append(planner.graspable_at(problem, clear, jnp.float32([x, y, 0.0])).action)
     return {
         name: np.stack([np.asarray(getattr(action, name)) for action in found])
         for name in ("T_world_gripper", "displacement", "T_world_place", "q7", "opening", "object")
@@ -139,10 +130,10 @@ def chosen_actions():
 
 
 def simulator(kept):
-    """The actions of `chosen_actions`, in the order none, push, pick-and-place, retrieve."""
-    from mechsearch_jax.actions import Action, ActionKind
-    from mechsearch_jax.envs.mjx_simulator import RETRIEVE, MjxSimulator
-    from mechsearch_jax.scenario import example_scenarios, load_scenario
+    """The actions of `chosen_actions`."""
+    from mechsearch_jax.actions import KINDS, Action
+    from mechsearch_jax.envs.mjx_simulator import MjxSimulator
+    from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
     actions = {k: v for k, v in kept.items() if k.startswith("action ")} or {
         f"action {name}": value for name, value in chosen_actions().items()
@@ -151,52 +142,51 @@ def simulator(kept):
     alone = dataclasses.replace(scenario, objects=())
     simulator = MjxSimulator()
     simulator.reset([scenario, scenario, scenario, alone])
-    kinds = [ActionKind.NONE, ActionKind.PUSH, ActionKind.PICK_AND_PLACE, RETRIEVE]
-    outcomes = simulator.execute(
+    outcome = simulator.execute(
         Action(
-            kind=jnp.array([int(kind) for kind in kinds], jnp.int32),
+            kind=jnp.array([int(kind) for kind in sorted(KINDS)], jnp.int32),
             **{name.removeprefix("action "): jnp.asarray(value) for name, value in actions.items()},
         )
     )
     names = ("failure", "steps", "settled", "fallen", "held", "outside", "retrieved", "overflow")
-    told = {name: np.asarray(getattr(outcomes, name)) for name in names}
+    told = {name: np.asarray(getattr(outcome, name)) for name in names}
     world = simulator.world
     return {**actions, **told, "position": np.asarray(world.position), "rotation": np.asarray(world.rotation)}
 
 
 def maps(kept):
-    from mechsearch_jax.cache import kept_problem
-    from mechsearch_jax.envs.episode import target_of
+    from mechsearch_jax.envs.episodes import target_of
     from mechsearch_jax.envs.pictures import inspect_scenario
-    from mechsearch_jax.planner import PlannerConfig
-    from mechsearch_jax.scenario import load_scenario
+    from mechsearch_jax.planner.cache import cached_problem
+    from mechsearch_jax.workspace.scenario import load_scenario
 
     found = {}
     for file in scenario_files():
         scenario = load_scenario(file)
-        told, _ = inspect_scenario(scenario, kept_problem(target_of(scenario)), PlannerConfig())
+        told, _ = inspect_scenario(scenario, cached_problem(target_of(scenario)))
         found[f"{file.stem} existence"] = np.asarray(told.existence)
         found[f"{file.stem} graspability"] = np.asarray(told.graspability)
     return found
 
 
 def shapes(kept):
-    from mechsearch_jax.cache import kept_problem
-    from mechsearch_jax.envs.episode import Snapshot, target_of
+    from mechsearch_jax.envs.episodes import target_of
     from mechsearch_jax.envs.recognisers import recogniser
+    from mechsearch_jax.envs.snapshot import Snapshot
     from mechsearch_jax.envs.world import from_scenario
-    from mechsearch_jax.scenario import load_scenario
+    from mechsearch_jax.planner.cache import cached_problem
+    from mechsearch_jax.workspace.scenario import load_scenario
 
     found = {}
     for file in scenario_files():
         scenario = load_scenario(file)
-        problem = kept_problem(target_of(scenario))
+        problem = cached_problem(target_of(scenario))
         for recognition in RECOGNITIONS:
             see = recogniser(recognition, target_of(scenario))
             seen = see(jax.random.key(0), Snapshot(problem.camera, problem.shelf, from_scenario(scenario)))
             for name in ("size", "exponents", "position", "rotation", "valid"):
-                found[f"{file.stem} {recognition} {name}"] = np.asarray(getattr(seen.scene, name))
-            found[f"{file.stem} {recognition} found"] = np.asarray(seen.found)
+                found[f"{file.stem} {recognition} {name}"] = np.asarray(getattr(seen.objects, name))
+            found[f"{file.stem} {recognition} found"] = np.asarray(seen.target_visible)
             found[f"{file.stem} {recognition} target_pose"] = np.asarray(seen.target_pose)
     return found
 
@@ -205,9 +195,9 @@ def made_up_pushes():
     """Pushes of the first object of each shipped scenario, after which it is where the gripper has gone."""
     from mechsearch_jax.envs.pushes import Pushes
     from mechsearch_jax.envs.world import BODIES, from_scenario
+    from mechsearch_jax.geometry.transforms import make
     from mechsearch_jax.graspability import gripper_rotation
-    from mechsearch_jax.scenario import example_scenarios, load_scenario
-    from mechsearch_jax.transforms import make
+    from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
     worlds = [from_scenario(load_scenario(file)) for file in example_scenarios().values()]
     before = jax.tree.map(lambda *leaves: jnp.stack(leaves), *worlds)
@@ -229,9 +219,9 @@ def made_up_pushes():
 
 
 def losses(kept):
-    from mechsearch_jax.models.push import PushConfig
-    from mechsearch_jax.models.recognition import RecognitionConfig
-    from mechsearch_jax.models.segmentation import SegmentationConfig
+    from mechsearch_jax.networks.push import PushConfig
+    from mechsearch_jax.networks.recognition import RecognitionConfig
+    from mechsearch_jax.networks.segmentation import SegmentationConfig
     from mechsearch_jax.train.push import PushTask
     from mechsearch_jax.train.recognition import RecognitionTask
     from mechsearch_jax.train.segmentation import SegmentationTask
@@ -263,14 +253,14 @@ def weights(kept):
 def report(kept):
     """What is written of a few episodes whose wall times are made up."""
     from mechsearch_jax.benchmarks.report import write_report
-    from mechsearch_jax.envs.episode import row
-    from mechsearch_jax.scenario import example_scenarios
+    from mechsearch_jax.benchmarks.rows import Row
+    from mechsearch_jax.workspace.scenario import example_scenarios
 
     rows = []
     for file in example_scenarios().values():
         for method in METHODS:
-            told = row(run_episode(file, method, "oracle"))
-            rows.append(dataclasses.replace(told, planning_seconds=1.0, simulation_seconds=2.0))
+            row = Row.of_episode(run_episode(file, method, "oracle"))
+            rows.append(dataclasses.replace(row, planning_seconds=1.0, simulation_seconds=2.0))
     with tempfile.TemporaryDirectory() as folder:
         write_report(rows, Path(folder))
         texts = ("report.md", "rates.csv", "rates.json", "failures.csv")
@@ -333,7 +323,7 @@ def main():
     parser.add_argument("do", choices=("write", "compare"))
     parser.add_argument("--only", nargs="+", choices=tuple(PARTS), default=tuple(PARTS))
     options = parser.parse_args()
-    from mechsearch_jax.cache import keep_compilations
+    from mechsearch_jax.planner.cache import keep_compilations
 
     keep_compilations()
     found = 0

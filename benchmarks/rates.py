@@ -1,0 +1,85 @@
+"""Success rates of episodes with confidence intervals."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import scipy.stats
+
+from mechsearch_jax.benchmarks.rows import Row, label_variants
+
+
+@dataclasses.dataclass(frozen=True)
+class Rates:
+    """Shares of episodes, among those with a number of objects.
+
+    Attributes:
+      method: the planner's method, with the options that tell it from the others: see `label_variants`.
+      objects: number of surrounding objects; None for all.
+      episodes: how many episodes.
+      errors: how many of them could not be run to their end; they count as failures.
+      found, graspable, retrieved: shares of them.
+      found_interval, graspable_interval, retrieved_interval: what the true shares may be: see `wilson`.
+      steps: mean number of actions, attempts to take the target out among them.
+      planning_seconds, simulation_seconds: mean wall time per action [s].
+    """
+
+    method: str
+    objects: int | None
+    episodes: int
+    errors: int
+    found: float
+    graspable: float
+    retrieved: float
+    found_interval: tuple[float, float]
+    graspable_interval: tuple[float, float]
+    retrieved_interval: tuple[float, float]
+    steps: float
+    planning_seconds: float
+    simulation_seconds: float
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """Wilson's 95% confidence interval of a share: low and high; (0, 1) if nothing was counted."""
+    if count == 0:
+        return 0.0, 1.0
+    interval = scipy.stats.binomtest(successes, count).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def is_error(row: Row) -> bool:
+    """Whether an episode ended because the program failed, not the robot."""
+    return row.failure is not None and row.failure.startswith("error: ")
+
+
+def summarise(rows: Sequence[Row]) -> list[Rates]:
+    """Rates by method (and what else differs) and number of objects, and for each method over all of them."""
+    summary = []
+    labels = label_variants(rows)
+    for method in sorted(set(labels)):
+        of_method = [row for row, label in zip(rows, labels, strict=True) if label == method]
+        for objects in [*sorted({row.objects for row in of_method}), None]:
+            group = [row for row in of_method if objects is None or row.objects == objects]
+            actions = max(sum(row.steps for row in group), 1)
+            found = sum(row.found_step is not None for row in group)
+            graspable = sum(row.graspable_step is not None for row in group)
+            retrieved = sum(row.retrieved for row in group)
+            summary.append(
+                Rates(
+                    method=method,
+                    objects=objects,
+                    episodes=len(group),
+                    errors=sum(is_error(row) for row in group),
+                    found=found / len(group),
+                    graspable=graspable / len(group),
+                    retrieved=retrieved / len(group),
+                    found_interval=wilson(found, len(group)),
+                    graspable_interval=wilson(graspable, len(group)),
+                    retrieved_interval=wilson(retrieved, len(group)),
+                    steps=sum(row.steps for row in group) / len(group),
+                    planning_seconds=sum(row.planning_seconds for row in group) / actions,
+                    simulation_seconds=sum(row.simulation_seconds for row in group) / actions,
+                )
+            )
+    return summary

@@ -1,0 +1,44 @@
+"""What files of earlier versions say of the options of an episode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+# An option's name then, and its name now.
+RENAMED: Mapping[str, str] = {
+    "method": "policy",
+    "caution": "unseen_contact_penalty",
+    "focus": "guided_fraction",
+    "give": "contact_tolerance",
+    "jam": "max_penetration",
+    "kinds": "actions",
+}
+# What options that files of earlier versions do not hold were then.
+EARLIER: Mapping[str, Any] = {
+    "push_model": "quasi-static",
+    "topple_charge": 0.0,
+    "crowding_weight": 0.02,
+    "draws": 1,
+    "move_again": False,
+    "predicted_collisions": False,
+    "avoid_unseen": True,
+    "grasp_tilts": [math.radians(angle) for angle in (20, 25, 30)],
+    "retrieval_tilts": [math.radians(angle) for angle in (20, 22.5, 25, 27.5, 30)],
+    "object_grasp_tilts": [math.radians(angle) for angle in (20, 30)],
+}
+# When there were two kinds of action, their set was a word.
+_KINDS: Mapping[str, list[str]] = {
+    "both": ["push", "pick-and-place"],
+    "push": ["push"],
+    "pick-and-place": ["pick-and-place"],
+}
+
+
+def present_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of an episode by their present names and in their present form, whichever version wrote them."""
+    present = {**EARLIER, **{RENAMED.get(name, name): value for name, value in options.items()}}
+    if isinstance(present.get("actions"), str):
+        present["actions"] = _KINDS.get(present["actions"], present["actions"])
+    return present

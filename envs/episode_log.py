@@ -1,0 +1,197 @@
+"""What is written down of an episode while it runs, and the verdicts on it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.actions import Action, ActionKind, kind_of
+from mechsearch_jax.envs.outcome import Outcome, Overflow
+from mechsearch_jax.envs.records import Episode, Step, record_action
+from mechsearch_jax.planner import Decision
+from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.scenario import Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+
+# A target that leans further than this has fallen over [rad].
+MAX_TILT = math.radians(15)
+
+
+class Choice(flax.struct.PyTreeNode):
+    """What a policy decided, without the sequences that it did not choose.
+
+    Attributes:
+      action, cost, predicted_cost, overflow: of the `Decision`.
+      sequences: how many sequences it was chosen from.
+    """
+
+    action: Action
+    cost: jax.Array
+    predicted_cost: jax.Array
+    sequences: jax.Array
+    overflow: jax.Array
+
+
+def chosen(decision: Decision) -> Choice:
+    """What a decision comes down to."""
+    count = jnp.sum(jnp.isfinite(decision.sequences.value))
+    return Choice(decision.action, decision.cost, decision.predicted_cost, count, decision.overflow)
+
+
+def takes_target(choice: Choice) -> bool:
+    """Whether the chosen action is to take the target out."""
+    return kind_of(int(choice.action.kind)).takes_target
+
+
+def distrust(choice: Choice) -> str | None:
+    """Why a choice must not be acted upon; None if it may."""
+    if choice.overflow:
+        return "error: an object's image outgrew its window, so that f may be too small"
+    numbers = [choice.cost, *jax.tree.leaves(choice.action)]
+    return None if all(np.all(np.isfinite(n)) for n in numbers) else "error: the decision is not finite"
+
+
+def target_trouble(shelf: Shelf, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"]) -> str | None:
+    """Why a target at this pose can no longer be taken out as the planner knows it; None if it can."""
+    if position[0] < shelf.front or position[2] < shelf.board:
+        return "the target fell off the board"
+    return "the target fell over" if abs(rotation[2, 2]) < math.cos(MAX_TILT) else None
+
+
+def overflow_trouble(outcome: Outcome, i: int) -> str | None:
+    """What was too small for the contacts of world `i`; None if nothing was."""
+    flags = Overflow(int(outcome.overflow[i]))
+    if flags is Overflow.NONE:
+        return None
+    names = ", ".join(str(flag.name).lower() for flag in Overflow if flag and flag in flags)
+    return f"error: the simulator's buffers were too small ({names})"
+
+
+def failure_of(choice: Choice, outcome: Outcome, i: int) -> str | None:
+    """Why the action in world `i` was not carried out as chosen, in the words of a record; None if it was."""
+    kind, reason = kind_of(int(choice.action.kind)), outcome.reason(i)
+    if kind.code == ActionKind.NONE:
+        return "no action is possible"
+    return f"retrieval: {reason}" if reason and kind.takes_target else reason
+
+
+def record(found: bool, belief_size: int, graspable: bool, choice: Choice | None) -> Step:
+    """A step as it is decided: what comes of it is filled in later.
+
+    Args:
+      found: whether the target has been found.
+      belief_size: number of poses where it can be.
+      graspable: whether it truly is.
+      choice: None where nothing is done.
+    """
+    cost = predicted = action = None
+    sequences = 0
+    if choice is not None:
+        action, cost = record_action(choice.action), float(choice.cost)
+        if not takes_target(choice):
+            # A policy need not say what it expects.
+            predicted = float(choice.predicted_cost) if np.isfinite(choice.predicted_cost) else None
+            sequences = int(choice.sequences)
+    return Step(
+        belief_size=belief_size,
+        found=found,
+        graspable=graspable,
+        cost=cost,
+        action=action,
+        predicted_cost=predicted,
+        observed_cost=None,
+        sequences=sequences,
+        failure=None,
+        timings={},
+    )
+
+
+class EpisodeLog:
+    """The steps of an episode that is running, and the verdicts on them.
+
+    At every step `decide` notes what was known and decided, and then `act` what came of it.
+
+    Attributes:
+      steps: those that are over, and the one that was decided.
+    """
+
+    def __init__(self, max_steps: int) -> None:
+        self.steps: list[Step] = []
+        self._max_steps = max_steps
+        self._index = 0
+        self._found_step: int | None = None
+        self._graspable_step: int | None = None
+        self._retrieved = False
+        self._failure: str | None = None
+
+    @property
+    def index(self) -> int:
+        """Number of the present step: how many steps came before it."""
+        return self._index
+
+    @property
+    def last(self) -> bool:
+        """Whether at the present step only a retrieval is allowed any more."""
+        return self._index == self._max_steps
+
+    @property
+    def acts(self) -> bool:
+        """Whether an action was decided upon."""
+        return self.steps[-1].action is not None
+
+    def decide(self, step: Step) -> Step:
+        """Note what is known and decided at the present step."""
+        if self.steps:
+            self.steps[-1] = dataclasses.replace(self.steps[-1], observed_cost=step.cost)
+        if step.found and self._found_step is None:
+            self._found_step = self._index
+        if step.graspable and self._graspable_step is None:
+            self._graspable_step = self._index
+        self.steps.append(step)
+        return step
+
+    def act(self, retrieved: bool, failure: str | None, trouble: str | None, timings: dict[str, float]) -> bool:
+        """Note what came of the decision; whether the episode ends with it.
+
+        Args:
+          retrieved: whether it took the target out.
+          failure: why the action was not carried out as chosen; None if it was, or if nothing was done.
+          trouble: why the episode cannot go on, unless it was a success; None if it can.
+          timings: of the step's stages [s].
+        """
+        step = self.steps[-1] = dataclasses.replace(self.steps[-1], failure=failure, timings=timings)
+        self._retrieved = retrieved and not (trouble or "").startswith("error")
+        self._failure = None if self._retrieved else trouble or _end(step, self.last)
+        self._index += 1
+        return self._retrieved or self._failure is not None
+
+    def episode(self, scenario: Scenario, options: dict[str, Any]) -> Episode:
+        """The record of the episode, which has ended."""
+        return Episode(
+            scenario=scenario.name,
+            objects=len(scenario.objects),
+            config=options,
+            versions=versions(),
+            steps=tuple(self.steps),
+            found_step=self._found_step,
+            graspable_step=self._graspable_step,
+            retrieved=self._retrieved,
+            failure=self._failure,
+        )
+
+
+def _end(step: Step, last: bool) -> str | None:
+    """Why an episode without a retrieval ends here; None if it goes on."""
+    # Trying once more would neither make the same grasp reachable nor put a fallen object back on the board.
+    if step.failure in ("retrieval: unreachable", "retrieval: fallen"):
+        return step.failure
+    if not last:
+        return None
+    return step.failure or ("found, but not graspable" if step.found else "not found")

@@ -1,0 +1,362 @@
+"""The closed loop: look, recognise, update the belief, decide, act; many episodes at once, or one alone.
+
+Each episode has a slot. All slots look, decide and act together; an episode that ends leaves its slot to the next one,
+so that short episodes do not wait for long ones. The random numbers of an episode are its own: what it decides depends
+neither on its slot nor on its neighbours. An episode alone is a pool of one slot, which calls the functions of a single
+scene, and which can be watched.
+
+Two verdicts are passed on an episode, both on the true state: `graspable` (the target is in sight and a collision-free
+grasp exists) and `retrieved` (the hand took it out of the shelf, and no object fell). An action that fails costs a step
+and leaves the world as it made it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, UInt
+
+from mechsearch_jax.actions import Action, no_action
+from mechsearch_jax.envs.episode_log import (
+    Choice,
+    EpisodeLog,
+    distrust,
+    failure_of,
+    overflow_trouble,
+    record,
+    takes_target,
+    target_trouble,
+)
+from mechsearch_jax.envs.outcome import Outcome
+from mechsearch_jax.envs.records import Episode, Step
+from mechsearch_jax.envs.simulator import Simulator
+from mechsearch_jax.envs.slots import ManySlots, OneSlot, Slots
+from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle
+from mechsearch_jax.envs.world import TARGET, World
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import Belief, Decision, Policy, Problem
+from mechsearch_jax.workspace.scenario import Scenario
+from mechsearch_jax.workspace.target import Target
+
+# How finely the yaw of a box is searched, over half a turn.
+BOX_YAWS = 6
+
+
+def target_of(scenario: Scenario) -> Target:
+    """The target of a scenario as the planner knows it: its shape, and how finely its yaw is searched."""
+    body = scenario.target
+    return Target(shape=body.shape, half_size=body.half_size, yaws=BOX_YAWS if body.shape == "box" else 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """An episode to be run.
+
+    Attributes:
+      scenario: where everything stands at the start.
+      seed: of the planner's and of the environment's random numbers, which are independent of each other.
+    """
+
+    scenario: Scenario
+    seed: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Moment:
+    """All that is known at one step of an episode, for who looks on.
+
+    Attributes:
+      index: number of actions before it.
+      snapshot: what the camera sees.
+      observation: what was recognised.
+      belief: where the target can be.
+      decision: of the policy; None where none was needed or none could be acted upon.
+      record: what is written down; its `observed_cost` comes later.
+      outcome: what the simulator said of the action; None before it was executed, or without one.
+    """
+
+    index: int
+    snapshot: Snapshot
+    observation: Observation
+    belief: Belief
+    decision: Decision | None
+    record: Step
+    outcome: Outcome | None
+
+
+@runtime_checkable
+class Watcher(Protocol):
+    """Looks on while an episode runs alone."""
+
+    def busy(self, stage: str) -> None:
+        """A stage begins: "recognise", "plan", "judge" or "simulate"."""
+        ...
+
+    def decided(self, moment: Moment) -> None:
+        """The robot has looked and decided, and is about to act."""
+        ...
+
+    def acted(self, moment: Moment) -> None:
+        """The action is over. Also called, without an action, when the episode ends."""
+        ...
+
+
+def run_episode(
+    seed: int,
+    scenario: Scenario,
+    problem: Problem,
+    policy: Policy,
+    simulator: Simulator,
+    recogniser: Recogniser = oracle,
+    max_steps: int = 10,
+    options: Mapping[str, Any] | None = None,
+    watcher: Watcher | None = None,
+) -> Episode:
+    """Run one episode to its end, whatever that is.
+
+    Args:
+      seed: see `Start`.
+      scenario: where everything stands at the start.
+      problem, policy, simulator, recogniser, max_steps, options, watcher: see `run_episodes`. Neither the policy nor
+        the recogniser need be traceable.
+    """
+    found: list[tuple[int, Episode]] = []
+    start = Start(scenario, seed)
+    run_episodes([start], problem, policy, simulator, 1, found.extend, recogniser, max_steps, options, watcher=watcher)
+    return found[0][1]
+
+
+def run_episodes(
+    starts: Iterable[Start],
+    problem: Problem,
+    policy: Policy,
+    simulator: Simulator,
+    slots: int,
+    ended: Callable[[Sequence[tuple[int, Episode]]], None],
+    recogniser: Recogniser = oracle,
+    max_steps: int = 10,
+    options: Mapping[str, Any] | None = None,
+    at_once: int = 64,
+    busy: Callable[[str, int], None] = lambda stage, episodes: None,
+    watcher: Watcher | None = None,
+) -> None:
+    """Run episodes to their ends, many at a time.
+
+    Args:
+      starts: the episodes.
+      problem: built for the target of all their scenarios.
+      policy: decides; it takes the target out by an action of kind RETRIEVE.
+      simulator: executes the actions; reset first.
+      slots: how many episodes run at the same time, at most.
+      ended: told after every round of the episodes that ended in it, if any, with their places in `starts`.
+      recogniser: what the policy sees the world through; with several slots it has to be traceable, as the policy.
+      max_steps: actions in an episode; afterwards the target may still be taken out.
+      options: what the records keep of how the episodes were run, beside target, simulator and seed.
+      at_once: how many slots look or decide in one computation.
+      busy: told of every stage ("recognise", "plan", "judge", "simulate"), with the number of slots in it.
+      watcher: told of every step; for one slot only.
+
+    Raises:
+      InputError: there is no slot, a watcher is given for several, or the policy decides on an unknown kind of action.
+    """
+    if slots < 1:
+        raise InputError(f"run_episodes: {slots} slots run nothing; give at least 1")
+    queue = enumerate(starts)
+    first = [pair for _, pair in zip(range(slots), queue, strict=False)]
+    if not first:
+        return
+    if watcher is not None and len(first) > 1:
+        raise InputError(f"run_episodes: a watcher looks on at one slot, not at {len(first)}")
+    count = len(first)
+    world = simulator.reset([start.scenario for _, start in first])
+    if count == 1:
+        known: Slots = OneSlot(problem, policy, recogniser)
+    else:
+        known = ManySlots(problem, policy, recogniser, world, min(at_once, count))
+    pool = _EpisodePool(simulator, problem, known, count, _Run(max_steps, options or {}, busy, watcher))
+    pool.begin(dict(enumerate(first)))
+    while pool.running:
+        done = pool.round()
+        if done:
+            ended([pair for _, pair in done])
+        fresh = {slot: pair for (slot, _), pair in zip(done, queue, strict=False)}
+        if fresh:
+            simulator.replace({slot: start.scenario for slot, (_, start) in fresh.items()})
+            pool.begin(fresh)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Run:
+    """What concerns all episodes alike; see `run_episodes`."""
+
+    max_steps: int
+    options: Mapping[str, Any]
+    told: Callable[[str, int], None]
+    watcher: Watcher | None
+
+    def busy(self, stage: str, episodes: int) -> None:
+        """Say that a stage begins."""
+        self.told(stage, episodes)
+        if self.watcher is not None:
+            self.watcher.busy(stage)
+
+
+class _Clock:
+    """Wall time of the stages of a round, shared equally by the slots that took part."""
+
+    def __init__(self, slots: int, busy: Callable[[str, int], None]) -> None:
+        self._timings: list[dict[str, float]] = [{} for _ in range(slots)]
+        self._busy = busy
+
+    @contextmanager
+    def __call__(self, stage: str, rows: Sequence[int]) -> Iterator[None]:
+        if rows:
+            self._busy(stage, len(rows))
+        start = time.perf_counter()
+        yield
+        share = (time.perf_counter() - start) / max(len(rows), 1)
+        for row in rows:
+            self._timings[row][stage] = round(share, 6)
+
+    def timings(self, row: int) -> dict[str, float]:
+        return self._timings[row]
+
+
+@dataclasses.dataclass
+class _Slot:
+    """An episode that is running: its place among all, and what is written down of it."""
+
+    place: int
+    start: Start
+    log: EpisodeLog
+
+
+class _EpisodePool:
+    """All slots, and what happens in a round."""
+
+    def __init__(self, simulator: Simulator, problem: Problem, known: Slots, count: int, run: _Run) -> None:
+        """Args:
+        simulator: with a world for each slot.
+        problem: of all episodes.
+        known: what the planner knows in every slot.
+        count: of slots; all are free at first.
+        run: what concerns all episodes alike.
+        """
+        self._simulator, self._problem, self._known, self._run = simulator, problem, known, run
+        self._slots: list[_Slot | None] = [None] * count
+        key = jax.random.key_data(jax.random.key(0))
+        self._keys: UInt[np.ndarray, "slots 2 *words"] = np.zeros((count, 2, *key.shape), key.dtype)
+
+    @property
+    def running(self) -> dict[int, _Slot]:
+        """The episodes that have not ended, by their slots."""
+        return {row: slot for row, slot in enumerate(self._slots) if slot is not None}
+
+    def begin(self, starts: Mapping[int, tuple[int, Start]]) -> None:
+        """Begin episodes, with their places among all, in slots that are free and whose worlds are theirs."""
+        fresh = np.zeros(len(self._slots), bool)
+        for row, (place, start) in starts.items():
+            self._slots[row] = _Slot(place, start, EpisodeLog(self._run.max_steps))
+            self._keys[row] = jax.random.key_data(jax.random.split(jax.random.key(start.seed)))
+            fresh[row] = True
+        self._known.forget(fresh)
+
+    def round(self) -> list[tuple[int, tuple[int, Episode]]]:
+        """Look, decide and act once in all slots; the slots whose episodes ended, with their places and records."""
+        world, logs = self._simulator.world, {row: slot.log for row, slot in self.running.items()}
+        assert world is not None
+        clock = _Clock(len(self._slots), self._run.busy)
+        steps = [slot.log.index if slot else 0 for slot in self._slots]
+        planner_keys, environment_keys = _keys_at(jnp.asarray(self._keys), jnp.array(steps, jnp.int32))
+
+        with clock("recognise", list(logs)):
+            found, possible = self._known.look(world, environment_keys, list(logs))
+        trouble = self._target_troubles(world, [r for r in logs if found[r]])
+        sought = [r for r in logs if found[r] and r not in trouble]
+        # After the last action the target may still be taken out, where it is found.
+        asked = [r for r in logs if r in sought or not (found[r] or logs[r].last)]
+        with clock("plan", asked):
+            choices = self._known.decide(planner_keys, asked)
+        choices = {r: choice for r, choice in choices.items() if not logs[r].last or takes_target(choice)}
+        with clock("judge", sought):
+            graspable = self._known.judge(world, sought)
+
+        trouble |= {r: reason for r, choice in choices.items() if (reason := distrust(choice))}
+        for r, log in logs.items():
+            size = 1 if found[r] else int(possible[r])
+            log.decide(record(bool(found[r]), size, graspable.get(r, False), None if r in trouble else choices.get(r)))
+        return self._act(clock, choices, trouble)
+
+    def _target_troubles(self, world: World, rows: Sequence[int]) -> dict[int, str]:
+        """In which of these slots the target can no longer be taken out, and why."""
+        position, rotation = jax.device_get((world.position[:, TARGET], world.rotation[:, TARGET]))
+        reasons = {r: target_trouble(self._problem.shelf, position[r], rotation[r]) for r in rows}
+        return {r: reason for r, reason in reasons.items() if reason}
+
+    def _act(
+        self, clock: _Clock, choices: Mapping[int, Choice], trouble: Mapping[int, str]
+    ) -> list[tuple[int, tuple[int, Episode]]]:
+        """Execute what was decided, and note what came of it; returns as `round`."""
+        running = self.running
+        acting = [r for r, slot in running.items() if slot.log.acts]
+        moment = self._moment(choices)
+        if self._run.watcher is not None and moment is not None and acting:
+            self._run.watcher.decided(moment)
+        outcome: Outcome | None = None
+        with clock("simulate", acting):
+            if acting:
+                active = np.isin(np.arange(len(self._slots)), acting)
+                actions = _actions(len(self._slots), {r: choices[r].action for r in acting})
+                outcome = jax.device_get(self._simulator.execute(actions, jnp.asarray(active)))
+
+        done: list[tuple[int, tuple[int, Episode]]] = []
+        for r, slot in running.items():
+            retrieved, failure, why = False, None, trouble.get(r)
+            if outcome is not None and r in acting:
+                retrieved, failure = bool(outcome.retrieved[r]), failure_of(choices[r], outcome, r)
+                why = overflow_trouble(outcome, r)
+            if slot.log.act(retrieved, failure, why, clock.timings(r)):
+                done.append((r, (slot.place, slot.log.episode(slot.start.scenario, self._options(slot.start)))))
+                self._slots[r] = None
+        if self._run.watcher is not None and moment is not None:
+            told = None if outcome is None else jax.tree.map(lambda a: a[0], outcome)
+            self._run.watcher.acted(dataclasses.replace(moment, record=running[0].log.steps[-1], outcome=told))
+        return done
+
+    def _options(self, start: Start) -> dict[str, Any]:
+        """The options of an episode, as its record keeps them."""
+        engine, shape = self._simulator.engine, self._problem.target.shape
+        return {**self._run.options, "target": shape, "simulator": engine, "seed": start.seed}
+
+    def _moment(self, choices: Mapping[int, Choice]) -> Moment | None:
+        """What is known in a single slot."""
+        known = self._known
+        if not isinstance(known, OneSlot) or known.snapshot is None or known.observation is None:
+            return None
+        log = self.running[0].log
+        decision = known.decision if 0 in choices else None
+        return Moment(log.index, known.snapshot, known.observation, known.belief, decision, log.steps[-1], None)
+
+
+@jax.jit
+def _keys_at(data: UInt[Array, "slots 2 *words"], steps: Int[Array, " slots"]) -> tuple[Array, Array]:
+    """The planner's and the environment's key of every slot at its present step."""
+    keys, fold = jax.random.wrap_key_data(data), jax.vmap(jax.random.fold_in)
+    return fold(keys[:, 0], steps), fold(keys[:, 1], steps)
+
+
+def _actions(count: int, chosen: Mapping[int, Action]) -> Action:
+    """What every slot does; nothing where nothing was decided."""
+    actions = jax.tree.map(lambda a: np.broadcast_to(a, (count, *np.shape(a))).copy(), jax.device_get(no_action()))
+    for row, action in chosen.items():
+        for name in Action.__dataclass_fields__:
+            getattr(actions, name)[row] = getattr(action, name)
+    return jax.tree.map(jnp.asarray, actions)

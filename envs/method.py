@@ -1,0 +1,102 @@
+"""What decides about an episode beside its scenario and its seed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal
+
+from mechsearch_jax.actions import SAMPLED_KINDS
+from mechsearch_jax.envs.push_models import push_models
+from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, policy_factory
+from mechsearch_jax.workspace.target import Target
+
+EngineName = Literal["NativeSimulator", "MjxSimulator"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A policy with all of its settings, what it sees the world through, and what steps the world; hashable.
+
+    Attributes:
+      name: of the policy, as `planner.policy_factory` takes it: one of `planner.POLICIES`, or the import path of
+        another, as "my_lab.policies:Mine".
+      config: every setting of the problem and of the policy, one preset's worth.
+      recognition: name of the recogniser.
+      engine: name of the simulator.
+    """
+
+    name: str = "search-for-grasp"
+    config: Config = dataclasses.field(default_factory=PRESETS["standard"])
+    recognition: RecognitionName = "oracle"
+    engine: EngineName = "NativeSimulator"
+
+    def policy(self) -> Policy:
+        """The policy, with the push models that the configuration names.
+
+        Raises:
+          InputError: there is no such policy, or its push model cannot be used.
+        """
+        first, later = push_models(self.config.push_model)
+        return policy_factory(self.name)(self.config.planner, push_model=first, later_push_model=later)
+
+    def check(self) -> None:
+        """Fail before the first episode rather than in every one.
+
+        Raises:
+          InputError: as `policy`, or there is no such kind of action, or the weights that the recogniser needs are
+            missing or damaged.
+        """
+        kinds = [kind.name for kind in SAMPLED_KINDS]
+        unknown = [name for name in self.config.problem.actions.actions if name not in kinds]
+        if unknown:
+            raise InputError(f'actions: "{unknown[0]}" is unknown; use one or more of {", ".join(kinds)}')
+        self.policy()
+        recogniser(self.recognition, Target.cylinder())
+
+    def options(self) -> dict[str, Any]:
+        """What tells this method from others, flat and as JSON values: the policy, the recognition, every option of the
+        configuration by its name, and other settings that are not the preset `standard`'s by their path."""
+        usual, named = dict(_settings(PRESETS["standard"]())), {".".join(option.path) for option in OPTIONS}
+        unusual = {path: value for path, value in _settings(self.config) if value != usual[path] and path not in named}
+        return {"policy": self.name, "recognition": self.recognition, **self.config.options(), **unusual}
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as JSON values, for another process."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> Method:
+        """What `to_json` returned, possibly in another process.
+
+        Raises:
+          InputError: a setting is impossible.
+        """
+        return _restored(cls(), value)
+
+
+def _settings(config: Config) -> Iterator[tuple[str, Any]]:
+    """Every setting, as JSON has it, by its path: "problem.grasps.wrists"."""
+
+    def inside(value: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+        for name, part in value.items():
+            if isinstance(part, dict):
+                yield from inside(part, f"{path}{name}.")
+            else:
+                yield f"{path}{name}", part
+
+    return inside(json.loads(json.dumps(dataclasses.asdict(config))), "")
+
+
+def _restored(like: Any, value: Any) -> Any:
+    """What `dataclasses.asdict` and JSON made of something like `like`: dataclasses from dictionaries, tuples from
+    lists."""
+    if dataclasses.is_dataclass(like):
+        return type(like)(**{name: _restored(getattr(like, name), part) for name, part in value.items()})
+    if isinstance(value, list | tuple):
+        first = like[0] if isinstance(like, tuple) and like else None
+        return tuple(_restored(first, part) for part in value)
+    return value

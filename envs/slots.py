@@ -1,0 +1,246 @@
+"""What the planner knows in the slots of an episode pool, and how it looks, decides and is judged there.
+
+`OneSlot` calls the functions of a single scene, `ManySlots` maps them over so many slots at a time. They cannot be the
+same: mapped over, both branches of a condition are computed, and what is outside of any transformation need not be
+traceable.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from mechsearch_jax.envs.episode_log import Choice, chosen
+from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, objects_on_the_board, true_target_pose
+from mechsearch_jax.envs.world import World
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import Belief, Decision, Policy, Problem, graspable_at, initial_belief, update_belief
+
+
+class Slots(Protocol):
+    """What the planner knows in every slot; S of them."""
+
+    def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
+        """Let the fresh slots know nothing."""
+        ...
+
+    def look(
+        self, world: World, keys: Array, rows: Sequence[int]
+    ) -> tuple[Bool[np.ndarray, " slots"], Int[np.ndarray, " slots"]]:
+        """Recognise and update the belief in some slots.
+
+        Args:
+          world: the true state, fields (S, ...).
+          keys: the environment's, one for each slot.
+          rows: the slots.
+
+        Returns:
+          For all slots, whether the target is found, and at how many poses it can be.
+        """
+        ...
+
+    def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
+        """What the policy decides in some slots; `keys` are the planner's, one for each slot."""
+        ...
+
+    def judge(self, world: World, rows: Sequence[int]) -> dict[int, bool]:
+        """In which of some slots a collision-free grasp of the target exists, whatever anybody believes."""
+        ...
+
+
+class OneSlot:
+    """A single slot.
+
+    Attributes:
+      snapshot: what was there to be seen.
+      observation: what was recognised.
+      belief: what is known of the target.
+      decision: of the policy; None since the last look.
+    """
+
+    def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser) -> None:
+        self.snapshot: Snapshot | None = None
+        self.observation: Observation | None = None
+        self.belief = initial_belief(problem)
+        self.decision: Decision | None = None
+        self._problem, self._policy, self._recogniser = problem, policy, recogniser
+
+    def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
+        """See `Slots`."""
+        if fresh[0]:
+            self.belief = initial_belief(self._problem)
+
+    def look(
+        self, world: World, keys: Array, rows: Sequence[int]
+    ) -> tuple[Bool[np.ndarray, " 1"], Int[np.ndarray, " 1"]]:
+        """See `Slots`."""
+        snapshot = self._snapshot(world)
+        observation = self._recogniser(keys[0], snapshot)
+        self.belief = update_belief(self._problem, self.belief, observation)
+        self.snapshot, self.observation, self.decision = snapshot, observation, None
+        return np.array([bool(self.belief.found)]), np.array([int(jnp.sum(self.belief.exists))])
+
+    def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
+        """See `Slots`."""
+        if not rows:
+            return {}
+        assert self.observation is not None
+        self.decision = self._policy(keys[0], self._problem, self.belief, self.observation)
+        return {0: jax.device_get(chosen(self.decision))}
+
+    def judge(self, world: World, rows: Sequence[int]) -> dict[int, bool]:
+        """See `Slots`."""
+        here = self._snapshot(world)
+        objects, pose = objects_on_the_board(here), true_target_pose(here.world)
+        # Called as the policies call it, so that nothing is compiled twice.
+        return {r: bool(graspable_at(self._problem, objects, pose).success) for r in rows}
+
+    def _snapshot(self, world: World) -> Snapshot:
+        here = jax.tree.map(lambda a: a[0], world)
+        return Snapshot(self._problem.camera, self._problem.shelf, here)
+
+
+def _graspable(problem: Problem, objects: Any, world: World, active: Bool[Array, ""]) -> Array:
+    return graspable_at(problem, objects, true_target_pose(world), active).success
+
+
+class PlannerState(flax.struct.PyTreeNode):
+    """What the planner knows in every slot; fields have a leading axis for the slots."""
+
+    belief: Belief
+    observation: Observation
+
+
+class ManySlots:
+    """Several slots, looked at and decided upon a fixed number at a time, those that need it only.
+
+    Memory does not grow with the number of slots then. Where there are fewer slots to look at than that number, empty
+    scenes take their places, which cost next to nothing.
+    """
+
+    def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, world: World, at_once: int) -> None:
+        """Args:
+        problem, policy: of all episodes.
+        recogniser: must be traceable, as the policy.
+        world: of all slots, for what recognisers make of it.
+        at_once: how many slots are looked at or decided upon in one computation.
+        """
+        self._problem = problem
+        # A plain function is a pytree without leaves, too, if it is told so.
+        self._policy = jax.tree_util.Partial(policy) if jax.tree_util.all_leaves([policy]) else policy
+        self._recogniser = recogniser
+        self._at_once = at_once
+        self._count = len(world.kind)
+        one = jax.tree.map(lambda a: a[0], world)
+        seen = jax.eval_shape(
+            lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), one
+        )
+        empty = PlannerState(initial_belief(problem), seen)
+        self._state: PlannerState = jax.tree.map(lambda a: jnp.zeros((self._count, *a.shape), a.dtype), empty)
+
+    def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
+        """See `Slots`."""
+        self._state = _forget(self._problem, self._state, jnp.asarray(fresh))
+
+    def look(
+        self, world: World, keys: Array, rows: Sequence[int]
+    ) -> tuple[Bool[np.ndarray, " slots"], Int[np.ndarray, " slots"]]:
+        """See `Slots`."""
+        for _, padded in self._chunks(rows):
+            self._state = _look(self._problem, self._state, world, keys, padded, self._recogniser)
+        belief = self._state.belief
+        found, possible = jax.device_get((belief.found, jnp.sum(belief.exists, axis=1)))
+        return found, possible
+
+    def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
+        """See `Slots`."""
+        found: dict[int, Choice] = {}
+        for some, padded in self._chunks(rows):
+            choice = jax.device_get(_decide(self._policy, self._problem, self._state, keys, padded))
+            found |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(some)}
+        return found
+
+    def judge(self, world: World, rows: Sequence[int]) -> dict[int, bool]:
+        """See `Slots`."""
+        found: dict[int, bool] = {}
+        for some, padded in self._chunks(rows):
+            graspable = np.asarray(_judge(self._problem, world, padded))
+            found |= {r: bool(graspable[i]) for i, r in enumerate(some)}
+        return found
+
+    def _chunks(self, rows: Sequence[int]) -> Iterator[tuple[Sequence[int], Array]]:
+        """Rows, so many at once, and the same padded to a fixed number with rows beyond the end."""
+        for i in range(0, len(rows), self._at_once):
+            some = rows[i : i + self._at_once]
+            padded = np.full(self._at_once, self._count, np.int32)
+            padded[: len(some)] = some
+            yield some, jnp.asarray(padded)
+
+
+def _some(tree: Any, rows: Int[Array, " n"]) -> Any:
+    """These rows of all leaves; the last one for rows beyond the end."""
+    return jax.tree.map(lambda a: a[jnp.minimum(rows, a.shape[0] - 1)], tree)
+
+
+def _some_worlds(world: World, rows: Int[Array, " n"]) -> World:
+    """The worlds in the slots `rows`, empty ones for rows beyond the end."""
+    here = _some(world, rows)
+    return here.replace(valid=here.valid & (rows < len(world.kind))[:, None])
+
+
+@jax.jit
+def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"]) -> PlannerState:
+    """Let the fresh slots know nothing."""
+    belief = jax.tree.map(
+        lambda new, old: jnp.where(fresh.reshape(-1, *[1] * new.ndim), new[None], old),
+        initial_belief(problem),
+        state.belief,
+    )
+    return state.replace(belief=belief)
+
+
+@functools.partial(jax.jit, static_argnames=("recogniser",))
+def _look(
+    problem: Problem, state: PlannerState, world: World, keys: Array, rows: Int[Array, " n"], recogniser: Recogniser
+) -> PlannerState:
+    """Recognise and update the belief in the slots `rows`."""
+
+    def one(belief, here, key):
+        observation = recogniser(key, Snapshot(problem.camera, problem.shelf, here))
+        return PlannerState(update_belief(problem, belief, observation), observation)
+
+    new = jax.vmap(one)(_some(state.belief, rows), _some_worlds(world, rows), _some(keys, rows))
+    return jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state, new)
+
+
+@jax.jit
+def _decide(policy: Policy, problem: Problem, state: PlannerState, keys: Array, rows: Int[Array, " n"]) -> Choice:
+    """What the policy decides in the slots `rows`."""
+
+    def one(key, mine):
+        return chosen(policy(key, problem, mine.belief, mine.observation))
+
+    mine, active = _some(state, rows), rows < keys.shape[0]
+    # Where the target is not found and can be nowhere, and nothing stands, a decision costs next to nothing.
+    belief = mine.belief.replace(exists=mine.belief.exists & active[:, None], found=mine.belief.found & active)
+    objects = mine.observation.objects
+    objects = objects.replace(valid=objects.valid & active[:, None])
+    return jax.vmap(one)(_some(keys, rows), PlannerState(belief, mine.observation.replace(objects=objects)))
+
+
+@jax.jit
+def _judge(problem: Problem, world: World, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
+    """Whether the target can truly be taken out in the slots `rows`."""
+
+    def one(here, active):
+        objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, here))
+        return _graspable(problem, objects, here, active)
+
+    return jax.vmap(one)(_some_worlds(world, rows), rows < len(world.kind))

@@ -1,0 +1,66 @@
+"""What may be known of the shelf at one moment, and the recogniser that knows it all."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Protocol, runtime_checkable
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.envs.simulated_camera import Image, is_found, observe
+from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+
+@dataclasses.dataclass(frozen=True)
+class Snapshot:
+    """The shelf at one moment, as the camera can see it; images are ray-cast only when they are asked for.
+
+    Attributes:
+      camera, shelf: of the problem.
+      world: the true state, for a recogniser that may know it.
+    """
+
+    camera: Camera
+    shelf: Shelf
+    world: World
+
+    @functools.cached_property
+    def image(self) -> Image:
+        """Depth, segmentation and colour at full resolution."""
+        return observe(self.camera, self.world, self.shelf)
+
+    @functools.cached_property
+    def target_seen(self) -> Bool[Array, ""]:
+        """Whether the detector finds the target in the image; much cheaper than the image."""
+        return is_found(self.camera, self.world)
+
+
+@runtime_checkable
+class Recogniser(Protocol):
+    """Turns what the camera sees into what the planner plans with. For batches it has to be traceable by JAX."""
+
+    def __call__(self, key: Array, snapshot: Snapshot) -> Observation: ...
+
+
+def oracle(key: Array, snapshot: Snapshot) -> Observation:
+    """The `Recogniser` that knows the true shapes and poses, of the target once the detector sees it. Needs no key."""
+    return Observation(objects_on_the_board(snapshot), snapshot.target_seen, true_target_pose(snapshot.world))
+
+
+def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:
+    """The true objects, without those that have fallen off the board."""
+    scene, shelf = true_superquadrics(snapshot.world), snapshot.shelf
+    fallen = (scene.position[:, 0] < shelf.front) | (scene.position[:, 2] < shelf.board)
+    return scene.replace(valid=scene.valid & ~fallen)
+
+
+def true_target_pose(world: World) -> Float[Array, " 3"]:
+    """x, y [m] and yaw [rad] of the target."""
+    R, t = world.rotation[TARGET], world.position[TARGET]
+    return jnp.stack([t[0], t[1], jnp.arctan2(R[1, 0], R[0, 0])])

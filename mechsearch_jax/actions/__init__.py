@@ -1,0 +1,42 @@
+"""What the robot can do: one file for each kind of action, their registry, and how they are sampled."""
+
+from mechsearch_jax.actions.candidates import Candidates, candidates, free_ways, no_candidates
+from mechsearch_jax.actions.config import ActionConfig, ActionSpace, ActionTables, action_tables
+from mechsearch_jax.actions.kind import Kind, SampledKind
+from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.registry import KINDS, SAMPLED_KINDS, ActionKind, kind_of
+from mechsearch_jax.actions.retrieve import retrieve_action
+from mechsearch_jax.actions.sampler import sample_action
+from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.trajectory import JointTrajectory, joint_trajectory
+from mechsearch_jax.actions.types import Action, Prediction, Sample, Ways
+from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
+
+__all__ = [
+    "KINDS",
+    "SAMPLED_KINDS",
+    "Action",
+    "ActionConfig",
+    "ActionKind",
+    "ActionSpace",
+    "ActionTables",
+    "Candidates",
+    "JointTrajectory",
+    "Kind",
+    "PossibleSpace",
+    "Prediction",
+    "Sample",
+    "SampledKind",
+    "Sketch",
+    "Ways",
+    "action_tables",
+    "candidates",
+    "free_ways",
+    "joint_trajectory",
+    "kind_of",
+    "no_action",
+    "no_candidates",
+    "retrieve_action",
+    "sample_action",
+    "widen",
+]

@@ -1,0 +1,102 @@
+"""Every way to move every object of a scene, and what stands in the way: one batched evaluation for all kinds."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from mechsearch_jax.actions.approach import approach_clear, gripper_hits
+from mechsearch_jax.actions.config import ActionSpace, ActionTables
+from mechsearch_jax.actions.kind import SampledKind
+from mechsearch_jax.actions.registry import SAMPLED_KINDS
+from mechsearch_jax.actions.types import Ways
+from mechsearch_jax.actions.unseen_space import PossibleSpace
+from mechsearch_jax.geometry.footprints import footprints
+from mechsearch_jax.geometry.superquadric import Superquadrics
+
+# The ways of every sampled kind, in the order of `SAMPLED_KINDS`.
+Candidates = tuple[Ways, ...]
+
+
+def no_candidates(space: ActionSpace, capacity: int) -> Candidates:
+    """The candidates of so many objects that are yet to be looked at."""
+
+    def none(kind: SampledKind) -> Ways:
+        n, v, d = capacity, len(kind.wrists(space)), kind.distances(space)
+        return Ways(
+            T_world_gripper=jnp.zeros((n, v, 4, 4)),
+            reached=jnp.zeros((n, v, d), bool),
+            hits=jnp.zeros((n, v, n), bool),
+            enters=jnp.zeros((n, v, d), bool),
+        )
+
+    return tuple(none(kind) for kind in SAMPLED_KINDS)
+
+
+def candidates(
+    space: ActionSpace,
+    tables: ActionTables,
+    scene: Superquadrics,
+    possible: PossibleSpace,
+    previous: Candidates | None = None,
+    moved: Bool[Array, " n"] | None = None,
+) -> Candidates:
+    """All ways to move all objects, and what stands in their way.
+
+    The kinds are tested together as far as they are alike: the approaches of the first kind to all objects, then those
+    of the next.
+
+    Args:
+      space: static.
+      tables: constants of the problem.
+      scene: the objects, fields (N, ...).
+      possible: where the target may be.
+      previous: candidates before some objects moved.
+      moved: which moved since; only what concerns them is computed anew.
+    """
+    n = scene.capacity
+    previous = no_candidates(space, n) if previous is None else previous
+    fresh = scene.valid if moved is None else moved & scene.valid
+    concerns = fresh[:, None] | fresh[None, :]
+    others = concerns & scene.valid[:, None] & scene.valid[None, :]
+    prints = footprints(scene)
+
+    poses, wanted, wrists, openings, owners, parts = [], [], [], [], [], []
+    first = 0
+    for kind, before in zip(SAMPLED_KINDS, previous, strict=True):
+        T, plausible = kind.propose(space, tables, scene, prints, fresh)
+        poses.append(jnp.where(fresh[:, None, None, None], T, before.T_world_gripper))
+        wanted.append((plausible & (kind.name in space.config.actions) & fresh[:, None]).reshape(-1))
+        count = n * T.shape[1]
+        wrists.append(np.tile(kind.wrists(space), n))
+        openings.append(np.full(count, kind.opening))
+        owners.append(np.repeat(np.arange(n), T.shape[1]))
+        parts.append(slice(first, first + count))
+        first += count
+    flat = jnp.concatenate([T.reshape(-1, 4, 4) for T in poses])
+    opening, wrist = np.concatenate(openings), np.concatenate(wrists)
+    near = approach_clear(space, tables, opening, wrist, flat, jnp.concatenate(wanted))
+
+    reached, against = [], []
+    for kind, before, T, part, owner in zip(SAMPLED_KINDS, previous, poses, parts, owners, strict=True):
+        travels = kind.travels(space, tables, flat[part], near[part]).reshape(*T.shape[:2], -1)
+        reached.append(jnp.where(fresh[:, None, None], travels, before.reached))
+        obstacles = others & ~jnp.eye(n, dtype=bool) if kind.surrounds_object else others
+        against.append(obstacles[owner] & jnp.any(reached[-1], axis=-1).reshape(-1)[:, None])
+    mask = jnp.concatenate(against)
+    by_hand = gripper_hits(tables, opening, wrist, flat, scene, mask)
+
+    found = []
+    for kind, before, T, part, arrives in zip(SAMPLED_KINDS, previous, poses, parts, reached, strict=True):
+        hits = by_hand[part]
+        hits |= kind.swept_hits(space, scene, flat[part], mask[part] & ~hits)
+        hits = jnp.where(concerns[:, None, :], hits.reshape(*T.shape[:2], n), before.hits)
+        ways = Ways(T, arrives, hits, before.enters)
+        found.append(ways.replace(enters=kind.entering(space, tables, scene, possible, ways)))
+    return tuple(found)
+
+
+def free_ways(ways: Ways) -> Bool[Array, "n v d"]:
+    """Which ways nothing stands in the way of."""
+    return ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None]

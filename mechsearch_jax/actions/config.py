@@ -1,0 +1,159 @@
+"""Which actions there are, and the constants that follow from it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mechsearch_jax.actions.object_grasps import ObjectGraspConfig
+from mechsearch_jax.dynamics.push_model import LEVERAGE
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.graspability import WRIST_ORIGIN
+from mechsearch_jax.options import option
+from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
+from mechsearch_jax.workspace.shelf import Shelf
+
+# Longer pushes would leave the shelf [m].
+LONGEST_PUSH = 0.5
+# How far the hand extends behind the finger tips' centres [m].
+HAND_LENGTH = 0.11
+# Which of the swept clouds an action's approach is tested with.
+OPEN, CLOSED = 0, 1
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionConfig:
+    """Which actions there are; hashable, static under jit.
+
+    Attributes:
+      actions: names of the kinds that are sampled: "push", "pick-and-place" or both.
+      push_distances: how far the gripper travels in a push [m].
+      push_tilt: angle by which the pushing gripper points downwards [rad].
+      push_wrists: angles of joint 7 relative to 45 degrees that pushes are tried with [rad].
+      push_yaws: angles between the gripper's approach and +x in a push, seen from above [rad].
+      push_height: largest height of the finger tips above the board in a push [m].
+      push_leverage: largest height at which a push may begin to touch; see `push_model.LEVERAGE`.
+      topple: a push is not executed if an object is predicted to fall over with a probability above this.
+      push_gap: distance between gripper and object where a push starts [m].
+      push_depths: how far the finger tips reach past the object's front, or past its centre, in a push [m].
+      grasps: the ways in which an object is grasped.
+      placements: how many places are tried for a picked object, and how many of those are tested for collision.
+      place_yaw: largest angle by which a picked object is turned [rad].
+      clearance: distance to keep from neighbours when placing [m].
+      contact_tolerance: an object may brush others this deep on its way out [m]: those that touch each other are
+        recognised as overlapping as often as not, and would lock each other in.
+      max_penetration: deepest unresolved penetration of a predicted push that is still executed [m].
+      avoid_unseen: whether an object's actions that enter space where the target may be are sampled only if it has no
+        others; the paper does not look at that.
+      cloud_points: points on the swept gripper.
+      pusher_points: points on the hand and fingers.
+      object_points: points on an object.
+    """
+
+    actions: tuple[str, ...] = option(("push", "pick-and-place"), "kinds of action that are sampled")
+    push_distances: tuple[float, ...] = option((0.05, 0.10, 0.15), "how far pushes go [m]")
+    push_tilt: float = math.radians(30)
+    push_wrists: tuple[float, ...] = (math.radians(-45), math.radians(-15), math.radians(30))
+    push_yaws: tuple[float, ...] = (math.radians(-25), 0.0, math.radians(25))
+    push_height: float = 0.08
+    push_leverage: tuple[float, float] = LEVERAGE
+    topple: float = 0.5
+    push_gap: float = 0.01
+    push_depths: tuple[float, float] = (0.02, 0.02)
+    grasps: ObjectGraspConfig = dataclasses.field(default_factory=ObjectGraspConfig)
+    placements: tuple[int, int] = (32, 4)
+    place_yaw: float = math.radians(30)
+    clearance: float = 0.005
+    contact_tolerance: float = 0.003
+    max_penetration: float = 0.006
+    avoid_unseen: bool = option(
+        True, "whether actions that enter space where the target may be come last; the paper's do not"
+    )
+    cloud_points: int = 1024
+    pusher_points: int = 384
+    object_points: int = 128
+
+    def __post_init__(self):
+        if not self.actions or isinstance(self.actions, str):
+            raise InputError(f"actions {self.actions!r}: give a tuple of one or more kinds of action")
+        if not self.contact_tolerance >= 0.0:
+            raise InputError(f"contact_tolerance {self.contact_tolerance} m must not be negative")
+        if not self.push_distances or not all(0.0 < d <= LONGEST_PUSH for d in self.push_distances):
+            raise InputError(
+                f"push_distances {self.push_distances} must be one or more lengths above 0 and at most {LONGEST_PUSH} m"
+            )
+
+
+class ActionTables(flax.struct.PyTreeNode):
+    """Constants of the actions.
+
+    Attributes:
+      q7: angles of joint 7 with the hand open, then closed, shape (2, W) [rad].
+      clouds: what the gripper sweeps on its way in, in its own frame, open and then closed: shape (2, W, 3, P) [m].
+      low, high: boxes around them, shape (2, W, 3) [m].
+      pusher: surface of the closed hand and fingers in the gripper's frame, shape (Q, 3) [m].
+    """
+
+    q7: jax.Array
+    clouds: jax.Array
+    low: jax.Array
+    high: jax.Array
+    pusher: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionSpace:
+    """All that is static about actions, gathered so that it can be passed on as one argument.
+
+    Attributes:
+      shelf, gripper, config: as elsewhere.
+      max_yaw: of grasps, as in `graspability.GraspConfig`.
+      waypoints: poses at which an approach has to be reachable.
+      wrists: number of angles of joint 7.
+    """
+
+    shelf: Shelf
+    gripper: Gripper
+    config: ActionConfig
+    max_yaw: float
+    waypoints: int
+    wrists: int
+
+
+def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: ActionConfig) -> ActionTables:
+    """Sample the clouds of the open and the closed gripper for every wrist.
+
+    Args:
+      gripper: the gripper.
+      grasp_wrists: angles of joint 7 in grasps, relative to 45 degrees [rad].
+      config: has as many angles for pushes.
+
+    Raises:
+      InputError: it has not.
+    """
+    if len(grasp_wrists) != len(config.push_wrists):
+        raise InputError(
+            f"{len(grasp_wrists)} wrist angles for grasps but {len(config.push_wrists)} for pushes; give as many each"
+        )
+    q7 = WRIST_ORIGIN + np.array([grasp_wrists, config.push_wrists])
+    clouds = np.stack(
+        [
+            [swept_cloud(gripper, opening, float(angle), config.cloud_points) for angle in angles]
+            for opening, angles in zip((gripper.max_opening, 0.0), q7, strict=True)
+        ]
+    )
+    # Only the hand and the fingers push; the links behind them would thin out the points that matter.
+    surface = gripper_cloud(gripper, 0.0, float(q7[CLOSED][0]), 2048)
+    pusher = surface[surface[:, 2] > -HAND_LENGTH][: config.pusher_points]
+    return ActionTables(
+        q7=jnp.float32(q7),
+        clouds=jnp.float32(np.swapaxes(clouds, -1, -2)),
+        low=jnp.float32(clouds.min(axis=-2)),
+        high=jnp.float32(clouds.max(axis=-2)),
+        pusher=jnp.float32(pusher),
+    )

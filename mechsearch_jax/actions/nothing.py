@@ -1,0 +1,52 @@
+"""Doing nothing: what is left where no action is possible."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+
+from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.types import Action, Prediction
+
+CODE = 0
+
+
+def no_action() -> Action:
+    """The action that does nothing."""
+    return Action(
+        kind=jnp.int32(CODE),
+        object=jnp.int32(0),
+        T_world_gripper=jnp.eye(4),
+        displacement=jnp.zeros(3),
+        T_world_place=jnp.eye(4),
+        q7=jnp.float32(0.0),
+        opening=jnp.float32(0.0),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Nothing:
+    """A `kind.Kind`."""
+
+    code: int = CODE
+    name: str = "none"
+    moves_object: bool = False
+    holds_object: bool = False
+    takes_target: bool = False
+    returns_home: bool = False
+
+    def predict(self, space, tables, push_model, scene, untouchable, action, wrist) -> Prediction:
+        """Nothing changes, and nothing is achieved: not a possible action."""
+        return Prediction(scene, jnp.array(False), jnp.float32(0.0))
+
+    def reference(self, action, config) -> None:
+        """No motion."""
+        return None
+
+    def sketch(self, scene, after, action) -> Sketch:
+        """Nothing to show."""
+        return Sketch()
+
+    def describe(self, action: Action) -> str:
+        return "do nothing: no action is possible"

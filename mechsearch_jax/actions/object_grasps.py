@@ -1,0 +1,159 @@
+"""Candidate grasps of the objects in the way: from the side, with the fingers closing horizontally (paper B.5)."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.footprints import QUARTER_TURN, Footprints
+from mechsearch_jax.geometry.transforms import make
+from mechsearch_jax.graspability import gripper_rotation
+from mechsearch_jax.options import option
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace.shelf import Shelf
+
+# How close to an object's front the palm may pass, and how far above the board the finger tips' centres stay [m].
+PASSING_GAP = 0.003
+LOWEST = 0.025
+# How far the palm's flat front is behind the finger tips' centres, which is also how far it extends above them [m].
+PALM = 0.033
+
+
+@dataclasses.dataclass(frozen=True)
+class BoxGrasp:
+    """A way to grasp an object with flat sides.
+
+    Attributes:
+      face: which side the gripper approaches: 0 is the one most square to +x, 1 the next.
+      turn: how far the approach turns away from square to that side, as a share of what is possible; positive towards
+        +x. The object turns in the hand as the fingers close.
+      drop: how far below its top the object is grasped [m].
+      reach: how far the fingers reach past its front, as a share of what the palm leaves room for.
+    """
+
+    face: int = 0
+    turn: float = 0.0
+    drop: float = 0.03
+    reach: float = 1.0
+
+    def __post_init__(self):
+        if self.face not in range(4) or not (-1 <= self.turn <= 1 and 0 < self.reach <= 1 and self.drop > 0):
+            raise InputError(f"{self}: face must be 0 to 3, turn in -1 to 1, reach in 0 to 1, drop above 0 m")
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectGraspConfig:
+    """How objects are grasped.
+
+    Attributes:
+      boxes: the ways to grasp an object with flat sides.
+      round_drops: how far below its top a round object is grasped, in turn over its approach directions, of which
+        there are as many as `boxes` [m].
+      tilts: angles by which the gripper points downwards [rad].
+      max_turn: largest angle between the approach and the side that is grasped [rad].
+      min_turn: smaller ones are as good as none [rad].
+      turn_gap: how much of the opening must be left when the approach is turned [m].
+    """
+
+    boxes: tuple[BoxGrasp, ...] = (
+        BoxGrasp(drop=0.02),
+        BoxGrasp(reach=0.7),
+        BoxGrasp(drop=0.045, reach=0.7),
+        BoxGrasp(turn=0.5),
+        BoxGrasp(turn=1.0, drop=0.02),
+        BoxGrasp(turn=1.0),
+        BoxGrasp(turn=-1.0),
+        BoxGrasp(face=1, turn=0.5),
+        BoxGrasp(face=1, turn=1.0),
+    )
+    round_drops: tuple[float, ...] = (0.03, 0.04)
+    tilts: tuple[float, ...] = option(
+        (math.radians(20), math.radians(30)),
+        "angles by which the gripper points downwards as it grasps an object [rad]; the paper's is 0.35",
+    )
+    max_turn: float = math.radians(22)
+    min_turn: float = math.radians(5)
+    turn_gap: float = 0.004
+
+    def __post_init__(self):
+        if not (self.boxes and self.round_drops and self.tilts):
+            raise InputError("ObjectGraspConfig: boxes, round_drops and tilts must each have at least one entry")
+
+
+def grasp_variants(config: ObjectGraspConfig, wrists: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Index of the way, index of the wrist and tilt [rad] of each candidate grasp of an object, each of shape (A,)."""
+    grid = np.meshgrid(np.arange(len(config.boxes)), config.tilts, np.arange(wrists), indexing="ij")
+    way, tilt, wrist = (g.reshape(-1) for g in grid)
+    return way, wrist, tilt.astype(np.float32)
+
+
+def _largest_turn(width: Array, depth: Array, opening: float, config: ObjectGraspConfig) -> Array:
+    """How far a hand may be turned from square to a side before an object of these half-extents is too wide for it."""
+    radius = jnp.sqrt(width**2 + depth**2)
+    held = 0.5 * (opening - config.turn_gap)
+    wide = radius > held
+    room = jnp.arcsin(jnp.where(wide, held / radius, 0.0)) - jnp.arctan2(width, depth)
+    return jnp.where(wide, jnp.clip(room, 0.0, config.max_turn), config.max_turn)
+
+
+def object_grasps(
+    shelf: Shelf,
+    gripper: Gripper,
+    prints: Footprints,
+    config: ObjectGraspConfig,
+    max_yaw: float,
+    wrists: int,
+) -> tuple[Float[Array, "n a 4 4"], Bool[Array, "n a"]]:
+    """Side grasps of objects that stand or lie on the board.
+
+    Round objects are grasped through their axis from directions spread over `max_yaw`, others as `config.boxes` says.
+
+    Args:
+      shelf: the shelf.
+      gripper: the gripper.
+      prints: the objects seen from above, leading axis N.
+      config: static.
+      max_yaw: largest angle between the approach and +x [rad].
+      wrists: number of angles of joint 7.
+
+    Returns:
+      Gripper poses in the world, in the order of `grasp_variants`, and whether the object is thin enough to be grasped
+      so.
+    """
+    way, _, tilt = grasp_variants(config, wrists)
+    n, a, count = prints.yaw.shape[0], len(way), len(config.boxes)
+    is_round = prints.round[:, None]
+    rank, share, box_drop, box_reach = np.array([dataclasses.astuple(box) for box in config.boxes], np.float32)[way].T
+
+    faces = prints.yaw[:, None] + QUARTER_TURN * jnp.arange(4)[None]
+    faces = jnp.arctan2(jnp.sin(faces), jnp.cos(faces))
+    by_yaw = jnp.argsort(jnp.abs(faces), axis=1)
+    face = jnp.take_along_axis(by_yaw, jnp.broadcast_to(rank.astype(np.int32)[None], (n, a)), axis=1)
+    square = jnp.take_along_axis(faces, face, axis=1)
+    depth = jnp.where(face % 2 == 0, prints.half[:, :1], prints.half[:, 1:])
+    width = jnp.where(face % 2 == 0, prints.half[:, 1:], prints.half[:, :1])
+    turn = share[None] * _largest_turn(width, depth, gripper.usable_opening, config)
+    directions = np.linspace(-max_yaw, max_yaw, count) if count > 1 else np.zeros(1)
+    yaw = jnp.where(is_round, jnp.float32(directions[way])[None], square - jnp.where(square < 0, -turn, turn))
+    fits = (2 * width <= gripper.usable_opening) & (jnp.abs(yaw) <= max_yaw + 1e-3)
+    fits &= is_round | (share == 0.0)[None] | (jnp.abs(turn) > config.min_turn)
+    front = jnp.where(is_round, depth, depth * jnp.cos(turn) + width * jnp.abs(jnp.sin(turn)))
+
+    round_drop = np.asarray(config.round_drops, np.float32)[way % len(config.round_drops)]
+    drop = jnp.where(is_round, round_drop[None], box_drop[None])
+    z = jnp.maximum(prints.high[:, None] - drop, shelf.board + LOWEST)
+    # The palm must not run into what stands up before it: the object's front, or its top if the palm reaches that high.
+    c, t = np.cos(tilt), np.tan(tilt)
+    above = jnp.clip(prints.high[:, None] - z, 0.0, jnp.float32(PALM * np.sin(tilt) + PALM * c)[None])
+    reach = jnp.float32(PALM / c)[None] - above * jnp.float32(t)[None] - PASSING_GAP
+    reach = jnp.where(is_round, jnp.maximum(reach, 0.0), reach * box_reach[None])
+    offset = jnp.maximum(front - reach, 0.0)
+    x = prints.position[:, None, 0] - offset * jnp.cos(yaw)
+    y = prints.position[:, None, 1] - offset * jnp.sin(yaw)
+    rotation = gripper_rotation(yaw, jnp.broadcast_to(jnp.asarray(tilt)[None], (n, a)))
+    return make(rotation, jnp.stack([x, y, z], axis=-1)), fits & prints.valid[:, None]

@@ -1,0 +1,306 @@
+"""Pushes: the closed hand travels sideways behind an object, and what it meets gives way (paper appendix B.5)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, PLACES, gripper_hits, object_clouds
+from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace, ActionTables
+from mechsearch_jax.actions.object_grasps import PASSING_GAP
+from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.types import Action, Draft, Prediction, Ways
+from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
+from mechsearch_jax.dynamics.push_model import LOW_CONTACT, TOUCH, PushModel
+from mechsearch_jax.dynamics.rigid import moved_objects
+from mechsearch_jax.geometry.footprints import Footprints, bounding_half_extents, turned
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import back_off, make, transform, translate
+from mechsearch_jax.graspability import gripper_rotation
+from mechsearch_jax.robot.gripper import arm_hits_shelf
+from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
+from mechsearch_jax.robot.motion import MotionConfig, Reference, push_reference
+from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
+
+CODE = 1
+# Number of places on the way of a push that are tested for collision.
+PUSH_PLACES = 3
+# An object is not to be pushed to where its centre is nearer than this to the front edge [m].
+EDGE = 0.01
+# Length of the way in that a picture shows [m].
+SHOWN_WAY_IN = 0.12
+
+
+def _exit_distance(half, is_round, points, direction):
+    """How far points must move along a direction to leave a footprint, in its own frame; 0 if they never are inside."""
+    safe = jnp.where(jnp.abs(direction) < 1e-6, 1e-6, direction)
+    a, b = (-half - points) / safe, (half - points) / safe
+    enter, leave = jnp.max(jnp.minimum(a, b), axis=-1), jnp.min(jnp.maximum(a, b), axis=-1)
+    flat = jnp.where(enter < leave, leave, 0.0)
+    p, d = points / half, direction / half
+    dd, pd, pp = jnp.sum(d * d, axis=-1), jnp.sum(p * d, axis=-1), jnp.sum(p * p, axis=-1)
+    square = pd**2 - dd * (pp - 1.0)
+    meets = square > 0
+    circle = jnp.where(meets, (-pd + jnp.sqrt(jnp.where(meets, square, 1.0))) / dd, 0.0)
+    return jnp.maximum(jnp.where(is_round, circle, flat), 0.0)
+
+
+def _push_grid(config: ActionConfig, wrists: int):
+    """Side, depth, yaw and wrist of each push of an object."""
+    grid = np.meshgrid([1.0, -1.0], [0, 1], np.asarray(config.push_yaws), np.arange(wrists), indexing="ij")
+    return [g.reshape(-1) for g in grid]
+
+
+def push_variants(config: ActionConfig, wrists: int) -> tuple[np.ndarray, np.ndarray]:
+    """Side (+1 or -1 along y) and wrist of each push of `object_pushes`, each of shape (V,)."""
+    side, _, _, wrist = _push_grid(config, wrists)
+    return np.asarray(side, np.float32), wrist
+
+
+def object_pushes(
+    shelf: Shelf,
+    tables: ActionTables,
+    scene: Superquadrics,
+    prints: Footprints,
+    config: ActionConfig,
+    fresh: Bool[Array, " n"],
+) -> tuple[Float[Array, "n v 4 4"], Bool[Array, "n v"]]:
+    """Gripper poses where pushes start, beside each object at `push_gap` from it, and whether it would stay upright.
+
+    Only for `fresh` objects. For each side (pushing towards +y, then -y), for two depths (fingers just past the
+    object's front, then past its centre so that the palm pushes), for each yaw of the gripper, for each wrist.
+    """
+    wrists = tables.q7.shape[1]
+    side, deep, yaw, _ = _push_grid(config, wrists)
+    rotation = gripper_rotation(jnp.float32(yaw), jnp.full(len(yaw), config.push_tilt, jnp.float32))
+    extent = bounding_half_extents(scene)
+    x = jnp.where(
+        jnp.asarray(deep == 0)[None],
+        (prints.position[:, 0] - extent[:, 0] + config.push_depths[0])[:, None],
+        (prints.position[:, 0] + config.push_depths[1])[:, None],
+    )
+    height = prints.high - shelf.board
+    leverage = jnp.where(prints.round, config.push_leverage[1], config.push_leverage[0]) * extent[:, 1]
+    limit = jnp.minimum(leverage, 0.75 * height)
+    shape = (scene.capacity, len(side))
+    z = jnp.broadcast_to(shelf.board + jnp.clip(limit, LOW_CONTACT, config.push_height)[:, None], shape)
+    centre = jnp.stack([x, jnp.broadcast_to(prints.position[:, 1:2], shape), z], axis=-1)
+    T = make(jnp.broadcast_to(rotation[None], (*shape, 3, 3)), centre)
+
+    def beside(tables, row, i):
+        k, variant = i // len(side), i % len(side)
+        one = jax.tree.map(lambda a: a[k], row[0])
+        world = transform(row[1][k, variant], tables.pusher)
+        level = (world[:, 2] > one.low - config.push_gap) & (world[:, 2] < one.high + config.push_gap)
+        local = turned(-one.yaw, world[:, :2] - one.position[None])
+        heading = turned(-one.yaw, jnp.array([0.0, 1.0]) * -jnp.float32(side)[variant])
+        # In front of the object the palm may pass close by; only sideways does it keep the whole gap.
+        grown = one.half + PASSING_GAP
+        away = _exit_distance(grown[None], one.round, local, jnp.broadcast_to(heading[None], local.shape))
+        away = jnp.where(level, away, 0.0)
+        farthest = jnp.max(away)
+        touching = level & (away > farthest - TOUCH)
+        lowest = jnp.min(jnp.where(touching, world[:, 2], jnp.inf))
+        return farthest + config.push_gap - PASSING_GAP, lowest - shelf.board
+
+    beside_all = masked_vmap(beside, jnp.repeat(fresh, len(side)), tables, (prints, T))
+    distance, contact = (a.reshape(shape) for a in beside_all)
+    stable = contact <= jnp.maximum(leverage, LOW_CONTACT)[:, None]
+    return T.at[..., 1, 3].add(-jnp.float32(side)[None] * distance), stable
+
+
+def _sideways(length):
+    """Lengths along the world's y as vectors (..., 3)."""
+    return jnp.stack([jnp.zeros_like(length), length, jnp.zeros_like(length)], axis=-1)
+
+
+def motion_feasible(space: ActionSpace, action: Action) -> Bool[Array, ""]:
+    """Whether the arm can follow a push closely, in one configuration and without passing a singularity.
+
+    Proposals are looked at in few poses, which is enough to rule out most; this is for the few that are drawn.
+    """
+    n, back = CLOSE_WAYPOINTS, jnp.float32(space.gripper.approach)
+    start, end = action.T_world_gripper, action.T_world_place
+    way = translate(jnp.broadcast_to(start, (n, 4, 4)), jnp.linspace(0.0, 1.0, n)[:, None] * (end - start)[None, :3, 3])
+    into, out = line_poses(start, back, n), line_poses(end, back, n)[::-1]
+    return path_kinematics(jnp.concatenate([into, way[1:], out[1:]]), action.q7)[1]
+
+
+def push_hits_others(
+    space: ActionSpace,
+    tables: ActionTables,
+    scene: Superquadrics,
+    action: Action,
+    wrist: Int[Array, ""],
+    still: Bool[Array, " n"],
+) -> Bool[Array, ""]:
+    """Whether a pushing gripper, on its way or on its retreat, hits an object that the push should leave in place.
+
+    A `PushModel` knows the hand and the fingers; links 6 and 7 and the retreat are tested here.
+
+    Args:
+      space: static.
+      tables: constants of the problem.
+      scene: the objects, before or after the push.
+      action: the push.
+      wrist: index of its wrist angle.
+      still: which objects it leaves in place.
+    """
+    share = (jnp.arange(PUSH_PLACES) + 1.0) / PUSH_PLACES
+    T = jnp.broadcast_to(action.T_world_gripper, (PUSH_PLACES, 4, 4))
+    T = translate(T, share[:, None] * action.displacement[None])
+    mask = jnp.broadcast_to(still & scene.valid, (PUSH_PLACES, scene.capacity))
+    return jnp.any(gripper_hits(tables, CLOSED, jnp.broadcast_to(wrist, PUSH_PLACES), T, scene, mask))
+
+
+@dataclasses.dataclass(frozen=True)
+class Push:
+    """A `kind.SampledKind`: a push to either side by one of a few distances."""
+
+    code: int = CODE
+    name: str = "push"
+    moves_object: bool = True
+    holds_object: bool = False
+    takes_target: bool = False
+    returns_home: bool = True
+    opening: int = CLOSED
+    surrounds_object: bool = False
+
+    def wrists(self, space: ActionSpace) -> Int[np.ndarray, " v"]:
+        return push_variants(space.config, space.wrists)[1]
+
+    def distances(self, space: ActionSpace) -> int:
+        return len(space.config.push_distances)
+
+    def propose(self, space, tables, scene, prints, fresh):
+        """See `object_pushes`."""
+        return object_pushes(space.shelf, tables, scene, prints, space.config, fresh)
+
+    def _displacements(self, space: ActionSpace, capacity: int) -> Float[Array, "k d 3"]:
+        side, _ = push_variants(space.config, space.wrists)
+        lengths = jnp.asarray(np.tile(side, capacity))[:, None] * jnp.float32(space.config.push_distances)[None]
+        return _sideways(lengths)
+
+    def travels(self, space: ActionSpace, tables: ActionTables, T, near) -> Bool[Array, "k d"]:
+        """Whether the arm follows the push and its retreat, and nothing of it touches the shelf where it ends."""
+        d = self.distances(space)
+        wrist = self.wrists(space)
+        capacity = T.shape[0] // len(wrist)
+        wrist = np.tile(wrist, capacity)
+        ends = translate(jnp.broadcast_to(T[:, None], (T.shape[0], d, 4, 4)), self._displacements(space, capacity))
+
+        def path(tables, row, i):
+            starts, ends = row
+            T, end = starts[i // d], ends[i // d, i % d]
+            w = jnp.asarray(wrist)[i // d]
+            back = jnp.float32(space.gripper.approach)
+            middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
+            q, reachable = path_kinematics(
+                jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)]), tables.q7[CLOSED, w]
+            )
+            points = transform(end, tables.clouds[CLOSED, w].T)
+            return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf)) & ~jnp.any(hits_shelf(space.shelf, points))
+
+        return masked_vmap(path, jnp.repeat(near, d), tables, (T, ends), block=512).reshape(-1, d)
+
+    def swept_hits(self, space, scene, T, mask):
+        """The hand is empty."""
+        return jnp.zeros(mask.shape, bool)
+
+    def entering(
+        self, space: ActionSpace, tables: ActionTables, scene: Superquadrics, possible: PossibleSpace, ways: Ways
+    ) -> Bool[Array, "n v d"]:
+        """Whether gripper or object enter possible space at places on the way less than two finger widths apart."""
+        n, v, d = ways.reached.shape
+        wrist, owner = np.tile(self.wrists(space), n), np.repeat(np.arange(n), v)
+        clouds = object_clouds(scene, space.config.object_points)
+        usable = ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None] & space.config.avoid_unseen
+        shift = self._displacements(space, n)
+
+        def one(tables, row, i):
+            T, shift, possible, scene, clouds = row
+            k, j = i // d, i % d
+            w, o = jnp.asarray(wrist)[k], jnp.asarray(owner)[k]
+            way = shift[k, j][None] * jnp.linspace(0.0, 1.0, PLACES)[:, None]
+            gripper = transform(T[k], tables.clouds[CLOSED, w].T)
+            body = transform(make(scene.rotation[o], scene.position[o]), clouds[o].T)
+            both = jnp.concatenate([gripper[None] + way[:, None], body[None] + way[:, None]], axis=1)
+            return jnp.any(enters(jax.tree.map(lambda a: a[...], possible), both))
+
+        row = (ways.T_world_gripper.reshape(-1, 4, 4), shift, possible, scene, clouds)
+        return masked_vmap(one, usable.reshape(-1), tables, row, block=64).reshape(n, v, d)
+
+    def draft(self, key, space: ActionSpace, tables: ActionTables, scene, possible, ways: Ways, index, way) -> Draft:
+        """The push, and the space that it sweeps between its ends."""
+        _, v, d = ways.reached.shape
+        way = jnp.clip(way, 0, v * d - 1)
+        push, distance = way // d, way % d
+        side, wrists = (jnp.asarray(a) for a in push_variants(space.config, space.wrists))
+        T, wrist = ways.T_world_gripper[index, push], wrists[push]
+        displacement = _sideways(side[push] * jnp.float32(space.config.push_distances)[distance])
+        action = Action(
+            kind=jnp.int32(CODE),
+            object=index.astype(jnp.int32),
+            T_world_gripper=T,
+            displacement=displacement,
+            T_world_place=translate(T, displacement),
+            q7=tables.q7[CLOSED, wrist],
+            opening=jnp.float32(0.0),
+        )
+        T_object = make(scene.rotation[index], scene.position[index])
+        passed = displacement[None] * jnp.linspace(0.0, 1.0, PLACES)[:, None]
+        grippers = translate(jnp.broadcast_to(T, (PLACES, 4, 4)), passed)
+        bodies = translate(jnp.broadcast_to(T_object, (PLACES, 4, 4)), passed)
+        return Draft(jnp.array(True), action, wrist, grippers, bodies)
+
+    def predict(
+        self,
+        space: ActionSpace,
+        tables: ActionTables,
+        push_model: PushModel,
+        scene: Superquadrics,
+        untouchable: Bool[Array, " n"],
+        action: Action,
+        wrist: Int[Array, ""],
+    ) -> Prediction:
+        """What the push model says; impossible where the arm cannot follow, or where it would do what it must not.
+
+        That is: jam, tip an object, move what is untouchable, push an object to the front edge, or hit one that stays.
+        A prediction that is not a number makes a push impossible, too.
+        """
+        pushes = action.kind == CODE
+        # A model that simulates has less to do where nothing is pushed.
+        way = jnp.where(pushes, action.displacement, 0.0)
+        pushed = push_model(space.shelf, scene, tables.pusher, action.T_world_gripper, way, action.q7)
+        moved = moved_objects(scene, pushed.scene)
+        still = scene.valid & ~moved & pushes
+        config = space.config
+        holds = (pushed.residual <= config.max_penetration) & jnp.all(pushed.topples <= config.topple)
+        spoiled = ~holds | jnp.any(moved & untouchable)
+        spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
+        spoiled |= push_hits_others(space, tables, scene, action, wrist, still)
+        return Prediction(pushed.scene, ~spoiled & motion_feasible(space, action), jnp.sum(pushed.topples))
+
+    def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
+        """See `motion.push_reference`."""
+        return push_reference(action.T_world_gripper, action.displacement, action.q7, config)
+
+    def sketch(self, scene: Superquadrics, after: Superquadrics, action: Action) -> Sketch:
+        """The hand's way in, and how far it pushes."""
+        T = np.asarray(action.T_world_gripper, float)
+        start, share = T[:3, 3], np.linspace(0.0, 1.0, 40)[:, None]
+        return Sketch(
+            way_in=start - (1 - share) * SHOWN_WAY_IN * T[:3, 2],
+            path=start + share * np.asarray(action.displacement, float),
+            start=start,
+        )
+
+    def describe(self, action: Action) -> str:
+        d = np.asarray(action.displacement)
+        side = "to the left" if d[1] > 0 else "to the right"
+        return f"push object {int(action.object)} by {100 * np.linalg.norm(d):.0f} cm {side}"

@@ -1,0 +1,40 @@
+"""All kinds of action. A new kind is a file of its own, beside the others, and its two lines here."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping, Sequence
+
+from mechsearch_jax.actions import nothing, pick_and_place, push, retrieve
+from mechsearch_jax.actions.kind import Kind, SampledKind
+from mechsearch_jax.errors import InputError
+
+
+class ActionKind(enum.IntEnum):
+    """The values of `Action.kind`, which are kept in files."""
+
+    NONE = nothing.CODE
+    PUSH = push.CODE
+    PICK_AND_PLACE = pick_and_place.CODE
+    RETRIEVE = retrieve.CODE
+
+
+# Those that sequences are sampled from. Their order decides which random number stands for which action.
+SAMPLED_KINDS: Sequence[SampledKind] = (pick_and_place.PickAndPlace(), push.Push())
+
+KINDS: Mapping[ActionKind, Kind] = {
+    ActionKind(kind.code): kind for kind in (nothing.Nothing(), *SAMPLED_KINDS, retrieve.Retrieve())
+}
+
+
+def kind_of(code: int) -> Kind:
+    """The kind with a code.
+
+    Raises:
+      InputError: there is none.
+    """
+    for kind in KINDS.values():
+        if kind.code == int(code):
+            return kind
+    known = ", ".join(f"{kind.code} ({kind.name})" for kind in KINDS.values())
+    raise InputError(f"action kind {int(code)} is unknown; there are {known}")

@@ -1,0 +1,68 @@
+"""Taking the found target out of the shelf: the end of a search."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.types import Action, Prediction
+from mechsearch_jax.robot.motion import MotionConfig, Reference, retrieve_reference
+
+CODE = 3
+# Length of the way out that a picture shows [m].
+SHOWN_WAY_OUT = 0.25
+
+
+def retrieve_action(
+    T_world_gripper: Float[Array, "*batch 4 4"],
+    q7: Float[Array, "*batch"],
+    opening: Float[Array, "*batch"],
+) -> Action:
+    """The action that takes the target out; any leading axes.
+
+    Args:
+      T_world_gripper: pose of the gripper where it closes.
+      q7: angle of joint 7 [rad].
+      opening: distance between the fingers on the approach [m].
+    """
+    return Action(
+        kind=jnp.full(q7.shape, CODE, jnp.int32),
+        object=jnp.zeros(q7.shape, jnp.int32),
+        T_world_gripper=T_world_gripper,
+        displacement=jnp.zeros((*q7.shape, 3)),
+        T_world_place=T_world_gripper,
+        q7=q7,
+        opening=opening,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Retrieve:
+    """A `kind.Kind`; which grasp takes the target out, `planner.retrieval` decides."""
+
+    code: int = CODE
+    name: str = "retrieve"
+    moves_object: bool = False
+    holds_object: bool = False
+    takes_target: bool = True
+    returns_home: bool = False
+
+    def predict(self, space, tables, push_model, scene, untouchable, action, wrist) -> Prediction:
+        """A retrieval that hits nothing leaves all objects where they are."""
+        return Prediction(scene, jnp.array(True), jnp.float32(0.0))
+
+    def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
+        """See `motion.retrieve_reference`."""
+        return retrieve_reference(action.T_world_gripper, action.q7, action.opening, config)
+
+    def sketch(self, scene, after, action: Action) -> Sketch:
+        """The hand's way out with the target."""
+        T = np.asarray(action.T_world_gripper, float)
+        return Sketch(path=T[:3, 3] - np.linspace(0.0, SHOWN_WAY_OUT, 40)[:, None] * T[:3, 2])
+
+    def describe(self, action: Action) -> str:
+        return "take the target out"

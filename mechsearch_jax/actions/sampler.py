@@ -1,0 +1,87 @@
+"""How actions are sampled (paper appendix B.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.actions.candidates import Candidates, free_ways
+from mechsearch_jax.actions.config import ActionSpace, ActionTables
+from mechsearch_jax.actions.registry import SAMPLED_KINDS, ActionKind
+from mechsearch_jax.actions.types import Sample
+from mechsearch_jax.actions.unseen_space import PossibleSpace, risk
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import transform
+
+
+def _choose(key, weight):
+    """A random index in proportion to weights, and whether any weight is positive."""
+    logits = jnp.where(weight > 0, jnp.log(jnp.where(weight > 0, weight, 1.0)), -jnp.inf)
+    return jnp.argmax(logits + jax.random.gumbel(key, weight.shape)), jnp.any(weight > 0)
+
+
+def _shares(clean, dirty):
+    """One for every object that has an action, shared evenly among its clean ones, or the others in need."""
+    usable = jnp.where(jnp.any(clean, axis=-1, keepdims=True), clean, dirty)
+    return usable / jnp.maximum(jnp.sum(usable, axis=-1, keepdims=True), 1)
+
+
+def _stacked(rows: Sequence[Bool[Array, "n _ _"]]) -> Bool[Array, "rows width"]:
+    """The ways of all objects by all kinds, padded to the same number."""
+    width = max(a.shape[1] * a.shape[2] for a in rows)
+    flat = [a.reshape(a.shape[0], -1) for a in rows]
+    return jnp.concatenate([jnp.pad(a, ((0, 0), (0, width - a.shape[1]))) for a in flat])
+
+
+def sample_action(
+    key: Array,
+    space: ActionSpace,
+    tables: ActionTables,
+    scene: Superquadrics,
+    possible: PossibleSpace,
+    options: Candidates,
+    available: Bool[Array, " n"],
+    weights: Float[Array, " n"] | None = None,
+) -> Sample:
+    """Draw an action: an object and a kind (the multi-set of B.5) by the object's weight, then one of its ways evenly.
+
+    Args:
+      key: PRNG key.
+      space: static.
+      tables: constants of the problem.
+      scene: the objects.
+      possible: where the target may be. An object's actions that enter it are drawn only if it has no others.
+      options: of this scene, by kind.
+      available: which objects may be moved.
+      weights: sampling weights of the objects, positive; the paper's, and those left out, are equal.
+    """
+    n = scene.capacity
+    key_choice, key_place = jax.random.split(key)
+    ways = _stacked([free_ways(w) & available[:, None, None] for w in options])
+    enters = _stacked([w.enters for w in options])
+    weights = jnp.ones(n) if weights is None else weights
+    weight = jnp.tile(weights, len(SAMPLED_KINDS))[:, None] * _shares(ways & ~enters, ways)
+    choice, possible_at_all = _choose(key_choice, weight.reshape(-1))
+    row, way = choice // ways.shape[1], choice % ways.shape[1]
+    chosen, index = row // n, row % n
+
+    drafts = [
+        kind.draft(key_place, space, tables, scene, possible, w, index, way)
+        for kind, w in zip(SAMPLED_KINDS, options, strict=True)
+    ]
+    draft = drafts[-1]
+    for i in reversed(range(len(drafts) - 1)):
+        draft = jax.tree.map(lambda a, b, i=i: jnp.where(chosen == i, a, b), drafts[i], draft)
+    able = possible_at_all & draft.possible
+    kind = jnp.where(able, draft.action.kind, ActionKind.NONE).astype(jnp.int32)
+    opening = jnp.array([kind.opening for kind in SAMPLED_KINDS])[chosen]
+    cloud = tables.clouds[opening, draft.wrist].T
+    body = superquadric.sample_surface(scene.size[index], scene.exponents[index], space.config.object_points)
+    swept = jnp.concatenate(
+        [transform(draft.grippers[:, None], cloud[None]), transform(draft.bodies[:, None], body[None])], axis=1
+    )
+    return Sample(draft.action.replace(kind=kind), draft.wrist, jnp.where(able, risk(possible, swept), 0.0))

@@ -1,0 +1,80 @@
+"""An action as a robot's controller takes it: joint angles over time."""
+
+from __future__ import annotations
+
+import functools
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from mechsearch_jax.actions.kind import Kind
+from mechsearch_jax.actions.registry import kind_of
+from mechsearch_jax.actions.types import Action
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.robot.motion import MotionConfig, Reference
+
+
+class JointTrajectory(flax.struct.PyTreeNode):
+    """The motion of the arm and the fingers, one row for each time step.
+
+    It begins where the gripper starts its straight approach; the way there from the home configuration, in front of the
+    shelf, is the caller's. The fingers cannot come closer than the thing between them: a width of 0 then means grip.
+
+    Attributes:
+      time: since the motion began [s], shape (T,).
+      position: joint angles [rad], shape (T, 7).
+      velocity: joint velocities [rad/s], shape (T, 7).
+      gripper: distance between the fingers [m], shape (T,).
+    """
+
+    time: jax.Array
+    position: jax.Array
+    velocity: jax.Array
+    gripper: jax.Array
+
+
+@functools.partial(jax.jit, static_argnames=("kind", "config"))
+def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:
+    """`Kind.reference`, compiled: the motion of an action and whether the arm reaches all of it, or None.
+
+    Args:
+      kind: of the action; static.
+      action: a single action.
+      config: lengths and durations; static.
+    """
+    return kind.reference(action, config)
+
+
+def joint_trajectory(problem, action: Action, config: MotionConfig | None = None) -> JointTrajectory:
+    """The joint trajectory of a decision's action: a push, a pick-and-place or a retrieval.
+
+    Not to be called inside `jit`: its length depends on the kind of action. For the action that does nothing it is a
+    single row, the home configuration.
+
+    Args:
+      problem: what does not change; says how long an approach is.
+      action: a single action.
+      config: lengths and durations; the problem's approach and the defaults if left out.
+
+    Raises:
+      InputError: the kind of action is unknown, or the arm does not reach all of the motion.
+    """
+    config = config or MotionConfig(approach=problem.gripper.approach)
+    kind = kind_of(int(action.kind))
+    found = reference_motion(kind, action, config)
+    if found is None:
+        still = jnp.float32(HOME)[None]
+        return JointTrajectory(jnp.zeros(1), still, jnp.zeros_like(still), jnp.zeros(1))
+    reference, reachable = found
+    if not reachable:
+        raise InputError(f"{kind.name}: the arm does not reach all of this motion; decide anew")
+    steps = reference.q.shape[0]
+    return JointTrajectory(
+        time=(jnp.arange(steps) + 1.0) * config.timestep,
+        position=reference.q,
+        velocity=reference.velocity,
+        gripper=2.0 * jnp.maximum(reference.fingers, 0.0),
+    )

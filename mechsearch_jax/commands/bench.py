@@ -1,0 +1,225 @@
+"""`mechsearch bench`: how long the parts take."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from mechsearch_jax.commands.options import (
+    DEFAULTS,
+    EpisodeOptions,
+    JsonFile,
+    OneMethod,
+    OnePolicy,
+    PushModel,
+    WeightsFile,
+    at_least_one,
+    check_files,
+    chosen_policies,
+    forget_kept_compilations,
+)
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.benchmarks.bench import Timing
+
+
+def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing]) -> None:
+    """Measure, print and write a timing.
+
+    Raises:
+      InputError: the file cannot be written, or what `measure` raises.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.bench import save_timing
+    from mechsearch_jax.benchmarks.tables import timing_table
+
+    check_files(out)
+    forget_kept_compilations()
+    console = Console(highlight=False)
+    with console.status(f"timing {subject}"):
+        timing = measure()
+    console.print(timing_table(timing))
+    if out is not None:
+        save_timing(timing, out)
+
+
+def _timing_of(subject: Literal["existence", "graspability"], what: str) -> Callable[..., None]:
+    """The command that times a part of the planner that no policy matters to."""
+
+    def command(
+        *,
+        objects: int = 8,
+        batch: int = 1,
+        repeats: int = 10,
+        out: JsonFile = None,
+        options: EpisodeOptions = DEFAULTS,
+    ) -> None:
+        from mechsearch_jax.benchmarks import bench as benches
+
+        at_least_one(f"bench {subject}", repeats=repeats, batch=batch)
+        config = options.config()
+        _print_timing(subject, out, lambda: benches.bench_part(subject, objects, config, batch, repeats=repeats))
+
+    command.__name__ = subject
+    command.__doc__ = f"""Time {what}: compilation, median and spread.
+
+    Args:
+      objects: number of objects in a scene.
+      batch: how many scenes at once.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+      options: how the planner decides.
+    """
+    return command
+
+
+def bench_plan(
+    *,
+    method: OneMethod = None,
+    policy: OnePolicy = None,
+    objects: int = 8,
+    batch: int = 1,
+    repeats: int = 10,
+    out: JsonFile = None,
+    options: EpisodeOptions = DEFAULTS,
+) -> None:
+    """Time a whole decision: compilation, median and spread.
+
+    Args:
+      method: how it is decided; "search-for-grasp" by default.
+      policy: instead of a method, the name of a policy ("random" is one more), or the import path of another.
+      objects: number of objects in a scene.
+      batch: how many scenes at once.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+      options: how the planner decides.
+    """
+    from mechsearch_jax.benchmarks import bench as benches
+
+    at_least_one("bench plan", repeats=repeats, batch=batch)
+    (chosen,) = options.methods(chosen_policies("bench plan", method and (method,), policy and (policy,)))
+    _print_timing("plan", out, lambda: benches.bench_plan(objects, chosen, batch, repeats=repeats))
+
+
+def bench_perceive(
+    *,
+    objects: int = 8,
+    batch: int = 1,
+    repeats: int = 10,
+    recognition: Literal["masks", "full"] = "full",
+    out: JsonFile = None,
+) -> None:
+    """Time recognising all objects of a scene from its noisy depth image: compilation, median and spread.
+
+    Args:
+      objects: number of objects in a scene.
+      batch: how many scenes at once.
+      repeats: number of timed calls.
+      recognition: "masks" is told which pixels are whose, "full" finds out.
+      out: JSON file for the result.
+    """
+    from mechsearch_jax.benchmarks import bench as benches
+
+    at_least_one("bench perceive", repeats=repeats, batch=batch)
+    _print_timing("perceive", out, lambda: benches.bench_perceive(recognition, objects, batch, repeats=repeats))
+
+
+def bench_predict(
+    *,
+    push_model: PushModel = "learned",
+    weights: WeightsFile = None,
+    objects: int = 8,
+    batch: int = 30,
+    repeats: int = 20,
+    out: JsonFile = None,
+) -> None:
+    """Time predicting random pushes, all at once, each in a scene of its own: compilation, median and spread.
+
+    Args:
+      push_model: what predicts them; "physics" simulates every one.
+      weights: of the learned model; those that ship if not given.
+      objects: number of objects in a scene.
+      batch: pushes predicted at once; each step of a decision predicts 30.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
+    from mechsearch_jax.benchmarks import bench as benches
+
+    at_least_one("bench predict", repeats=repeats, batch=batch)
+    if weights is not None and push_model != "learned":
+        raise InputError(f"bench predict: --weights is for --push-model learned, not for {push_model}")
+    _print_timing("predict", out, lambda: benches.bench_predict(push_model, objects, batch, repeats, weights))
+
+
+def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, out: JsonFile = None) -> None:
+    """Time the batch simulator with 8 objects, the arm sweeping through them: steps per second of all worlds together.
+
+    Args:
+      worlds: simulated at once.
+      steps: time steps in a timed call.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
+    from mechsearch_jax.benchmarks import bench as benches
+
+    _print_timing("simulate", out, lambda: benches.bench_simulate(worlds, steps, repeats))
+
+
+def bench_inside(
+    *, placed: int = 1024, objects: int = 8, points: int = 2560, repeats: int = 10, out: JsonFile = None
+) -> None:
+    """Time every point of clouds against every superquadric, and what the device can do at most, apart from compiling.
+
+    Args:
+      placed: clouds in one call; a GPU needs some 100000 to be busy for milliseconds.
+      objects: that each is tested against.
+      points: of a cloud.
+      repeats: number of timed calls.
+      out: JSON file for the result.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import roofline
+    from mechsearch_jax.benchmarks.bench import save_timings
+    from mechsearch_jax.benchmarks.tables import timings_table
+
+    check_files(out)
+    forget_kept_compilations()
+    console = Console(highlight=False)
+    with console.status("timing inside"):
+        timings = roofline.bench_inside(placed, objects, points, repeats)
+    console.print(timings_table(timings))
+    if out is not None:
+        save_timings(timings, out)
+
+
+def bench_roofline(
+    results: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")], /, *, out: Path
+) -> None:
+    """Write the page that compares measured rates with what devices allow, from results of `inside` and `simulate`.
+
+    Args:
+      results: folder with their JSON files; others are left out.
+      out: Markdown file.
+    """
+    from mechsearch_jax.benchmarks.roofline import write_page
+
+    write_page(results, out)
+    print(out)
+
+
+COMMANDS = {
+    "existence": _timing_of("existence", "f"),
+    "graspability": _timing_of("graspability", "g where f = 1"),
+    "plan": bench_plan,
+    "predict": bench_predict,
+    "perceive": bench_perceive,
+    "simulate": bench_simulate,
+    "inside": bench_inside,
+    "roofline": bench_roofline,
+}

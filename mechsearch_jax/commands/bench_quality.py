@@ -1,0 +1,251 @@
+"""`mechsearch bench`: how good the parts are."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
+
+import tyro
+
+from mechsearch_jax.commands.options import (
+    JsonFile,
+    SomeScenarios,
+    WeightsFile,
+    at_least_one,
+    check_files,
+    find_scenarios,
+    forget_kept_compilations,
+)
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.workspace.scenario import Scenario
+
+
+Noise = Literal["clean", "gaussian", "time-of-flight"]
+Recogniser = Literal["network", "network-refined", "ems", "ems-refined"]
+ComparedModel = Literal["no motion", "quasi-static", "learned", "physics", "nudged"]
+
+
+def _loaded(names: Sequence[str]) -> list[Scenario]:
+    """What files, folders and names of scenarios stand for; none if there are none."""
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    return [load_scenario(file) for file in find_scenarios(names)] if names else []
+
+
+def bench_agreement(
+    scenarios: SomeScenarios = (),
+    /,
+    *,
+    actions: int = 200,
+    scenes: int = 40,
+    seed: int = 0,
+    out: JsonFile = None,
+) -> None:
+    """Compare the batch simulator with the native one: random pushes and pick-and-places, executed by both.
+
+    Args:
+      scenarios: scenario files, folders of them, or names of shipped ones; scenes are generated if there are none.
+      actions: how many; they are as many worlds of one batch.
+      scenes: how many are generated, with 1 to 8 objects in turn.
+      seed: of the scenes and of the actions.
+      out: JSON file for the result.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.agreement import agreement, draw_actions, generated_scenes, save_agreement
+    from mechsearch_jax.benchmarks.tables import agreement_table
+    from mechsearch_jax.envs.mjx_model import import_mjx
+    from mechsearch_jax.planner.cache import keep_compilations
+
+    at_least_one("bench agreement", actions=actions, scenes=scenes)
+    given = _loaded(scenarios)
+    check_files(out)
+    import_mjx()
+    keep_compilations()
+    console = Console(highlight=False)
+    with console.status("making scenes") as status:
+        where = given or generated_scenes(scenes, seed)
+        status.update("drawing actions")
+        cases = draw_actions(where, actions, seed)
+        status.update("executing actions")
+        found = agreement(cases)
+    console.print(agreement_table(found))
+    if out is not None:
+        save_agreement(found, out)
+
+
+def bench_recognition(
+    scenarios: SomeScenarios = (),
+    /,
+    *,
+    scenes: int = 40,
+    seed: int = 0,
+    noise: tuple[Noise, ...] = ("clean", "gaussian"),
+    method: tuple[Recogniser, ...] = get_args(Recogniser),
+    ems_scenes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    out: JsonFile = None,
+    picture: JsonFile = None,
+    worst: int = 12,
+    worst_of: Recogniser = "network-refined",
+) -> None:
+    """Compare recognisers, given true masks, with the truth: the network, refinement and the classical EMS.
+
+    Args:
+      scenarios: scenario files, folders of them, or names of shipped ones, beside the generated scenes.
+      scenes: how many are generated, with a seed that training cannot have; may be 0 if there are scenarios.
+      seed: of the generated scenes, of the noise and of the methods.
+      noise: of the depth image, one or more; "gaussian" is the paper's, 1 mm.
+      method: one or more; one that begins with another's answers brings it along.
+      ems_scenes: number of scenes, spread evenly over all, for EMS, which is slow; all if not given.
+      out: JSON file for the figures and for every object's row.
+      picture: PNG file for the worst answers of a method, beside the truth.
+      worst: how many of them.
+      worst_of: which method's.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import images, recognition, recognition_figure
+    from mechsearch_jax.benchmarks.tables import recognition_tables, recognition_times_table
+    from mechsearch_jax.perception.cloud import shelf_view
+    from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.workspace.shelf import Shelf
+
+    at_least_one("bench recognition", worst=worst)
+    check_files(out, picture)
+    given = images.scenes_of(_loaded(scenarios))
+    console = Console(highlight=False)
+    with console.status("making scenes") as status:
+        methods = recognition.shipped_methods(shelf_view().camera, Shelf())
+        bench = recognition.Bench(
+            [*images.held_out_scenes(scenes, seed), *given],
+            recognition.chosen_methods(methods, method),
+            tuple(dict.fromkeys(noise)),
+            seed,
+            ems_scenes,
+        )
+        if picture is not None and worst_of not in bench.methods:
+            raise InputError(f"bench recognition: --worst-of {worst_of} is not among the methods; add it to --method")
+        forget_kept_compilations()
+        total = len(bench.scenes) * len(bench.noises)
+        status.update("compiling")
+        measured = bench.run(lambda done: status.update(f"recognising {done}/{total}"))
+        if out is not None:
+            recognition.save_recognition(measured, out)
+        if picture is not None:
+            status.update("drawing")
+            rows = recognition_figure.worst(measured.rows, worst_of, worst)
+            save_figure(recognition_figure.worst_figure(bench, rows), picture)
+    console.print(recognition_tables(measured))
+    console.print(recognition_times_table(measured))
+
+
+def bench_segmentation(
+    scenarios: SomeScenarios = (),
+    /,
+    *,
+    scenes: int = 100,
+    seed: int = 0,
+    noise: tuple[Noise, ...] = ("clean", "gaussian"),
+    out: JsonFile = None,
+    picture: JsonFile = None,
+    worst: int = 6,
+) -> None:
+    """Measure how well the objects of depth images are told apart, against their true masks.
+
+    Args:
+      scenarios: scenario files, folders of them, or names of shipped ones, beside the generated scenes.
+      scenes: how many are generated, with a seed that training cannot have; may be 0 if there are scenarios.
+      seed: of the generated scenes and of the noise.
+      noise: of the depth image, one or more; "gaussian" is the paper's, 1 mm.
+      out: JSON file for the figures and for every object's row.
+      picture: PNG file for the worst images, the true masks above those found.
+      worst: how many of them.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import images, segmentation
+    from mechsearch_jax.benchmarks.tables import segmentation_tables
+    from mechsearch_jax.viz.drawing import save_figure
+
+    at_least_one("bench segmentation", worst=worst)
+    check_files(out, picture)
+    given = images.scenes_of(_loaded(scenarios))
+    console = Console(highlight=False)
+    with console.status("making scenes") as status:
+        everything = [*images.held_out_scenes(scenes, seed), *given]
+        bench = segmentation.Bench(everything, tuple(dict.fromkeys(noise)), seed)
+        forget_kept_compilations()
+        total = len(bench.scenes) * len(bench.noises)
+        status.update("compiling")
+        measured = bench.run(lambda done: status.update(f"segmenting {done}/{total}"))
+        if out is not None:
+            segmentation.save_segmentation(measured, out)
+        if picture is not None:
+            status.update("drawing")
+            save_figure(segmentation.worst_figure(bench, measured.rows, worst), picture)
+    console.print(segmentation_tables(measured))
+
+
+def bench_push(
+    *,
+    pushes: Annotated[int, tyro.conf.arg(metavar="N")] = 2000,
+    seed: int = 0,
+    models: tuple[ComparedModel, ...] = get_args(ComparedModel),
+    weights: WeightsFile = None,
+    worlds: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    data: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None,
+    out: JsonFile = None,
+) -> None:
+    """Simulate random pushes in scenes that no training has seen, and compare push models with what became of them.
+
+    Args:
+      pushes: at least so many.
+      seed: of the scenes and the pushes, of those that training cannot have.
+      models: what is compared, one or more; "no motion" predicts nothing, and "nudged" is the same simulation again
+        from a hundredth of a millimetre elsewhere: how far it differs from itself.
+      weights: of the learned model; those that ship if not given.
+      worlds: simulated at once; 512 on a GPU and 64 on a CPU if left out.
+      data: folder for the pushes, so that a killed run goes on and another need not simulate them again; they are not
+        kept if left out.
+      out: JSON file for the scores, in groups by distance and number of objects.
+    """
+    import tempfile
+
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import push
+    from mechsearch_jax.benchmarks.tables import push_scores_tables
+    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.train.run import counting
+
+    worlds = (64 if jax.default_backend() == "cpu" else 512) if worlds is None else worlds
+    bench = push.Bench(push.held_out_generation(pushes, worlds, seed), models, weights)
+    for folder in (data, None if out is None else out.parent):
+        if folder is not None:
+            check_writable(folder)
+    keep_compilations()
+    with contextlib.ExitStack() as stack:
+        folder = data or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        with counting("pushes", pushes) as told:
+            made = bench.pushes(folder, told)
+    console = Console(highlight=False)
+    with console.status("predicting") as status:
+        total = len(made.object)
+        measured = bench.run(made, lambda name, done: status.update(f"{name}: {done}/{total}"))
+        if out is not None:
+            push.save_push_scores(measured, out)
+    console.print(push_scores_tables(measured))
+
+
+COMMANDS = {
+    "agreement": bench_agreement,
+    "recognition": bench_recognition,
+    "segmentation": bench_segmentation,
+    "push": bench_push,
+}

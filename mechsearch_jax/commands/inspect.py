@@ -1,0 +1,50 @@
+"""`mechsearch inspect`: maps of f and g."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mechsearch_jax.commands.options import DEFAULTS, EpisodeOptions, Scenarios, find_scenarios
+
+
+def inspect(
+    scenarios: Scenarios,
+    /,
+    *,
+    out: Path,
+    seed: int = 0,
+    options: EpisodeOptions = DEFAULTS,
+) -> None:
+    """Write maps of f and g at the start of scenarios, as NAME.npz and NAME.png.
+
+    Args:
+      scenarios: scenario files, folders of them, or names of shipped ones.
+      out: folder for the maps.
+      seed: of the recogniser.
+      options: how the planner decides.
+    """
+    from rich.progress import track
+
+    from mechsearch_jax.envs.episodes import target_of
+    from mechsearch_jax.envs.pictures import inspect_scenario
+    from mechsearch_jax.envs.recognisers import recogniser
+    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.planner.cache import cached_problem, keep_compilations
+    from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.viz.maps import save_maps
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    options.only_native("inspect")
+    (method,) = options.methods(("search-for-grasp",))
+    scenes = [load_scenario(file) for file in find_scenarios(scenarios)]
+    check_writable(out)
+    keep_compilations()
+    problems = {
+        target: cached_problem(target, method.config.problem) for target in {target_of(scene) for scene in scenes}
+    }
+    for scene in track(scenes, "inspecting"):
+        see = recogniser(method.recognition, target_of(scene))
+        maps, figure = inspect_scenario(scene, problems[target_of(scene)], see, seed)
+        save_maps(maps, out / f"{scene.name}.npz")
+        save_figure(figure, out / f"{scene.name}.png")
+    print(f"{len(scenes)} scenario{'s' if len(scenes) > 1 else ''} inspected: {out}")

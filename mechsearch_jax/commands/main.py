@@ -1,0 +1,130 @@
+"""The command line: parse, call, print. `mechsearch --help` tells what there is.
+
+Bad input ends a command with one line on standard error and status 2, and leaves existing output as it is. What a
+command needs is imported when it runs, so that help and mistakes are answered at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import inspect
+import io
+import re
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, get_type_hints
+
+import tyro
+
+from mechsearch_jax.commands import bench, bench_quality, scenarios, train
+from mechsearch_jax.commands.evaluate import evaluate
+from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
+from mechsearch_jax.commands.options import with_planner_options
+from mechsearch_jax.commands.report import report
+from mechsearch_jax.commands.search import search
+from mechsearch_jax.errors import InputError
+
+Commands = Mapping[str, Callable[..., None]]
+
+
+def _only_described(description: str | None) -> Callable[[], None]:
+    """A command without arguments that does nothing, for the list of commands."""
+
+    def described() -> None: ...
+
+    described.__doc__ = description
+    return described
+
+
+COMMANDS: Commands = {
+    "search": search,
+    "inspect": inspect_scenarios,
+    "evaluate": evaluate,
+    "report": report,
+    "scenarios": _only_described("Generate and check scenario files: mechsearch scenarios generate|check."),
+    "train": _only_described("Train the networks: mechsearch train segmentation|recognition|push."),
+    "bench": _only_described("Measure the parts, one command each."),
+}
+GROUPS: Mapping[str, Commands] = {
+    "scenarios": scenarios.COMMANDS,
+    "train": train.COMMANDS,
+    "bench": {**bench.COMMANDS, **bench_quality.COMMANDS},
+}
+
+
+def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """A function that takes the command's arguments, with all options if it takes any, and only returns what is to be
+    run."""
+
+    # A named function may be wrapped by a checker of annotations, and the parser looks beneath what is wrapped.
+    parsed: Any = lambda *args, **kwargs: functools.partial(command, *args, **kwargs)  # noqa: E731
+    plain = inspect.unwrap(command)
+    hints, signature = get_type_hints(plain, include_extras=True), inspect.signature(plain)
+    parameters = dict(signature.parameters)
+    if "options" in hints:
+        options = with_planner_options()
+        hints["options"] = Annotated[options, tyro.conf.arg(name="")]
+        parameters["options"] = parameters["options"].replace(default=options())
+    parsed.__name__, parsed.__doc__, parsed.__annotations__ = command.__name__, command.__doc__, hints
+    parsed.__signature__ = signature.replace(parameters=list(parameters.values()))
+    return parsed
+
+
+def one_line(complaint: str) -> str:
+    """The message in the box that the parser draws around it, on one line."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", complaint)
+    rows = [row.strip("│╭╰╮╯ \t") for row in plain.splitlines()]
+    title, *rows = [row for row in rows if row] or ["the arguments are wrong"]
+    body: list[str] = []
+    for row in rows:
+        if not row.strip("─"):
+            break
+        body.append(row)
+    text = " ".join(body) if body else title.strip("─ ")
+    return re.sub(r"\s+", " ", text)
+
+
+def parse(arguments: Sequence[str]) -> Callable[[], None]:
+    """The command that arguments ask for, ready to be called.
+
+    Raises:
+      InputError: the arguments are wrong.
+      SystemExit: after help was printed.
+    """
+    group = arguments[0] if arguments and arguments[0] in GROUPS else None
+    program = f"mechsearch {group}" if group else "mechsearch"
+    commands = GROUPS[group] if group else COMMANDS
+    description = COMMANDS[group].__doc__ if group else "Find a hidden object on a cluttered shelf and take it out."
+    rest = list(arguments[1:] if group else arguments)
+    asked = rest[0] if rest else None
+    # What options there are takes long to find out, and is of no use to other commands.
+    known = {n: _deferred(c) if n == asked else _only_described(c.__doc__) for n, c in commands.items()}
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            command: Any = tyro.extras.subcommand_cli_from_dict(known, prog=program, description=description, args=rest)
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise InputError(f"{one_line(complaint.getvalue())} ({program} --help tells more)") from None
+    return command
+
+
+def main() -> None:
+    """The console command `mechsearch`."""
+    # Tracing makes millions of small objects that are not garbage: looking for it takes a fifth of a start.
+    gc.set_threshold(200_000, 20, 20)
+    try:
+        parse(sys.argv[1:])()
+    except InputError as error:
+        print(f"mechsearch: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("mechsearch: stopped", file=sys.stderr)
+        raise SystemExit(130) from None
+
+
+if __name__ == "__main__":
+    main()

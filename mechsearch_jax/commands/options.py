@@ -1,0 +1,248 @@
+"""Options and arguments that several commands share."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.envs.method import EngineName, Method
+    from mechsearch_jax.planner import Config, Option
+
+PaperMethod = Literal["search-for-grasp", "search-and-grasp"]
+PushModel = Literal["quasi-static", "learned", "physics"]
+TargetShape = Literal["cylinder", "box"]
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeOptions:
+    """What episodes run with. `with_planner_options` adds the preset and all of the planner's options.
+
+    Attributes:
+      recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses; the others see
+        a noisy depth image, "masks" with the true segmentation, "full" without.
+      simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
+        batches where there is a GPU.
+    """
+
+    recognition: Literal["oracle", "masks", "full"] = "oracle"
+    simulator: Literal["auto", "native", "mjx"] = "auto"
+
+    def config(self) -> Config:
+        """The preset's configuration, with what is given in its place.
+
+        Raises:
+          InputError: an option is impossible.
+        """
+        from mechsearch_jax.planner import OPTIONS, PRESETS
+
+        given = {option.name: getattr(self, option.name, None) for option in OPTIONS}
+        preset = PRESETS[getattr(self, "preset", DEFAULT_PRESET)]
+        return preset().with_options(**{name: value for name, value in given.items() if value is not None})
+
+    def methods(self, policies: Sequence[str], engine: EngineName = "NativeSimulator") -> list[Method]:
+        """What episodes are run with: one for each policy.
+
+        Raises:
+          InputError: a policy, an option, the push model or the recognition cannot be used; told of now, not by every
+            episode.
+        """
+        from mechsearch_jax.envs.method import Method
+
+        if any(":" in policy for policy in policies) and "" not in sys.path:
+            # As Python itself does for a program that is not installed.
+            sys.path.append("")
+        config = self.config()
+        methods = [Method(policy, config, self.recognition, engine) for policy in policies]
+        for method in methods:
+            method.check()
+        return methods
+
+    def engine(self) -> EngineName:
+        """The simulator that runs many episodes.
+
+        Raises:
+          InputError: it is not installed.
+        """
+        if self.simulator == "native" or (self.simulator == "auto" and not has_gpu()):
+            return "NativeSimulator"
+        from mechsearch_jax.envs.mjx_model import import_mjx
+
+        if self.simulator == "mjx":
+            import_mjx()
+            return "MjxSimulator"
+        try:
+            import_mjx()
+        except InputError as error:
+            print(f"mechsearch: {error}; using the native simulator", file=sys.stderr)
+            return "NativeSimulator"
+        return "MjxSimulator"
+
+    def only_native(self, command: str) -> None:
+        """Refuse the batch simulator where one episode is run.
+
+        Raises:
+          InputError: it was asked for.
+        """
+        if self.simulator == "mjx":
+            raise InputError(
+                f"{command}: --simulator mjx is for batches (mechsearch evaluate); leave it out for one episode"
+            )
+
+
+DEFAULT_PRESET = "standard"
+# What a command's parameter `options` is until `with_planner_options` knows the rest.
+DEFAULTS = EpisodeOptions()
+
+
+@functools.cache
+def with_planner_options() -> type[EpisodeOptions]:
+    """`EpisodeOptions` with one more field for the preset and for each of the planner's options, None if not given.
+
+    They are those of the configuration, which takes a second to import.
+    """
+    from mechsearch_jax.planner import OPTIONS, PRESETS
+
+    preset = tyro.conf.arg(help="where settings come from that are not given: what is best known, or the paper.")
+    fields: list[tuple[str, Any, Any]] = [("preset", Annotated[Literal[tuple(PRESETS)], preset], DEFAULT_PRESET)]
+    fields += [(option.name, _annotation(option), None) for option in OPTIONS]
+    return dataclasses.make_dataclass("Options", fields, bases=(EpisodeOptions,), frozen=True, kw_only=True)
+
+
+def _annotation(option: Option) -> Any:
+    """The type of a command line's option that may be left out."""
+    kind = Literal[option.choices] if option.choices else option.type
+    shown = "{" + ",".join(option.choices) + "}" if option.choices else _METAVARS.get(option.type)
+    about = tyro.conf.arg(metavar=shown, help=f"{option.help}.", help_behavior_hint=_usual(option))
+    return Annotated[kind | None, about]
+
+
+def _usual(option: Option) -> str:
+    """What an option is where it is not given."""
+    from mechsearch_jax.planner import PRESETS
+
+    values = {name: preset().options()[option.name] for name, preset in PRESETS.items()}
+    said = {name: " ".join(map(str, value)) if isinstance(value, list) else value for name, value in values.items()}
+    if len(set(said.values())) == 1:
+        return f"(default: {said[DEFAULT_PRESET]})"
+    return f"(default: {', '.join(f'{value} in preset {name}' for name, value in said.items())})"
+
+
+_METAVARS: dict[Any, str] = {
+    float: "FLOAT",
+    int: "INT",
+    bool: "{True,False}",
+    tuple[float, ...]: "FLOAT ...",
+    tuple[str, ...]: "NAME ...",
+}
+
+
+def chosen_policies(command: str, method: Sequence[str] | None, policy: Sequence[str] | None) -> Sequence[str]:
+    """The policies that `--policy`, or `--method` for short, name; search-for-grasp where neither is given.
+
+    Raises:
+      InputError: both are given.
+    """
+    if method and policy:
+        raise InputError(f"{command}: give either --method or --policy, not both; --policy takes a method's name too")
+    return method or policy or ("search-for-grasp",)
+
+
+def has_gpu() -> bool:
+    """Whether JAX computes on something else than the CPU."""
+    import jax
+
+    return jax.default_backend() != "cpu"
+
+
+OnePolicy = Annotated[str | None, tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE")]
+OneMethod = Annotated[PaperMethod | None, tyro.conf.arg(metavar="{search-for-grasp,search-and-grasp}")]
+Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER ...")]
+
+SomeScenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")]
+JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
+WeightsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")]
+
+
+def at_least_one(command: str, **options: int | None) -> None:
+    """Refuse counts below 1; None stands for what is not given.
+
+    Raises:
+      InputError: one is.
+    """
+    for name, value in options.items():
+        if value is not None and value < 1:
+            raise InputError(f"{command}: --{name.replace('_', '-')} {value} must be at least 1")
+
+
+def check_files(*files: Path | None) -> None:
+    """Fail before the work begins rather than after it, if a file that is asked for cannot be written.
+
+    Raises:
+      InputError: one cannot.
+    """
+    from mechsearch_jax.files import check_writable
+
+    for file in files:
+        if file is not None:
+            check_writable(file.parent)
+
+
+def forget_kept_compilations() -> None:
+    """Compile everything anew: what was read from disk would not tell how long compiling takes."""
+    import jax
+
+    jax.config.update("jax_enable_compilation_cache", False)
+
+
+def find_scenario(name: str) -> Path:
+    """The file that a scenario's path, or the name of one that ships with the package, stands for.
+
+    Raises:
+      InputError: there is neither.
+    """
+    from mechsearch_jax.workspace.scenario import example_scenarios
+
+    shipped = example_scenarios()
+    if Path(name).is_file():
+        return Path(name)
+    if name in shipped:
+        return shipped[name]
+    raise InputError(f"{name}: there is no such file, nor a shipped scenario of that name ({', '.join(shipped)})")
+
+
+def find_scenarios(names: Sequence[str]) -> list[Path]:
+    """The files that paths, folders and names stand for.
+
+    In a folder, JSON files that are plainly something else, as the episode.json that `search` writes beside its
+    scenario, are left out; each is named on standard error.
+
+    Raises:
+      InputError: there is nothing for one of them.
+    """
+    from mechsearch_jax.workspace.scenario import is_another_format
+
+    files: list[Path] = []
+    for name in names:
+        if Path(name).is_dir():
+            inside = sorted(Path(name).glob("*.json"))
+            others = [file for file in inside if is_another_format(file)]
+            for file in others:
+                print(f"{file}: is not a scenario file and is left out", file=sys.stderr)
+            inside = [file for file in inside if file not in others]
+            if not inside:
+                raise InputError(f"{name}: there are no scenario files (*.json) in this folder")
+            files += inside
+        else:
+            files.append(find_scenario(name))
+    if not files:
+        raise InputError("no scenario is given; name a file, a folder or a shipped scenario")
+    return files

@@ -1,0 +1,95 @@
+"""`mechsearch search`: one episode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from mechsearch_jax.commands.options import (
+    DEFAULTS,
+    EpisodeOptions,
+    OneMethod,
+    OnePolicy,
+    TargetShape,
+    chosen_policies,
+    find_scenario,
+)
+from mechsearch_jax.errors import InputError
+
+
+def search(
+    scenario: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")] = None,
+    /,
+    *,
+    objects: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    target: Annotated[TargetShape | None, tyro.conf.arg(metavar="{cylinder,box}")] = None,
+    method: OneMethod = None,
+    policy: OnePolicy = None,
+    seed: int = 0,
+    out: Path,
+    options: EpisodeOptions = DEFAULTS,
+) -> None:
+    """Run one episode: look, decide, act, until the target is found, graspable and taken out.
+
+    Args:
+      scenario: a scenario file, or the name of one that ships with the package.
+      objects: instead of a scenario, generate one with so many objects.
+      target: shape of a generated target; a cylinder if not given.
+      method: "search-for-grasp", the default, minds the grasp while it searches, "search-and-grasp" only afterwards.
+      policy: instead of a method, the name of a policy ("random" is one more), or the import path of another.
+      seed: of the planner, of the environment, and of a generated scenario.
+      out: folder for episode.json, filmstrip.png and the scenario.
+      options: how the planner decides.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.envs.episodes import run_episode, target_of
+    from mechsearch_jax.envs.generator import generate_scenario
+    from mechsearch_jax.envs.narration import Narrator, verdict
+    from mechsearch_jax.envs.native import NativeSimulator
+    from mechsearch_jax.envs.recognisers import recogniser
+    from mechsearch_jax.envs.records import save_episode
+    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.planner.cache import cached_problem, keep_compilations
+    from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.viz.filmstrip import filmstrip
+    from mechsearch_jax.workspace.scenario import load_scenario, save_scenario
+
+    if (scenario is None) == (objects is None):
+        raise InputError("search: give either a scenario or --objects N, not both")
+    if scenario is not None and target is not None:
+        raise InputError("search: --target is for a generated scenario; a scenario file says itself what its target is")
+    options.only_native("search")
+    (chosen,) = options.methods(chosen_policies("search", method and (method,), policy and (policy,)))
+    known = load_scenario(find_scenario(scenario)) if scenario is not None else None
+    check_writable(out)
+    keep_compilations()
+    console = Console(highlight=False)
+    with console.status("preparing") as status:
+        scene = known or generate_scenario(seed, objects or 0, target or "cylinder")
+        console.print(
+            f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
+        )
+        wanted = target_of(scene)
+        problem = cached_problem(wanted, chosen.config.problem)
+        narrator = Narrator(console, status, problem)
+        episode = run_episode(
+            seed,
+            scene,
+            problem,
+            chosen.policy(),
+            NativeSimulator(),
+            recogniser(chosen.recognition, wanted),
+            chosen.config.max_steps,
+            chosen.options(),
+            narrator,
+        )
+        status.update("writing")
+        strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
+        save_figure(strip, out / "filmstrip.png")
+        save_scenario(scene, out / "scenario.json")
+        save_episode(episode, out / "episode.json")
+    narrator.ended(episode)
+    console.print(f"{out / 'episode.json'}\n{out / 'filmstrip.png'}", soft_wrap=True)

@@ -1,0 +1,95 @@
+"""Contacts of footprints with the gripper, with walls and with each other."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mechsearch_jax.geometry.footprints import Footprints, dot, turned
+from mechsearch_jax.workspace.shelf import Shelf
+
+BOUNDARY_POINTS = 24
+
+
+def point_depth(half, is_round, points):
+    """How deep points are inside a footprint, in its own frame; broadcast, negative outside."""
+    gap = half - jnp.abs(points)
+    scaled = points / half
+    square = dot(scaled, scaled)
+    norm = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    mean = 0.5 * (half[..., 0] + half[..., 1])
+    return jnp.where(is_round, (1.0 - norm) * mean, jnp.minimum(gap[..., 0], gap[..., 1]))
+
+
+def point_normal(half, is_round, points):
+    """Outward normal of a footprint at points inside it, in its own frame; broadcast."""
+    gap = half - jnp.abs(points)
+    sign = jnp.where(points < 0, -1.0, 1.0)
+    x_is_nearer = gap[..., 0] < gap[..., 1]
+    flat = jnp.stack([jnp.where(x_is_nearer, sign[..., 0], 0.0), jnp.where(x_is_nearer, 0.0, sign[..., 1])], axis=-1)
+    gradient = points / half / half
+    length = jnp.sqrt(jnp.maximum(dot(gradient, gradient), 1e-12))
+    return jnp.where(is_round[..., None], gradient / length[..., None], flat)
+
+
+def deepest(depth, points):
+    """Depth and place of the deepest of the points along the last axis of `depth`."""
+    i = jnp.argmax(depth, axis=-1)[..., None]
+    return jnp.take_along_axis(depth, i, axis=-1)[..., 0], jnp.take_along_axis(points, i[..., None], axis=-2)[..., 0, :]
+
+
+def outline_points(prints):
+    """Points on the outline of every footprint, in the world seen from above, shape (N, BOUNDARY_POINTS, 2) [m]."""
+    angle = np.arange(BOUNDARY_POINTS) * 2 * np.pi / BOUNDARY_POINTS
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    square = circle / np.abs(circle).max(axis=-1, keepdims=True)
+    unit = jnp.where(prints.round[:, None, None], jnp.float32(circle)[None], jnp.float32(square)[None])
+    return turned(prints.yaw[:, None], unit * prints.half[:, None, :]) + prints.position[:, None, :]
+
+
+def pusher_depth(prints, points):
+    """How deep the gripper's points are in each footprint, -1 at other heights, and where they are in its frame."""
+    local = turned(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
+    depth = point_depth(prints.half[:, None, :], prints.round[:, None], local)
+    level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
+    return jnp.where(level & prints.valid[:, None], depth, -1.0), local
+
+
+def pair_contacts(prints):
+    """For every ordered pair (i, j): the deepest contact, and the direction in which j has to give way."""
+    outline = outline_points(prints)
+    into_j = turned(-prints.yaw[None, :, None], outline[:, None] - prints.position[None, :, None, :])
+    depth, point = deepest(point_depth(prints.half[None, :, None, :], prints.round[None, :, None], into_j), into_j)
+    normal = point_normal(prints.half[None], prints.round[None], point)
+    yaw = jnp.broadcast_to(prints.yaw[None, :], depth.shape)
+    direction, arm = -turned(yaw, normal), turned(yaw, point)
+    # The same the other way round: a corner of j inside a face of i, where j gives way along i's normal.
+    other_direction = -jnp.swapaxes(direction, 0, 1)
+    world = arm + prints.position[None, :, :]
+    other_arm = jnp.swapaxes(world, 0, 1) - prints.position[None, :, :]
+    swap = depth < depth.T
+    deeper = jnp.where(swap[..., None], other_direction, direction), jnp.where(swap[..., None], other_arm, arm)
+    both = prints.valid[:, None] & prints.valid[None, :] & ~jnp.eye(prints.valid.size, dtype=bool)
+    return jnp.where(both, jnp.maximum(depth, depth.T), -1.0), *deeper
+
+
+def wall_depth(shelf, prints):
+    """How deep outlines are in the back, right and left walls, shape (N, BOUNDARY_POINTS, 3) [m]; and the outlines."""
+    outline = outline_points(prints)
+    x, y = outline[..., 0], outline[..., 1]
+    return jnp.stack([x - shelf.back, shelf.right - y, y - shelf.left], axis=-1), outline
+
+
+def unresolved(shelf: Shelf, before: Footprints, after: Footprints, points: Float[Array, "p 3"]) -> Float[Array, ""]:
+    """Deepest penetration after a push [m]: of the gripper, of walls, and of objects as far as it is new; at least 0.
+
+    Args:
+      shelf: walls.
+      before, after: the objects.
+      points: surface of the gripper where the push ends, in the world [m].
+    """
+    held = jnp.max(pusher_depth(after, points)[0])
+    jammed = jnp.max(pair_contacts(after)[0]) - jnp.maximum(jnp.max(pair_contacts(before)[0]), 0.0)
+    wall = jnp.max(jnp.where(after.valid[:, None], jnp.max(wall_depth(shelf, after)[0], axis=1), -1.0))
+    return jnp.maximum(jnp.maximum(jnp.maximum(held, jammed), wall), 0.0)

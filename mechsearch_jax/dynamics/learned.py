@@ -1,0 +1,113 @@
+"""The push model that was learnt from simulated pushes (paper section 4.3); a `push_model.PushModel`."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.resources
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from mechsearch_jax.dynamics.contacts import unresolved
+from mechsearch_jax.dynamics.push_model import PushOutcome
+from mechsearch_jax.dynamics.rigid import rigid_motion
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.networks.push import PushNetwork, apply_network
+from mechsearch_jax.networks.push_geometry import push_start
+from mechsearch_jax.networks.weights import Weights, load_weights
+from mechsearch_jax.workspace.shelf import Shelf
+
+NAME = "push"
+# An object is moved if it moves with a probability above this: of those that stay, less than 1 in 100 is then moved,
+# but 3 in 100 where there is one object and the target.
+LIKELY = 0.75
+# The hand gives way and ends short of where it was sent: what simulated pushes come to overlaps in 1 of 20 cases by
+# about this with the hand where it was sent or with a neighbour [m]. Next to a wall, predictions are as far off.
+SLACK = 0.02
+
+
+@functools.cache
+def _weights(path: Path, digest: str) -> Weights:
+    """The network in a file whose card states this digest."""
+    # Called while a plan is traced, it still has to give numbers.
+    with jax.ensure_compile_time_eval():
+        return load_weights(path, NAME)
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnedPush:
+    """Predicts pushes with a trained network. Two are equal if their weights are.
+
+    Attributes:
+      path: of the weights; those that ship with the package if left out.
+      likely: an object is moved if it moves with a probability above this, and else left exactly where it is.
+      slack: so much overlap, with the hand, a wall or another object, is taken off the residual [m]: what a push really
+        comes to overlaps with the hand where it was sent, too.
+      digest: of the weights, read from their card.
+
+    Raises:
+      InputError: the weights are missing or damaged, or a number is out of range.
+    """
+
+    path: Path | None = dataclasses.field(default=None, compare=False)
+    likely: float = LIKELY
+    slack: float = SLACK
+    digest: str = dataclasses.field(default="", init=False)
+
+    def __post_init__(self):
+        if not 0.0 <= self.likely <= 1.0 or not self.slack >= 0.0:
+            raise InputError(
+                f"LearnedPush: likely {self.likely} must be from 0 to 1, and slack {self.slack} m must not be negative"
+            )
+        path = self.path or Path(str(importlib.resources.files("mechsearch_jax") / "networks" / f"{NAME}.npz"))
+        # What a frozen instance derives from its arguments can be set in no other way.
+        object.__setattr__(self, "path", path)
+        object.__setattr__(self, "digest", load_weights(path, NAME).card["sha256"])
+
+    def __call__(
+        self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
+    ) -> PushOutcome:
+        """See `push_model.PushModel`."""
+        assert self.path is not None
+        weights = _weights(self.path, self.digest)
+        network = weights.network
+        assert isinstance(network, PushNetwork)
+        predict = functools.partial(predicted, network, weights.parameters, self.likely, self.slack)
+        return predict(shelf, scene, pusher, T_world_gripper, displacement, q7)
+
+
+def predicted(
+    network: PushNetwork,
+    parameters: Any,
+    likely: float,
+    slack: float,
+    shelf: Shelf,
+    scene: Superquadrics,
+    pusher: Array,
+    T_world_gripper: Array,
+    displacement: Array,
+    q7: Array,
+) -> PushOutcome:
+    """What a network predicts of a push; see `LearnedPush` and `push_model.PushModel` for the arguments."""
+    start = push_start(shelf, scene, pusher, T_world_gripper, displacement)
+    told = apply_network(network, parameters, start)
+    moves = scene.valid & (jax.nn.sigmoid(told.moves) > likely)
+    before = start.prints
+    prints = before.replace(
+        position=before.position + jnp.where(moves[:, None], told.shift, 0.0),
+        yaw=before.yaw + jnp.where(moves, told.turn, 0.0),
+    )
+    moved = rigid_motion(scene, before.position, prints.position, told.turn)
+    after = jax.tree.map(lambda new, old: jnp.where(moves.reshape(-1, *[1] * (new.ndim - 1)), new, old), moved, scene)
+    # Of the gripper, as much as the network sees: with all points, overlaps are deeper by half a millimetre.
+    end = start.points + displacement[None]
+    return PushOutcome(
+        scene=after,
+        residual=jnp.maximum(unresolved(shelf, before, prints, end) - slack, 0.0),
+        topples=jnp.where(scene.valid, jax.nn.sigmoid(told.topples), 0.0),
+    )

@@ -1,0 +1,54 @@
+"""Rigid motions of objects: in the plane, in the hand, and from one gripper pose to another."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.geometry.footprints import QUARTER_TURN, footprints, turned
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import compose, inverse, matmul, transform, yaw_rotation
+
+
+def rigid_motion(
+    scene: Superquadrics, before: Float[Array, "n 2"], after: Float[Array, "n 2"], turn: Float[Array, " n"]
+) -> Superquadrics:
+    """Objects moved in the plane from `before` to `after` [m] and turned about the vertical through `before` [rad]."""
+    arm = turned(turn, scene.position[:, :2] - before) + after
+    return scene.replace(
+        position=jnp.concatenate([arm, scene.position[:, 2:]], axis=-1),
+        rotation=matmul(yaw_rotation(turn), scene.rotation),
+    )
+
+
+def in_hand(scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Array, "4 4"]) -> Float[Array, "3 3"]:
+    """`R_world_object` of an object once the fingers have closed on it.
+
+    An approximation: one with flat sides turns about its own vertical axis until the nearest of them lies flat against
+    a finger, and does not shift; a round one stays as it is.
+    """
+    one = footprints(jax.tree.map(lambda a: a[index][None], scene))
+    approach = jnp.arctan2(T_world_grasp[1, 2], T_world_grasp[0, 2])
+    skew = approach - one.yaw[0]
+    skew = skew - QUARTER_TURN * jnp.round(skew / QUARTER_TURN)
+    return matmul(yaw_rotation(jnp.where(one.round[0], 0.0, skew)), scene.rotation[index])
+
+
+def pick_and_place(
+    scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Array, "4 4"], T_world_place: Float[Array, "4 4"]
+) -> Superquadrics:
+    """The scene after an object, turned `in_hand`, has moved with the gripper from one pose to the other."""
+    motion = compose(T_world_place, inverse(T_world_grasp))
+    position = transform(motion, scene.position[index])
+    rotation = matmul(motion[:3, :3], in_hand(scene, index, T_world_grasp))
+    return scene.replace(
+        position=scene.position.at[index].set(position), rotation=scene.rotation.at[index].set(rotation)
+    )
+
+
+def moved_objects(before: Superquadrics, after: Superquadrics) -> Bool[Array, " n"]:
+    """Which objects differ in pose between two scenes."""
+    return jnp.any(before.position != after.position, axis=-1) | jnp.any(
+        before.rotation != after.rotation, axis=(-1, -2)
+    )

@@ -1,0 +1,159 @@
+"""Superquadrics: the shape class that the planner sees objects as (paper section 4.1).
+
+A superquadric is written here as two nested p-norms. With `p = 2/e2` in the plane and `r = 2/e1` along the axis,
+
+    gauge(x) = ( ||(x1/a1, x2/a2)||_p ^ r  +  |x3/a3| ^ r ) ^ (1/r),
+
+so that the paper's `S` of equation 5 is `gauge ** (2/e1)`. The gauge is homogeneous of degree one and, for exponents up
+to 2, convex; neither overflows in float32 however far away the point is, and both gradients are finite everywhere.
+"""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.transforms import align, inverse, make, transform
+
+BOX_EXPONENTS = (0.2, 0.2)
+CYLINDER_EXPONENTS = (0.2, 1.0)
+
+
+class Superquadrics(flax.struct.PyTreeNode):
+    """A fixed number of superquadrics, some of which may be absent; every field has the leading axes `(..., N)`.
+
+    Attributes:
+      size: half-extents along the object's own axes [m], shape (..., N, 3).
+      exponents: (e1, e2), shape (..., N, 2); (0.2, 0.2) is a box, (0.2, 1.0) a cylinder.
+      position: `t_world_object` [m], shape (..., N, 3).
+      rotation: `R_world_object`, shape (..., N, 3, 3).
+      valid: whether the slot holds an object, shape (..., N).
+    """
+
+    size: jax.Array
+    exponents: jax.Array
+    position: jax.Array
+    rotation: jax.Array
+    valid: jax.Array
+
+    @property
+    def capacity(self) -> int:
+        return self.size.shape[-2]
+
+
+def empty(capacity: int) -> Superquadrics:
+    """`capacity` absent superquadrics: millimetre spheres at the origin, masked out."""
+    return Superquadrics(
+        size=jnp.full((capacity, 3), 1e-3, jnp.float32),
+        exponents=jnp.ones((capacity, 2)),
+        position=jnp.zeros((capacity, 3)),
+        rotation=jnp.broadcast_to(jnp.eye(3), (capacity, 3, 3)),
+        valid=jnp.zeros(capacity, bool),
+    )
+
+
+def pad(superquadrics: Superquadrics, capacity: int) -> Superquadrics:
+    """The same superquadrics in `capacity` slots.
+
+    Raises:
+      InputError: there are more objects than slots.
+    """
+    missing = capacity - superquadrics.capacity
+    if missing < 0:
+        raise InputError(f"{superquadrics.capacity} objects do not fit a capacity of {capacity}; raise the capacity")
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b[:missing]]), superquadrics, empty(capacity))
+
+
+def standard_edges(superquadrics: Superquadrics) -> Superquadrics:
+    """The same superquadrics with edges no sharper than those of `BOX_EXPONENTS`, which the paper plans with.
+
+    What fits an image best has nearly the sharp edges of a real box. It hides more and is hit more than the rounded box
+    of the same size that stands for it in plans: with it, f and g would depend on how an object came to be known.
+    """
+    return superquadrics.replace(exponents=jnp.maximum(superquadrics.exponents, BOX_EXPONENTS[0]))
+
+
+def _power(base: Array, exponent: Array) -> Array:
+    """`base ** exponent` for `base >= 0`, with a zero gradient instead of NaN where `base` is 0."""
+    positive = base > 0
+    return jnp.where(positive, jnp.exp(exponent * jnp.log(jnp.where(positive, base, 1.0))), 0.0)
+
+
+def _norm2(a: Array, b: Array, p: Array) -> Array:
+    """`(a**p + b**p) ** (1/p)` for `a, b >= 0`, without overflow and with finite gradients, also at the origin."""
+    big, small = jnp.maximum(a, b), jnp.minimum(a, b)
+    ratio = small / jnp.where(big > 0, big, 1.0)
+    return big * jnp.exp(jnp.log1p(_power(ratio, p)) / p)
+
+
+def gauge(
+    size: Float[Array, "... 3"], exponents: Float[Array, "... 2"], points: Float[Array, "... 3"]
+) -> Float[Array, "..."]:
+    """The factor by which a superquadric must be scaled about its centre for its surface to pass through a point.
+
+    Args:
+      size: half-extents [m].
+      exponents: (e1, e2), each in (0, 2].
+      points: in the object's own frame [m].
+
+    Returns:
+      0 at the centre, 1 on the surface, more outside; broadcast over the leading axes.
+    """
+    size, exponents, points = align((size, 1), (exponents, 1), (points, 1))
+    x = jnp.abs(points / size)
+    p, r = 2.0 / exponents[..., 1], 2.0 / exponents[..., 0]
+    return _norm2(_norm2(x[..., 0], x[..., 1], p), x[..., 2], r)
+
+
+def radial_distance(
+    size: Float[Array, "... 3"], exponents: Float[Array, "... 2"], points: Float[Array, "... 3"]
+) -> Float[Array, "..."]:
+    """Distance from a point to the surface along the ray from the centre (equation 6) [m]. Arguments as in `gauge`.
+
+    At the centre itself, where every ray is as good as another, it is the smallest half-extent.
+    """
+    size, exponents, points = align((size, 1), (exponents, 1), (points, 1))
+    scale = gauge(size, exponents, points)
+    square = jnp.sum(points**2, axis=-1)
+    centre = (square <= 0) | (scale <= 0)
+    norm = jnp.sqrt(jnp.where(centre, 1.0, square))
+    distance = norm * jnp.abs(1.0 - 1.0 / jnp.where(centre, 1.0, scale))
+    return jnp.where(centre, jnp.broadcast_to(jnp.min(size, axis=-1), distance.shape), distance)
+
+
+def to_object_frame(superquadrics: Superquadrics, points: Float[Array, "... 3"]) -> Float[Array, "... n 3"]:
+    """World points in the frame of every superquadric [m]."""
+    return transform(inverse(make(superquadrics.rotation, superquadrics.position)), points[..., None, :])
+
+
+def bounding_radius(size: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
+    """Radius of a sphere about the centre that holds a superquadric of any exponents up to 2 [m]: its box's."""
+    return jnp.sqrt(jnp.sum(size**2, axis=-1))
+
+
+def surface_directions(count: int) -> Float[np.ndarray, "count 3"]:
+    """`count` unit vectors spread evenly over the sphere (Fibonacci lattice)."""
+    k = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * k / count
+    azimuth = np.pi * (1.0 + 5.0**0.5) * k
+    radius = np.sqrt(1.0 - z**2)
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1).astype(np.float32)
+
+
+def sample_surface(
+    size: Float[Array, "*batch 3"], exponents: Float[Array, "*batch 2"], count: int
+) -> Float[Array, "*batch count 3"]:
+    """Points on the surface of a superquadric, in its own frame [m].
+
+    Directions spread evenly over the sphere are warped towards the box's faces by the half-extents and projected
+    radially: deterministic, on the surface to rounding, dense enough for collision tests but not uniform in area.
+    """
+    direction = jnp.asarray(surface_directions(count))
+    cube = direction / jnp.max(jnp.abs(direction), axis=-1, keepdims=True)
+    cube = cube.reshape(*[1] * (size.ndim - 1), count, 3)
+    points = cube * size[..., None, :]
+    return points / gauge(size[..., None, :], exponents[..., None, :], points)[..., None]

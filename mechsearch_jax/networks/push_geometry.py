@@ -1,0 +1,486 @@
+"""What the push network is told of a push: objects, contacts and walls, along the push and across it."""
+
+from __future__ import annotations
+
+import functools
+from typing import Literal
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.dynamics.push_model import TOUCH
+from mechsearch_jax.geometry.footprints import Footprints, footprints, turned
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import transform
+from mechsearch_jax.workspace.shelf import Shelf
+
+# Directions, spread over half a turn, in which an object's reach is a feature; an even number.
+DIRECTIONS = 8
+# Contacts and walls farther away than this are all the same to the network [m]: no push is longer.
+REACH = 0.25
+# Over how much lateral overlap a contact comes into being: a graze is no contact [m].
+GRAZE = 1e-3
+# Deeper overlaps are all the same to the network, and so are objects passed by at more than this [m].
+DEEPEST = 0.02
+# Points of the gripper that are looked at.
+POINTS = 192
+# How far behind the first point of contact others still count as touching [m], and a stricter notion of that: its
+# weights are a power of the others, which saves an exponential.
+SOFTNESS, STRICTER = 0.015, 5
+# Two objects meet along a normal if it parts them until they touch and, linearly less, if it does so until at most this
+# much before [m].
+SAME_CONTACT = 2e-3
+# A step towards a contact at a cylinder is taken as if it were met at no flatter an angle than one of this sine.
+_FLATTEST = 0.3
+# Objects that push each other on, one after the other, in the estimate of who is reached when.
+CHAIN = 4
+# Units of the network's inputs and outputs: lengths [m], angles [rad].
+_LENGTH = 0.1
+# The inward normals of the back, right and left walls, and of the front edge, beyond which is nothing.
+NORMALS = np.array([[-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], np.float32)
+_IS_EDGE = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
+MIRRORED_DIRECTIONS = (-np.arange(DIRECTIONS)) % DIRECTIONS
+
+
+class Parity(flax.struct.PyTreeNode):
+    """Numbers by what a mirror along the frame's first axis makes of them; any leading axes.
+
+    Attributes:
+      even: what stays as it is: lengths, and vectors along the axis.
+      odd: what changes its sign: vectors across the axis.
+    """
+
+    even: jax.Array
+    odd: jax.Array
+
+
+class PushGeometry(flax.struct.PyTreeNode):
+    """Input features of a push, in the frame of `PushConfig`; lengths in units of 10 cm but where [m] is given.
+
+    Attributes:
+      objects: of each object, shapes (N, ...).
+      pairs: of object j as seen from object i, shapes (N, N, ...).
+      walls: of each wall as seen from each object, shapes (N, 4, ...).
+      wall_near: 1 at the wall, 0 from `REACH` on, shape (N, 4).
+      carry: how far each object would be carried if nothing turned or slid off [m], shape (N,).
+      heading: unit vector of the push in the frame, shape (2,).
+      axis: first axis of the frame in the world, a planar unit vector, shape (2,).
+      round: which objects are round, shape (N,).
+      valid: which objects are there, shape (N,).
+    """
+
+    objects: Parity
+    pairs: Parity
+    walls: Parity
+    wall_near: jax.Array
+    carry: jax.Array
+    heading: jax.Array
+    axis: jax.Array
+    round: jax.Array
+    valid: jax.Array
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
+
+
+def perpendicular(v: Array) -> Array:
+    return jnp.stack([-v[..., 1], v[..., 0]], axis=-1)
+
+
+def _norm(v: Array) -> Array:
+    """Length of planar vectors; 0, with a gradient of 0, where they vanish."""
+    square = _dot(v, v)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def _fan(axis: Array) -> Array:
+    """Angles of directions over half a turn, from a planar vector on [rad]."""
+    return jnp.arctan2(axis[1], axis[0]) + jnp.asarray(np.arange(DIRECTIONS) * np.pi / DIRECTIONS, jnp.float32)
+
+
+def reach(prints: Footprints, direction: Float[Array, "*other n 2"]) -> Float[Array, "*other n"]:
+    """How far footprints (N) reach from their centres along planar unit vectors [m]."""
+    lead = (1,) * (direction.ndim - 2)
+    yaw, half = prints.yaw.reshape(*lead, -1), prints.half.reshape(*lead, -1, 2)
+    along = _dot(direction, jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1))
+    across = _dot(direction, jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)], axis=-1))
+    parts = jnp.abs(jnp.stack([along, across], axis=-1)) * half
+    return jnp.where(prints.round.reshape(*lead, -1), _norm(parts), parts[..., 0] + parts[..., 1])
+
+
+def _slabs(width: Array, offset: Array, speed: Array) -> tuple[Array, Array]:
+    """When a point that is at `offset` and moves at `speed` enters and leaves all slabs |x| <= width along axis -1."""
+    safe = jnp.where(jnp.abs(speed) < 1e-5, 1e-5, speed)
+    middle, half = -offset / safe, width / jnp.abs(safe)
+    return jnp.max(middle - half, axis=-1), jnp.min(middle + half, axis=-1)
+
+
+def _grazing(enters: Array, leaves: Array, overlap: Array, longest: float = REACH) -> Array:
+    """A distance to a contact, at most `longest`, and `longest` where one passes by or is past it already."""
+    share = jnp.clip(jnp.minimum(overlap, leaves) / GRAZE, 0.0, 1.0)
+    return share * jnp.clip(enters, -DEEPEST, longest) + (1.0 - share) * longest
+
+
+def pusher_distance(
+    prints: Footprints, points: Float[Array, "p 3"], heading: Float[Array, "2"], longest: float = REACH
+) -> tuple[Float[Array, "n p"], Bool[Array, "n p"]]:
+    """How far each point moves along a planar unit vector until it enters each footprint, at most `longest` [m].
+
+    Also whether it is at the height of the object; below 0 it is inside already.
+    """
+    level = (points[None, :, 2] > prints.low[:, None] - TOUCH) & (points[None, :, 2] < prints.high[:, None] + TOUCH)
+    side = perpendicular(heading)
+    from_centre = points[None, :, :2] - prints.position[:, None]
+    lateral = _dot(from_centre, side[None, None])
+    widest = reach(prints, jnp.broadcast_to(side[None], prints.position.shape))[:, None]
+    # What passes by is looked at as if it grazed the side, and then counts for nothing.
+    inside = jnp.clip(lateral, GRAZE / 4 - widest, widest - GRAZE / 4)
+    start = from_centre + (inside - lateral)[..., None] * side[None, None]
+    local = turned(-prints.yaw, start)
+    speed = turned(-prints.yaw, jnp.broadcast_to(heading[None], prints.position.shape))[:, None]
+    flat = _slabs(prints.half[:, None], local, speed)
+    p, d = local / prints.half[:, None], speed / prints.half[:, None]
+    square, product = _dot(d, d), _dot(p, d)
+    root = jnp.sqrt(jnp.maximum(product**2 - square * (_dot(p, p) - 1.0), 1e-9))
+    disc = (-product - root) / square, (-product + root) / square
+    enters, leaves = (jnp.where(prints.round[:, None], a, b) for a, b in zip(disc, flat, strict=True))
+    return _grazing(enters, leaves, widest - jnp.abs(lateral), longest), level
+
+
+class Meetings(flax.struct.PyTreeNode):
+    """Where object i would meet object j if it moved along the heading; leading axes (N, N).
+
+    Distances are exact for two boxes, and gaps then a lower bound. A cylinder's contact is sought with a polygon around
+    it, up to 2% wider, and then moved onto the circle by one step of Newton's method: too soon by up to 3 mm where it
+    is nearly passed by.
+
+    Attributes:
+      distance: how far i moves until it touches j [m]: at least `-DEEPEST`, and `REACH` where it passes by or is past.
+      gap: between them now; negative where they overlap [m].
+      normal: unit vector along which i meets j, never against the heading, (N, N, 2); of two boxes the mean where there
+        are several. Where i passes by, it is about that of a graze, and where it is past, that of a meeting before.
+      middle: of where they overlap across the heading, or of the room between them, to its left, from i's centre [m].
+      breadth: of that overlap; negative where i passes by [m].
+    """
+
+    distance: jax.Array
+    gap: jax.Array
+    normal: jax.Array
+    middle: jax.Array
+    breadth: jax.Array
+
+
+def _round_contacts(prints: Footprints, axis: Array, offset: Array) -> tuple[Array, Array]:
+    """The way from footprints i to footprints j where they are nearest, if one of them is round.
+
+    An approximation: an ellipse is taken for a circle of its mean half-axis. Of two boxes it says nothing.
+
+    Args:
+      prints: the footprints (N).
+      axis: first axis of each, planar unit vectors (N, 2).
+      offset: of i from j, (K, N, N, 2) [m].
+
+    Returns:
+      Unit vectors (K, N, N, 2), and how far they are apart, (K, N, N) [m]; below 0 they overlap. Where the axis of one
+      is inside the other the vector is 0, and less is told than how deep.
+    """
+    # Seen from the one that may be a box, the other one is a disc.
+    disc_moves = prints.round[:, None, None]
+    axis = jnp.where(disc_moves, axis[None], axis[:, None])[None]
+    side = perpendicular(axis)
+    flat = jnp.where(prints.round[:, None], 0.0, prints.half)
+    half = jnp.where(disc_moves, flat[None], flat[:, None])[None]
+    seen = jnp.where(disc_moves[None], offset, -offset)
+    x, y = _dot(seen, axis), _dot(seen, side)
+    x, y = x - jnp.clip(x, -half[..., 0], half[..., 0]), y - jnp.clip(y, -half[..., 1], half[..., 1])
+    away = x[..., None] * axis + y[..., None] * side
+    length = _norm(away)
+    radii = jnp.where(prints.round, 0.5 * (prints.half[:, 0] + prints.half[:, 1]), 0.0)
+    way = jnp.where(disc_moves[None], -away, away) / jnp.maximum(length, 1e-6)[..., None]
+    return way, length - (radii[:, None] + radii[None])[None]
+
+
+def meetings(prints: Footprints, heading: Float[Array, "2"]) -> Meetings:
+    """Where footprints (N) would meet each other along a planar unit vector."""
+    n = prints.yaw.shape[0]
+    fan = _fan(heading)
+    rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
+    # A round object has no sides of its own: in their place, two of the rays are taken once more.
+    axis = jnp.stack([jnp.cos(prints.yaw), jnp.sin(prints.yaw)], axis=-1)
+    first = jnp.where(prints.round[:, None], heading[None], axis)
+    sides = jnp.stack([first, perpendicular(first)], axis=1)
+    # How far all objects reach along the rays, (K, N), and along each other's sides: [k, s, m] is m along those of k.
+    along_rays = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, n, 2)))
+    along_sides = reach(prints, jnp.broadcast_to(sides[:, :, None], (n, 2, n, 2)))
+    own = jnp.diagonal(along_sides, axis1=0, axis2=2).T
+    offset = prints.position[:, None] - prints.position[None]
+    side = perpendicular(heading)
+    lateral = _dot(offset, side[None, None])
+    across = reach(prints, jnp.broadcast_to(side[None], prints.position.shape))
+    widest = across[:, None] + across[None]
+    inside = jnp.clip(lateral, GRAZE / 4 - widest, widest - GRAZE / 4)
+    start = offset + (inside - lateral)[..., None] * side[None, None]
+
+    normals = (
+        jnp.broadcast_to(rays[:, None, None], (DIRECTIONS, n, n, 2)),
+        jnp.broadcast_to(jnp.moveaxis(sides, 1, 0)[:, :, None], (2, n, n, 2)),
+        jnp.broadcast_to(jnp.moveaxis(sides, 1, 0)[:, None], (2, n, n, 2)),
+    )
+    normals = jnp.concatenate(normals)
+    width = jnp.moveaxis(own[:, :, None] + along_sides, 1, 0)
+    width = jnp.concatenate([along_rays[:, :, None] + along_rays[:, None], width, jnp.swapaxes(width, 1, 2)])
+    speed = _dot(normals, heading[None, None, None])
+    safe = jnp.where(jnp.abs(speed) < 1e-5, 1e-5, speed)
+    nearest, half = -_dot(normals, start[None]) / safe, width / jnp.abs(safe)
+    each = nearest - half
+    enters, leaves = jnp.max(each, axis=0), jnp.min(nearest + half, axis=0)
+    gap = jnp.max(jnp.abs(_dot(normals, offset[None])) - width, axis=0)
+    share = jnp.maximum(1.0 - (enters[None] - each) / SAME_CONTACT, 0.0) * jnp.sign(speed)
+    normal = jnp.sum(share[..., None] * normals, axis=0)
+    length = _norm(normal)[..., None]
+    normal = jnp.where(length > 1e-6, normal / jnp.where(length > 1e-6, length, 1.0), 0.0)
+    is_round = prints.round[:, None] | prints.round[None]
+    places = [start + enters[..., None] * heading[None, None], start + leaves[..., None] * heading[None, None], offset]
+    way, between = _round_contacts(prints, axis, jnp.stack(places))
+    normal = jnp.where(is_round[..., None], way[0], normal)
+    steepness = _dot(way[:2], heading[None, None, None]) * jnp.array([1.0, -1.0]).reshape(2, 1, 1)
+    step = jnp.where(is_round[None], jnp.maximum(between[:2], 0.0) / jnp.maximum(steepness, _FLATTEST), 0.0)
+    enters, leaves, gap = enters + step[0], leaves - step[1], jnp.where(is_round, between[2], gap)
+    # From the centre of i, j reaches from -lateral - across_j to -lateral + across_j.
+    left = jnp.minimum(across[:, None], across[None] - lateral)
+    right = jnp.maximum(-across[:, None], -across[None] - lateral)
+    return Meetings(
+        distance=_grazing(enters, leaves, widest - jnp.abs(lateral)),
+        gap=gap,
+        normal=normal,
+        middle=0.5 * (left + right),
+        breadth=left - right,
+    )
+
+
+def _soft_contacts(distance: Array, level: Array, points: Array, heading: Array) -> tuple[Array, Array]:
+    """Where points (P, 3), moved along the heading by distances (N, P), first touch, strictly and less so; (N, 3)."""
+    first = jnp.min(jnp.where(level, distance, REACH), axis=1, keepdims=True)
+    # What is not level may be reached long before; the inner `where` keeps it from overflowing.
+    weight = jnp.where(level, jnp.exp((first - jnp.where(level, distance, first)) / SOFTNESS), 0.0)
+
+    def mean(weight):
+        total = jnp.maximum(jnp.sum(weight, axis=1), 1e-6)
+        place = jnp.matmul(weight, points, precision=jax.lax.Precision.HIGHEST)
+        way = jnp.sum(weight * distance, axis=1)[:, None] * jnp.append(heading, 0.0)[None]
+        return (place + way) / total[:, None]
+
+    return mean(weight**STRICTER), mean(weight)
+
+
+class PushStart(flax.struct.PyTreeNode):
+    """A push as it begins.
+
+    Attributes:
+      prints: footprints of the objects, fields (N, ...).
+      tilt: 10 (1 - cos) of the angle by which each object leans, 0 if a face of it is level, shape (N,).
+      points: surface of the gripper in the world [m], shape (P, 3).
+      T_world_gripper: its pose, shape (4, 4).
+      displacement: how the gripper moves in the plane [m], shape (2,).
+      faces: where the inner faces of the back, right and left walls are along their inward normals, and the front edge
+        [m], shape (4,).
+      board: height of the shelf's board [m].
+    """
+
+    prints: Footprints
+    tilt: jax.Array
+    points: jax.Array
+    T_world_gripper: jax.Array
+    displacement: jax.Array
+    faces: jax.Array
+    board: jax.Array
+
+
+def push_start(
+    shelf: Shelf,
+    scene: Superquadrics,
+    pusher: Float[Array, "p 3"],
+    T_world_gripper: Float[Array, "4 4"],
+    displacement: Float[Array, "3"],
+) -> PushStart:
+    """The start of a push; see `push_model.PushModel` for the arguments.
+
+    Args:
+      shelf: walls; one of which is farther than `REACH` from an object does not exist for it.
+      scene: the objects, fields (N, ...).
+      pusher: surface of the closed gripper in its own frame [m]; the first `POINTS` of it have to cover all of it.
+      T_world_gripper: where the push starts.
+      displacement: how the gripper moves [m]; what is vertical in it is neglected.
+    """
+    return PushStart(
+        prints=footprints(scene),
+        tilt=10.0 * (1.0 - jnp.max(jnp.abs(scene.rotation[:, 2, :]), axis=-1)),
+        points=transform(T_world_gripper, pusher[:POINTS]),
+        T_world_gripper=T_world_gripper,
+        displacement=displacement[:2],
+        faces=jnp.array([-shelf.back, shelf.right, -shelf.left, shelf.front]),
+        board=jnp.float32(shelf.board),
+    )
+
+
+def _framed(axis: Array, vectors: Array) -> Array:
+    """Planar vectors (..., 2) in the frame with this first axis."""
+    x, y = (a.reshape(*[1] * (vectors.ndim - 1), 2) for a in (axis, perpendicular(axis)))
+    return jnp.stack([_dot(vectors, x), _dot(vectors, y)], axis=-1)
+
+
+def _pairs(prints: Footprints, met: Meetings, carry: Array, heading: Array, axis: Array) -> Parity:
+    """Features of object j in the frame of object i, (N, N, ...)."""
+    offset = prints.position[None] - prints.position[:, None]
+    overlap = jnp.minimum(prints.high[:, None], prints.high[None]) - jnp.maximum(prints.low[:, None], prints.low[None])
+    onward = jnp.clip(met.distance, -DEEPEST, REACH)
+    # How far i carries j.
+    passed = jnp.maximum(carry[:, None] - jnp.maximum(onward, 0.0), 0.0)
+    gap, breadth = (jnp.clip(a, -DEEPEST, REACH) for a in (met.gap, met.breadth))
+    lengths = [onward, onward.T, passed, passed.T, gap, jnp.clip(overlap, -0.05, 0.2), breadth]
+    # From the centre of i; from that of j it differs by the offset, which is a feature.
+    side = met.middle[..., None] * perpendicular(heading)[None, None]
+    normal = _framed(axis, met.normal)
+    offset, side = _framed(axis, offset) / _LENGTH, _framed(axis, side) / _LENGTH
+    vectors = jnp.stack([offset, normal, jnp.swapaxes(normal, 0, 1), side], axis=-2)
+    even = jnp.concatenate([jnp.stack(lengths, axis=-1) / _LENGTH, vectors[..., 0]], axis=-1)
+    return Parity(even=even, odd=vectors[..., 1])
+
+
+def _walls(prints: Footprints, faces: Array, axis: Array) -> tuple[Parity, Array]:
+    """Features of each wall in each object's frame, (N, 4, ...), and how near it is; see `PushGeometry`."""
+    n = prints.yaw.shape[0]
+    normals = jnp.asarray(NORMALS)
+    toward = reach(prints, jnp.broadcast_to(normals[:, None], (4, n, 2))).T
+    gap = _dot(prints.position[:, None], normals[None]) - faces[None] - toward
+    gap = jnp.clip(gap, -0.05, REACH)
+    near = 1.0 - jnp.maximum(gap, 0.0) / REACH
+    edge = jnp.broadcast_to(jnp.asarray(_IS_EDGE)[None], (n, 4))
+    inwards = jnp.broadcast_to(_framed(axis, normals)[None], (n, 4, 2))
+    even = jnp.stack([gap / _LENGTH, near, edge, inwards[..., 0]], axis=-1)
+    return Parity(even=even, odd=inwards[..., 1:]), near
+
+
+def _extents(prints: Footprints, axis: Array) -> Parity:
+    """How far each object reaches in directions that begin with the axis [m], (N, ...)."""
+    fan = _fan(axis)
+    rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
+    extents = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, prints.yaw.shape[0], 2))).T
+    opposite, half = extents[:, MIRRORED_DIRECTIONS], DIRECTIONS // 2
+    return Parity(even=0.5 * (extents + opposite)[:, : half + 1], odd=0.5 * (extents - opposite)[:, 1:half])
+
+
+def _reached(prints: Footprints, met: Meetings, direct: Array, length: Array) -> tuple[Array, Array]:
+    """After how long a way objects are reached, by the gripper or by others, and how far each is then carried [m]."""
+    valid = prints.valid[:, None]
+    other = ~jnp.eye(prints.yaw.shape[0], dtype=bool) & valid & valid.T
+    onward = jnp.where(other, jnp.maximum(met.distance, 0.0), REACH)
+    reached = direct
+    for _ in range(CHAIN):
+        reached = jnp.minimum(reached, jnp.min(reached[:, None] + onward, axis=0))
+    return reached, jnp.maximum(length - reached, 0.0)
+
+
+def _swept_band(start: PushStart, level: Array, heading: Array) -> tuple[Array, Array]:
+    """Middle, across the push, of the band that the gripper sweeps at each object's height, and half its breadth."""
+    across = _dot(start.points[None, :, :2] - start.prints.position[:, None], perpendicular(heading)[None, None])
+    low = jnp.min(jnp.where(level, across, REACH), axis=1)
+    high = jnp.max(jnp.where(level, across, -REACH), axis=1)
+    level_at_all = jnp.any(level, axis=1)
+    return jnp.where(level_at_all, 0.5 * (low + high), 0.0), jnp.where(level_at_all, 0.5 * (high - low), 0.0)
+
+
+def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") -> PushGeometry:
+    """The network's input features of a push.
+
+    Args:
+      start: see there.
+      frame: see `PushConfig`.
+    """
+    prints, points, T_world_gripper = start.prints, start.points, start.T_world_gripper
+    n = prints.yaw.shape[0]
+    length = _norm(start.displacement)
+    heading = jnp.where(length > 1e-6, start.displacement / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0]))
+    axis = heading if frame == "push" else jnp.array([1.0, 0.0])
+    framed = functools.partial(_framed, axis)
+
+    def spread(vector):
+        return jnp.broadcast_to(vector[None], (n, *vector.shape))
+
+    distance, level = pusher_distance(prints, points, heading)
+    level &= prints.valid[:, None]
+    direct = jnp.min(jnp.where(level, distance, REACH), axis=1)
+    met = meetings(prints, heading)
+    reached, carry = _reached(prints, met, direct, length)
+
+    touching = jnp.maximum(1.0 - direct / REACH, 0.0)[:, None]
+    base = jnp.concatenate([prints.position, prints.low[:, None]], axis=1)
+    contacts = [(c - base) * touching for c in _soft_contacts(distance, level, points, heading)]
+    middle, breadth = _swept_band(start, level, heading)
+
+    gripper = T_world_gripper[:2, 3]
+    approach, closing = T_world_gripper[:2, 2], T_world_gripper[:2, 1]
+    # The hand is the same after half a turn about its approach.
+    closing = framed(closing[None])[0]
+    twice = jnp.stack([closing[0] ** 2 - closing[1] ** 2, 2.0 * closing[0] * closing[1]])
+    to_gripper = gripper[None] - prints.position
+    faces = start.faces
+    planar = [
+        to_gripper,
+        contacts[0][:, :2],
+        contacts[1][:, :2],
+        middle[:, None] * perpendicular(heading)[None],
+    ]
+    units = [spread(framed(approach[None])[0]), spread(twice)]
+    if frame == "world":
+        room = 0.5 * jnp.stack([faces[3] - faces[0], faces[1] - faces[2]])
+        planar += [prints.position - room[None], carry[:, None] * heading[None], to_gripper + (length * heading)[None]]
+        units += [spread(framed(heading[None])[0])]
+    vectors = jnp.concatenate([framed(jnp.stack(planar, axis=1)) / _LENGTH, jnp.stack(units, axis=1)], axis=1)
+    tall = prints.high - prints.low
+    lengths = jnp.stack(
+        [
+            prints.low - start.board,
+            tall,
+            spread(length),
+            direct,
+            reached,
+            carry,
+            jnp.maximum(length - direct, 0.0),
+            contacts[0][:, 2],
+            contacts[1][:, 2],
+            breadth,
+            T_world_gripper[2, 3] - prints.low,
+        ],
+        axis=1,
+    )
+    plain = jnp.stack(
+        [
+            prints.round.astype(jnp.float32),
+            start.tilt,
+            spread(T_world_gripper[2, 2]),
+            touching[:, 0],
+            (reached < length).astype(jnp.float32),
+        ],
+        axis=1,
+    )
+    extents = _extents(prints, axis)
+    walls, near = _walls(prints, faces, axis)
+    return PushGeometry(
+        objects=Parity(
+            even=jnp.concatenate([lengths / _LENGTH, plain, vectors[..., 0], extents.even / _LENGTH], axis=1),
+            odd=jnp.concatenate([vectors[..., 1], extents.odd / _LENGTH], axis=1),
+        ),
+        pairs=_pairs(prints, met, carry, heading, axis),
+        walls=walls,
+        wall_near=near,
+        carry=carry,
+        heading=framed(heading[None])[0],
+        axis=axis,
+        round=prints.round,
+        valid=prints.valid,
+    )

@@ -1,0 +1,317 @@
+"""From a camera's images to what the planner plans with: the front door of perception.
+
+Depth image -> points of the shelf's part of it -> labels (a given mask, or the segmentation network) -> superquadrics
+(recognition network, refinement on the depth image) and the target's pose -> `Observation`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.networks.weights import Weights
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.cloud import MARGIN, OVERHANG, STRIDE, View, above_board, shelf_view
+from mechsearch_jax.perception.colour import TargetColour
+from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
+from mechsearch_jax.perception.refinement import RefinementConfig
+from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
+from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+# Pixels of a 1280 x 720 image that make the target visible.
+VISIBLE_PIXELS = 100
+# The focal length, in pixels, of the images that the networks were trained on.
+_TRAINED_FOCAL = Camera().fx / STRIDE
+
+# Which pixels are the target's, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
+TargetDetector = Callable[[Array], Array]
+
+
+class Setting(Protocol):
+    """What a recogniser has to know of a problem; a planner's `Problem` is one."""
+
+    @property
+    def camera(self) -> Camera: ...
+
+    @property
+    def shelf(self) -> Shelf: ...
+
+    @property
+    def target(self) -> Target: ...
+
+
+@jax.tree_util.register_pytree_node_class
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class Recogniser:
+    """What a camera's images show: the objects' shapes and poses, and the target where it is seen.
+
+    A callable `(key, depth, colour=None, mask=None, target_id=None) -> Observation` for `jit` and `vmap`, and a pytree,
+    so that it can be an argument of either. Networks' weights are its leaves, all else is static.
+
+    The image is looked at with the angular resolution that the networks were trained on, about 0.19 degrees a pixel:
+    of a larger image every second pixel, or third, and so on, of the part in which the shelf's space appears.
+
+    Attributes:
+      camera: what took the images; depth and colour are registered to it.
+      shelf: whose space is looked at.
+      target: whose pose is fitted.
+      segmenter: labels images that come without a mask.
+      shapes: the recognition network.
+      detector: finds the target's pixels in a colour image.
+      refinement: how the network's shapes are fitted to the depth image.
+    """
+
+    camera: Camera
+    shelf: Shelf
+    target: Target
+    segmenter: Segmenter
+    shapes: ShapeNetwork
+    detector: TargetDetector
+    refinement: RefinementConfig
+
+    def __init__(
+        self,
+        problem: Setting,
+        *,
+        camera: Camera | None = None,
+        segmenter: Segmenter | None = None,
+        weights: Weights | None = None,
+        detector: TargetDetector | None = None,
+        refinement: RefinementConfig | None = None,
+    ):
+        """Set up recognition for a problem; every slot has a default.
+
+        Args:
+          problem: whose camera, shelf and target are meant.
+          camera: another one than the problem's, such as one whose pose `real_camera.prepare` corrected.
+          segmenter: by default the `NetworkSegmenter` with the shipped weights.
+          weights: of the recognition network; by default those that ship with the package.
+          detector: by default the target is what is red in any light, `TargetColour.lit()`.
+          refinement: the default if None.
+
+        Raises:
+          InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
+        """
+        camera = camera or problem.camera
+        _view(camera, problem.shelf)
+        fields = {
+            "camera": camera,
+            "shelf": problem.shelf,
+            "target": problem.target,
+            "segmenter": _as_pytree(segmenter or NetworkSegmenter.of()),
+            "shapes": ShapeNetwork.of(weights),
+            "detector": _as_pytree(detector or TargetColour.lit()),
+            "refinement": refinement or RefinementConfig(),
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        return (self.segmenter, self.shapes, self.detector), (self.camera, self.shelf, self.target, self.refinement)
+
+    @classmethod
+    def tree_unflatten(cls, static: tuple[Any, ...], leaves: tuple[Any, ...]) -> Recogniser:
+        made = object.__new__(cls)
+        names = ("segmenter", "shapes", "detector", "camera", "shelf", "target", "refinement")
+        for name, value in zip(names, (*leaves, *static), strict=True):
+            object.__setattr__(made, name, value)
+        return made
+
+    def __call__(
+        self,
+        key: Key[Array, ""],
+        depth: Any,
+        colour: Any = None,
+        mask: Any = None,
+        target_id: Any = None,
+    ) -> Observation:
+        """Recognise what the images show.
+
+        The target is seen by its colour, or named by `target_id` in the mask; from depth alone it cannot be told from
+        the objects, and `target_visible` is False. It is visible if it shows more than 100 pixels at 1280 x 720, and
+        the same share of a larger or smaller image, in the shelf's space and with a measured depth.
+
+        With a mask, slot i of the objects is instance i; where the target is one of the instances, instance 8 takes
+        its slot. Without one, the order of the slots means nothing.
+
+        Args:
+          key: PRNG key of the points that are drawn; the same key recognises the same.
+          depth: float (H, W), metres along the camera's z; 0 or NaN where nothing was measured, infinite where it is
+            known that nothing is there, for at least 3 m.
+          colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
+          mask: integers (H, W), registered to the depth image: for each pixel the number of its object, 0 to 8, or
+            what `perception.labels` has: OTHER (-1), FREE (-2), MISSING (-3). What was measured on the shelf's faces
+            counts as FREE, whatever the mask says.
+          target_id: the number in the mask that is the target's, an integer; negative where the mask does not show it.
+
+        Returns:
+          Objects with eight slots; whether the target is visible; and its pose.
+
+        Raises:
+          InputError: an image's shape, type or unit is not as said. Values are looked at outside `jit` only.
+        """
+        _check(self.camera, depth, colour, mask, target_id)
+        keys = jax.random.split(key, 3)
+        image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
+        camera = _view(self.camera, self.shelf).camera
+        # Compiled on its own, whatever the images that the labels come from.
+        found = recognise_image(keys[1:], image, self.shapes, camera, self.shelf, self.target, self.refinement)
+        return Observation(found[0], visible, found[1])
+
+
+def _as_pytree(slot: Any) -> Any:
+    """A callable that may hold arrays as it is, any other, such as a function, as one without leaves."""
+    return jax.tree_util.Partial(slot) if jax.tree_util.all_leaves([slot]) else slot
+
+
+def _view(camera: Camera, shelf: Shelf) -> View:
+    return shelf_view(camera, shelf, max(1, round(camera.fx / _TRAINED_FOCAL)))
+
+
+@jax.jit
+def _labelled(
+    recogniser: Recogniser, key: Array, depth: Any, colour: Any, mask: Any, target_id: Any
+) -> tuple[LabelledImage, Bool[Array, ""]]:
+    """The shelf's part of the image with labels, and whether the target is visible in it."""
+    camera, shelf = recogniser.camera, recogniser.shelf
+    view = _view(camera, shelf)
+    seen = view.of(jnp.asarray(depth, jnp.float32))
+    seen = jnp.where(seen > 0.0, seen, jnp.nan)
+    points = back_project(view.camera, seen)
+
+    # What touches the board still is the target's.
+    near = above_board(shelf, points, -MARGIN)
+    coloured = jnp.zeros(seen.shape, bool)
+    if colour is not None:
+        pixels = view.of(jnp.asarray(colour))
+        scale = 255.0 if pixels.dtype == jnp.uint8 else 1.0
+        coloured = recogniser.detector(pixels.astype(jnp.float32) / scale) & near
+    if mask is None:
+        of_target = coloured
+        labels = recogniser.segmenter(key, shelf, points, of_target)
+    else:
+        instances = _instances(view.of(jnp.asarray(mask)))
+        of_target, freed = _target_in(instances, coloured, target_id)
+        of_target &= near
+        labels = _labels(instances, freed, shelf, points)
+        labels = jnp.where(of_target & (labels != MISSING) & (labels != FREE), OTHER, labels)
+
+    share = camera.width * camera.height / (1280 * 720)
+    visible = jnp.sum(of_target) * view.stride**2 > VISIBLE_PIXELS * share
+    return LabelledImage(points, seen, labels, of_target & above_board(shelf, points)), visible
+
+
+def _instances(mask: Int[Array, "h w"]) -> Int[Array, "h w"]:
+    """A mask whose numbers are those of `perception.labels`, int8; what it has beside them is OTHER."""
+    known = (mask >= MISSING) & (mask < INSTANCES)
+    return jnp.where(known, mask, OTHER).astype(jnp.int8)
+
+
+def _target_in(
+    instances: Int[Array, "h w"], coloured: Bool[Array, "h w"], target_id: Any
+) -> tuple[Bool[Array, "h w"], Int[Array, ""]]:
+    """The target's pixels in a mask, and its instance's number; that of the last instance if it is none of them."""
+    numbers = jnp.arange(INSTANCES)
+    own = instances[..., None] == numbers.reshape(1, 1, -1)
+    if target_id is not None:
+        is_target = numbers == target_id
+        rest = jnp.zeros(instances.shape, bool)
+    else:
+        # An instance is the target if most of it has the target's colour.
+        shown = jnp.sum(own & coloured[..., None], axis=(0, 1))
+        is_target = 2 * shown > jnp.sum(own, axis=(0, 1))
+        rest = coloured & (instances == OTHER)
+    of_target = jnp.any(own & is_target.reshape(1, 1, -1), axis=-1) | rest
+    return of_target, jnp.where(jnp.any(is_target), jnp.argmax(is_target), INSTANCES - 1).astype(jnp.int8)
+
+
+def _labels(
+    instances: Int[Array, "h w"], freed: Int[Array, ""], shelf: Shelf, points: Float[Array, "h w 3"]
+) -> Int[Array, "h w"]:
+    """The labels of a masked image: the objects' slots, and what the points' places say of the rest.
+
+    Args:
+      instances: as the mask has them.
+      freed: the target's number, which the last instance takes.
+      shelf: static.
+      points: in the world [m].
+    """
+    body = jnp.where(instances == freed, OTHER, jnp.where(instances == INSTANCES - 1, freed, instances))
+    # Something between the camera and the shelf, such as the robot, hides what is behind it.
+    before = (points[..., 0] <= shelf.front - OVERHANG) & (points[..., 2] > shelf.board) & (instances != FREE)
+    labels = jnp.where(above_board(shelf, points), body, jnp.where(before, OTHER, FREE))
+    missing = ~jnp.isfinite(points).all(axis=-1) | (instances == MISSING)
+    return jnp.where(missing, MISSING, labels).astype(jnp.int8)
+
+
+def _check(camera: Camera, depth: Any, colour: Any, mask: Any, target_id: Any) -> None:
+    size = (camera.height, camera.width)
+    for name, image, shape in (("depth", depth, size), ("colour", colour, (*size, 3)), ("mask", mask, size)):
+        if image is None and name != "depth":
+            continue
+        if image is None or not (hasattr(image, "shape") and hasattr(image, "dtype")):
+            raise InputError(f"{name} image: is a {type(image).__name__}; give an array of the shape {shape}")
+        if tuple(image.shape) != shape:
+            raise InputError(f"{name} image: its shape is {tuple(image.shape)}, the camera's images are {shape}")
+    _check_depth(depth)
+    if colour is not None:
+        _check_colour(colour)
+    if target_id is not None:
+        if mask is None:
+            raise InputError("target_id: names a number of a mask; give the mask too, or leave it out")
+        if not jnp.issubdtype(jnp.result_type(target_id), jnp.integer) or jnp.ndim(target_id) != 0:
+            raise InputError(f"target_id: {target_id} must be one whole number, that of the target in the mask")
+    if mask is not None:
+        _check_mask(mask, colour is None and target_id is None)
+
+
+def _values(image: Any) -> np.ndarray | None:
+    """Every eighth row and column, to look at the values; None while JAX traces."""
+    return None if isinstance(image, Tracer) else np.asarray(image[::8, ::8])
+
+
+def _check_depth(depth: Any) -> None:
+    if not jnp.issubdtype(depth.dtype, jnp.floating):
+        raise InputError(f"depth image: holds {depth.dtype}; give floats in metres (millimetres divided by 1000)")
+    values = _values(depth)
+    if values is None:
+        return
+    measured = values[np.isfinite(values) & (values > 0)]
+    if measured.size and np.median(measured) > 20:
+        raise InputError(f"depth image: its median is {np.median(measured):.0f}; give metres, not millimetres")
+
+
+def _check_colour(colour: Any) -> None:
+    if colour.dtype == jnp.uint8:
+        return
+    if not jnp.issubdtype(colour.dtype, jnp.floating):
+        raise InputError(f"colour image: holds {colour.dtype}; give floats from 0 to 1, or uint8")
+    values = _values(colour)
+    if values is not None and not np.all((values >= 0) & (values <= 1)):
+        raise InputError("colour image: its floats must be from 0 to 1; divide 8-bit values by 255")
+
+
+def _check_mask(mask: Any, blind: bool) -> None:
+    if not jnp.issubdtype(mask.dtype, jnp.integer):
+        raise InputError(f"mask image: holds {mask.dtype}; give whole numbers, 0 to 8 for objects, -1 for none")
+    values = _values(mask)
+    if values is None:
+        return
+    low, high = (int(v) for v in (np.asarray(mask).min(), np.asarray(mask).max()))
+    if low < MISSING or high >= INSTANCES:
+        raise InputError(
+            f"mask image: holds numbers from {low} to {high}; objects are 0 to {INSTANCES - 1}, all else -1, -2 or -3"
+        )
+    if blind and high == INSTANCES - 1:
+        raise InputError(f"mask image: nine things are too many; say with target_id which of 0 to {high} is the target")

@@ -1,0 +1,49 @@
+"""Deciding: from an observation and a belief to the next action."""
+
+from mechsearch_jax.planner.belief import Belief, graspability_map, initial_belief, update_belief
+from mechsearch_jax.planner.config import OPTIONS, Config, Option, PlannerConfig, ProblemConfig
+from mechsearch_jax.planner.policies import (
+    POLICIES,
+    Policy,
+    PolicyFactory,
+    Search,
+    policy_factory,
+    random_action,
+    search,
+    search_and_grasp,
+    search_for_grasp,
+)
+from mechsearch_jax.planner.presets import PRESETS, paper, standard
+from mechsearch_jax.planner.problem import Problem, build_problem
+from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at
+from mechsearch_jax.planner.state import Decision, Sequences
+
+__all__ = [
+    "OPTIONS",
+    "POLICIES",
+    "PRESETS",
+    "Belief",
+    "Config",
+    "Decision",
+    "GraspChoice",
+    "Option",
+    "PlannerConfig",
+    "Policy",
+    "PolicyFactory",
+    "Problem",
+    "ProblemConfig",
+    "Search",
+    "Sequences",
+    "build_problem",
+    "graspability_map",
+    "graspable_at",
+    "initial_belief",
+    "paper",
+    "policy_factory",
+    "random_action",
+    "search",
+    "search_and_grasp",
+    "search_for_grasp",
+    "standard",
+    "update_belief",
+]

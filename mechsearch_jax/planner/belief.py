@@ -1,0 +1,121 @@
+"""What is known of the target: where it can still be, or where it was found (equation 4)."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
+from mechsearch_jax.existence import existence, object_views
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import upright_pose
+from mechsearch_jax.graspability import FoundGrasps, find_grasps, grasp_hits, graspability, split_found
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner.problem import Problem
+
+
+class Belief(flax.struct.PyTreeNode):
+    """What is known of the target.
+
+    Attributes:
+      exists: f_t, shape (X,). It only ever shrinks, unless it contradicts every pose: see `update_belief`.
+      found: c_t, whether the target has been seen.
+      found_pose: where, as x, y [m], yaw [rad].
+      grasps: the grasps that arm and shelf allow there.
+      restarts: how often f became empty and was started anew.
+    """
+
+    exists: jax.Array
+    found: jax.Array
+    found_pose: jax.Array
+    grasps: FoundGrasps
+    restarts: jax.Array
+
+
+def initial_belief(problem: Problem) -> Belief:
+    """Nothing is known: the target can be at every candidate pose."""
+    g = problem.grasps.q7.shape[0]
+    return Belief(
+        exists=jnp.ones(problem.poses.shape[0], bool),
+        found=jnp.array(False),
+        found_pose=jnp.zeros(3),
+        grasps=FoundGrasps(jnp.eye(4), jnp.zeros(g, bool)),
+        restarts=jnp.int32(0),
+    )
+
+
+@jax.jit
+def update_belief(problem: Problem, belief: Belief, observation: Observation) -> Belief:
+    """Fold an observation into the belief: `f_t = f_{t-1} * f_hat(s_t)` (equation 4), or the target's pose once it is
+    seen.
+
+    A target that was pushed without having been seen may leave f empty, which is a contradiction; f then starts anew
+    from what the objects allow now, and `restarts` counts it.
+
+    Args:
+      problem: what does not change.
+      belief: before the observation.
+      observation: what is seen now.
+    """
+    everywhere = jnp.ones_like(belief.exists)
+    settings, found = problem.config.existence, jnp.asarray(observation.target_visible)
+    views = object_views(problem.existence, problem.camera, observation.objects, everywhere, settings)
+    now = existence(problem.existence, problem.camera, views, everywhere, settings)
+    both = belief.exists & now
+    seen = belief.found | found
+    contradiction = ~jnp.any(both) & ~seen
+    exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, belief.exists), both)
+    pose = jnp.where(found, observation.target_pose, belief.found_pose)
+    T_world_target = upright_pose(pose, problem.target.height(problem.shelf))
+    grasps = find_grasps(problem.grasps, problem.shelf, problem.gripper, problem.config.grasps, T_world_target)
+    return Belief(
+        exists=jnp.where(seen, belief.exists, exists),
+        found=seen,
+        found_pose=pose,
+        grasps=grasps.replace(feasible=grasps.feasible & seen),
+        restarts=belief.restarts + contradiction,
+    )
+
+
+def possible_poses(belief: Belief, exists: Bool[Array, " x"]) -> Bool[Array, " y"]:
+    """f at the candidate poses and at the found pose (Y = X + 1): one or the other."""
+    return jnp.concatenate([exists & ~belief.found, belief.found[None]])
+
+
+def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) -> PossibleSpace:
+    """Raster of the space that an unseen target may take; empty once it is found, and an obstacle like any other."""
+    grid = jnp.sum(exists.reshape(*problem.target.grid, -1), axis=-1) * ~belief.found
+    return PossibleSpace(
+        occupied=widen(grid > 0),
+        chance=grid / jnp.maximum(jnp.sum(grid), 1),
+        origin=problem.poses[0, :2],
+        cell=jnp.float32(problem.target.cell(problem.shelf)[:2]),
+        top=jnp.float32(problem.shelf.board + 2 * problem.target.half_size[2]),
+    )
+
+
+def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tuple[Superquadrics, Bool[Array, " n"]]:
+    """The objects and, in one more slot, the target, absent until it is found; and which of the slots is the target's.
+
+    It can be pushed along like any object, but neither hides itself nor is in the way of its own grasp.
+    """
+    T = belief.grasps.T_world_target
+    target = Superquadrics(
+        size=jnp.float32(problem.target.half_size),
+        exponents=jnp.float32(problem.target.exponents),
+        position=T[:3, 3],
+        rotation=T[:3, :3],
+        valid=belief.found,
+    )
+    everything = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), objects, target)
+    return everything, jnp.arange(everything.capacity) == objects.capacity
+
+
+@jax.jit
+def graspability_map(problem: Problem, belief: Belief, objects: Superquadrics) -> Int[Array, " x"]:
+    """g at every candidate pose, whether the target can be there or not: 1, 0, -1, ... (section B.4), shape (X,)."""
+    everywhere = jnp.ones(problem.poses.shape[0] + 1, bool)
+    hits = grasp_hits(problem.grasps, belief.grasps, objects, everywhere)
+    return split_found(graspability(problem.grasps, belief.grasps, hits))[0]

@@ -1,0 +1,141 @@
+"""What programs of this package keep from one run to the next: compiled functions and built problems."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib.metadata
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mechsearch_jax.actions.config import ActionTables
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.existence import ExistenceTables
+from mechsearch_jax.files import replacing
+from mechsearch_jax.graspability import GraspTables
+from mechsearch_jax.planner import problem as problems
+from mechsearch_jax.planner.config import ProblemConfig
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.versions import source_digest
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+VARIABLE = "MECHSEARCH_CACHE_DIR"
+# Problems of older versions of the package are of no use; a few are left for those who switch between versions.
+CACHED_PROBLEMS = 6
+
+_TABLES = {"existence": ExistenceTables, "grasps": GraspTables, "actions": ActionTables, "retrieval": GraspTables}
+
+
+def cache_folder() -> Path | None:
+    """`MECHSEARCH_CACHE_DIR`, or a folder in the user's cache; None if that variable is set to nothing."""
+    chosen = os.environ.get(VARIABLE)
+    if chosen is not None:
+        return Path(chosen) if chosen else None
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "mechsearch-jax"
+
+
+def keep_compilations() -> None:
+    """Make this process keep what JAX compiles, so that the next one starts in seconds.
+
+    Meant for programs, which own their process; a library's user decides alone. A cache that the user has set up with
+    `JAX_COMPILATION_CACHE_DIR` is left as it is.
+    """
+    folder = cache_folder()
+    if folder is None or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    # Small ones too: the many that a start needs add up to most of a second.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def cached_problem(target: Target | None = None, config: ProblemConfig | None = None) -> Problem:
+    """`build_problem` for a target and a configuration, with everything else at its default: read from disk if it was
+    built before.
+
+    The file is told apart by the package's source, the versions of what computes it, the device and the settings. One
+    that is damaged or of something else is built anew, and a folder that cannot be written to is done without.
+
+    Raises:
+      InputError: the target cannot be grasped by the gripper.
+    """
+    parts: dict[str, Any] = {
+        "camera": Camera(),
+        "shelf": Shelf(),
+        "gripper": Gripper(),
+        "target": target or Target(),
+        "config": config or ProblemConfig(),
+    }
+    folder = cache_folder()
+    if folder is None:
+        return problems.build_problem(**parts)
+    key = _key(parts)
+    file = folder / f"problem-{key[:32]}.npz"
+    problem = _load(file, key, parts)
+    if problem is None:
+        problem = problems.build_problem(**parts)
+        with contextlib.suppress(InputError):
+            _save(problem, file, key)
+            _forget_old(folder)
+    return problem
+
+
+@functools.cache
+def _source() -> str:
+    """A digest of the package's source: a problem is no better than the code that built it."""
+    return source_digest((".py",))
+
+
+def _key(parts: dict[str, Any]) -> str:
+    device = jax.devices()[0]
+    versions = [importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy", "scipy", "trimesh")]
+    said = (_source(), versions, device.platform, device.device_kind, jax.config.read("jax_enable_x64"), parts)
+    return hashlib.sha256(repr(said).encode()).hexdigest()
+
+
+def _digest(arrays: dict[str, np.ndarray], key: str) -> str:
+    digest = hashlib.sha256(key.encode())
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.dtype.str} {array.shape} ".encode() + np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _save(problem: Problem, file: Path, key: str) -> None:
+    arrays = {"poses": np.asarray(problem.poses)}
+    for table in _TABLES:
+        arrays |= {f"{table}.{name}": np.asarray(value) for name, value in vars(getattr(problem, table)).items()}
+    with replacing(file) as target:
+        np.savez(target, allow_pickle=False, **arrays, digest=np.array(_digest(arrays, key)))
+
+
+def _load(file: Path, key: str, parts: dict[str, Any]) -> Problem | None:
+    """The problem in a file; None if there is none that is whole and has this key."""
+    try:
+        with np.load(file, allow_pickle=False) as saved:
+            arrays = {name: saved[name] for name in saved.files}
+        if str(arrays.pop("digest")) != _digest(arrays, key):
+            return None
+        poses = jnp.asarray(arrays.pop("poses"))
+        fields: dict[str, dict[str, jax.Array]] = {table: {} for table in _TABLES}
+        for name, array in arrays.items():
+            table, field = name.split(".")
+            fields[table][field] = jnp.asarray(array)
+        return Problem(poses=poses, **{table: kind(**fields[table]) for table, kind in _TABLES.items()}, **parts)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def _forget_old(folder: Path) -> None:
+    files = sorted(folder.glob("problem-*.npz"), key=lambda file: file.stat().st_mtime, reverse=True)
+    for file in files[CACHED_PROBLEMS:]:
+        file.unlink(missing_ok=True)

@@ -1,0 +1,208 @@
+"""Every setting in one place: of the planner, of the problem, and of an episode.
+
+What is discrete decides about the shapes of a computation and is static under jit; what is continuous is data, so that
+changing it compiles nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from typing import Any, get_args, get_type_hints
+
+import jax
+
+from mechsearch_jax.actions.config import ActionConfig
+from mechsearch_jax.actions.object_grasps import ObjectGraspConfig
+from mechsearch_jax.dynamics.named import PushModelName, check_name
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.existence import ExistenceConfig
+from mechsearch_jax.graspability import GraspConfig
+from mechsearch_jax.options import option
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("gamma", "unseen_contact_penalty", "topple_charge", "guided_fraction", "crowding_weight"),
+    meta_fields=("horizon", "sequences", "draws", "move_again", "predicted_collisions"),
+)
+@dataclasses.dataclass(frozen=True)
+class PlannerConfig:
+    """How the planner decides: a pytree whose leaves are the settings that are not static.
+
+    Attributes:
+      gamma: discount of equation 2, in (0, 1]. The paper gives none; 0.9 is ours.
+      horizon: M, actions in a sequence; static.
+      sequences: how many sequences are sampled for a decision; static.
+      unseen_contact_penalty: what touching the target unseen would cost, in units of J: a sampled action is charged
+        with J times the share of the possible poses at which it would do so. The paper charges nothing.
+      topple_charge: what an object that falls over would cost, in units of J: a sampled push is charged with J times
+        the number of objects that are expected to. `ActionConfig.topple` says which pushes are ruled out altogether;
+        to charge what is left with 0.5 gained nothing.
+      guided_fraction: share of the draws that go to objects by how much they hide or are in the way; the others are
+        even, as the paper's all are. 0 to below 1.
+      crowding_weight: how much J minds objects that only some of a pose's grasps hit; the paper's J sees the best grasp
+        of a pose alone. Small enough that no number of hits outweighs one object of the cost proper.
+      draws: how often an action is drawn, until one is possible; static. The paper draws until one is.
+      move_again: whether an object may move more than once in a sequence, as in the paper; static.
+      predicted_collisions: whether f also rules out, in predicted states, where the target would overlap objects
+        (equation 14), as in the paper; static. Without, what an action covers is not ruled out: a target there would be
+        pushed along, not found to be elsewhere.
+    """
+
+    gamma: float = option(0.9, "discount of later actions, above 0 and at most 1")
+    horizon: int = option(3, "actions in a sequence; the paper's is 3")
+    sequences: int = option(30, "sequences that are sampled for a decision; the paper's is 30")
+    unseen_contact_penalty: float = option(
+        1.0, "what an action costs that may touch the unseen target, as a share of J; the paper's is 0"
+    )
+    topple_charge: float = option(
+        0.0, "what a push costs, as a share of J, for each object that is expected to fall over; the paper's is 0"
+    )
+    guided_fraction: float = option(
+        0.7, "share of the sampled actions that go to objects by how much they hide or block; the paper's is 0"
+    )
+    crowding_weight: float = option(
+        0.02, "how much J minds objects that only some grasps of a pose hit; the paper's is 0"
+    )
+    draws: int = option(1, "how often an action is drawn until one is possible")
+    move_again: bool = option(False, "whether an object may move more than once in a sequence, as in the paper")
+    predicted_collisions: bool = option(
+        False, "whether f rules out overlaps with objects in predicted states too, as in the paper"
+    )
+
+    def __post_init__(self):
+        # Rebuilt by JAX, the fields that are data hold whatever stands for their leaves, which is not checked.
+        number = lambda name: isinstance(getattr(self, name), int | float)  # noqa: E731
+        if number("gamma") and not 0.0 < self.gamma <= 1.0:
+            raise InputError(f"gamma {self.gamma} is outside (0, 1]; the default is 0.9")
+        for name in ("unseen_contact_penalty", "topple_charge", "crowding_weight"):
+            if number(name) and not 0.0 <= getattr(self, name) < math.inf:
+                raise InputError(f"{name} {getattr(self, name)} must be a number that is not negative")
+        if number("guided_fraction") and not 0.0 <= self.guided_fraction < 1.0:
+            raise InputError(
+                f"guided_fraction {self.guided_fraction} is outside [0, 1); the default is 0.7, and 0 draws evenly"
+            )
+        for name in ("horizon", "sequences", "draws"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} {getattr(self, name)} must be at least 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class ProblemConfig:
+    """How a problem is built; hashable, static under jit.
+
+    Attributes:
+      existence: how f is decided.
+      grasps: the candidate grasps of g.
+      retrieval: a denser set of grasps, for the target once it is found.
+      actions: which actions there are.
+    """
+
+    existence: ExistenceConfig = dataclasses.field(default_factory=ExistenceConfig)
+    grasps: GraspConfig = dataclasses.field(default_factory=GraspConfig)
+    retrieval: GraspConfig = dataclasses.field(default_factory=GraspConfig.dense)
+    actions: ActionConfig = dataclasses.field(default_factory=ActionConfig)
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Everything that decides about an episode beside scenario, seed, policy, recognition and simulator.
+
+    Attributes:
+      problem: how the problem is built.
+      planner: how the planner decides.
+      push_model: name of what predicts pushes; see `dynamics.named`, and `envs.push_models` for "physics".
+      max_steps: T, actions in an episode.
+    """
+
+    problem: ProblemConfig = dataclasses.field(default_factory=ProblemConfig)
+    planner: PlannerConfig = dataclasses.field(default_factory=PlannerConfig)
+    push_model: PushModelName = option(
+        "learned",
+        "what predicts pushes: a network, geometry, or simulating them, on a CPU only those that come first",
+        get_args(PushModelName),
+    )
+    max_steps: int = option(10, "actions in an episode")
+
+    def __post_init__(self):
+        check_name(self.push_model)
+        if self.max_steps < 1:
+            raise InputError(f"max_steps {self.max_steps} must be at least 1")
+
+    def options(self) -> dict[str, Any]:
+        """The values of all `OPTIONS` by name, as JSON has them: what rows and episodes keep."""
+        found = {option.name: _at(self, option.path) for option in OPTIONS}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+
+    def with_options(self, **changes: Any) -> Config:
+        """The same configuration but for some of `OPTIONS`, by name; lists stand for tuples.
+
+        Raises:
+          InputError: there is no such option, or a value is impossible.
+        """
+        config = self
+        paths = {option.name: option.path for option in OPTIONS}
+        for name, value in changes.items():
+            if name not in paths:
+                raise InputError(f"option {name} is unknown; there are {', '.join(paths)}")
+            config = _with(config, paths[name], tuple(value) if isinstance(value, list) else value)
+        return config
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """A setting that rows keep and that the command line offers.
+
+    Attributes:
+      name: of the field, which is unique.
+      path: the fields that lead from a `Config` to it.
+      type: of a value.
+      help: one line.
+      choices: the values it may have; None where any will do.
+    """
+
+    name: str
+    path: tuple[str, ...]
+    type: Any
+    help: str
+    choices: tuple[str, ...] | None
+
+
+def _at(value: Any, path: tuple[str, ...]) -> Any:
+    for name in path:
+        value = getattr(value, name)
+    return value
+
+
+def _with(value: Any, path: tuple[str, ...], new: Any) -> Any:
+    inner = new if len(path) == 1 else _with(getattr(value, path[0]), path[1:], new)
+    return dataclasses.replace(value, **{path[0]: inner})
+
+
+def _fields(kind: type, path: tuple[str, ...], prefix: str = "") -> tuple[Option, ...]:
+    """The options among the fields of a configuration, in the order that they stand in."""
+    hints = get_type_hints(kind)
+    return tuple(
+        Option(
+            prefix + field.name,
+            (*path, field.name),
+            str if field.metadata["choices"] else hints[field.name],
+            field.metadata["help"],
+            field.metadata["choices"],
+        )
+        for field in dataclasses.fields(kind)
+        if "help" in field.metadata
+    )
+
+
+OPTIONS: tuple[Option, ...] = (
+    *_fields(PlannerConfig, ("planner",)),
+    *_fields(ActionConfig, ("problem", "actions")),
+    *_fields(ObjectGraspConfig, ("problem", "actions", "grasps"), "object_grasp_"),
+    *_fields(ExistenceConfig, ("problem", "existence")),
+    *_fields(GraspConfig, ("problem", "grasps"), "grasp_"),
+    *_fields(GraspConfig, ("problem", "retrieval"), "retrieval_"),
+    *_fields(Config, ()),
+)

@@ -1,0 +1,100 @@
+"""What a search tries to make small: J of equation 2, as a slot of the engine."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Protocol
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.graspability import crowding, graspability, split_found
+from mechsearch_jax.planner.belief import Belief, possible_poses
+from mechsearch_jax.planner.problem import Problem
+
+
+class Objective(Protocol):
+    """The cost of a state; static under jit.
+
+    Attributes:
+      reached: the cost of a state in which the target is found and nothing is in the way of its grasp.
+    """
+
+    @property
+    def reached(self) -> float: ...
+
+    def cost(
+        self,
+        problem: Problem,
+        belief: Belief,
+        exists: Bool[Array, " x"],
+        hits: Bool[Array, "k n"],
+        crowding_weight: Array | float,
+    ) -> Float[Array, ""]:
+        """J of a state.
+
+        Args:
+          problem: what does not change.
+          belief: what was known at the start.
+          exists: f of the state.
+          hits: H of the state; see `graspability.grasp_hits`.
+          crowding_weight: see `PlannerConfig`.
+        """
+        ...
+
+    def needs_graspability(self, belief: Belief, exists: Bool[Array, " x"]) -> Bool[Array, " y"]:
+        """At which poses, the candidates and then the found one, J depends on g."""
+        ...
+
+
+def _where_and_how_graspable(problem, belief, exists, hits, crowding_weight):
+    """f, how far each pose is from graspable with g extended below zero (B.4), and how crowded its grasps are.
+
+    g only sees the best grasp of a pose; while nothing changes that one, clearing the way for others is progress too.
+    """
+    f = possible_poses(belief, exists).astype(jnp.float32)
+    g = graspability(problem.grasps, belief.grasps, hits).astype(jnp.float32)
+    return f, g, crowding_weight * crowding(problem.grasps, belief.grasps, hits)
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchForGrasp:
+    """Where the target can be and how far it is from graspable there, together (the sum of f * (2 - g))."""
+
+    reached: float = 1.0
+
+    def cost(self, problem, belief, exists, hits, crowding_weight) -> Float[Array, ""]:
+        f, g, crowded = _where_and_how_graspable(problem, belief, exists, hits, crowding_weight)
+        return jnp.sum(f * (1.0 + (1.0 - g) + crowded))
+
+    def needs_graspability(self, belief, exists) -> Bool[Array, " y"]:
+        return possible_poses(belief, exists)
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchAndGrasp:
+    """First where the target can be; once it is found, how far it is from graspable."""
+
+    reached: float = 0.0
+
+    def cost(self, problem, belief, exists, hits, crowding_weight) -> Float[Array, ""]:
+        f, g, crowded = _where_and_how_graspable(problem, belief, exists, hits, crowding_weight)
+        (_, g_found), (_, crowded_found) = split_found(g), split_found(crowded)
+        return jnp.where(belief.found, 1.0 - g_found + crowded_found, jnp.sum(f))
+
+    def needs_graspability(self, belief, exists) -> Bool[Array, " y"]:
+        candidates, found = split_found(possible_poses(belief, exists))
+        return jnp.concatenate([jnp.zeros_like(candidates), found[None]])
+
+
+@dataclasses.dataclass(frozen=True)
+class Indifferent:
+    """Everything is as good as everything else: the first possible sequence is the best."""
+
+    reached: float = 0.0
+
+    def cost(self, problem, belief, exists, hits, crowding_weight) -> Float[Array, ""]:
+        return jnp.float32(0.0)
+
+    def needs_graspability(self, belief, exists) -> Bool[Array, " y"]:
+        return jnp.zeros_like(possible_poses(belief, exists))

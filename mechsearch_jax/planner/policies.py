@@ -1,0 +1,215 @@
+"""Policies: what decides on the next action. Each is a partial application of one engine to slots of its own.
+
+A policy is a callable `(key, problem, belief, observation) -> Decision`. Those that are made here are pytrees, too:
+what is continuous in their configuration is data, so that a jitted function takes them as arguments.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array
+
+from mechsearch_jax.dynamics.named import own_push_model
+from mechsearch_jax.dynamics.push_model import PushModel
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner.belief import Belief
+from mechsearch_jax.planner.config import PlannerConfig
+from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
+from mechsearch_jax.planner.prediction import Predict, PredictByKind
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.proposal import Propose, guided_draw
+from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at
+from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
+from mechsearch_jax.planner.state import Decision
+
+
+class Policy(Protocol):
+    """Decides on the next action."""
+
+    def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
+        """The next action, and why.
+
+        Args:
+          key: PRNG key of the planner.
+          problem: what does not change.
+          belief: what is known of the target, after the observation.
+          observation: what is seen now.
+        """
+        ...
+
+
+class PolicyFactory(Protocol):
+    """Makes a policy."""
+
+    def __call__(
+        self,
+        config: PlannerConfig | None = None,
+        *,
+        push_model: PushModel | None = None,
+        later_push_model: PushModel | None = None,
+    ) -> Policy:
+        """A policy with a configuration and push models, of which it may take what it likes.
+
+        Args:
+          config: how it decides.
+          push_model: predicts pushes; the learned one if left out.
+          later_push_model: predicts those that are not the first action of a sequence; `push_model` if left out.
+        """
+        ...
+
+
+class Search(flax.struct.PyTreeNode):
+    """The engine as a `Policy`: takes a found target out as soon as a grasp hits nothing, and else plans.
+
+    Attributes:
+      config: how it decides.
+      propose, predict, objective: the slots; static.
+    """
+
+    config: PlannerConfig
+    propose: Propose = flax.struct.field(pytree_node=False)
+    predict: Predict = flax.struct.field(pytree_node=False)
+    objective: Objective = flax.struct.field(pytree_node=False)
+
+    def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
+        """See `Policy`."""
+        if not isinstance(belief.found, Tracer):
+            # Outside of any transformation, what is not needed is neither computed nor compiled.
+            if not belief.found:
+                return _plan(self, key, problem, belief, observation)
+            grasp = graspable_at(problem, observation.objects, belief.found_pose)
+            # The belief may be known where the observation is traced.
+            if not isinstance(grasp.success, Tracer):
+                if not grasp.success:
+                    return _plan(self, key, problem, belief, observation)
+                return _take_out(self, observation, grasp)
+        # Both are computed, each with next to nothing to do where it does not count. A `cond` would under `vmap` give
+        # every scene of a batch a problem of its own, and what they share could no longer be computed together.
+        grasp = graspable_at(problem, observation.objects, belief.found_pose, belief.found)
+        able = belief.found & grasp.success
+        rest = observation.objects.replace(valid=observation.objects.valid & ~able)
+        planned = _plan(
+            self,
+            key,
+            problem,
+            belief.replace(exists=belief.exists & ~able),
+            observation.replace(objects=rest),
+        )
+        return jax.tree.map(lambda a, b: jnp.where(able, a, b), _take_out(self, observation, grasp), planned)
+
+
+@jax.jit
+def _plan(search: Search, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
+    rollout = Rollout(problem, belief, search.config, search.propose, search.predict, search.objective)
+    return plan(rollout, key, observation.objects)
+
+
+@jax.jit
+def _take_out(search: Search, observation: Observation, grasp: GraspChoice) -> Decision:
+    return Decision(
+        action=grasp.action,
+        value=jnp.float32(0.0),
+        cost=jnp.float32(search.objective.reached),
+        predicted_cost=jnp.float32(jnp.nan),
+        predicted=observation.objects,
+        sequences=no_sequences(search.config),
+        overflow=jnp.array(False),
+    )
+
+
+def _planner_config(config: PlannerConfig | None) -> PlannerConfig:
+    """The configuration, or the default.
+
+    Raises:
+      InputError: it is something else, such as a whole preset.
+    """
+    if config is not None and not isinstance(config, PlannerConfig):
+        raise InputError(f"config: is a {type(config).__name__}; give a PlannerConfig, such as paper().planner")
+    return config or PlannerConfig()
+
+
+def search(
+    config: PlannerConfig | None = None,
+    *,
+    push_model: PushModel | None = None,
+    later_push_model: PushModel | None = None,
+    objective: Objective,
+    propose: Propose = guided_draw,
+    **changes: Any,
+) -> Search:
+    """The engine with slots; see `PolicyFactory` for the first arguments.
+
+    Args:
+      config: how it decides; the defaults if left out.
+      push_model, later_push_model: predict pushes.
+      objective: what it makes small.
+      propose: samples an action in a state.
+      **changes: fields of `config` that are to be different.
+
+    Raises:
+      InputError: a setting is impossible, or weights are missing or damaged.
+    """
+    push_model = push_model or own_push_model("learned")
+    return Search(
+        config=dataclasses.replace(_planner_config(config), **changes),
+        propose=propose,
+        predict=PredictByKind(push_model, later_push_model or push_model),
+        objective=objective,
+    )
+
+
+# Minds the grasp while it searches: f and g together (equation 2).
+search_for_grasp = functools.partial(search, objective=SearchForGrasp())
+# First finds the target, and then clears the way to it.
+search_and_grasp = functools.partial(search, objective=SearchAndGrasp())
+
+
+def random_action(config: PlannerConfig | None = None, **options: Any) -> Search:
+    """A baseline: a random possible action, by the sampler's even draw, until the target can be taken out.
+
+    It plans no further: of `config`, the horizon, the guided fraction and all charges are not used.
+    """
+    even = dataclasses.replace(
+        _planner_config(config), horizon=1, guided_fraction=0.0, unseen_contact_penalty=0.0, topple_charge=0.0
+    )
+    return search(even, objective=Indifferent(), **options)
+
+
+POLICIES: Mapping[str, PolicyFactory] = {
+    "search-for-grasp": search_for_grasp,
+    "search-and-grasp": search_and_grasp,
+    "random": random_action,
+}
+
+
+def policy_factory(name: str) -> PolicyFactory:
+    """What makes the policy of a name, one of `POLICIES` or an import path such as "my_lab.policies:Mine".
+
+    Raises:
+      InputError: there is none of that name, or it cannot be imported.
+    """
+    if name in POLICIES:
+        return POLICIES[name]
+    module, colon, attribute = name.partition(":")
+    if not (colon and module and attribute):
+        raise InputError(
+            f'policy "{name}" is unknown; use {", ".join(POLICIES)}, or an import path such as my_lab.policies:Mine'
+        )
+    try:
+        factory = functools.reduce(getattr, attribute.split("."), importlib.import_module(module))
+    except Exception as error:
+        reason = " ".join(str(error).split())
+        raise InputError(f'policy "{name}" cannot be imported ({type(error).__name__}: {reason})') from error
+    if not callable(factory):
+        raise InputError(f'policy "{name}" is not callable; name a function or a class that makes a policy')
+    return factory

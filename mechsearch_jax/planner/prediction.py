@@ -1,0 +1,69 @@
+"""What a sampled action changes in a state: the engine's slot `predict` (S of equation 4)."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from mechsearch_jax.actions.registry import KINDS
+from mechsearch_jax.actions.types import Prediction, Sample
+from mechsearch_jax.dynamics.push_model import PushModel
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.state import State
+
+
+class Predict(Protocol):
+    """Predicts an action; static under jit."""
+
+    def __call__(self, problem: Problem, state: State, sample: Sample, first: Bool[Array, ""]) -> Prediction:
+        """What the action does; where it cannot be executed, the scene stays as it was.
+
+        Args:
+          problem: what does not change.
+          state: before the action.
+          sample: the action.
+          first: whether it is the first of its sequence.
+        """
+        ...
+
+
+def _either(first: Bool[Array, ""], model: PushModel, later: PushModel) -> PushModel:
+    """The first model where `first` is set, else the other; the other is not run, as long as `first` is not batched."""
+    if model == later:
+        return model
+
+    def chosen(shelf, scene, pusher, T_world_gripper, displacement, q7):
+        branches = (functools.partial(model, shelf), functools.partial(later, shelf))
+        return jax.lax.cond(first, *branches, scene, pusher, T_world_gripper, displacement, q7)
+
+    return chosen
+
+
+@dataclasses.dataclass(frozen=True)
+class PredictByKind:
+    """The default `Predict`: every kind of action predicts itself, pushes with a push model.
+
+    Attributes:
+      push_model: predicts pushes that are the first action of a sequence.
+      later_push_model: predicts the others.
+    """
+
+    push_model: PushModel
+    later_push_model: PushModel
+
+    def __call__(self, problem: Problem, state: State, sample: Sample, first: Bool[Array, ""]) -> Prediction:
+        push_model = _either(first, self.push_model, self.later_push_model)
+        action, scene = sample.action, state.scene
+        found = Prediction(scene, jnp.array(False), jnp.float32(0.0))
+        for code, kind in KINDS.items():
+            told = kind.predict(
+                problem.space, problem.actions, push_model, scene, state.is_target, action, sample.wrist
+            )
+            found = jax.tree.map(lambda a, b, code=code: jnp.where(action.kind == code, a, b), told, found)
+        after = jax.tree.map(lambda new, old: jnp.where(found.possible, new, old), found.scene, scene)
+        return found.replace(scene=after)

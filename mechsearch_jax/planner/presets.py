@@ -1,0 +1,55 @@
+"""Presets: whole configurations under a name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from mechsearch_jax.planner.config import Config
+
+# How often preset `paper` draws an action until one is possible: an approximation of the paper's, which never gives up.
+REDRAWS = 8
+
+
+def standard(**changes: Any) -> Config:
+    """Our own settings, the default; `docs/method.md` lists where they leave the paper.
+
+    Args:
+      **changes: options by name, see `Config.with_options`.
+    """
+    return Config().with_options(**changes)
+
+
+def paper(**changes: Any) -> Config:
+    """The paper's settings, and where it gives none, as for gamma, those of `standard` (appendices B.2 to B.5).
+
+    f by the difference of depth images, with the collision condition in predicted states too; grasps tilted by 20
+    degrees; even draws, repeated until one is possible, of any object at any step; nothing in the cost but J.
+
+    Args:
+      **changes: options by name, see `Config.with_options`.
+    """
+    tilt = (math.radians(20),)
+    settings = {
+        "criterion": "depth-mse",
+        "predicted_collisions": True,
+        "grasp_tilts": tilt,
+        "retrieval_tilts": tilt,
+        "object_grasp_tilts": tilt,
+        "push_distances": (0.05, 0.10, 0.15),
+        "actions": ("push", "pick-and-place"),
+        "avoid_unseen": False,
+        "guided_fraction": 0.0,
+        "unseen_contact_penalty": 0.0,
+        "topple_charge": 0.0,
+        "crowding_weight": 0.0,
+        "draws": REDRAWS,
+        "move_again": True,
+        "horizon": 3,
+        "sequences": 30,
+    }
+    return Config().with_options(**settings | changes)
+
+
+PRESETS: Mapping[str, Callable[..., Config]] = {"standard": standard, "paper": paper}

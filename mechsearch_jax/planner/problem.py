@@ -1,0 +1,90 @@
+"""What does not change in an episode, and all that can be computed from it before it begins."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tables
+from mechsearch_jax.actions.registry import SAMPLED_KINDS
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.existence import ExistenceTables, existence_tables
+from mechsearch_jax.graspability import GraspTables, grasp_tables
+from mechsearch_jax.planner.config import ProblemConfig
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+
+class Problem(flax.struct.PyTreeNode):
+    """What does not change in an episode: the world around the objects, and all that follows from it.
+
+    Attributes:
+      existence, grasps, actions: constants of f, of g and of the actions.
+      retrieval: a denser set of grasps, for the target once it is found; it has no candidate poses.
+      poses: the candidate poses X as x, y [m], yaw [rad], shape (X, 3).
+      camera, shelf, gripper, target, config: static.
+    """
+
+    existence: ExistenceTables
+    grasps: GraspTables
+    actions: ActionTables
+    retrieval: GraspTables
+    poses: jax.Array
+    camera: Camera = flax.struct.field(pytree_node=False)
+    shelf: Shelf = flax.struct.field(pytree_node=False)
+    gripper: Gripper = flax.struct.field(pytree_node=False)
+    target: Target = flax.struct.field(pytree_node=False)
+    config: ProblemConfig = flax.struct.field(pytree_node=False)
+
+    @property
+    def space(self) -> ActionSpace:
+        """The static part of the actions."""
+        return ActionSpace(
+            shelf=self.shelf,
+            gripper=self.gripper,
+            config=self.config.actions,
+            max_yaw=self.config.grasps.max_yaw,
+            waypoints=self.config.grasps.waypoints,
+            wrists=self.actions.q7.shape[1],
+        )
+
+
+def build_problem(
+    target: Target | None = None,
+    camera: Camera | None = None,
+    shelf: Shelf | None = None,
+    gripper: Gripper | None = None,
+    config: ProblemConfig | None = None,
+) -> Problem:
+    """Precompute everything about a target, a camera, a shelf and a gripper that no object changes.
+
+    Takes seconds; what is left out takes its default. Not to be called inside `jit`.
+
+    Raises:
+      InputError: the target cannot be grasped by the gripper, a kind of action cannot be sampled, or `config` is of
+        something else.
+    """
+    target, camera, shelf = target or Target(), camera or Camera(), shelf or Shelf()
+    gripper, config = gripper or Gripper(), ProblemConfig() if config is None else config
+    if not isinstance(config, ProblemConfig):
+        raise InputError(f"config: is a {type(config).__name__}; give a ProblemConfig, such as paper().problem")
+    known = [kind.name for kind in SAMPLED_KINDS]
+    for name in config.actions.actions:
+        if name not in known:
+            raise InputError(f'actions: "{name}" is unknown; use {" or ".join(known)}')
+    grasps = grasp_tables(shelf, gripper, target, config.grasps)
+    return Problem(
+        existence=existence_tables(camera, shelf, target, config.existence),
+        grasps=grasps,
+        actions=action_tables(gripper, config.grasps.wrists, config.actions),
+        retrieval=grasp_tables(shelf, gripper, target, config.retrieval, candidates=False),
+        poses=jnp.asarray(target.candidate_poses(shelf)),
+        camera=camera,
+        shelf=shelf,
+        gripper=gripper,
+        target=target,
+        config=config,
+    )

@@ -1,0 +1,86 @@
+"""Which action is sampled in a state: the engine's slot `propose`."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.actions.sampler import sample_action
+from mechsearch_jax.actions.types import Sample
+from mechsearch_jax.existence import occluders
+from mechsearch_jax.graspability import pairs
+from mechsearch_jax.planner.belief import Belief, possible_space
+from mechsearch_jax.planner.objective import Objective
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.state import State
+
+# How much more an object matters that is in the way alone than one of two that are, one of two than one of three, ...
+ALONE = 4.0
+
+
+class Propose(Protocol):
+    """Samples an action in a state; static under jit."""
+
+    def __call__(
+        self,
+        key: Array,
+        problem: Problem,
+        belief: Belief,
+        objective: Objective,
+        guided_fraction: Array | float,
+        state: State,
+    ) -> Sample:
+        """One action, of kind NONE where none is possible.
+
+        Args:
+          key: PRNG key.
+          problem: what does not change.
+          belief: what was known at the start.
+          objective: what the search makes small.
+          guided_fraction: see `PlannerConfig`.
+          state: where it is sampled.
+        """
+        ...
+
+
+def blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[Array, " n"]:
+    """Each object's share of what is in the way in those rows that count; the fewer share a row, the more it weighs."""
+    others = jnp.sum(in_the_way, axis=1, keepdims=True) - 1.0
+    weight = jnp.where(in_the_way & counts[:, None], ALONE**-others, 0.0)
+    total = jnp.sum(weight, axis=0)
+    return total / jnp.maximum(jnp.sum(total), 1e-12)
+
+
+def sampling_weights(
+    problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
+) -> Float[Array, " n"]:
+    """Sampling weight of each object: in part even, in part by what it hides and which grasps it blocks."""
+    pose, _, allowed, _ = pairs(problem.grasps, belief.grasps)
+    blocks = blame(state.hits, allowed & objective.needs_graspability(belief, state.exists)[pose])
+    hides = blame(occluders(problem.existence, state.views), state.exists & ~belief.found)
+    both = blocks + hides
+    share = both / jnp.maximum(jnp.sum(both), 1e-12)
+    return (1.0 - guided_fraction) / state.scene.capacity + guided_fraction * share
+
+
+def guided_draw(
+    key: Array,
+    problem: Problem,
+    belief: Belief,
+    objective: Objective,
+    guided_fraction: Array | float,
+    state: State,
+) -> Sample:
+    """The default `Propose`: draws go to objects by `sampling_weights`."""
+    return sample_action(
+        key,
+        problem.space,
+        problem.actions,
+        state.scene,
+        possible_space(problem, belief, state.exists),
+        state.options,
+        state.available & state.alive,
+        sampling_weights(problem, belief, objective, guided_fraction, state),
+    )

@@ -1,0 +1,220 @@
+"""The engine: sampling-based model predictive control over predicted states (paper sections 3 and 4.4, appendix B.4).
+
+Sequences of actions are sampled from the predicted state of each step, all of them in one vmapped computation, and the
+first action of the best is taken. What is sampled, what it changes and what is to be made small are slots.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.actions.candidates import candidates, no_candidates
+from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.registry import ActionKind
+from mechsearch_jax.actions.types import Action, Prediction, Sample
+from mechsearch_jax.dynamics.rigid import moved_objects
+from mechsearch_jax.existence import existence, no_views, object_views
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.graspability import grasp_hits, no_hits
+from mechsearch_jax.planner.belief import Belief, possible_space, with_target
+from mechsearch_jax.planner.config import PlannerConfig
+from mechsearch_jax.planner.objective import Objective
+from mechsearch_jax.planner.prediction import Predict
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.proposal import Propose
+from mechsearch_jax.planner.state import Decision, Sequences, State
+
+
+def prefix_values(
+    cost: Float[Array, " n"], charge: Float[Array, " m"], acted: Bool[Array, " m"], gamma: Array | float
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Equation 2 for every prefix of a sequence, with what its actions are charged: the best value, and its length.
+
+    `cost` is J before each action and after the last.
+    """
+    discount = gamma ** jnp.arange(charge.shape[0], dtype=jnp.float32)
+    values = jnp.where(acted, jnp.cumsum(discount * (jnp.diff(cost) + charge)), jnp.inf)
+    return jnp.min(values), jnp.argmin(values) + 1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rollout:
+    """What all states of a decision share, and how one leads to the next.
+
+    Attributes:
+      problem, belief: what does not change, and what is known.
+      config: how the planner decides.
+      propose, predict, objective: the slots.
+    """
+
+    problem: Problem
+    belief: Belief
+    config: PlannerConfig
+    propose: Propose
+    predict: Predict
+    objective: Objective
+
+    def root(self, objects: Superquadrics) -> State:
+        """The present state, of which nothing is computed yet: as if every object had just moved."""
+        problem = self.problem
+        scene, is_target = with_target(problem, self.belief, objects)
+        candidates, spread = problem.existence.T_world_target.shape[:2]
+        places = (candidates, spread) if self.config.predicted_collisions else None
+        return State(
+            scene=scene,
+            is_target=is_target,
+            exists=self.belief.exists,
+            views=no_views(scene.capacity, problem.config.existence, places),
+            hits=no_hits(problem.grasps, scene.capacity),
+            options=no_candidates(problem.space, scene.capacity),
+            moved=scene.valid,
+            available=scene.valid & ~is_target,
+            alive=jnp.array(True),
+        )
+
+    def update(self, state: State, moved: Bool[Array, " n"]) -> State:
+        """Bring f and g of a state up to date after some objects moved."""
+        problem, settings = self.problem, self.problem.config.existence
+        objects = state.scene.replace(valid=state.scene.valid & ~state.is_target)
+        counts_collisions = state.exists if self.config.predicted_collisions else None
+        views = object_views(
+            problem.existence, problem.camera, objects, counts_collisions, settings, state.views, moved
+        )
+        exists = existence(problem.existence, problem.camera, views, state.exists, settings)
+        counts = self.objective.needs_graspability(self.belief, exists)
+        hits = grasp_hits(problem.grasps, self.belief.grasps, objects, counts, state.hits, moved)
+        return state.replace(exists=exists, views=views, hits=hits)
+
+    def options(self, state: State, moved: Bool[Array, " n"]):
+        """What can be done in a state after some objects moved."""
+        possible = possible_space(self.problem, self.belief, state.exists)
+        return candidates(self.problem.space, self.problem.actions, state.scene, possible, state.options, moved)
+
+    def cost(self, state: State) -> Float[Array, ""]:
+        """J of a state that is up to date."""
+        return self.objective.cost(self.problem, self.belief, state.exists, state.hits, self.config.crowding_weight)
+
+    def _attempt(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
+        sample = self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, state)
+        return sample, self.predict(self.problem, state, sample, first)
+
+    def _draw(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
+        """An action and what it does; drawn again, at most `config.draws` times in all, until it is possible."""
+        attempt = functools.partial(self._attempt, first, state)
+        if self.config.draws == 1:
+            return attempt(key)
+        shapes, _ = jax.eval_shape(attempt, key)
+        nothing = Prediction(state.scene, jnp.array(False), jnp.float32(0.0))
+        blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
+
+        def again(carry):
+            i, _ = carry
+            return i + 1, attempt(jax.random.fold_in(key, i))
+
+        def wanted(carry):
+            i, (_, prediction) = carry
+            return (i < self.config.draws) & ~prediction.possible & state.alive
+
+        return jax.lax.while_loop(wanted, again, (jnp.int32(0), blank))[1]
+
+    def act(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[dict[str, Any], Action, Array]:
+        """Sample an action and predict what it changes in a state; also what it may cost beside, as a share of J."""
+        sample, told = self._draw(first, state, key)
+        acted = told.possible & state.alive
+        action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
+        spent = (jnp.arange(state.scene.capacity) == action.object) & (not self.config.move_again)
+        changes = {
+            "scene": told.scene,
+            "moved": moved_objects(state.scene, told.scene) & acted,
+            "available": state.available & ~spent,
+            "alive": acted,
+        }
+        charge = self.config.unseen_contact_penalty * sample.risk + self.config.topple_charge * told.topples
+        return changes, action, charge
+
+    def step(self, states: State, keys: Array, time: Int[Array, ""]):
+        """All sequences by one action: the states after it, and what is to be kept of the ones before it."""
+        count = self.config.sequences
+        # All sequences begin in the same state, so only the first computes it.
+        first = time == 0
+        computes = (~first | (jnp.arange(count) == 0))[:, None]
+        moved = states.moved & computes
+        shared = lambda tree: jax.tree.map(lambda a: jnp.where(first, a[:1], a), tree)  # noqa: E731
+        states = shared(jax.vmap(self.update)(states.replace(exists=states.exists & computes), moved))
+
+        def go_on():
+            options = shared(jax.vmap(self.options)(states, moved))
+            act = jax.vmap(functools.partial(self.act, first))
+            changes, actions, price = act(states.replace(options=options), keys)
+            return changes | {"options": options}, actions, price
+
+        def stay():
+            changes = {name: getattr(states, name) for name in ("scene", "moved", "available", "alive", "options")}
+            return changes, repeated(no_action(), count), jnp.zeros(count)
+
+        # After the last action only the cost counts. What the actions do not change does not pass through the branches.
+        changes, actions, price = jax.lax.cond(time < self.config.horizon, go_on, stay)
+        kept = (actions, jax.vmap(self.cost)(states), price, jnp.any(states.views.overflow), changes["scene"])
+        return states.replace(**changes), kept
+
+
+def repeated(tree: Any, count: int) -> Any:
+    """A pytree with a leading axis of so many equal rows."""
+    return jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *a.shape)), tree)
+
+
+def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
+    """Decide on the next action by sampling sequences and keeping the first action of the best (B.4).
+
+    Args:
+      rollout: what is known, and how states lead to states.
+      key: PRNG key of the planner.
+      objects: as recognised, fields (N, ...).
+
+    Returns:
+      The decision and everything that was considered. The same arguments give the same decision, also under `vmap`.
+    """
+    config = rollout.config
+    count, horizon = config.sequences, config.horizon
+    states = repeated(rollout.root(objects), count)
+    keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
+    _, (actions, cost, price, overflow, scenes) = jax.lax.scan(
+        lambda states, now: rollout.step(states, *now), states, (keys, jnp.arange(horizon + 1))
+    )
+    actions, price = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, price))
+    cost, now = jnp.swapaxes(cost, 0, 1), cost[0, 0]
+    charge = price * cost[:, :-1]
+    value, length = jax.vmap(lambda c, h, k: prefix_values(c, h, k != ActionKind.NONE, config.gamma))(
+        cost, charge, actions.kind
+    )
+    sequences = Sequences(actions, cost[:, 1:], value, length)
+    order = jnp.argsort(sequences.value, stable=True)
+    sequences = jax.tree.map(lambda a: a[order], sequences)
+    best, slots = order[0], objects.capacity
+    return Decision(
+        action=jax.tree.map(lambda a: a[0, 0], sequences.actions),
+        value=sequences.value[0],
+        cost=now,
+        predicted_cost=sequences.cost[0, 0],
+        # Without the target's slot, which comes after those of the objects.
+        predicted=jax.tree.map(lambda a: a[0, best, :slots], scenes),
+        sequences=sequences,
+        overflow=overflow[0],
+    )
+
+
+def no_sequences(config: PlannerConfig) -> Sequences:
+    """What there is where nothing was sampled."""
+    count, horizon = config.sequences, config.horizon
+    return Sequences(
+        actions=repeated(repeated(no_action(), horizon), count),
+        cost=jnp.full((count, horizon), jnp.nan),
+        value=jnp.full(count, jnp.inf),
+        length=jnp.ones(count, jnp.int32),
+    )

@@ -1,0 +1,75 @@
+"""A predicted state on the way through a sequence of actions, and what a decision consists of."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+
+from mechsearch_jax.actions.candidates import Candidates
+from mechsearch_jax.actions.types import Action
+from mechsearch_jax.existence import ObjectViews
+from mechsearch_jax.geometry.superquadric import Superquadrics
+
+
+class State(flax.struct.PyTreeNode):
+    """A predicted state, with what was computed of the one before it.
+
+    Attributes:
+      scene: the objects and the target, fields (N, ...).
+      is_target: which slot is the target's, shape (N,).
+      exists: f, shape (X,).
+      views: the objects as the camera sees them.
+      hits: H, shape (K, N).
+      options: the ways to move the objects.
+      moved: which objects differ from the state before, shape (N,).
+      available: which objects may be moved, shape (N,).
+      alive: whether the sequence has found something to do so far.
+    """
+
+    scene: Superquadrics
+    is_target: jax.Array
+    exists: jax.Array
+    views: ObjectViews
+    hits: jax.Array
+    options: Candidates
+    moved: jax.Array
+    available: jax.Array
+    alive: jax.Array
+
+
+class Sequences(flax.struct.PyTreeNode):
+    """Sampled sequences of actions, best first; leading axis S, and M within.
+
+    Attributes:
+      actions: shape (S, M), of kind NONE from where a sequence found nothing more to do.
+      cost: J after each action, shape (S, M).
+      value: equation 2 of the best prefix, shape (S,); infinite if there was no first action.
+      length: number of actions in that prefix, shape (S,).
+    """
+
+    actions: Action
+    cost: jax.Array
+    value: jax.Array
+    length: jax.Array
+
+
+class Decision(flax.struct.PyTreeNode):
+    """What to do next, and everything that was considered.
+
+    Attributes:
+      action: what to do next; of kind NONE if nothing is possible, of kind RETRIEVE if the target can be taken out.
+      value: equation 2 of the sequence it begins: the change of the cost, negative is good; 0 for a retrieval.
+      cost: J now.
+      predicted_cost: J that is expected after the action; NaN after a retrieval.
+      predicted: the objects as they are expected to be after the action, without the target, fields (N, ...).
+      sequences: all sampled sequences, best first; none has a first action where none was sampled.
+      overflow: whether an object's image outgrew its window (see `existence.ObjectViews`): f may be too small.
+    """
+
+    action: Action
+    value: jax.Array
+    cost: jax.Array
+    predicted_cost: jax.Array
+    predicted: Superquadrics
+    sequences: Sequences
+    overflow: jax.Array

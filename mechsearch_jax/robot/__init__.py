@@ -1,0 +1,1 @@
+"""The Panda: geometry, kinematics, motions."""

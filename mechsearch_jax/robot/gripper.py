@@ -1,0 +1,357 @@
+"""The Panda's hand, fingers and arm as few primitives, and the point clouds that collision tests use.
+
+The boxes and capsules are fitted to the convex collision meshes of the maker's description of the robot: for the hand,
+the fingers and links 6 and 7 the real surface lies inside their union and at most 8 mm beneath it; links 1 to 5 are
+wrapped more loosely in capsules. The same primitives are the contact geometry of the simulator.
+
+Frames: as in `kinematics`. The gripper frame has its origin between the finger tips, z along the approach, y along the
+direction in which the fingers open. When joint 7 is at `q7`, links 6 and 7 are rigid with the hand.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.robot import kinematics
+from mechsearch_jax.robot.kinematics import Numbers
+from mechsearch_jax.workspace.shelf import Shelf, spheres_hit_shelf
+
+FINGER_BASE = 0.0584  # z of the fingers' frames in the hand frame [m]
+FINE = 0.5  # spacing of a cloud near the front, relative to the rest
+
+
+@dataclasses.dataclass(frozen=True)
+class Gripper:
+    """The two-finger gripper and how it is used [m].
+
+    Attributes:
+      max_opening: largest distance between the fingers.
+      usable_opening: largest width of an object that may be grasped.
+      approach: length of the straight approach and retreat along the gripper's z.
+      front: the clouds are dense where z in the gripper frame is above this.
+    """
+
+    max_opening: float = 0.08
+    usable_opening: float = 0.075
+    approach: float = 0.3
+    front: float = -0.08
+
+    def __post_init__(self):
+        for field in ("max_opening", "usable_opening", "approach"):
+            if not getattr(self, field) > 0:
+                raise InputError(f"Gripper: {field} ({getattr(self, field)}) must be positive, in metres")
+        if self.usable_opening > self.max_opening:
+            raise InputError(
+                f"Gripper: usable_opening ({self.usable_opening}) must not exceed max_opening ({self.max_opening})"
+            )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Primitive:
+    """A box or a capsule in the frame of a link.
+
+    Attributes:
+      kind: "box" or "capsule".
+      size: half-extents of a box (3), or radius and half length (2) of a capsule along its own z, caps excluded [m].
+      T_frame_primitive: its pose in the link's frame, shape (4, 4), float64.
+    """
+
+    kind: Literal["box", "capsule"]
+    size: tuple[float, ...]
+    T_frame_primitive: np.ndarray
+
+
+def _box(
+    half_size: tuple[float, float, float],
+    centre: tuple[float, float, float],
+    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+) -> Primitive:
+    """A box from its half-extents, centre and orientation (w, x, y, z)."""
+    return Primitive("box", half_size, _pose(trimesh.transformations.quaternion_matrix(quaternion), centre))
+
+
+def _capsule(radius: float, start: tuple[float, float, float], end: tuple[float, float, float]) -> Primitive:
+    """A capsule from its radius and the ends of its axis."""
+    axis = np.subtract(end, start)
+    rotation = trimesh.geometry.align_vectors((0.0, 0.0, 1.0), axis)
+    return Primitive("capsule", (radius, float(np.linalg.norm(axis)) / 2), _pose(rotation, np.add(start, end) / 2))
+
+
+def _pose(rotation: Any, origin: Any) -> np.ndarray:
+    """A rotation, given as a 4 x 4 transform, with an origin."""
+    pose = np.array(rotation)
+    pose[:3, 3] = origin
+    return pose
+
+
+HAND = (
+    _box((0.01129, 0.04649, 0.01977), (-0.00572, -0.05382, -0.0075), (0.32851, -0.03161, 0.9438, -0.01807)),
+    _box((0.01961, 0.06294, 0.03174), (-0.00005, 0.00793, 0.0138), (0.02888, 0.70797, -0.02897, -0.70506)),
+    _box((0.01492, 0.0463, 0.02958), (0.00831, -0.05895, 0.01312), (0.99484, -0.01118, 0.05441, -0.08495)),
+    _box((0.02373, 0.10127, 0.03188), (-0.00051, -0.00013, 0.03583), (0.99995, 0.0087, -0.00375, -0.0006)),
+    _box((0.02673, 0.05606, 0.03078), (-0.00004, 0.03764, 0.01604), (-0.06087, 0.99814, 0.00043, 0.00154)),
+)
+
+FINGER = (
+    _box((0.0108, 0.0076, 0.0273), (0.0, 0.0073, 0.0270)),
+    _box((0.0108, 0.005, 0.0182), (0.0, 0.0152, 0.0345), (0.9886, 0.1508, 0.0, 0.0)),
+    _box((0.0108, 0.0135, 0.0102), (0.0, 0.0132, 0.01)),
+)
+
+# Links 1 to 7, each in its own frame.
+LINKS = (
+    (
+        _capsule(0.07155, (0.00141, -0.01398, -0.14142), (-0.00037, -0.04212, -0.00193)),
+        _capsule(0.03295, (-0.03801, -0.00133, -0.1751), (-0.0044, 0.03718, -0.1746)),
+        _capsule(0.05628, (0.01556, 0.00741, -0.15736), (-0.00334, -0.08696, -0.00371)),
+    ),
+    (
+        _capsule(0.07369, (0.00036, -0.03256, 0.04395), (-0.00009, -0.14886, 0.00003)),
+        _capsule(0.07138, (-0.001, -0.00234, 0.03809), (0.0, -0.00352, 0.06165)),
+    ),
+    (
+        _capsule(0.07045, (0.08243, 0.04239, -0.00006), (0.01428, 0.00831, -0.06747)),
+        _capsule(0.03409, (-0.00868, 0.03646, -0.10118), (-0.03492, -0.00002, -0.10157)),
+        _capsule(0.03391, (0.02724, -0.0275, -0.10228), (-0.02111, -0.02835, -0.10221)),
+    ),
+    (
+        _capsule(0.03528, (-0.09881, 0.10426, -0.03038), (-0.04961, 0.10394, -0.02364)),
+        _capsule(0.03481, (-0.11789, 0.10508, -0.00345), (-0.09068, 0.10515, 0.03865)),
+        _capsule(0.07092, (-0.0689, 0.06985, 0.0081), (-0.00009, 0.00013, 0.04226)),
+    ),
+    (
+        _capsule(0.0572, (0.0001, 0.0, -0.2462), (0.0002, 0.0404, -0.0028)),
+        _capsule(0.0572, (0.0004, 0.027, -0.2177), (0.0003, 0.0828, -0.0027)),
+    ),
+    (
+        _box((0.03003, 0.03832, 0.03168), (0.10187, -0.01343, -0.00309), (0.99328, -0.00342, 0.11567, 0.00318)),
+        _box((0.02344, 0.03959, 0.02744), (0.08156, 0.04066, -0.00917), (0.99431, -0.05223, 0.04435, -0.08157)),
+        _box((0.04028, 0.03837, 0.00542), (-0.00839, -0.00951, -0.01476), (0.99872, 0.00396, 0.04986, -0.007)),
+        _box((0.0464, 0.05037, 0.02033), (0.02026, 0.00959, -0.01022), (0.97765, 0.01815, 0.07186, 0.19676)),
+        _box((0.04083, 0.04002, 0.04438), (0.07839, -0.01179, 0.00207), (0.99372, 0.00087, 0.11191, 0.0018)),
+        _capsule(0.04735, (0.06704, 0.04147, 0.00538), (0.08893, 0.03747, 0.00176)),
+        _capsule(0.04461, (0.03814, 0.0288, 0.01262), (-0.01039, 0.00071, 0.01471)),
+        _capsule(0.04526, (-0.00377, -0.00913, 0.01384), (0.03818, -0.00906, 0.01777)),
+        _capsule(0.02457, (0.0269, -0.03191, -0.01215), (0.0088, -0.02828, 0.00533)),
+    ),
+    (
+        _box((0.02548, 0.01692, 0.02809), (-0.01693, -0.02312, 0.07797), (0.95002, -0.06056, 0.02416, -0.30531)),
+        _box((0.03753, 0.02851, 0.01536), (0.04415, 0.04421, 0.07774), (0.89954, 0.21258, -0.08736, -0.37149)),
+        _box((0.03858, 0.04412, 0.02513), (0.00491, 0.00486, 0.07679), (0.9246, -0.00109, 0.0018, 0.38094)),
+        _box((0.03757, 0.05097, 0.01686), (0.0136, 0.01379, 0.09039), (0.92302, -0.01228, 0.00681, -0.38448)),
+        _box((0.02695, 0.026, 0.02581), (-0.01714, -0.0144, 0.07612), (0.98562, 0.07825, -0.05998, 0.13722)),
+    ),
+)
+
+
+def primitives_in_gripper(gripper: Gripper, opening: float, q7: float) -> tuple[Primitive, ...]:
+    """The primitives of the hand, both fingers, link 7 and link 6, with their poses in the gripper frame.
+
+    Args:
+      gripper: the gripper.
+      opening: distance between the fingers [m].
+      q7: angle of joint 7 [rad].
+
+    Raises:
+      InputError: the opening is negative or larger than the gripper's.
+    """
+    if not 0.0 <= opening <= gripper.max_opening:
+        raise InputError(f"Gripper: opening {opening} m must be between 0 and {gripper.max_opening}")
+    T_gripper_hand = trimesh.transformations.translation_matrix((0.0, 0.0, -kinematics.FINGER_TIPS))
+    T_gripper_left = _moved(T_gripper_hand, y=opening / 2, z=FINGER_BASE)
+    T_gripper_right = _moved(T_gripper_hand, y=-opening / 2, z=FINGER_BASE) @ _rotation(math.pi, "z")
+    T_gripper_link7 = _moved(T_gripper_hand, z=-kinematics.FLANGE) @ _rotation(-kinematics.HAND_ANGLE, "z")
+    T_link7_link6 = _moved(_rotation(-q7, "z"), x=-kinematics.JOINTS[6][0]) @ _rotation(-math.pi / 2, "x")
+    bodies = (
+        (T_gripper_hand, HAND),
+        (T_gripper_left, FINGER),
+        (T_gripper_right, FINGER),
+        (T_gripper_link7, LINKS[6]),
+        (T_gripper_link7 @ T_link7_link6, LINKS[5]),
+    )
+    return tuple(
+        dataclasses.replace(primitive, T_frame_primitive=T @ primitive.T_frame_primitive)
+        for T, primitives in bodies
+        for primitive in primitives
+    )
+
+
+def gripper_cloud(
+    gripper: Gripper, opening: float, q7: float, count: int, seed: int = 0
+) -> Float[np.ndarray, "{count} 3"]:
+    """`count` points spread over the surface of the hand, both fingers, link 7 and link 6: `swept_cloud` at rest."""
+    return swept_cloud(gripper, opening, q7, count, 0.0, seed)
+
+
+def swept_cloud(
+    gripper: Gripper, opening: float, q7: float, count: int, distance: float | None = None, seed: int = 0
+) -> Float[np.ndarray, "{count} 3"]:
+    """Points spread over the surface of all that the moving gripper passes through on a straight approach.
+
+    What a convex primitive sweeps on a line is the convex hull of its start and its end. The cloud covers the boundary
+    of the union of these hulls, twice as densely near the fingers and the front of the hand as behind.
+
+    Args:
+      gripper: the gripper.
+      opening: distance between the fingers [m].
+      q7: angle of joint 7 [rad].
+      count: number of points.
+      distance: length of the approach along z, ending in the frame [m]; the gripper's own by default.
+      seed: the same seed gives the same points.
+
+    Returns:
+      points in the gripper frame [m], float32; ordered so that any first part of them covers everything more coarsely.
+
+    Raises:
+      InputError: the opening is out of range, the distance negative, or fewer than one point asked for.
+    """
+    distance = gripper.approach if distance is None else distance
+    if distance < 0.0 or count < 1:
+        raise InputError(f"swept_cloud: distance ({distance} m) must not be negative, count ({count}) at least 1")
+    return _sampled(gripper, float(opening), float(q7), int(count), float(distance), int(seed)).copy()
+
+
+@functools.cache
+def _sampled(
+    gripper: Gripper, opening: float, q7: float, count: int, distance: float, seed: int
+) -> Float[np.ndarray, "{count} 3"]:
+    """`swept_cloud` of checked arguments; kept, because several tables of a problem are made of the same clouds."""
+    hulls = [
+        _swept_hull(primitive.kind, primitive.size, primitive.T_frame_primitive.tobytes(), distance)
+        for primitive in primitives_in_gripper(gripper, opening, q7)
+    ]
+    areas = np.array([hull.mesh.area for hull in hulls])
+    shares = np.ceil(12 * count * areas / areas.sum()).astype(int) + 50
+    candidates = np.concatenate(
+        [
+            _outside(trimesh.sample.sample_surface(hull.mesh, share, seed=seed + i)[0], hulls[:i] + hulls[i + 1 :])
+            for i, (hull, share) in enumerate(zip(hulls, shares, strict=True))
+        ]
+    )
+    spacing = np.where(candidates[:, 2] > gripper.front, FINE, 1.0)
+    return candidates[_spread(candidates, spacing, count)].astype(np.float32)
+
+
+def arm_points(q: Float[Numbers, "*batch 7"], count: int) -> tuple[Float[Array, "*batch n 3"], Float[Array, " n"]]:
+    """Points along the axes of the capsules of links 2 to 5, in the base frame.
+
+    Args:
+      q: joint angles [rad].
+      count: number of points on each capsule, its ends included; at least 2.
+
+    Returns:
+      points: spheres of the given radii about these points fill the capsules, up to dents between them [m].
+      radii: one for each point [m].
+    """
+    links, points, radii = [], [], []
+    for link in range(1, 5):
+        for capsule in LINKS[link]:
+            radius, half = capsule.size
+            z = np.linspace(-half, half, count)[:, None]
+            points.append(capsule.T_frame_primitive[:3, 3] + z * capsule.T_frame_primitive[:3, 2])
+            radii.append(np.full(count, radius))
+            links.append(np.full(count, link))
+    frames = kinematics.forward_kinematics(q)[..., np.concatenate(links), :, :]
+    local = jnp.asarray(np.concatenate(points), jnp.float32)
+    local = local.reshape((1,) * (frames.ndim - 3) + local.shape)
+    world = frames[..., :3, 3] + sum(frames[..., :3, i] * local[..., i, None] for i in range(3))
+    return world, jnp.asarray(np.concatenate(radii), jnp.float32)
+
+
+@functools.partial(jax.jit, static_argnames=("shelf", "count"))
+def arm_hits_shelf(q: Float[Numbers, "*batch 7"], shelf: Shelf, count: int = 5) -> Bool[Array, "*batch"]:
+    """Whether links 2 to 5 touch the shelf or come closer to it than the planner's margins.
+
+    All that is beyond the plane of the shelf's front and outside its free space counts as solid.
+
+    Args:
+      q: joint angles [rad].
+      shelf: the shelf.
+      count: spheres for each capsule, see `arm_points`.
+    """
+    return jnp.any(spheres_hit_shelf(shelf, *arm_points(q, count)), axis=-1)
+
+
+def _moved(T: np.ndarray, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:
+    """A pose moved along its own axes."""
+    return T @ trimesh.transformations.translation_matrix((x, y, z))
+
+
+def _rotation(angle: float, axis: Literal["x", "y", "z"]) -> np.ndarray:
+    return trimesh.transformations.rotation_matrix(angle, np.eye(3)["xyz".index(axis)])
+
+
+def _mesh(primitive: Primitive) -> trimesh.Trimesh:
+    """A primitive's surface; a capsule's facets lie at most half a percent of its radius beneath it."""
+    if primitive.kind == "box":
+        mesh = trimesh.creation.box(extents=2 * np.array(primitive.size))
+    else:
+        radius, half = primitive.size
+        mesh = trimesh.creation.capsule(height=2 * half, radius=radius, count=[32, 32])
+        mesh.apply_translation((0.0, 0.0, -mesh.bounds.mean(axis=0)[2]))
+    return mesh.apply_transform(primitive.T_frame_primitive)
+
+
+class _Hull(NamedTuple):
+    """A convex mesh, and its faces and bounds as plain arrays: trimesh checks its own for changes at every access."""
+
+    mesh: trimesh.Trimesh
+    normals: np.ndarray
+    offsets: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+@functools.cache
+def _swept_hull(kind: Literal["box", "capsule"], size: tuple[float, ...], pose: bytes, distance: float) -> _Hull:
+    """The convex hull of a primitive and of itself `distance` back along z; the fields of the primitive are hashable.
+
+    Kept, because only link 6 differs between the angles of joint 7.
+    """
+    mesh = _mesh(Primitive(kind, size, np.frombuffer(pose).reshape(4, 4)))
+    hull = trimesh.convex.convex_hull(np.concatenate([mesh.vertices, mesh.vertices - (0.0, 0.0, distance)]))
+    normals, centres, bounds = (np.array(a) for a in (hull.face_normals, hull.triangles_center, hull.bounds))
+    return _Hull(hull, normals, np.sum(normals * centres, axis=-1), bounds[0], bounds[1])
+
+
+def _outside(points: np.ndarray, hulls: list[_Hull]) -> np.ndarray:
+    """The points that are not inside any of the convex hulls, to a tenth of a millimetre."""
+    points = np.array(points)
+    for hull in hulls:
+        inside = np.all((points > hull.low) & (points < hull.high), axis=-1)
+        inside[inside] = np.max(points[inside] @ hull.normals.T - hull.offsets, axis=-1, initial=-np.inf) <= -1e-4
+        points = points[~inside]
+    return points
+
+
+def _spread(points: np.ndarray, spacing: np.ndarray, count: int) -> np.ndarray:
+    """Indices of `count` points, each chosen where the distance to those before, over the spacing, is largest."""
+    chosen = np.empty(count, int)
+    chosen[0] = np.argmax(points[:, 2])
+    gap = np.full(len(points), np.inf)
+    x, y, z = np.array(points.T, order="C")
+    scale = spacing**2
+    distance, square = np.empty_like(gap), np.empty_like(gap)
+    # Column by column and in place: this loop is most of the time that a cloud takes.
+    for i in range(1, count):
+        last = chosen[i - 1]
+        np.subtract(x, x[last], out=distance)
+        np.multiply(distance, distance, out=distance)
+        for axis in (y, z):
+            np.subtract(axis, axis[last], out=square)
+            np.multiply(square, square, out=square)
+            np.add(distance, square, out=distance)
+        np.divide(distance, scale, out=distance)
+        np.minimum(gap, distance, out=gap)
+        chosen[i] = np.argmax(gap)
+    return chosen

@@ -1,0 +1,46 @@
+"""What a result depends on: versions, the device, the source."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import importlib.resources
+import platform
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+
+# Folders of `mechsearch_jax` that decide nothing, and those that are packages of their own although they are installed
+# beneath it.
+UNDECIDING = ("commands", "viz", "data", "envs", "train", "benchmarks")
+
+
+def versions() -> dict[str, str]:
+    """The versions of what a result depends on, and the device that it was computed on."""
+    packages = ("mechsearch-jax", "jax", "mujoco", "numpy")
+    device = jax.devices()[0]
+    return {
+        **{name: importlib.metadata.version(name) for name in packages},
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "device": f"{device.platform}: {device.device_kind}",
+    }
+
+
+def source_digest(endings: Sequence[str], packages: Sequence[str] = ("mechsearch_jax",)) -> str:
+    """SHA-256 of the source that decides, in hexadecimal: of all folders of packages but those of `UNDECIDING`.
+
+    Args:
+      endings: of the files that count.
+      packages: names of packages.
+    """
+    digest = hashlib.sha256()
+    for package in packages:
+        root = Path(str(importlib.resources.files(package)))
+        for file in sorted(file for file in root.rglob("*") if file.suffix in endings):
+            inside = file.relative_to(root)
+            if inside.parts[0] not in UNDECIDING:
+                source = file.read_bytes()
+                digest.update(f"{package} {inside.as_posix()} {len(source)} ".encode() + source)
+    return digest.hexdigest()

@@ -1,0 +1,1 @@
+"""Where the search takes place: camera, shelf, target, scenario files."""

@@ -1,0 +1,105 @@
+"""The pinhole camera that looks into the shelf: rays and projection."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.transforms import rotate
+
+
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A fixed pinhole camera; its frame has x right, y down, z forward. Defaults: docs/method.md,
+    "Facts of the scene".
+
+    Attributes:
+      width, height: image size in pixels.
+      fx, fy: focal lengths in pixels.
+      cx, cy: principal point in pixels; pixel (row, column) has its centre at (column + 0.5, row + 0.5).
+      rotation: rows of `R_world_camera`.
+      position: `t_world_camera` [m].
+    """
+
+    width: int = 1280
+    height: int = 720
+    fx: float = 609.635
+    fy: float = 609.635
+    cx: float = 640.0
+    cy: float = 360.0
+    rotation: tuple[tuple[float, float, float], ...] = (
+        (-0.43471579, -0.10620786, 0.894283),
+        (-0.9005385, 0.05926315, -0.43071834),
+        (-0.00725236, -0.99257633, -0.12140689),
+    )
+    position: tuple[float, float, float] = (-0.04457319, 0.44833383, 0.65361773)
+
+    def __post_init__(self):
+        if self.width < 1 or self.height < 1 or self.fx <= 0 or self.fy <= 0:
+            raise InputError(f"Camera: size {self.width} x {self.height} and focal lengths must be positive")
+        if not np.allclose(np.array(self.rotation) @ np.array(self.rotation).T, np.eye(3), atol=1e-4):
+            raise InputError("Camera: rotation must be a rotation matrix, three orthonormal rows")
+
+    def scaled(self, factor: int) -> Camera:
+        """The same view at `1/factor` of the resolution, its size rounded down."""
+        return dataclasses.replace(
+            self,
+            width=self.width // factor,
+            height=self.height // factor,
+            fx=self.fx / factor,
+            fy=self.fy / factor,
+            cx=self.cx / factor,
+            cy=self.cy / factor,
+        )
+
+
+def pixel_rays(
+    camera: Camera, rows: Float[Array, "*batch"], columns: Float[Array, "*batch"]
+) -> Float[Array, "*batch 3"]:
+    """Directions in the world of the rays through pixel centres, scaled to unit depth along the optical axis.
+
+    Args:
+      camera: the camera.
+      rows, columns: pixel indices; need not be whole numbers, nor inside the image.
+
+    Returns:
+      `d` such that `camera.position + depth * d` lies at that depth [m per m of depth].
+    """
+    x = (columns + 0.5 - camera.cx) / camera.fx
+    y = (rows + 0.5 - camera.cy) / camera.fy
+    right, down, forward = (jnp.array([row[i] for row in camera.rotation]) for i in range(3))
+    shape = [1] * x.ndim + [3]
+    return x[..., None] * right.reshape(shape) + y[..., None] * down.reshape(shape) + forward.reshape(shape)
+
+
+def rays(camera: Camera) -> Float[Array, "h w 3"]:
+    """`pixel_rays` of every pixel, shape (height, width, 3)."""
+    rows, columns = jnp.meshgrid(jnp.arange(camera.height) * 1.0, jnp.arange(camera.width) * 1.0, indexing="ij")
+    return pixel_rays(camera, rows, columns)
+
+
+def project(
+    camera: Camera, points: Float[Array, "*batch 3"]
+) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
+    """World points as (row, column) pixel coordinates and depth [m]; the inverse of `pixel_rays`.
+
+    Points at or behind the camera's plane have no image: theirs is computed at a depth of 1 micrometre.
+    """
+    inverse = jnp.array(camera.rotation).T
+    origin = jnp.array(camera.position).reshape([1] * (points.ndim - 1) + [3])
+    x, y, z = jnp.moveaxis(rotate(inverse, points - origin), -1, 0)
+    safe = jnp.maximum(z, 1e-6)
+    row = camera.fy * y / safe + camera.cy - 0.5
+    column = camera.fx * x / safe + camera.cx - 0.5
+    return jnp.stack([row, column], axis=-1), z
+
+
+def back_project(camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+    """The point in the world that every pixel of a depth image sees [m]; NaN where the depth is not finite."""
+    seen = jnp.isfinite(depth)
+    points = jnp.array(camera.position).reshape(1, 1, 3) + jnp.where(seen, depth, 0.0)[..., None] * rays(camera)
+    return jnp.where(seen[..., None], points, jnp.nan)

@@ -1,0 +1,166 @@
+"""Depth images of superquadrics (paper equations 8 to 13)."""
+
+from __future__ import annotations
+
+import functools
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import make, rotate, transform
+from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
+
+SHARPNESS = 1000.0
+TAU = 100.0
+SAMPLES = 64
+NEWTON_STEPS = 8
+GRAZING = 2e-3
+
+
+def _slab_chord(size, origin, direction):
+    """Where a ray enters and leaves the box around a superquadric; `enter > leave` if it misses."""
+    safe = jnp.where(jnp.abs(direction) < 1e-9, jnp.where(direction < 0, -1e-9, 1e-9), direction)
+    a, b = (-size - origin) / safe, (size - origin) / safe
+    return jnp.max(jnp.minimum(a, b)), jnp.min(jnp.maximum(a, b))
+
+
+def cast(
+    size: Float[Array, "3"], exponents: Float[Array, "2"], origin: Float[Array, "3"], direction: Float[Array, "3"]
+) -> Float[Array, ""]:
+    """First crossing of a ray with one superquadric, in its own frame.
+
+    The gauge is convex along a ray, and at least 1 where the ray enters the bounding box: Newton's method from there
+    approaches the first crossing from the near side, and a gauge that stops falling before it reaches 1 is a miss.
+
+    Returns:
+      The ray parameter of the crossing, infinite for a miss; differentiable in all arguments where it is finite.
+    """
+    enter, leave = _slab_chord(size, origin, direction)
+
+    def value_and_slope(t):
+        return jax.jvp(lambda t: superquadric.gauge(size, exponents, origin + t * direction), (t,), (jnp.ones_like(t),))
+
+    def newton(_, t):
+        value, slope = value_and_slope(t)
+        step = jnp.where(slope < 0, (1.0 - value) / jnp.where(slope < 0, slope, -1.0), 0.0)
+        return jnp.clip(t + jnp.maximum(step, 0.0), enter, jnp.maximum(enter, leave))
+
+    t = jax.lax.stop_gradient(jax.lax.fori_loop(0, NEWTON_STEPS, newton, jnp.maximum(enter, 0.0)))
+    value, slope = value_and_slope(t)
+    hit = (enter <= leave) & (leave > 0.0) & (value <= 1.0 + GRAZING)
+    # One more step that is differentiated: by the implicit function theorem its gradient is the crossing's.
+    slope = jax.lax.stop_gradient(slope)
+    descending = slope < -1e-6
+    refined = t + jnp.where(descending, (1.0 - value) / jnp.where(descending, slope, -1.0), 0.0)
+    return jnp.where(hit, refined, jnp.inf)
+
+
+def integrate(
+    size: Float[Array, "3"], exponents: Float[Array, "2"], origin: Float[Array, "3"], direction: Float[Array, "3"]
+) -> Float[Array, ""]:
+    """The volumetric depth of equations 10 to 12 of one superquadric, in its own frame and in units of the ray
+    parameter.
+
+    Integrated over the chord through the ellipsoid of equation 13. The finite `TAU` lets a ray sink in by 1 / TAU =
+    10 mm in the mean, which is this method's bias.
+    """
+    scaled_o, scaled_d = origin / (3.0**0.5 * size), direction / (3.0**0.5 * size)
+    a, b = jnp.sum(scaled_d**2), jnp.sum(scaled_o * scaled_d)
+    square = b**2 - a * (jnp.sum(scaled_o**2) - 1.0)
+    meets = square > 0
+    half = jnp.sqrt(jnp.where(meets, square, 1.0)) / a
+    start = jnp.maximum(-b / a - half, 0.0)
+    length = jnp.maximum(-b / a + half - start, 0.0)
+    step = length / SAMPLES
+    t = start + (jnp.arange(SAMPLES) + 0.5) * step
+    points = origin[None] + t[:, None] * direction[None]
+    value = jnp.minimum(superquadric.gauge(size, exponents, points) ** 2, 1e6)
+    occupancy = jax.nn.sigmoid(SHARPNESS * (1.0 - value))
+    metres = jnp.sqrt(jnp.sum(direction**2))
+    transparent = jnp.exp(-TAU * jnp.cumsum(occupancy) * step * metres)
+    return jnp.where(meets & (transparent[-1] < 0.5), start + jnp.sum(transparent) * step, jnp.inf)
+
+
+METHODS = {"root": cast, "volumetric": integrate}
+
+
+def object_depth(
+    scene_object: Superquadrics,
+    origin: Float[Array, "3"],
+    directions: Float[Array, "*batch 3"],
+    method: Literal["root", "volumetric"] = "root",
+) -> Float[Array, "*batch"]:
+    """Depth of one object (a `Superquadrics` without its object axis) along world rays; infinite where it is not."""
+    inverse = scene_object.rotation.T
+    local_origin = rotate(inverse, origin - scene_object.position)
+    local = rotate(inverse, directions)
+    trace = jax.vmap(METHODS[method], in_axes=(None, None, None, 0))
+    depth = trace(scene_object.size, scene_object.exponents, local_origin, local.reshape(-1, 3))
+    return jnp.where(scene_object.valid, depth, jnp.inf).reshape(local.shape[:-1])
+
+
+def render_depth(
+    camera: Camera, scene: Superquadrics, method: Literal["root", "volumetric"] = "root"
+) -> Float[Array, "h w"]:
+    """Depth image of a scene, object by object and then the nearest.
+
+    Args:
+      camera: pinhole camera; static.
+      scene: superquadrics with fields (N, ...).
+      method: "root" finds the crossing S = 1; "volumetric" integrates equations 9 to 12 (biased by 10 mm, see
+        `integrate`); static.
+
+    Returns:
+      Depth along the optical axis [m], shape (height, width); infinite where no object is seen.
+    """
+    origin, directions = jnp.array(camera.position), rays(camera)
+    each = jax.lax.map(lambda one: object_depth(one, origin, directions, method), scene)
+    return jnp.min(each, axis=0)
+
+
+def window_corner(
+    camera: Camera, scene_object: Superquadrics, window: tuple[int, int]
+) -> tuple[Int[Array, "2"], Float[Array, "2"]]:
+    """First row and column of a window of fixed size that is centred on an object's image.
+
+    Returns:
+      The corner, and by how many pixels the image of the object's bounding box exceeds the window in rows and columns
+      (0 where it fits).
+    """
+    corners = jnp.stack(jnp.meshgrid(*[jnp.array([-1.0, 1.0])] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+    T_world_object = make(scene_object.rotation, scene_object.position)
+    pixels, _ = project(camera, transform(T_world_object, corners * scene_object.size[None]))
+    low, high = jnp.min(pixels, axis=0), jnp.max(pixels, axis=0)
+    extent = jnp.array(window, jnp.float32)
+    corner = jnp.round((low + high) / 2.0 - (extent - 1.0) / 2.0)
+    corner = jnp.clip(corner, -extent, jnp.array([camera.height, camera.width], jnp.float32))
+    return corner.astype(jnp.int32), jnp.maximum(jnp.ceil(high - low) + 1.0 - extent, 0.0)
+
+
+@functools.partial(jax.jit, static_argnames=("camera", "window"))
+def object_window(
+    camera: Camera, scene_object: Superquadrics, window: tuple[int, int]
+) -> tuple[Float[Array, "h w"], Int[Array, "2"]]:
+    """Depth of one object in a window around its image, and the window's first row and column."""
+    corner, _ = window_corner(camera, scene_object, window)
+    rows, columns = jnp.meshgrid(jnp.arange(window[0]), jnp.arange(window[1]), indexing="ij")
+    directions = pixel_rays(camera, (rows + corner[0]) * 1.0, (columns + corner[1]) * 1.0)
+    return object_depth(scene_object, jnp.array(camera.position), directions), corner
+
+
+def merge_windows(
+    camera: Camera, windows: Float[Array, "n h w"], corners: Int[Array, "n 2"]
+) -> Float[Array, "height width"]:
+    """The depth image of a scene from its objects' windows."""
+    _, h, w = windows.shape
+    rows = corners[:, 0, None, None] + jnp.arange(h)[None, :, None]
+    columns = corners[:, 1, None, None] + jnp.arange(w)[None, None, :]
+    # Negative indices would wrap around to the far side of the image instead of being dropped.
+    rows = jnp.where(rows < 0, camera.height, rows)
+    columns = jnp.where(columns < 0, camera.width, columns)
+    image = jnp.full((camera.height, camera.width), jnp.inf)
+    return image.at[rows, columns].min(windows, mode="drop")

@@ -1,0 +1,216 @@
+"""Scenarios: which objects stand where on the shelf at the start of an episode, and the file they are kept in."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.resources
+import json
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import replacing
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.workspace.shelf import Shelf
+
+FORMAT = "mechsearch-scenario"
+VERSION = 1
+MAX_OBJECTS = 8
+
+_SHAPES = ("box", "cylinder")
+_BODY_KEYS = {"shape": str, "half_size": 3, "position": 3, "quaternion": 4}
+
+
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """A rigid box or cylinder on the shelf.
+
+    Attributes:
+      shape: "box" or "cylinder"; a cylinder's axis is its own z.
+      half_size: half-extents along its own axes [m]; for a cylinder (radius, radius, half its height).
+      position: of its centre in the world [m].
+      quaternion: (w, x, y, z) of its rotation in the world, a unit quaternion.
+    """
+
+    shape: Literal["box", "cylinder"]
+    half_size: tuple[float, float, float]
+    position: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario:
+    """The start of an episode.
+
+    Attributes:
+      name: what results call it.
+      objects: the surrounding objects, which the robot may move.
+      target: what it searches.
+    """
+
+    name: str
+    objects: tuple[Body, ...]
+    target: Body
+
+
+def rotation_matrix(quaternion: Sequence[float] | Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Rotation matrices of quaternions (w, x, y, z), which are normalised first; at most one leading axis."""
+    return Rotation.from_quat(np.roll(np.asarray(quaternion, float), -1, axis=-1)).as_matrix()
+
+
+def _numbers(value: Any, count: int, where: str) -> tuple[float, ...]:
+    number = isinstance(value, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+    if not number or len(value) != count:
+        raise InputError(f"{where}: must be a list of {count} numbers")
+    if not all(math.isfinite(v) for v in value):
+        raise InputError(f"{where}: holds NaN or an infinite number; every number must be finite")
+    return tuple(float(v) for v in value)
+
+
+def _check_keys(value: Any, keys: Sequence[str], where: str, key: str | None) -> None:
+    place = where if key is None else f"{where}: {key}"
+    if not isinstance(value, dict):
+        raise InputError(f"{place}: must be a JSON object with the keys {', '.join(keys)}")
+    for unknown in value.keys() - set(keys):
+        raise InputError(f'{place}: unknown key "{unknown}"; known are {", ".join(keys)}')
+    for missing in [k for k in keys if k not in value]:
+        raise InputError(f'{place}: key "{missing}" is missing')
+
+
+def _body(value: Any, where: str, key: str, shelf: Shelf) -> Body:
+    _check_keys(value, tuple(_BODY_KEYS), where, key)
+    where = f"{where}: {key}"
+    shape = value["shape"]
+    if shape not in _SHAPES:
+        raise InputError(f'{where}.shape: {json.dumps(shape)} is unknown; use "box" or "cylinder"')
+    half_size = _numbers(value["half_size"], 3, f"{where}.half_size")
+    position = _numbers(value["position"], 3, f"{where}.position")
+    quaternion = _numbers(value["quaternion"], 4, f"{where}.quaternion")
+    if min(half_size) <= 0:
+        raise InputError(f"{where}.half_size: {list(half_size)} must be positive lengths in metres")
+    if shape == "cylinder" and half_size[0] != half_size[1]:
+        raise InputError(f"{where}.half_size: a cylinder's first two are its radius and must be equal")
+    if abs(math.hypot(*quaternion) - 1.0) > 1e-3:
+        raise InputError(f"{where}.quaternion: its norm is {math.hypot(*quaternion):.4g}; it must be 1 (w, x, y, z)")
+    ranges = ((shelf.front, shelf.back), (shelf.right, shelf.left), (shelf.board, shelf.ceiling))
+    for axis, p, (low, high) in zip("xyz", position, ranges, strict=True):
+        if not low <= p <= high:
+            raise InputError(
+                f"{where}.position: {axis} = {p:g} is off the board, which reaches from {low:g} to {high:g}"
+            )
+    return Body(shape, half_size, position, quaternion)  # pyright: ignore[reportArgumentType]
+
+
+def parse_scenario(value: Any, where: str, shelf: Shelf | None = None) -> Scenario:
+    """A scenario from parsed JSON.
+
+    Args:
+      value: what a JSON parser made of the file.
+      where: how to name the file in messages.
+      shelf: the shelf that the bodies must stand on; the default shelf if None.
+
+    Raises:
+      InputError: the format or version is another one; a key is unknown or missing; a number is not finite; a size is
+        not positive; a quaternion is not of unit length; a body is off the board.
+    """
+    shelf = shelf or Shelf()
+    _check_keys(value, ("format", "version", "name", "objects", "target"), where, None)
+    if value["format"] != FORMAT:
+        raise InputError(f'{where}: format: {json.dumps(value["format"])} is not "{FORMAT}"')
+    if value["version"] != VERSION or isinstance(value["version"], bool):
+        raise InputError(
+            f"{where}: version: {json.dumps(value['version'])} is not supported; this program reads {VERSION}"
+        )
+    if not isinstance(value["name"], str) or not value["name"]:
+        raise InputError(f"{where}: name: must be a text that is not empty")
+    if not isinstance(value["objects"], list):
+        raise InputError(f"{where}: objects: must be a list")
+    if len(value["objects"]) > MAX_OBJECTS:
+        raise InputError(f"{where}: objects: {len(value['objects'])} are too many; at most {MAX_OBJECTS} fit")
+    objects = tuple(_body(b, where, f"objects[{i}]", shelf) for i, b in enumerate(value["objects"]))
+    return Scenario(value["name"], objects, _body(value["target"], where, "target", shelf))
+
+
+def load_scenario(path: str | os.PathLike[str], shelf: Shelf | None = None) -> Scenario:
+    """Read a scenario file (JSON; docs/method.md, "Files").
+
+    Raises:
+      InputError: the file cannot be read, is not JSON, or fails a check of `parse_scenario`.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not a text file in UTF-8") from error
+    try:
+        value = json.loads(text)
+    except (json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
+    return parse_scenario(value, str(path), shelf)
+
+
+def is_another_format(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a JSON object that does not even look like a scenario: it has neither `format` nor `target`.
+
+    What cannot be read or parsed may be a broken scenario, and is left to `load_scenario` to complain about.
+    """
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(value, dict) and not {"format", "target"} & set(value)
+
+
+def format_scenario(scenario: Scenario) -> str:
+    """The text of a scenario's file."""
+    value = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(scenario)}
+    return json.dumps(value, indent=1, allow_nan=False) + "\n"
+
+
+def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
+    """Write a scenario file; a file that is already there is replaced as a whole or left as it is.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    text = format_scenario(scenario)
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def superquadrics(bodies: Sequence[Body], capacity: int = MAX_OBJECTS) -> Superquadrics:
+    """Bodies as the planner sees them when it knows them exactly.
+
+    Args:
+      bodies: at most `capacity` of them.
+      capacity: number of slots; the ones left over are masked out.
+
+    Raises:
+      InputError: there are more bodies than slots.
+    """
+    exponents = {"box": superquadric.BOX_EXPONENTS, "cylinder": superquadric.CYLINDER_EXPONENTS}
+    known = Superquadrics(
+        size=jnp.array([b.half_size for b in bodies], jnp.float32).reshape(-1, 3),
+        exponents=jnp.array([exponents[b.shape] for b in bodies], jnp.float32).reshape(-1, 2),
+        position=jnp.array([b.position for b in bodies], jnp.float32).reshape(-1, 3),
+        rotation=jnp.array([rotation_matrix(b.quaternion) for b in bodies], jnp.float32).reshape(-1, 3, 3),
+        valid=jnp.ones(len(bodies), bool),
+    )
+    return superquadric.pad(known, capacity)
+
+
+def example_scenarios() -> dict[str, Path]:
+    """The scenarios that ship with the package: their names and the files they are in."""
+    folder = importlib.resources.files("mechsearch_jax") / "data"
+    files = [Path(str(file)) for file in folder.iterdir() if file.name.endswith(".json")]
+    return {file.stem: file for file in sorted(files)}

@@ -1,0 +1,82 @@
+"""The shelf as the planner and the simulator know it: a box of free space, open at the front (-x)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Shelf:
+    """Inner faces of the shelf in the robot's base frame [m]; +x points into the shelf, z up (docs/method.md,
+    "Facts of the scene").
+
+    Attributes:
+      front: x of the board's front edge.
+      back: x of the back wall's face.
+      right: y of the side wall with the smaller y.
+      left: y of the side wall with the larger y.
+      board: z of the board's top, on which objects stand.
+      ceiling: z of the upper board's underside.
+      thickness: thickness of the boards.
+      side_margin: how much closer than they are the planner takes the side walls to be.
+      ceiling_margin: the same for the upper board.
+      spawn_x: range of x in which the generator drops object centres.
+      spawn_y: the same for y.
+    """
+
+    front: float = 0.414
+    back: float = 0.788
+    right: float = -0.2835
+    left: float = 0.4835
+    board: float = 0.4045
+    ceiling: float = 0.773
+    thickness: float = 0.022
+    side_margin: float = 0.009
+    ceiling_margin: float = 0.011
+    spawn_x: tuple[float, float] = (0.45, 0.73)
+    spawn_y: tuple[float, float] = (-0.18, 0.38)
+
+    def __post_init__(self):
+        for low, high in (("front", "back"), ("right", "left"), ("board", "ceiling")):
+            if not getattr(self, low) < getattr(self, high):
+                raise InputError(f"Shelf: {low} ({getattr(self, low)}) must be below {high} ({getattr(self, high)})")
+
+
+def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
+    """Whether world points are in the shelf, whose sides and ceiling are taken closer by their margins.
+
+    Everything beyond the front edge has to be inside the free box, or counts as in the shelf.
+    """
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    inside = (
+        (x <= shelf.back)
+        & (y >= shelf.right + shelf.side_margin)
+        & (y <= shelf.left - shelf.side_margin)
+        & (z >= shelf.board)
+        & (z <= shelf.ceiling - shelf.ceiling_margin)
+    )
+    return (x > shelf.front) & ~inside
+
+
+def spheres_hit_shelf(
+    shelf: Shelf, centres: Float[Array, "*batch n 3"], radii: Float[Array, " n"]
+) -> Bool[Array, "*batch n"]:
+    """Whether spheres touch what `hits_shelf` is true for; one in front of the shelf may bulge past its front edges.
+
+    Args:
+      shelf: the shelf.
+      centres: in the world [m].
+      radii: above 0 [m].
+    """
+    x, y, z = centres[..., 0], centres[..., 1], centres[..., 2]
+    to_wall = jnp.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
+    to_board = jnp.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
+    beside = jnp.maximum(jnp.minimum(to_wall, to_board), 0.0)
+    before = jnp.maximum(shelf.front - x, 0.0)
+    radii = radii.reshape((1,) * (x.ndim - 1) + radii.shape)
+    return (beside**2 + before**2 < radii**2) | (x + radii > shelf.back)

@@ -1,0 +1,77 @@
+"""The known target object and the finite set of poses it may have (paper section 3)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.workspace.shelf import Shelf
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """An upright target of known shape.
+
+    Attributes:
+      shape: "cylinder" or "box".
+      half_size: half-extents [m].
+      grid: number of candidate positions in x and y.
+      inset: distance between the outermost candidate positions and the board's edges [m].
+      yaws: number of candidate yaw angles over half a turn; 1 for the cylinder, which looks the same from all sides.
+    """
+
+    shape: Literal["cylinder", "box"] = "cylinder"
+    half_size: tuple[float, float, float] = (0.02, 0.02, 0.05)
+    grid: tuple[int, int] = (18, 44)
+    inset: float = 0.05
+    yaws: int = 1
+
+    def __post_init__(self):
+        if self.shape not in ("cylinder", "box"):
+            raise InputError(f'Target: shape "{self.shape}" is unknown; use "cylinder" or "box"')
+        if len(self.half_size) != 3 or not all(s > 0 for s in self.half_size):
+            raise InputError(f"Target: half_size {self.half_size} must be three positive lengths in metres")
+        if min(self.grid) < 2 or self.yaws < 1:
+            raise InputError(
+                f"Target: grid {self.grid} needs at least 2 positions an axis and yaws {self.yaws} at least 1"
+            )
+
+    @classmethod
+    def cylinder(cls) -> Target:
+        return cls()
+
+    @classmethod
+    def box(cls) -> Target:
+        return cls(shape="box", half_size=(0.015, 0.02, 0.05), yaws=6)
+
+    @property
+    def exponents(self) -> tuple[float, float]:
+        return superquadric.CYLINDER_EXPONENTS if self.shape == "cylinder" else superquadric.BOX_EXPONENTS
+
+    def height(self, shelf: Shelf) -> float:
+        """z of the centre of a target that stands on the board [m]."""
+        return shelf.board + self.half_size[2]
+
+    def candidate_poses(self, shelf: Shelf) -> Float[np.ndarray, "x 3"]:
+        """The candidate poses X as rows of x, y [m] and yaw [rad], yaw varying fastest and x slowest.
+
+        The outermost positions are `inset` from the board's edges, so that the spacing is 15 to 16 mm for the default
+        shelf.
+        """
+        x = np.linspace(shelf.front + self.inset, shelf.back - self.inset, self.grid[0])
+        y = np.linspace(shelf.right + self.inset, shelf.left - self.inset, self.grid[1])
+        yaw = np.arange(self.yaws) * np.pi / self.yaws
+        return np.stack(np.meshgrid(x, y, yaw, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
+
+    def cell(self, shelf: Shelf) -> tuple[float, float, float]:
+        """Spacing of the candidate poses in x, y [m] and yaw [rad]."""
+        return (
+            (shelf.back - shelf.front - 2 * self.inset) / (self.grid[0] - 1),
+            (shelf.left - shelf.right - 2 * self.inset) / (self.grid[1] - 1),
+            np.pi / self.yaws if self.yaws > 1 else 0.0,
+        )

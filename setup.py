@@ -1,0 +1,13 @@
+"""Which packages there are: those in `mechsearch_jax`, and the folders beside it, which are installed beneath it."""
+
+from setuptools import find_packages, setup
+
+BESIDE = ("envs", "train", "benchmarks")
+
+setup(
+    packages=[
+        *find_packages(include=["mechsearch_jax", "mechsearch_jax.*"]),
+        *(f"mechsearch_jax.{name}" for name in find_packages(include=[p for b in BESIDE for p in (b, f"{b}.*")])),
+    ],
+    package_dir={f"mechsearch_jax.{name}": name for name in BESIDE},
+)

@@ -1,0 +1,142 @@
+"""A stage for episodes: two scenes, worlds in which actions do what a test says, and a policy that plans nothing."""
+
+import dataclasses
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action
+from mechsearch_jax.envs.outcome import Failure, Outcome, Overflow
+from mechsearch_jax.envs.world import BODIES, TARGET, from_scenario
+from mechsearch_jax.planner import Decision, Sequences, graspable_at
+from mechsearch_jax.workspace.scenario import Body, Scenario
+
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+BOX = Body("box", (0.048, 0.028, 0.08), (0.5, 0.135, 0.4845), UPRIGHT)
+CYLINDER = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), UPRIGHT)
+HIDDEN = Scenario("hidden", (BOX,), CYLINDER)
+OPEN = Scenario("open", (dataclasses.replace(BOX, position=(0.6, -0.2, 0.4845)),), CYLINDER)
+TWO = Scenario("two", (BOX, dataclasses.replace(BOX, position=(0.6, -0.15, 0.4845))), CYLINDER)
+
+
+def reveal(world):
+    """Put the box out of the way."""
+    return world.replace(position=world.position.at[0].set(jnp.array([0.6, -0.2, 0.4845])))
+
+
+def topple(world):
+    lying = jnp.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    return reveal(world).replace(rotation=world.rotation.at[TARGET].set(lying))
+
+
+class Stage:
+    """A simulator in which actions do what a test says: for all worlds, or by the scenario that a world began with.
+
+    Attributes:
+      actions: those that moved an object, one by one.
+      executed: for each call the scenarios of the worlds that acted, None for those that did not.
+    """
+
+    engine = "Stage"
+
+    def __init__(self, acts=None, failures=Failure.NONE, retrievals=Failure.NONE, overflows=Overflow.NONE):
+        self.world = None
+        self.actions, self.executed, self.names = [], [], []
+        self._told = {"acts": acts, "failures": failures, "retrievals": retrievals, "overflows": overflows}
+
+    def _of(self, what, name, default):
+        told = self._told[what]
+        return told.get(name, default) if isinstance(told, dict) else default if told is None else told
+
+    def reset(self, scenarios):
+        self.names = [None] * len(scenarios)
+        self._worlds = [None] * len(scenarios)
+        return self.replace(dict(enumerate(scenarios)))
+
+    def replace(self, scenarios):
+        for i, scenario in scenarios.items():
+            self.names[i], self._worlds[i] = scenario.name, from_scenario(scenario)
+        return self._gather()
+
+    def load(self, world, only=None):
+        raise NotImplementedError
+
+    def settle(self, active=None):
+        raise NotImplementedError
+
+    def execute(self, actions, active=None):
+        count = len(self.names)
+        active = np.ones(count, bool) if active is None else active
+        self.executed.append([self.names[i] if active[i] else None for i in range(count)])
+        outcome = Outcome(
+            *(np.zeros(count, np.int32), np.ones(count, np.int32), np.ones(count, bool)),
+            *(np.zeros((count, BODIES), bool), np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, bool)),
+            np.zeros(count, np.int32),
+        )
+        for i in np.flatnonzero(active):
+            name = self.names[i]
+            outcome.overflow[i] = self._of("overflows", name, Overflow.NONE)
+            if KINDS[ActionKind(int(actions.kind[i]))].takes_target:
+                outcome.failure[i] = self._of("retrievals", name, Failure.NONE)
+                outcome.retrieved[i] = outcome.failure[i] == Failure.NONE
+            else:
+                self.actions.append(jax.tree.map(lambda a, i=i: a[i], actions))
+                outcome.failure[i] = self._of("failures", name, Failure.NONE)
+                self._worlds[i] = self._of("acts", name, lambda world: world)(self._worlds[i])
+        self._gather()
+        return jax.tree.map(jnp.asarray, outcome)
+
+    def _gather(self):
+        self.world = jax.tree.map(lambda *leaves: jnp.stack(leaves), *self._worlds)
+        return self.world
+
+
+class Grab(flax.struct.PyTreeNode):
+    """A policy: takes the target out as soon as it can be, and else pushes the first object, by a random distance.
+
+    Attributes:
+      charge: is added to the cost before the target is found.
+    """
+
+    charge: float = 1.0
+
+    def __call__(self, key, problem, belief, observation):
+        grasp = graspable_at(problem, observation.objects, belief.found_pose, belief.found)
+        able = belief.found & grasp.success
+        distance = jax.random.uniform(key, minval=0.05, maxval=0.15)
+        T = jnp.eye(4).at[:3, 3].set(jnp.array([0.5, 0.0, 0.5]))
+        push = Action(
+            kind=jnp.int32(ActionKind.PUSH),
+            object=jnp.int32(0),
+            T_world_gripper=T,
+            displacement=jnp.array([0.0, 1.0, 0.0]) * distance,
+            T_world_place=T.at[1, 3].add(distance),
+            q7=jnp.float32(0.7),
+            opening=jnp.float32(0.0),
+        )
+        cost = jnp.where(able, 1.0, jnp.sum(belief.exists) + jnp.where(belief.found, 1.0, self.charge))
+        tried = jnp.where(able, jnp.inf, -1.0)[None]
+        return Decision(
+            action=jax.tree.map(lambda a, b: jnp.where(able, a, b), grasp.action, push),
+            value=tried[0],
+            cost=cost,
+            predicted_cost=jnp.where(able, jnp.nan, cost - 1.0),
+            predicted=observation.objects,
+            sequences=Sequences(
+                actions=jax.tree.map(lambda a: a[None, None], push),
+                cost=cost[None, None] - 1.0,
+                value=tried,
+                length=jnp.ones(1, jnp.int32),
+            ),
+            overflow=jnp.array(False),
+        )
+
+
+grab = Grab()
+
+
+def idle(key, problem, belief, observation):
+    """Sees no action that is possible, not even taking the target out."""
+    return grab(key, problem, belief, observation).replace(action=no_action())

@@ -1,0 +1,143 @@
+"""Batches of jobs: rows for all of them, whatever fails, and the same after a kill."""
+
+import dataclasses
+
+import jax
+import pytest
+from stage import HIDDEN, OPEN
+
+from mechsearch_jax.benchmarks import batches
+from mechsearch_jax.benchmarks.batches import Batches, fitting_worlds
+from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
+from mechsearch_jax.benchmarks.rows import identity, read_rows
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.mjx_simulator import MjxSimulator
+from mechsearch_jax.envs.native import NativeSimulator
+from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.planner import PRESETS
+from mechsearch_jax.workspace.scenario import save_scenario
+
+METHOD = Method(config=PRESETS["standard"](max_steps=2))
+
+
+@pytest.fixture
+def files(tmp_path):
+    scenes = [dataclasses.replace(scene, name=f"{scene.name}-{i}") for i in range(2) for scene in (HIDDEN, OPEN)]
+    for scene in scenes:
+        save_scenario(scene, tmp_path / f"{scene.name}.json")
+    return [tmp_path / f"{scene.name}.json" for scene in scenes]
+
+
+def jobs_of(files, seeds=(0,)):
+    return make_jobs(files, [METHOD], seeds)
+
+
+class Stand:
+    """Stands in for `run_episodes`: ends the episodes one by one, and fails when a test says so."""
+
+    def __init__(self, problem, monkeypatch, fail=lambda place, slots: None):
+        self.slots = []
+        self._fail = fail
+        monkeypatch.setattr(batches, "run_episodes", self)
+        monkeypatch.setattr(batches, "cached_problem", lambda target, config: problem)
+
+    def __call__(self, starts, problem, policy, simulator, slots, ended, *, max_steps, options, **rest):
+        assert max_steps == METHOD.config.max_steps
+        self.slots.append(slots)
+        for place, start in enumerate(starts):
+            error = self._fail(start.scenario.name, slots)
+            if error:
+                raise error
+            scene = start.scenario
+            config = {**options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
+            ended([(place, Episode(scene.name, len(scene.objects), config, {}, (), 0, 0, False, "not found"))])
+
+
+def test_every_job_becomes_a_row_with_its_options(problem, tmp_path, files, monkeypatch):
+    stand = Stand(problem, monkeypatch)
+    jobs = jobs_of(files, seeds=(0, 1))
+    rows = evaluate(jobs, tmp_path / "rows.parquet", Batches(worlds=3))
+    assert [(r.scenario, r.seed) for r in rows] == [(j.scenario.name, j.seed) for j in jobs]
+    assert {identity(r) for r in rows} == {identity(j.failed("")) for j in jobs}
+    assert stand.slots == [3]
+
+
+def test_where_memory_does_not_suffice_it_goes_on_with_half_the_worlds(problem, tmp_path, files, monkeypatch):
+    def fail(name, slots):
+        return jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory") if slots > 1 else None
+
+    stand = Stand(problem, monkeypatch, fail)
+    rows = evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=4))
+    assert stand.slots == [4, 2, 1]
+    assert all(row.failure == "not found" for row in rows)
+
+
+def test_where_memory_does_not_suffice_for_one_world_the_run_ends(problem, tmp_path, files, monkeypatch):
+    stand = Stand(problem, monkeypatch, lambda name, slots: jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: full"))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="full"):
+        evaluate(jobs_of(files[:2]), tmp_path / "rows.parquet", Batches(worlds=16))
+    assert stand.slots == [16, 1]
+
+
+def test_an_error_of_the_device_costs_its_episode_alone(problem, tmp_path, files, monkeypatch):
+    def fail(name, slots):
+        return jax.errors.JaxRuntimeError("INTERNAL: no luck") if name == "hidden-1" else None
+
+    stand = Stand(problem, monkeypatch, fail)
+    rows = evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=1))
+    assert stand.slots == [1, 1]
+    assert [row.failure for row in rows if row.scenario == "hidden-1"] == ["error: JaxRuntimeError: INTERNAL: no luck"]
+    assert sum(row.failure == "not found" for row in rows) == 3
+
+
+def test_what_fails_in_a_batch_is_a_row_and_the_others_go_on(problem, tmp_path, files, monkeypatch):
+    Stand(problem, monkeypatch, lambda name, slots: ValueError("out of\nluck") if name == "hidden-1" else None)
+    rows = evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=2))
+    assert {r.scenario: r.failure for r in rows} == {
+        "hidden-0": "not found",
+        "open-0": "not found",
+        "hidden-1": "error: ValueError: out of luck",
+        "open-1": "not found",
+    }
+
+
+def test_what_fails_at_once_ends_the_run(problem, tmp_path, files, monkeypatch):
+    Stand(problem, monkeypatch, lambda name, slots: ValueError("never"))
+    with pytest.raises(ValueError, match="never"):
+        evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=2))
+    assert read_rows(tmp_path / "rows.parquet") == []
+
+
+@pytest.mark.slow
+def test_a_run_that_was_killed_goes_on_to_the_same_rows(tmp_path, files):
+    def facts(rows):
+        return [dataclasses.replace(row, planning_seconds=0.0, simulation_seconds=0.0) for row in rows]
+
+    def stop(row, rows):
+        raise KeyboardInterrupt
+
+    jobs = jobs_of(files)
+    whole = evaluate(jobs, tmp_path / "whole.parquet", Batches(worlds=2))
+    out = tmp_path / "killed.parquet"
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(jobs, out, Batches(worlds=2), stop)
+    kept = read_rows(out)
+    assert 0 < len(kept) < len(jobs)
+    rows = evaluate(jobs, out, Batches(worlds=2))
+    assert facts(rows) == facts(whole)
+    assert len(read_rows(out)) == len(jobs)
+    assert read_rows(out)[: len(kept)] == kept
+
+
+def test_the_memory_of_the_device_bounds_the_worlds(monkeypatch):
+    simulator = MjxSimulator()
+    assert fitting_worlds(NativeSimulator()) == batches.MOST_WORLDS_ON_CPU
+    assert 1e5 < simulator.bytes_per_world() < 1e7
+
+    class Device:
+        def memory_stats(self):
+            return {"bytes_limit": 100 * simulator.bytes_per_world()}
+
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(jax, "local_devices", lambda: [Device()])
+    assert fitting_worlds(simulator) == 40

@@ -1,0 +1,256 @@
+"""Many episodes: rows as they end, none missing or double, whatever is killed; and failures that are rows."""
+
+import dataclasses
+import io
+import json
+import sys
+
+import pyarrow.parquet
+import pytest
+from rich.console import Console
+
+from mechsearch_jax import versions
+from mechsearch_jax.benchmarks import evaluate as benchmark
+from mechsearch_jax.benchmarks import tables
+from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs, present_code
+from mechsearch_jax.benchmarks.processes import Processes
+from mechsearch_jax.benchmarks.rates import summarise
+from mechsearch_jax.benchmarks.rows import identity, read_code, read_rows, write_rows
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
+
+standard = PRESETS["standard"]
+TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
+
+# Stands in for the real worker: says what a scenario's name asks for.
+FAKE = """
+import json, os, pathlib, sys
+
+def settings(config, path=""):
+    for name, value in config.items():
+        yield from settings(value, path + name + ".") if isinstance(value, dict) else [(path + name, value)]
+
+names = json.loads(os.environ["OPTIONS"])
+for line in sys.stdin:
+    job = json.loads(line)
+    name = json.loads(pathlib.Path(job["path"]).read_text())["name"]
+    with open(os.environ["LOG"], "a") as log:
+        log.write(name + "\\n")
+    if name == "crash":
+        print("out of luck", file=sys.stderr, flush=True)
+        os._exit(3)
+    method = job["method"]
+    options = {names[path]: value for path, value in settings(method["config"]) if path in names}
+    options.update(policy=method["name"], recognition="oracle", simulator="NativeSimulator")
+    columns = ("policy", "recognition", "gamma", "horizon", "sequences")
+    row = dict({column: options[column] for column in columns}, actions="+".join(options["actions"]), scenario=name,
+               objects=0, target="cylinder", seed=job["seed"], found_step=1, graspable_step=2, retrieved=True, steps=3,
+               failure=None, planning_seconds=1.0, simulation_seconds=0.5)
+    row["configuration"] = json.dumps(options, sort_keys=True)
+    if name == "confused":
+        row["gamma"] = 0.123
+    print(json.dumps({"error": "ValueError: no"} if name == "raise" else {"row": row}), flush=True)
+"""
+
+
+@pytest.fixture
+def files(tmp_path):
+    names = ("one", "two", "crash", "raise", "three")
+    for name in names:
+        save_scenario(Scenario(name, (), TARGET), tmp_path / f"{name}.json")
+    return [tmp_path / f"{name}.json" for name in names]
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch):
+    monkeypatch.setenv("LOG", str(tmp_path / "log"))
+    monkeypatch.setenv("OPTIONS", json.dumps({".".join(option.path): option.name for option in OPTIONS}))
+    return (sys.executable, "-c", FAKE)
+
+
+def ran(tmp_path):
+    return sorted((tmp_path / "log").read_text().split())
+
+
+def test_all_combinations_become_rows(tmp_path, files, command):
+    jobs = make_jobs([files[0], files[1]], [Method(), Method("search-and-grasp")], (0, 1))
+    rows = evaluate(jobs, tmp_path / "rows.parquet", Processes(2, command))
+    assert len(rows) == len({identity(row) for row in rows}) == 8
+    assert sorted(map(identity, read_rows(tmp_path / "rows.parquet"))) == sorted(map(identity, rows))
+
+
+def test_failures_are_rows_with_their_reason_and_do_not_end_the_run(tmp_path, files, command):
+    rows = evaluate(make_jobs(files, [Method()], (0,)), tmp_path / "rows.parquet", Processes(1, command))
+    reasons = {row.scenario: row.failure for row in rows}
+    assert reasons == {
+        "one": None,
+        "two": None,
+        "crash": "error: the worker process ended with status 3: out of luck",
+        "raise": "error: ValueError: no",
+        "three": None,
+    }
+
+
+def test_a_stopped_run_goes_on_where_it_was(tmp_path, files, command):
+    out = tmp_path / "rows.parquet"
+    jobs = make_jobs(files, [Method()], (0,))
+
+    def stop(row, rows):
+        if len(rows) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(jobs, out, Processes(1, command), ended=stop)
+    first = read_rows(out)
+    assert len(first) == 2
+    rows = evaluate(jobs, out, Processes(1, command))
+    assert [row.scenario for row in rows] == ["one", "two", "crash", "raise", "three"]
+    assert read_rows(out)[:2] == first
+    (tmp_path / "log").write_text("")
+    assert evaluate(jobs, out, Processes(1, command)) == rows
+    assert ran(tmp_path) == []
+
+
+def test_rows_of_other_options_stay(tmp_path, files, command):
+    out = tmp_path / "rows.parquet"
+    for gamma in (0.9, 0.5):
+        rows = evaluate(make_jobs(files[:1], [Method(config=standard(gamma=gamma))], (0,)), out, Processes(1, command))
+        assert [row.gamma for row in rows] == [gamma]
+    assert sorted(row.gamma for row in read_rows(out)) == [0.5, 0.9]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"criterion": "depth-mse"},
+        {"max_steps": 5},
+        {"unseen_contact_penalty": 0.5},
+        {"push_distances": (0.1,)},
+        {"push_model": "physics"},
+        {"topple_charge": 0.5},
+    ],
+    ids=lambda other: next(iter(other)),
+)
+def test_every_option_tells_rows_apart(tmp_path, files, command, other):
+    out = tmp_path / "rows.parquet"
+    for method in (Method(), Method(config=standard(**other)), Method()):
+        rows = evaluate(make_jobs(files[:1], [method], (0,)), out, Processes(1, command))
+        assert len(rows) == 1
+    assert ran(tmp_path) == ["one", "one"]
+    both = read_rows(out)
+    assert len(both) == 2
+    assert len({identity(row) for row in both}) == 2
+    assert [rates.episodes for rates in summarise(both)] == [1] * 4
+
+
+def test_rows_that_do_not_say_how_they_ran_are_kept_but_not_believed(tmp_path, files, command):
+    out = tmp_path / "rows.parquet"
+    jobs = make_jobs(files[:1], [Method()], (0,))
+    (row,) = evaluate(jobs, out, Processes(1, command))
+    table = pyarrow.parquet.read_table(out)
+    pyarrow.parquet.write_table(table.drop_columns(["configuration"]), out)
+    evaluate(jobs, out, Processes(1, command))
+    assert ran(tmp_path) == ["one", "one"]
+    assert read_rows(out) == [dataclasses.replace(row, configuration=None), row]
+
+
+def test_rows_of_other_code_are_not_added_to(tmp_path, files, command, monkeypatch):
+    out = tmp_path / "rows.parquet"
+    evaluate(make_jobs(files[:1], [Method()], (0,)), out, Processes(1, command))
+    assert read_code(out) == present_code()
+    before = out.read_bytes()
+    monkeypatch.setattr(benchmark, "present_code", lambda: "mechsearch-jax 9.9 (abc)")
+    with pytest.raises(InputError, match=r"rows.parquet: .* run by mechsearch-jax 0.* is mechsearch-jax 9.9 \(abc\);"):
+        evaluate(make_jobs(files[:2], [Method()], (0,)), out, Processes(1, command))
+    assert out.read_bytes() == before
+    assert ran(tmp_path) == ["one"]
+
+    # A table that does not say what ran it may be anything.
+    write_rows(read_rows(out), out)
+    with pytest.raises(InputError, match="does not say which"):
+        evaluate(make_jobs(files[:1], [Method()], (0,)), out, Processes(1, command))
+
+
+def test_the_code_is_that_of_planner_perception_and_environment(tmp_path, monkeypatch):
+    inside = ["planner", "perception/far", "commands", "networks"]
+    for name in (*(f"mechsearch_jax/{folder}" for folder in inside), "mechsearch_jax.envs"):
+        (tmp_path / name).mkdir(parents=True)
+        for file in ("one.py", "network.npz", "network.json"):
+            (tmp_path / name / file).write_text(name)
+    monkeypatch.setattr(versions.importlib.resources, "files", lambda package: tmp_path / package)
+    before = present_code.__wrapped__()
+    for decides, change in (
+        (False, "mechsearch_jax/commands/one.py"),
+        (False, "mechsearch_jax/networks/network.json"),
+        (True, "mechsearch_jax/planner/one.py"),
+        (True, "mechsearch_jax/planner/two.py"),
+        (True, "mechsearch_jax.envs/one.py"),
+        (True, "mechsearch_jax/perception/far/one.py"),
+        (True, "mechsearch_jax/networks/network.npz"),
+    ):
+        (tmp_path / change).write_text("changed")
+        after = present_code.__wrapped__()
+        assert (after != before) == decides, change
+        before = after
+
+
+def test_a_worker_that_cannot_be_started_makes_rows_too(tmp_path, files):
+    jobs = make_jobs(files[:2], [Method()], (0,))
+    rows = evaluate(jobs, tmp_path / "rows.parquet", Processes(1, (str(tmp_path / "nothing"),)))
+    assert all("FileNotFoundError" in str(row.failure) for row in rows)
+
+
+def test_a_worker_that_ran_something_else_is_not_believed(tmp_path, command):
+    save_scenario(Scenario("confused", (), TARGET), tmp_path / "confused.json")
+    jobs = make_jobs([tmp_path / "confused.json"], [Method()], (0,))
+    (row,) = evaluate(jobs, tmp_path / "rows.parquet", Processes(1, command))
+    assert row.failure == "error: the worker ran the episode with other options than those asked for"
+
+
+def test_a_method_that_cannot_be_used_is_told_of_before_any_episode(tmp_path, files):
+    for method, message in (
+        (Method("guess"), 'policy "guess" is unknown'),
+        (Method("nobody.there:Mine"), "nobody"),
+        (Method(recognition="fog"), 'recognition "fog" is unknown'),
+    ):
+        with pytest.raises(InputError, match=message):
+            make_jobs(files[:1], [Method(), method], (0,))
+
+
+def test_another_table_is_not_overwritten(tmp_path, files, command):
+    (tmp_path / "rows.parquet").write_text("mine")
+    with pytest.raises(InputError):
+        evaluate(make_jobs(files[:1], [Method()], (0,)), tmp_path / "rows.parquet", Processes(1, command))
+    assert (tmp_path / "rows.parquet").read_text() == "mine"
+
+
+def test_progress_and_rates_are_shown(tmp_path, files, command):
+    screen = io.StringIO()
+    console = Console(file=screen, width=100)
+    with tables.EpisodeProgress(console, 3) as progress:
+        jobs = make_jobs([files[0], files[1], files[3]], [Method()], (0,))
+        rows = evaluate(jobs, tmp_path / "rows.parquet", Processes(1, command), ended=progress.ended)
+    console.print(tables.rates_table(rows))
+    text = screen.getvalue()
+    assert "3/3 raise: error: ValueError: no" in text
+    everything = next(line for line in text.splitlines() if " all " in line)
+    assert everything.split()[:6] == ["search-for-grasp", "all", "3", "0.67", "0.67", "0.67"]
+
+
+def test_a_policy_of_another_module_reaches_the_worker(tmp_path, files, monkeypatch):
+    source = (
+        "import os",
+        "def Mine(config, **push_models):",
+        "    if 'PJRT_NPROC' in os.environ:",
+        "        raise RuntimeError(f'gamma {config.gamma} arrived')",
+        "    return print",
+    )
+    (tmp_path / "their_lab.py").write_text("\n".join(source))
+    monkeypatch.delenv("PJRT_NPROC", raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    method = Method("their_lab:Mine", standard(gamma=0.25))
+    (row,) = evaluate(make_jobs(files[:1], [method], (0,)), tmp_path / "rows.parquet", Processes(1))
+    assert (row.policy, row.gamma) == ("their_lab:Mine", 0.25)
+    assert row.failure == "error: RuntimeError: gamma 0.25 arrived"

@@ -1,0 +1,88 @@
+"""Reports: the numbers are those of the rows, in every file, and no two configurations share a line."""
+
+import csv
+import dataclasses
+import json
+
+import pytest
+from matplotlib import image
+
+from mechsearch_jax.benchmarks import report
+from mechsearch_jax.benchmarks.rates import summarise, wilson
+from mechsearch_jax.benchmarks.rows import Row, write_rows
+from mechsearch_jax.errors import InputError
+
+WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)
+LOST = dataclasses.replace(
+    WON, scenario="b", graspable_step=None, retrieved=False, steps=10, failure="found, but not graspable"
+)
+BROKEN = LOST.__class__(
+    "c", 8, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0,
+    None, None, False, 0, "error: a | b\nc", 0.0, 0.0,
+)  # fmt: skip
+OTHER = dataclasses.replace(WON, policy="search-and-grasp")
+ROWS = [WON, LOST, BROKEN, OTHER]
+
+
+def test_goals_are_reached_once_and_for_all():
+    assert report.reached(ROWS, "found", 4) == [0, 3, 3, 3, 3]
+    assert report.reached(ROWS, "graspable", 4) == [0, 0, 2, 2, 2]
+    assert report.reached(ROWS, "retrieved", 4) == [0, 0, 0, 2, 2]
+
+
+def test_failures_are_counted_by_reason():
+    assert report.failures(ROWS) == [
+        report.Failures("search-for-grasp", "found, but not graspable", 1, 1 / 3),
+        report.Failures("search-for-grasp", "error: a | b\nc", 1, 1 / 3),
+    ]
+
+
+def test_a_report_holds_what_the_rows_say(tmp_path):
+    report.write_report(ROWS, tmp_path / "new")
+    assert {path.name for path in (tmp_path / "new").iterdir()} == set(report.FILES)
+    with open(tmp_path / "new" / "rates.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [(line["method"], line["objects"], line["episodes"], line["errors"]) for line in lines] == [
+        ("search-and-grasp", "2", "1", "0"),
+        ("search-and-grasp", "all", "1", "0"),
+        ("search-for-grasp", "2", "2", "0"),
+        ("search-for-grasp", "8", "1", "1"),
+        ("search-for-grasp", "all", "3", "1"),
+    ]
+    low, high = wilson(1, 3)
+    assert (float(lines[-1]["retrieved"]), float(lines[-1]["retrieved_low"])) == pytest.approx((1 / 3, low))
+    value = json.loads((tmp_path / "new" / "rates.json").read_text())
+    assert value["rates"][-1]["retrieved_high"] == pytest.approx(high)
+    assert value["failures"][0]["reason"] == "found, but not graspable"
+    text = (tmp_path / "new" / "report.md").read_text()
+    assert f"| search-for-grasp | all | 3 | 1 | 0.67 (0.21 to 0.94) | 0.33 ({low:.2f} to {high:.2f}) |" in text
+    assert "| search-for-grasp | error: a \\| b c | 1 | 0.33 |" in text
+    assert "](success.png)" in text
+    assert image.imread(tmp_path / "new" / "success.png").std() > 0.01
+
+
+def test_a_report_of_one_success_has_no_failures(tmp_path):
+    report.write_report([WON], tmp_path)
+    assert "None did." in (tmp_path / "report.md").read_text()
+    assert (tmp_path / "failures.csv").read_text() == "method,reason,episodes,share\n"
+
+
+def test_configurations_do_not_mix():
+    rows = [WON, dataclasses.replace(WON, gamma=0.5, retrieved=False, failure="not found")]
+    assert [(r.method, r.retrieved) for r in summarise(rows) if r.objects is None] == [
+        ("search-for-grasp, gamma 0.5", 0.0),
+        ("search-for-grasp, gamma 0.9", 1.0),
+    ]
+    assert [line.get_text() for line in report.success_figure(rows).legends[0].get_texts()] == [
+        "search-for-grasp, gamma 0.5", "search-for-grasp, gamma 0.9",
+    ]  # fmt: skip
+
+
+def test_an_episode_counts_once(tmp_path):
+    for name in ("a", "b"):
+        write_rows([WON], tmp_path / f"{name}.parquet")
+    with pytest.raises(InputError, match=r"b\.parquet: holds scenario 'a', seed 0.*one by one"):
+        report.read_tables([tmp_path / "a.parquet", tmp_path / "b.parquet"])
+    write_rows([], tmp_path / "none.parquet")
+    with pytest.raises(InputError, match="no episodes"):
+        report.read_tables([tmp_path / "none.parquet"])

@@ -1,0 +1,347 @@
+"""Result files: what is written is read back, a file is whole or not there, and what is wrong is one line."""
+
+import dataclasses
+import json
+import stat
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+
+from mechsearch_jax.actions import ActionKind, no_action
+from mechsearch_jax.benchmarks.rates import summarise, wilson
+from mechsearch_jax.benchmarks.rows import (
+    SCHEMA,
+    Row,
+    configuration,
+    identity,
+    label_variants,
+    read_code,
+    read_rows,
+    write_rows,
+)
+from mechsearch_jax.envs.earlier import EARLIER, RENAMED
+from mechsearch_jax.envs.records import Episode, Step, load_episode, record_action, save_episode
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import check_writable, replacing
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.viz.maps import Maps, load_maps, save_maps
+
+PUSH = no_action().replace(
+    kind=jnp.int32(ActionKind.PUSH), object=jnp.int32(3), displacement=jnp.array([0.0, 0.1, 0.0]), q7=jnp.float32(0.75)
+)
+STEPS = (
+    Step(40, False, False, 52.0, record_action(PUSH), 31.0, 33.0, 24, None, {"plan": 0.5}),
+    Step(17, True, True, 33.0, None, None, None, 0, "the object slipped", {"plan": 0.25}),
+)
+EPISODE = Episode("two-things", 2, {**EARLIER, "gamma": 0.9}, {"jax": "1.2.3"}, STEPS, 1, 1, True, None)
+ROW = Row(
+    scenario="two-things",
+    objects=2,
+    target="cylinder",
+    policy="search-for-grasp",
+    recognition="oracle",
+    gamma=0.9,
+    horizon=3,
+    sequences=30,
+    actions="push+pick-and-place",
+    seed=0,
+    found_step=1,
+    graspable_step=None,
+    retrieved=False,
+    steps=2,
+    failure="no grasp after 2 actions",
+    planning_seconds=1.5,
+    simulation_seconds=3.0,
+)
+
+
+def maps():
+    return Maps(
+        poses=np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32),
+        existence=np.array([True, False, True, True, False]),
+        graspability=np.array([1, 0, -1, -2, 1]),
+        scene=jax.tree.map(np.asarray, superquadric.empty(4)),
+    )
+
+
+def test_an_episode_is_read_back(tmp_path):
+    save_episode(EPISODE, tmp_path / "new" / "episode.json")
+    assert load_episode(tmp_path / "new" / "episode.json") == EPISODE
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["episode.json"]
+
+
+def test_an_episode_has_the_documented_keys(tmp_path):
+    save_episode(EPISODE, tmp_path / "episode.json")
+    value = json.loads((tmp_path / "episode.json").read_text())
+    assert {"scenario", "config", "versions", "steps", "found_step", "graspable_step", "retrieved", "failure"} <= set(
+        value
+    )
+    assert value["steps"][0]["action"]["kind"] == "push"
+    assert value["steps"][0]["action"]["object"] == 3
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "3", '{"steps": [{}]}', '{"steps": []}', "[" * 100_000])
+def test_what_is_no_episode_is_one_line(tmp_path, text):
+    (tmp_path / "episode.json").write_text(text)
+    with pytest.raises(InputError) as error:
+        load_episode(tmp_path / "episode.json")
+    assert str(tmp_path / "episode.json") in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_episode_without_a_push_model_was_planned_with_the_first_one(tmp_path):
+    known = {"push_model": "physics", "topple_charge": 0.25}
+    for config in ({"gamma": 0.9}, {"gamma": 0.9, **known}):
+        save_episode(dataclasses.replace(EPISODE, config=config), tmp_path / "episode.json")
+        assert load_episode(tmp_path / "episode.json").config == {**EARLIER, **config}
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "episode.json"
+    save_episode(EPISODE, path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError):
+        save_episode(dataclasses.replace(EPISODE, config={"gamma": float("nan")}), path)
+
+    def fail_halfway():
+        with replacing(path) as file:
+            file.write(b"half")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail_halfway()
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["episode.json"]
+
+
+def test_a_file_gets_ordinary_permissions(tmp_path):
+    (tmp_path / "plain").write_text("")
+    save_episode(EPISODE, tmp_path / "episode.json")
+    modes = {stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("plain", "episode.json")}
+    assert len(modes) == 1
+
+
+def test_an_unwritable_place_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    for write in (
+        lambda: save_episode(EPISODE, tmp_path / "file" / "episode.json"),
+        lambda: check_writable(tmp_path / "file"),
+    ):
+        with pytest.raises(InputError, match="cannot be written"):
+            write()
+
+
+def test_maps_are_read_back(tmp_path):
+    save_maps(maps(), tmp_path / "maps.npz")
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        dataclasses.asdict(load_maps(tmp_path / "maps.npz")),
+        dataclasses.asdict(maps()),
+    )
+    with np.load(tmp_path / "maps.npz") as file:
+        assert set(file) == {
+            "poses", "existence", "graspability", "size", "exponents", "position", "rotation", "valid",
+        }  # fmt: skip
+
+
+def test_what_holds_no_maps_is_one_line(tmp_path):
+    (tmp_path / "text.npz").write_text("no")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    for name in ("text.npz", "other.npz", "none.npz"):
+        with pytest.raises(InputError, match=name) as error:
+            load_maps(tmp_path / name)
+        assert "\n" not in str(error.value)
+
+
+def test_rows_are_read_back(tmp_path):
+    rows = [ROW, dataclasses.replace(ROW, seed=1, found_step=None, failure=None, graspable_step=2, retrieved=True)]
+    write_rows(rows, tmp_path / "new" / "rows.parquet")
+    assert read_rows(tmp_path / "new" / "rows.parquet") == rows
+    assert pyarrow.parquet.read_schema(tmp_path / "new" / "rows.parquet").equals(SCHEMA)
+
+
+def test_rows_of_the_first_version_are_read(tmp_path):
+    write_rows([ROW], tmp_path / "rows.parquet")
+    table = pyarrow.parquet.read_table(tmp_path / "rows.parquet")
+    pyarrow.parquet.write_table(table.drop_columns(["configuration"]), tmp_path / "rows.parquet")
+    assert read_rows(tmp_path / "rows.parquet") == [ROW]
+
+
+@pytest.mark.parametrize("text", ["{", "3"])
+def test_a_configuration_that_is_none_is_one_line(tmp_path, text):
+    write_rows([dataclasses.replace(ROW, configuration=text)], tmp_path / "rows.parquet")
+    with pytest.raises(InputError, match=r"rows\.parquet: the configuration of 'two-things'"):
+        read_rows(tmp_path / "rows.parquet")
+
+
+OLD = {
+    "actions": "both", "caution": 0.5, "criterion": "detector", "focus": 0.7, "gamma": 0.9, "horizon": 3,
+    "max_steps": 10, "method": "search-and-grasp", "push_distances": [0.05, 0.1], "recognition": "oracle",
+    "sequences": 30, "simulator": "NativeSimulator",
+}  # fmt: skip
+# The columns of the tables that were written when a policy was called a method.
+OLD_SCHEMA = pyarrow.schema(
+    [
+        ("scenario", pyarrow.string()),
+        ("objects", pyarrow.int64()),
+        ("target", pyarrow.string()),
+        ("method", pyarrow.string()),
+        ("recognition", pyarrow.string()),
+        ("gamma", pyarrow.float64()),
+        ("horizon", pyarrow.int64()),
+        ("sequences", pyarrow.int64()),
+        ("actions", pyarrow.string()),
+        ("seed", pyarrow.int64()),
+        ("found_step", pyarrow.int64()),
+        ("graspable_step", pyarrow.int64()),
+        ("retrieved", pyarrow.bool_()),
+        ("steps", pyarrow.int64()),
+        ("failure", pyarrow.string()),
+        ("planning_seconds", pyarrow.float64()),
+        ("simulation_seconds", pyarrow.float64()),
+        ("configuration", pyarrow.string()),
+    ]
+)
+OLD_VALUES = {
+    "scenario": "two-things", "objects": 2, "target": "cylinder", "method": "search-and-grasp",
+    "recognition": "oracle", "gamma": 0.9, "horizon": 3, "sequences": 30, "actions": "both", "seed": 0,
+    "found_step": 1, "graspable_step": None, "retrieved": False, "steps": 2, "failure": "no grasp after 2 actions",
+    "planning_seconds": 1.5, "simulation_seconds": 3.0,
+}  # fmt: skip
+
+
+def old_table(path, *configurations):
+    rows = [{**OLD_VALUES, "configuration": json.dumps(value, sort_keys=True)} for value in configurations]
+    schema = OLD_SCHEMA.with_metadata({b"mechsearch_code": b"mechsearch-jax 0.1.0 (0123456789ab)"})
+    pyarrow.parquet.write_table(pyarrow.Table.from_pylist(rows, schema=schema), path)
+
+
+def test_tables_with_earlier_names_of_options_are_read(tmp_path):
+    old_table(tmp_path / "rows.parquet", OLD, {**OLD, "push_model": "learned", "topple_charge": 0.5})
+    before = (tmp_path / "rows.parquet").read_bytes()
+    first, second = read_rows(tmp_path / "rows.parquet")
+    now = {
+        **OLD,
+        **EARLIER,
+        "policy": OLD["method"],
+        "actions": ["push", "pick-and-place"],
+        "unseen_contact_penalty": 0.5,
+        "guided_fraction": 0.7,
+    }
+    for name in ("method", "caution", "focus"):
+        del now[name]
+    assert first == dataclasses.replace(ROW, policy="search-and-grasp", configuration=configuration(now))
+    assert json.loads(second.configuration) == {**now, "push_model": "learned", "topple_charge": 0.5}
+    assert (tmp_path / "rows.parquet").read_bytes() == before
+    assert read_code(tmp_path / "rows.parquet") == "mechsearch-jax 0.1.0 (0123456789ab)"
+    assert not set(RENAMED) & set(SCHEMA.names)
+
+
+def test_tables_of_the_first_version_with_earlier_columns_are_read(tmp_path):
+    table = pyarrow.Table.from_pylist([OLD_VALUES], schema=pyarrow.schema(list(OLD_SCHEMA)[:-1]))
+    pyarrow.parquet.write_table(table, tmp_path / "rows.parquet")
+    assert read_rows(tmp_path / "rows.parquet") == [dataclasses.replace(ROW, policy="search-and-grasp")]
+
+
+def test_what_differs_goes_by_the_present_names_of_options(tmp_path):
+    old_table(tmp_path / "rows.parquet", OLD, {**OLD, "caution": 1.0, "focus": 0.0})
+    assert label_variants(read_rows(tmp_path / "rows.parquet")) == [
+        "search-and-grasp, guided fraction 0.7, unseen contact penalty 0.5",
+        "search-and-grasp, guided fraction 0, unseen contact penalty 1",
+    ]
+
+
+def test_an_episode_with_earlier_names_of_options_is_read(tmp_path):
+    save_episode(dataclasses.replace(EPISODE, config={**OLD, "target": "box", "seed": 3}), tmp_path / "episode.json")
+    config = load_episode(tmp_path / "episode.json").config
+    assert config["policy"] == "search-and-grasp"
+    assert (config["unseen_contact_penalty"], config["guided_fraction"]) == (0.5, 0.7)
+    assert not set(RENAMED) & set(config)
+    assert Row.of_episode(load_episode(tmp_path / "episode.json")).policy == "search-and-grasp"
+
+
+def test_options_that_differ_tell_rows_apart():
+    full = configuration({"gamma": 0.9, "push_distances": [0.05, 0.1], "seed": 3, "target": "box"})
+    assert json.loads(full) == {"gamma": 0.9, "push_distances": [0.05, 0.1]}
+    rows = [dataclasses.replace(ROW, configuration=full), ROW, dataclasses.replace(ROW, gamma=0.5)]
+    assert label_variants(rows) == [
+        "search-for-grasp, gamma 0.9, push distances 0.05/0.1",
+        "search-for-grasp, gamma 0.9, push distances unknown",
+        "search-for-grasp, gamma 0.5, push distances unknown",
+    ]
+    assert label_variants(rows[1:2]) == ["search-for-grasp"]
+    assert [rates.episodes for rates in summarise(rows)] == [1] * 6
+
+
+def test_rows_without_a_push_model_were_planned_with_the_first_one(tmp_path):
+    old, new, other = (
+        dataclasses.replace(ROW, configuration=configuration({"gamma": 0.9, **more}))
+        for more in ({}, {"push_model": "quasi-static", "topple_charge": 0.0}, {"push_model": "physics"})
+    )
+    write_rows([old, new, other], tmp_path / "rows.parquet")
+    old, new, other = read_rows(tmp_path / "rows.parquet")
+    assert identity(old) == identity(new) != identity(other)
+    labels = label_variants([old, new, other])
+    assert labels == [
+        "search-for-grasp, push model quasi-static",
+        "search-for-grasp, push model quasi-static",
+        "search-for-grasp, push model physics",
+    ]
+
+
+def test_confidence_intervals_are_wilsons():
+    # Newcombe 1998, table I: 81 of 263, 15 of 148, 0 of 20, 29 of 29.
+    for counts, interval in {
+        (81, 263): (0.2553, 0.3662), (15, 148): (0.0624, 0.1605), (0, 20): (0.0, 0.1611), (29, 29): (0.8830, 1.0),
+    }.items():  # fmt: skip
+        assert wilson(*counts) == pytest.approx(interval, abs=5e-5)
+    assert wilson(0, 0) == (0.0, 1.0)
+
+
+def test_confidence_intervals_are_those_of_the_formula():
+    z = 1.959963984540054
+    for count in (1, 2, 7, 100):
+        for successes in range(count + 1):
+            share = successes / count
+            middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
+            half = z / (1 + z**2 / count) * np.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
+            assert wilson(successes, count) == pytest.approx((middle - half, middle + half), abs=1e-12)
+
+
+def test_the_columns_are_those_of_earlier_tables_but_for_names():
+    assert SCHEMA.types == OLD_SCHEMA.types
+    assert SCHEMA.names == [RENAMED.get(name, name) for name in OLD_SCHEMA.names]
+    assert SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
+
+
+def test_what_is_no_table_of_episodes_is_one_line(tmp_path):
+    (tmp_path / "text.parquet").write_text("no")
+    pyarrow.parquet.write_table(pyarrow.table({"a": [1]}), tmp_path / "other.parquet")
+    for name in ("text.parquet", "other.parquet", "none.parquet"):
+        with pytest.raises(InputError, match=name) as error:
+            read_rows(tmp_path / name)
+        assert "\n" not in str(error.value)
+
+
+def test_rows_are_summarised_by_method_and_number_of_objects():
+    rows = [
+        ROW,
+        dataclasses.replace(ROW, seed=1, graspable_step=2, retrieved=True, steps=4),
+        dataclasses.replace(ROW, objects=8, found_step=None, steps=10),
+        dataclasses.replace(ROW, policy="search-and-grasp"),
+    ]
+    summary = summarise(rows)
+    assert [(r.method, r.objects, r.episodes) for r in summary] == [
+        ("search-and-grasp", 2, 1),
+        ("search-and-grasp", None, 1),
+        ("search-for-grasp", 2, 2),
+        ("search-for-grasp", 8, 1),
+        ("search-for-grasp", None, 3),
+    ]
+    two = summary[2]
+    assert (two.found, two.graspable, two.retrieved, two.steps) == (1.0, 0.5, 0.5, 3.0)
+    assert two.planning_seconds == pytest.approx(0.5)

@@ -1,0 +1,99 @@
+"""The measurement of segmentation: what counts, what is missed, what is written, and what the picture shows."""
+
+import dataclasses
+import io
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+
+from mechsearch_jax.benchmarks import images, segmentation, tables
+from mechsearch_jax.benchmarks.segmentation import Bench, overlaps
+from mechsearch_jax.envs.recognisers import true_masks
+from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.viz.drawing import save_figure
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+
+SCENE = images.scenes_of([load_scenario(example_scenarios()["first-light"])])[0]
+
+
+def two_as_one(key, shelf, points, of_target, masks):
+    """The first object taken for a part of the second."""
+    return jnp.where(masks == 0, 1, masks)
+
+
+@pytest.fixture(scope="module")
+def perfect():
+    return Bench([SCENE], ("clean",), labeller=true_masks).run()
+
+
+@pytest.fixture(scope="module")
+def wrong():
+    return Bench([SCENE], ("clean", "gaussian"), labeller=two_as_one)
+
+
+def test_the_true_masks_are_perfect(perfect):
+    assert {row.iou for row in perfect.rows} == {1.0}
+    assert {row.objects for row in perfect.rows} == {int(SCENE.world.valid[:TARGET].sum())}
+    each, everything = perfect.summary()
+    assert everything["objects"] is None
+    assert each["iou_mean"] == everything["iou_mean"] == 1.0
+    assert everything["missed"] == 0
+    assert everything["counted"] <= everything["visible"] == len(perfect.rows)
+
+
+def test_an_object_that_is_not_told_apart_counts_as_nothing(wrong):
+    rows = {(row.noise, row.object): row for row in wrong.run().rows}
+    for noise in ("clean", "gaussian"):
+        assert rows[noise, 0].iou == 0.0
+        assert 0.0 < rows[noise, 1].iou < 1.0
+        assert all(row.iou == 1.0 for (sensor, i), row in rows.items() if sensor == noise and i > 1)
+
+
+def test_overlaps_are_those_of_a_plain_count():
+    rng = np.random.default_rng(0)
+    found, truth = rng.integers(-3, 6, (2, 20, 30))
+    told = overlaps(found, truth)
+    for i in range(TARGET):
+        both, either = np.sum((found == i) & (truth == i)), np.sum((found == i) | (truth == i))
+        assert told[i] == pytest.approx(both / either) if (truth == i).any() else np.isnan(told[i])
+
+
+def test_results_are_written_with_their_rows(perfect, tmp_path):
+    segmentation.save_segmentation(perfect, tmp_path / "s.json")
+    value = json.loads((tmp_path / "s.json").read_text())
+    assert value["summary"] == perfect.summary()
+    rows = [segmentation.Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
+    assert rows == list(perfect.rows)
+
+
+def test_the_table_shows_every_group(wrong):
+    console = Console(file=io.StringIO(), width=120)
+    console.print(tables.segmentation_tables(wrong.run()))
+    text = console.file.getvalue()
+    assert "files scenes, clean" in text
+    assert "files scenes, gaussian" in text
+
+
+def test_the_picture_shows_the_worst_images_first(wrong, tmp_path):
+    measured = wrong.run()
+    figure = segmentation.worst_figure(wrong, measured.rows, 5)
+    assert len(figure.subfigs) == 2
+    assert len(figure.axes) == 4
+    save_figure(figure, tmp_path / "worst.png")
+    assert (tmp_path / "worst.png").read_bytes().startswith(b"\x89PNG")
+    small = [dataclasses.replace(row, pixels=99) for row in measured.rows]
+    with pytest.raises(InputError, match="no images to draw"):
+        segmentation.worst_figure(wrong, small, 5)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"scenes": []}, "there are no scenes"), ({"noises": ()}, "unknown"), ({"noises": ("fog",)}, '"fog" is unknown')],
+)
+def test_a_measurement_of_nothing_is_refused(wrong, message):
+    with pytest.raises(InputError, match=message):
+        Bench(**{"scenes": [SCENE], **wrong})

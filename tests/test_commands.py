@@ -1,0 +1,314 @@
+"""The command line, mostly from outside the checkout: what it does, and how it refuses what is wrong."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from mechsearch_jax.benchmarks.report import FILES
+from mechsearch_jax.benchmarks.rows import Row, write_rows
+from mechsearch_jax.commands import main as cli
+from mechsearch_jax.commands import options
+from mechsearch_jax.envs.records import Episode, save_episode
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.viz.maps import load_maps
+from mechsearch_jax.workspace.scenario import (
+    Body,
+    Scenario,
+    example_scenarios,
+    format_scenario,
+    load_scenario,
+    save_scenario,
+)
+
+SCENE = Scenario(
+    name="one-box",
+    objects=(Body("box", (0.048, 0.028, 0.08), (0.5, 0.135, 0.4845), (1.0, 0.0, 0.0, 0.0)),),
+    target=Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0)),
+)
+
+
+ROW = Row("one-box", 1, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.5)
+
+
+def mechsearch(folder, *arguments):
+    """Run the program as a user would, in a folder that has nothing to do with the checkout."""
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    environment["JAX_COMPILATION_CACHE_DIR"] = str(cache())
+    program = (sys.executable, "-m", "mechsearch_jax.commands.main")
+    return subprocess.run(
+        [*program, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=600
+    )
+
+
+def cache():
+    import jax
+
+    return jax.config.jax_compilation_cache_dir
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with a good scenario, several bad ones, and output of an earlier run."""
+    save_scenario(SCENE, tmp_path / "good.json")
+    (tmp_path / "broken.json").write_text("{")
+    value = json.loads(format_scenario(SCENE))
+    value["objects"][0]["half_size"][1] = -0.02
+    (tmp_path / "negative.json").write_text(json.dumps(value))
+    for name in ("episode.json", "filmstrip.png", "one-box.npz", "rows.parquet"):
+        (tmp_path / "out" / name).parent.mkdir(exist_ok=True)
+        (tmp_path / "out" / name).write_text("from before")
+    (tmp_path / "empty").mkdir()
+    write_rows([ROW], tmp_path / "table.parquet")
+    return tmp_path
+
+
+WRONG = {
+    "no command": ([], "Expected one of"),
+    "unknown command": (["sweep"], "sweep"),
+    "unknown option": (["search", "good.json", "--out", "out", "--speed", "3"], "--speed"),
+    "unknown choice": (["search", "good.json", "--out", "out", "--actions", "fly"], '"fly" is unknown'),
+    "no number": (["search", "good.json", "--out", "out", "--gamma", "high"], "--gamma"),
+    "unknown push model": (["search", "good.json", "--out", "out", "--push-model", "guess"], "'guess'"),
+    "impossible gamma": (["search", "good.json", "--out", "out", "--gamma", "1.5"], "gamma 1.5 is outside (0, 1]"),
+    "impossible horizon": (["inspect", "good.json", "--out", "out", "--horizon", "0"], "horizon 0 must be at least 1"),
+    "no output": (["search", "good.json"], "--out"),
+    "nothing to search": (["search", "--out", "out"], "either a scenario or --objects"),
+    "both to search": (["search", "good.json", "--objects", "3", "--out", "out"], "either a scenario or --objects"),
+    "target of a file": (["search", "good.json", "--target", "box", "--out", "out"], "--target is for a generated"),
+    "too many objects": (["search", "--objects", "9", "--out", "out"], "9 is not between 1 and 8"),
+    "negative seed": (["search", "--objects", "2", "--seed", "-1", "--out", "out"], "-1"),
+    "missing file": (["search", "none.json", "--out", "out"], "none.json: there is no such file"),
+    "malformed file": (["search", "broken.json", "--out", "out"], "broken.json: is not JSON"),
+    "bad size": (["search", "negative.json", "--out", "out"], "negative.json: objects[0].half_size"),
+    "bad among good": (["inspect", "good.json", "negative.json", "--out", "out"], "negative.json: objects[0]"),
+    "nothing to inspect": (["inspect", "--out", "out"], "no scenario is given"),
+    "empty folder": (["inspect", "empty", "--out", "out"], "empty: there are no scenario files"),
+    "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new.parquet"], "'one-box'"),
+    "no table": (["evaluate", "good.json", "--out", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
+    "no worker": (["evaluate", "good.json", "--out", "new.parquet", "--workers", "0"], "--workers 0"),
+    "nowhere to report to": (["report", "table.parquet", "--out", "good.json"], "good.json: cannot be written to"),
+    "the same table twice": (["report", "table.parquet", "table.parquet"], "report them one by one"),
+    "unknown preset": (["search", "good.json", "--out", "out", "--preset", "worst"], "'worst'"),
+    "best preset": (["search", "good.json", "--out", "out", "--preset", "best"], "'best'"),
+    "both method and policy": (
+        ["search", "good.json", "--out", "out", "--method", "search-for-grasp", "--policy", "random"],
+        "search: give either --method or --policy, not both",
+    ),
+    "both methods and policies": (
+        ["evaluate", "good.json", "--out", "out", "--method", "search-for-grasp", "--policy", "random"],
+        "evaluate: give either --method or --policy, not both",
+    ),
+    "unknown method": (["search", "good.json", "--out", "out", "--method", "random"], "'random'"),
+    "unknown policy": (["search", "good.json", "--out", "out", "--policy", "guess"], 'policy "guess"'),
+    "missing policy": (["evaluate", "good.json", "--out", "new.parquet", "--policy", "nobody.there:Mine"], "nobody"),
+    "unknown subject": (["bench", "speed"], "speed"),
+    "no table to report": (["report", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
+    "no scenarios": (["scenarios", "generate", "--objects", "2", "--count", "0", "--out", "new"], "--count 0"),
+    "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
+    "no repeats": (["bench", "plan", "--repeats", "0"], "--repeats 0"),
+    "no worlds": (["bench", "simulate", "--worlds", "0"], "worlds 0 must be at least 1"),
+    "no clouds": (["bench", "inside", "--placed", "0"], "placed 0 must be at least 1"),
+    "no timings": (["bench", "roofline", "empty", "--out", "page.md"], "empty: there are no results of bench inside"),
+    "no timing": (["bench", "roofline", ".", "--out", "page.md"], "broken.json: is no result of bench"),
+    "negative scenes": (["bench", "recognition", "--scenes", "-1"], "--scenes -1 must be at least 0"),
+    "nothing to recognise": (["bench", "recognition", "--scenes", "0"], "there are no scenes"),
+    "unknown noise": (["bench", "recognition", "--noise", "fog"], "'fog'"),
+    "unknown seed": (["bench", "recognition", "--seed", "-1"], "--seed -1 must be from 0"),
+    "no images": (["bench", "perceive", "--batch", "0"], "--batch 0 must be at least 1"),
+    "nothing to segment": (["bench", "segmentation", "--scenes", "0"], "there are no scenes"),
+    "no picture of segments": (["bench", "segmentation", "--worst", "0"], "--worst 0 must be at least 1"),
+    "no picture": (["bench", "recognition", "--worst", "0"], "--worst 0 must be at least 1"),
+    "the same scene twice": (["bench", "recognition", "good.json", "good.json"], '"one-box"'),
+    "picture of nothing": (
+        ["bench", "recognition", "good.json", "--scenes", "0", "--method", "network", "--picture", "worst.png"],
+        "--worst-of network-refined is not among the methods",
+    ),
+    "file in a file": (["bench", "recognition", "--out", "good.json/a.json"], "good.json: cannot be written to"),
+    "no pushes": (["bench", "push", "--pushes", "0"], "bench push: --pushes 0 must be at least 1"),
+    "unknown seed of pushes": (["bench", "push", "--seed", "-1"], "bench push: --seed -1 must be from 0"),
+    "unknown model": (["bench", "push", "--models", "guess"], "guess"),
+    "weights of nothing": (
+        ["bench", "push", "--models", "quasi-static", "--weights", "push.npz"],
+        '--weights is for the model "learned"',
+    ),
+    "no weights": (["bench", "push", "--weights", "none.npz"], "none.json: cannot be read"),
+    "pushes in a file": (["bench", "push", "--models", "no motion", "--data", "good.json"], "cannot be written to"),
+    "nothing to predict": (["bench", "predict", "--batch", "0"], "bench predict: --batch 0 must be at least 1"),
+    "too many objects to push": (["bench", "predict", "--objects", "9"], "--objects 9 is not between 1 and 8"),
+    "weights of no network": (
+        ["bench", "predict", "--push-model", "quasi-static", "--weights", "push.npz"],
+        "--weights is for --push-model learned",
+    ),
+    "no weights to time": (
+        ["bench", "predict", "--push-model", "learned", "--weights", "none.npz"],
+        "none.json: cannot be read",
+    ),
+    "nothing to agree on": (["bench", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
+    "file for a folder": (["search", "good.json", "--out", "good.json"], "good.json: cannot be written to"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG.values(), ids=WRONG)
+def test_what_is_wrong_is_one_line_and_changes_nothing(folder, monkeypatch, capsys, arguments, message):
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "argv", ["mechsearch", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    complaint = capsys.readouterr().err
+    assert end.value.code == 2
+    assert message in complaint
+    assert complaint.endswith("\n")
+    assert complaint.count("\n") == 1
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("kind", ["unknown choice", "bad size", "missing file"])
+def test_the_program_says_it_too_outside_the_checkout(folder, kind):
+    arguments, message = WRONG[kind]
+    answer = mechsearch(folder, *arguments)
+    assert answer.returncode == 2
+    assert answer.stdout == ""
+    assert message in answer.stderr
+    assert answer.stderr.count("\n") == 1
+    assert "Traceback" not in answer.stderr
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["search", "--help"], ["scenarios", "--help"], ["bench", "--help"]])
+def test_help_is_no_mistake(capsys, arguments):
+    with pytest.raises(SystemExit) as end:
+        cli.parse(arguments)
+    assert not end.value.code
+    assert "usage: mechsearch" in capsys.readouterr().out
+
+
+def test_a_scenario_is_found_by_file_by_folder_and_by_name(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    name, shipped = next(iter(example_scenarios().items()))
+    assert options.find_scenario("good.json").name == "good.json"
+    assert options.find_scenario(name) == shipped
+    assert [file.name for file in options.find_scenarios([".", name])] == [
+        "broken.json", "good.json", "negative.json", shipped.name,
+    ]  # fmt: skip
+    with pytest.raises(InputError, match=name):
+        options.find_scenario("none")
+
+
+def test_checking_names_the_bad_and_lists_the_good(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    with pytest.raises(SystemExit) as end:
+        cli.parse(["scenarios", "check", "."])()
+    assert end.value.code == 2
+    printed = capsys.readouterr()
+    assert "good.json: 1 objects, target cylinder" in printed.out
+    assert printed.err.count("\n") == 2
+
+
+def test_a_folder_that_search_wrote_is_good(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save_scenario(SCENE, "out/scenario.json")
+    save_episode(Episode("one-box", 1, {}, {}, (), None, None, False, "not found"), "out/episode.json")
+    cli.parse(["scenarios", "check", "out"])()
+    printed = capsys.readouterr()
+    assert printed.out == "out/scenario.json: 1 objects, target cylinder\n"
+    assert printed.err == "out/episode.json: is not a scenario file and is left out\n"
+    # Named by itself, it is a mistake.
+    with pytest.raises(SystemExit):
+        cli.parse(["scenarios", "check", "out/episode.json"])()
+
+
+def options_of(*arguments):
+    """The options that a command would be called with."""
+    return cli.parse(["inspect", "first-light", "--out", "out", *arguments]).keywords["options"]
+
+
+@pytest.mark.parametrize("preset", list(PRESETS))
+def test_what_is_given_goes_before_the_preset(preset):
+    assert options_of("--preset", preset).config() == PRESETS[preset]()
+    given = options_of("--preset", preset, "--gamma", "0.5", "--actions", "push", "--push-distances", "0.1", "0.2")
+    assert given.config() == PRESETS[preset](gamma=0.5, actions=("push",), push_distances=(0.1, 0.2))
+
+
+def test_the_default_preset_is_the_standard():
+    assert options_of().config() == PRESETS["standard"]()
+    assert options.DEFAULTS.config() == PRESETS["standard"]()
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
+def test_every_option_of_the_configuration_is_one_of_the_command_line(option):
+    usual = PRESETS["standard"]().options()[option.name]
+    given = [str(value) for value in (usual if isinstance(usual, list) else [usual])]
+    parsed = options_of(f"--{option.name.replace('_', '-')}", *given)
+    assert getattr(parsed, option.name) == (tuple(usual) if isinstance(usual, list) else usual)
+    assert parsed.config() == PRESETS["standard"]()
+
+
+def test_a_policy_goes_by_a_methods_name_or_its_own():
+    def policies(*arguments):
+        given = cli.parse(["evaluate", "first-light", "--out", "out", *arguments]).keywords
+        return tuple(options.chosen_policies("evaluate", given["method"], given["policy"]))
+
+    assert policies() == ("search-for-grasp",)
+    assert policies("--method", "search-and-grasp", "search-for-grasp") == ("search-and-grasp", "search-for-grasp")
+    assert policies("--policy", "random", "my_lab.policies:Mine") == ("random", "my_lab.policies:Mine")
+
+
+def test_help_names_options_with_their_defaults(capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.parse(["bench", "plan", "--help"])
+    assert not end.value.code
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "--gamma FLOAT" in shown
+    assert "(default: 0.7 in preset standard, 0.0 in preset paper)" in shown
+    assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)
+
+
+def test_help_on_what_has_no_such_options_does_without_the_planner():
+    code = (
+        "import sys; from mechsearch_jax.commands import main\n"
+        "try: main.parse(sys.argv[1:])\n"
+        "except SystemExit: print('jax' in sys.modules)"
+    )
+    for arguments in (["--help"], ["scenarios", "generate", "--help"], ["bench", "--help"]):
+        answer = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+        assert answer.stdout.endswith("False\n"), answer.stderr
+
+
+def test_a_report_is_printed_and_written(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    cli.parse(["report", "table.parquet"])()
+    assert "search-for-grasp" in capsys.readouterr().out
+    cli.parse(["report", "table.parquet", "--out", "report"])()
+    assert {path.name for path in (folder / "report").iterdir()} == set(FILES)
+    assert "report/report.md" in capsys.readouterr().out
+
+
+def test_inspecting_writes_maps_and_a_picture(folder):
+    answer = mechsearch(folder, "inspect", "good.json", "--out", "maps")
+    assert answer.returncode == 0, answer.stderr
+    maps = load_maps(folder / "maps" / "one-box.npz")
+    assert maps.poses.shape == (792, 3)
+    assert 0 < maps.existence.sum() < 792
+    assert maps.graspability.max() == 1
+    nearest = np.argmin(np.linalg.norm(maps.poses[:, :2] - SCENE.target.position[:2], axis=1))
+    assert maps.existence[nearest]
+    assert (folder / "maps" / "one-box.png").stat().st_size > 10_000
+    assert sorted(path.name for path in (folder / "maps").iterdir()) == ["one-box.npz", "one-box.png"]
+
+
+def test_generated_scenarios_are_good_and_reproducible(folder):
+    for out in ("a", "b"):
+        answer = mechsearch(
+            folder, "scenarios", "generate", "--objects", "3", "--count", "2", "--seed", "5", "--out", out
+        )
+        assert answer.returncode == 0, answer.stderr
+    names = sorted(path.name for path in (folder / "a").iterdir())
+    assert len(names) == 2
+    for name in names:
+        assert len(load_scenario(folder / "a" / name).objects) == 3
+        assert (folder / "a" / name).read_bytes() == (folder / "b" / name).read_bytes()

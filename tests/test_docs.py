@@ -1,0 +1,138 @@
+"""The guides: their links lead somewhere, their code runs, and what the source cites of them is there."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+import mechsearch_jax
+from mechsearch_jax.envs.earlier import EARLIER, RENAMED
+from mechsearch_jax.planner import OPTIONS, PRESETS
+
+ROOT = Path(__file__).parents[1]
+PAGES = ["README.md", "CHANGELOG.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md"))]
+# Links and code may stand between backticks or in a block without meaning what they say.
+BLOCK = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+# As docstrings cite a page: docs/method.md, "Existence"; a line may end anywhere in between.
+CITATION = re.compile(r'(docs/\w+\.md),\s+"([^"]+)"')
+SOURCE = ("mechsearch_jax", "envs", "train", "benchmarks")
+# What a cell of a table says, and what follows from it.
+WORDS = {"yes": True, "no": False, "true": True, "false": False}
+
+
+def read(page):
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def headings(page):
+    return [title.strip() for title in re.findall(r"^#+ (.+)$", BLOCK.sub("", read(page)), re.MULTILINE)]
+
+
+def anchors(page):
+    """The fragments that GitHub gives the headings of a page."""
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in headings(page)}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page):
+    for link in LINK.findall(BLOCK.sub("", read(page))):
+        if re.match(r"\w+:", link):
+            continue
+        path, _, fragment = link.partition("#")
+        target = (ROOT / page).parent / path if path else ROOT / page
+        assert target.exists(), f"{page}: {link}"
+        if fragment:
+            assert fragment in anchors(target), f"{page}: {link}"
+
+
+def test_citations_in_the_source_name_a_heading():
+    found = 0
+    for folder in SOURCE:
+        for file in (ROOT / folder).rglob("*.py"):
+            for page, title in CITATION.findall(file.read_text(encoding="utf-8")):
+                assert title in headings(page), f"{file}: {page}, {title}"
+                found += 1
+    assert found > 0
+
+
+def test_no_table_row_is_broken():
+    for page in PAGES:
+        text = BLOCK.sub("", read(page))
+        for table in re.findall(r"(?:^\|.*\|$\n?)+", text, re.MULTILINE):
+            widths = {len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines()}
+            assert len(widths) == 1, f"{page}: {table[:80]}"
+        assert not re.search(r"^\|.*[^|\s]\s*$", text, re.MULTILINE), f"{page}: a row without an end"
+
+
+def rows(page, header):
+    """The cells of the table with a header, without the header."""
+    table = re.search(rf"^{re.escape(header)}\n\|[-|]+\|\n((?:\|.*\|\n)+)", read(page), re.MULTILINE)
+    assert table, f"{page}: {header}"
+    return [[cell.strip() for cell in row.strip("|").split(" | ")] for row in table[1].splitlines()]
+
+
+def said(cell):
+    """The value, or list of angles, that a cell begins with."""
+    cell = cell.strip('`"')
+    if "°" in cell:
+        return [math.radians(float(angle)) for angle in re.findall(r"([\d.]+)°", cell)]
+    word = re.match(r"[\w.-]+", cell)[0]
+    return WORDS.get(word.lower(), float(word) if word[0].isdigit() else word)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.startswith("docs/")])
+def test_files_that_a_page_names_are_there(page):
+    for path in re.findall(r"`([\w/]+\.py)`", read(page)):
+        assert any((ROOT / folder / path).is_file() for folder in ("", *SOURCE)), f"{page}: {path}"
+
+
+def test_what_the_python_guide_names_of_modules_is_there():
+    package, found = ROOT / "mechsearch_jax", 0
+    rooms = {path.stem for path in package.iterdir()} | set(SOURCE)
+    for path, name in re.findall(r"`(?:mechsearch_jax\.)?((?:\w+\.)+)(\w+)[`(]", read("docs/python.md")):
+        folders = [folder for folder in path.strip(".").split(".") if folder != "mechsearch_jax"]
+        if folders and folders[0] in rooms:
+            places = [root.joinpath(*folders) for root in (package, ROOT)]
+            modules = [file for place in places for file in (place.with_suffix(".py"), place / "__init__.py")]
+            text = "\n".join(file.read_text(encoding="utf-8") for file in modules if file.is_file())
+            within = any((place / name).is_dir() or (place / f"{name}.py").is_file() for place in places)
+            assert within or re.search(rf'^(def|class) {name}\b|^    "{name}",$', text, re.MULTILINE), (path, name)
+            found += 1
+    assert found > 15
+
+
+def test_the_python_guide_names_all_of_the_front_door():
+    guide = read("docs/python.md")
+    assert f"gives the {len(mechsearch_jax.__all__)} names" in guide
+    for name in mechsearch_jax.__all__:
+        assert re.search(rf"`(?:[^`]*\W)?{name}\b", guide), name
+
+
+def test_old_names_are_what_is_read():
+    page = "docs/results.md"
+    renamed = [(old.strip("`"), new.strip("`")) for old, new in rows(page, "| then | now |")]
+    assert dict(pair for pair in renamed if " " not in pair[0]) == RENAMED
+    missing = {name.strip("`"): said(value) for name, value in rows(page, "| option | value then |")}
+    assert missing == {
+        name: pytest.approx(value) if isinstance(value, list) else value for name, value in EARLIER.items()
+    }
+
+
+def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
+    table = rows("docs/commands.md", "| option | what it sets | `standard` | `paper` |")
+    told = {re.match(r"`--([\w-]+)", row[0])[1].replace("-", "_"): row[2:] for row in table}
+    assert {option.name for option in OPTIONS} == set(told) - {"preset", "recognition", "simulator"}
+    for name, cells in told.items():
+        for preset, cell in zip(("standard", "paper"), cells, strict=False):
+            value = PRESETS[preset]().options().get(name)
+            if value is not None and name not in ("actions", "push_distances"):
+                assert said(cell) == (pytest.approx(value) if isinstance(value, list) else value), f"{name}: {cell}"
+
+
+@pytest.mark.slow
+def test_the_code_of_the_python_guide_runs():
+    code = re.findall(r"^```python\n(.*?)^```$", read("docs/python.md"), re.MULTILINE | re.DOTALL)
+    # Classes in it are pytrees, and look for the module that they are defined in.
+    exec(compile("\n".join(code), "docs/python.md", "exec"), {"__name__": "guide"})

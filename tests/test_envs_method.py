@@ -1,0 +1,89 @@
+"""Methods: what tells them apart, and that they reach another process whole."""
+
+import dataclasses
+import json
+
+import pytest
+
+from mechsearch_jax.benchmarks.evaluate import Job
+from mechsearch_jax.benchmarks.rows import Row
+from mechsearch_jax.envs.earlier import present_options
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.existence import ExistenceConfig
+from mechsearch_jax.graspability import GraspConfig
+from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.workspace.scenario import Body, Scenario
+
+TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
+METHODS = [
+    Method(),
+    Method(
+        "my_lab.policies:Mine",
+        PRESETS["paper"](gamma=0.1 + 0.2, push_distances=(0.05, 0.2)),
+        recognition="full",
+        engine="MjxSimulator",
+    ),
+]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=["default", "other"])
+def test_a_method_survives_the_way_to_a_worker(method):
+    again = Method.from_json(json.loads(json.dumps(method.to_json())))
+    assert again == method
+    assert hash(again) == hash(method)
+
+
+def test_options_are_flat_and_complete():
+    options = METHODS[1].options()
+    assert {"policy", "recognition", *(option.name for option in OPTIONS)} <= set(options)
+    assert options["policy"] == "my_lab.policies:Mine"
+    assert options["push_distances"] == [0.05, 0.2]
+    assert json.loads(json.dumps(options)) == options
+    assert not any("." in name for name in options)
+    assert set(Method().options()) == {"policy", "recognition", *(option.name for option in OPTIONS)}
+
+
+def test_what_is_no_option_tells_methods_apart_too():
+    problem = dataclasses.replace(
+        METHODS[0].config.problem, existence=ExistenceConfig(spread=((0.0, 0.0),)), retrieval=GraspConfig(yaws=5)
+    )
+    method = Method(config=dataclasses.replace(METHODS[0].config, problem=problem))
+    unusual = {name: value for name, value in method.options().items() if "." in name}
+    assert unusual.pop("problem.existence.spread") == [[0.0, 0.0]]
+    assert unusual.pop("problem.retrieval.yaws") == 5
+    assert set(unusual) == {"problem.retrieval.wrists"}
+    assert Method.from_json(json.loads(json.dumps(method.to_json()))) == method
+
+
+def test_the_default_is_what_earlier_files_ran_with_by_default():
+    earlier = {
+        "method": "search-for-grasp", "gamma": 0.9, "horizon": 3, "sequences": 30, "actions": "both",
+        "criterion": "detector", "push_distances": [0.05, 0.10, 0.15], "caution": 1.0, "topple_charge": 0.0,
+        "push_model": "learned", "focus": 0.7, "max_steps": 10, "recognition": "oracle",
+    }  # fmt: skip
+    assert present_options(earlier) == Method().options()
+
+
+def test_the_row_of_a_job_is_that_of_its_episode():
+    job = Job("", Scenario("one", (), TARGET), METHODS[1], 3)
+    # As `run_episodes` writes it.
+    config = {**METHODS[1].options(), "target": "cylinder", "simulator": "MjxSimulator", "seed": 3}
+    episode = Episode("one", 0, config, {}, (), None, None, False, "error: no")
+    assert Row.of_episode(episode) == job.failed("no")
+
+
+def test_a_policy_of_another_module_is_found(tmp_path, monkeypatch):
+    source = (
+        "class Mine:",
+        "    def __init__(self, config, *, push_model, later_push_model):",
+        "        self.known = config.gamma, push_model is later_push_model",
+        "    def __call__(self, key, problem, belief, observation): ...",
+    )
+    (tmp_path / "my_lab.py").write_text("\n".join(source))
+    monkeypatch.syspath_prepend(tmp_path)
+    method = Method("my_lab:Mine", PRESETS["standard"](gamma=0.25))
+    method.check()
+    assert method.policy().known == (0.25, True)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        method.name = "random"

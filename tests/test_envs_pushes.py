@@ -1,0 +1,527 @@
+"""Random pushes: what is drawn, what the simulation makes of it, what is kept of that, and learning from it."""
+
+import dataclasses
+import functools
+import itertools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.actions import ActionKind
+from mechsearch_jax.benchmarks.push import repeated
+from mechsearch_jax.dynamics import push_model
+from mechsearch_jax.envs import pushes as generator
+from mechsearch_jax.envs.native import NativeSimulator
+from mechsearch_jax.envs.push_portions import portions
+from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
+from mechsearch_jax.envs.world import BOX, CYLINDER, TARGET, World, bodies_of, from_scenario, superquadrics
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import footprints, superquadric, transforms
+from mechsearch_jax.graspability import gripper_rotation
+from mechsearch_jax.networks.push import PushConfig
+from mechsearch_jax.networks.push_geometry import NORMALS, push_start, reach
+from mechsearch_jax.train import push as training
+from mechsearch_jax.train.loop import TrainConfig, train
+from mechsearch_jax.train.push import PushTask, average_precision, model_scores, planar_turn, push_truth
+from mechsearch_jax.train.scenes import SceneConfig, random_world
+from mechsearch_jax.workspace.scenario import Body, Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+
+SHELF = Shelf()
+CONFIG = PushesConfig()
+SCENES = SceneConfig(objects=(2, 5), lying=0.1, leaning=0.0, placements=8)
+DRAW_WORLD = functools.partial(random_world, config=SCENES)
+
+
+WORLDS = 8
+VARIED = jax.jit(jax.vmap(training.varied))
+VARIED_MUCH = jax.jit(jax.vmap(training.varied, in_axes=(0, None, None)))
+
+
+def simulated(seed, rounds):
+    # As many worlds everywhere, so that everything is compiled once.
+    simulator = NativeSimulator(2, generator.push_simulation())
+    return generate_pushes(jax.random.key(seed), WORLDS, rounds, simulator, DRAW_WORLD)
+
+
+@pytest.fixture(scope="module")
+def pushes():
+    return simulated(0, 4)
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Many worlds and a push that was drawn in each; the tables too."""
+    tables = push_tables(CONFIG)
+
+    @jax.jit
+    def draw(keys):
+        def one(key):
+            scene, push = jax.random.split(key)
+            world = DRAW_WORLD(scene)
+            # One world in eight is empty.
+            world = world.replace(valid=world.valid & (jax.random.bits(scene) % 8 > 0))
+            return world, *draw_push(push, world, tables, CONFIG, SHELF)
+
+        return jax.lax.map(one, keys, batch_size=16)
+
+    return jax.device_get(draw(jax.random.split(jax.random.key(5), 128))), tables
+
+
+# --- what is drawn ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_pushes_of_all_directions_and_lengths_are_found(drawn):
+    (world, action, found), _ = drawn
+    assert found[world.valid.any(axis=1)].mean() > 0.6
+    assert (action.kind == found).all()
+    assert world.valid[np.arange(128), action.object][found].all()
+    assert (action.object[found] < TARGET).all()
+    along = action.displacement[found]
+    length = np.linalg.norm(along, axis=1)
+    assert length.min() < 0.06
+    assert length.max() > 0.16
+    assert ((length >= CONFIG.lengths[0] - 1e-6) & (length <= CONFIG.lengths[1] + 1e-6)).all()
+    sideways = np.abs(along[:, 0]) < 1e-6
+    assert min(np.sum(along[sideways, 1] > 0), np.sum(along[sideways, 1] < 0), np.sum(~sideways)) > 10
+    assert (along[:, 0] > -1e-6).all()
+    assert (along[:, 2] == 0).all()
+
+
+def in_body(world, k, i, points, share=1.0):
+    """Which points are inside a true box or cylinder, or inside such a share of it, in float64."""
+    rotation, half = world.rotation[k, i].astype(float), share * world.half_size[k, i].astype(float)
+    local = (points - world.position[k, i]) @ rotation
+    flat = np.hypot(local[:, 0], local[:, 1]) < half[0]
+    if world.kind[k, i] == BOX:
+        flat = (np.abs(local[:, :2]) < half[:2]).all(axis=1)
+    return flat & (np.abs(local[:, 2]) < half[2])
+
+
+@pytest.mark.slow
+def test_the_gripper_starts_beside_the_object_and_inside_of_nothing(drawn):
+    (world, action, found), tables = drawn
+    pusher = np.asarray(tables.pusher, float)
+    gaps = []
+    for k in np.flatnonzero(found)[:60]:
+        T = action.T_world_gripper[k].astype(float)
+        points = pusher @ T[:3, :3].T + T[:3, 3]
+        # Superquadrics, against which pushes are tested, lack 7% at the corners.
+        assert not any(in_body(world, k, i, points, 0.93).any() for i in np.flatnonzero(world.valid[k]))
+        assert (points[points[:, 0] > SHELF.front, 2] > SHELF.board).all()
+        # Moved on by little, it is in the object that it is to push.
+        step = action.displacement[k] / np.linalg.norm(action.displacement[k])
+        hits = [in_body(world, k, action.object[k], points + d * step).any() for d in np.arange(0, 0.03, 1e-3)]
+        gaps.append(1e-3 * np.argmax(hits) if any(hits) else np.inf)
+    # A lying cylinder is taken for its bounding box: its side is farther away than that.
+    assert np.mean(np.array(gaps) < 0.021) > 0.85
+    assert np.median(gaps) == pytest.approx(0.5 * sum(CONFIG.gap), abs=4e-3)
+
+
+@pytest.mark.slow
+def test_where_there_is_nothing_to_push_nothing_is_drawn(drawn):
+    (world, action, found), _ = drawn
+    empty = ~world.valid.any(axis=1)
+    assert empty.sum() > 5
+    assert not found[empty].any()
+    assert (action.kind[empty] == ActionKind.NONE).all()
+
+
+# --- what becomes of it ----------------------------------------------------------------------------------------------
+
+
+def test_objects_are_displaced_along_the_push(pushes):
+    count = len(pushes.object)
+    assert count > 15
+    rows = np.arange(count)
+    shift = (pushes.after.position - pushes.before.position)[rows, pushes.object]
+    length = np.linalg.norm(pushes.displacement, axis=1)
+    along = np.sum(shift * pushes.displacement, axis=1) / length
+    upright = ~pushes.toppled[rows, pushes.object]
+    # Pushed objects do not outrun the gripper by much, hardly ever go back, and most are taken along.
+    assert (along[upright] < length[upright] + 0.03).all()
+    assert (along[upright] > -0.005).all()
+    assert np.median((along / np.maximum(length - 0.01, 0.01))[upright]) == pytest.approx(1.0, abs=0.35)
+
+
+def test_the_wrist_that_a_push_was_made_with_is_kept(pushes):
+    assert pushes.q7.shape == (len(pushes.object),)
+    assert np.isin(pushes.q7, push_tables(CONFIG).q7[1]).all()
+    assert len(np.unique(pushes.q7)) > 1
+
+
+def test_objects_that_are_far_from_the_push_stay(pushes):
+    truth = push_truth(jax.tree.map(jnp.asarray, pushes))
+    assert 0.1 < truth.moved[truth.valid].mean() < 0.9
+    middle = pushes.T_world_gripper[:, :3, 3] + 0.5 * pushes.displacement
+    away = np.linalg.norm(pushes.before.position[..., :2] - middle[:, None, :2], axis=-1)
+    far = truth.valid & (away > 0.35)
+    assert far.sum() > 3
+    assert not truth.moved[far].any()
+
+
+def test_pushes_that_follow_each_other_go_on_from_what_was(pushes):
+    followed = 0
+    for lane in np.unique(pushes.lane):
+        rows = np.flatnonzero(pushes.lane == lane)
+        for a, b in itertools.pairwise(rows):
+            if np.array_equal(pushes.after.half_size[a], pushes.before.half_size[b]):
+                followed += 1
+                valid = pushes.before.valid[b]
+                np.testing.assert_array_equal(pushes.after.position[a][valid], pushes.before.position[b][valid])
+    assert followed >= 3
+
+
+def test_the_same_key_gives_the_same_pushes(pushes):
+    again, other = simulated(0, 1), simulated(4, 1)
+    first = len(again.object)
+    for a, b in zip(jax.tree.leaves(pushes), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a[:first], b)
+    assert not np.isin(other.displacement[:, 1], again.displacement[:, 1]).any()
+
+
+def upright_world(kind, rotation):
+    """A world of one body."""
+    valid = np.zeros(9, bool)
+    valid[0] = True
+    rotation = np.broadcast_to(rotation, (9, 3, 3)).astype(np.float32)
+    kinds, half = np.full(9, kind, np.int32), np.full((9, 3), 0.03, np.float32)
+    return jax.tree.map(jnp.asarray, World(kinds, half, np.zeros((9, 3), np.float32), rotation, valid))
+
+
+@pytest.mark.parametrize(
+    ("kind", "before", "after", "expected"),
+    [
+        (BOX, "", ("z", 80), False),
+        (BOX, "", ("x", 90), True),
+        (BOX, "", ("x", 10), False),
+        (BOX, "", ("y", 25), True),
+        (CYLINDER, "", ("y", 90), True),
+        (CYLINDER, "lying", ("x", 170), False),
+        (CYLINDER, "lying", ("z", 100), False),
+        (BOX, "lying", ("x", 90), True),
+    ],
+)
+def test_what_has_toppled(kind, before, after, expected):
+    first = Rotation.from_euler("x", 90 if before else 0, degrees=True)
+    # Lying along y, a cylinder rolls about y.
+    axis = {"x": "y", "y": "x"}.get(after[0], after[0]) if before and kind == CYLINDER else after[0]
+    second = Rotation.from_euler(axis, after[1], degrees=True) * first
+    found = generator.toppled(upright_world(kind, first.as_matrix()), upright_world(kind, second.as_matrix()))
+    assert np.array_equal(found, np.arange(9) == 0) == expected
+    assert found.any() == expected
+
+
+def test_a_world_is_simulated_as_its_scenario_is():
+    turn = (np.cos(0.4), 0.0, 0.0, np.sin(0.4))
+    scenario = Scenario(
+        "one",
+        (Body("box", (0.054, 0.025, 0.054), (0.55, 0.1, SHELF.board + 0.054), turn),),
+        Body("cylinder", (0.02, 0.02, 0.05), (0.65, 0.25, SHELF.board + 0.05), (1.0, 0.0, 0.0, 0.0)),
+    )
+    simulator = NativeSimulator(1)
+    world = simulator.load(jax.tree.map(lambda a: a[None], from_scenario(scenario)))
+    assert np.asarray(world.valid).sum() == 2
+    bodies = bodies_of(from_scenario(scenario))
+    assert [body is not None for body in bodies] == [True, *[False] * 7, True]
+    assert bodies[0] is not None
+    np.testing.assert_allclose(bodies[0].quaternion, turn, atol=1e-6)
+    with pytest.raises(InputError, match="worlds"):
+        simulator.load(jax.tree.map(lambda a: jnp.concatenate([a, a]), world), np.array([True, False]))
+
+
+# --- what is kept ----------------------------------------------------------------------------------------------------
+
+
+def test_pushes_are_made_once_and_read_again(tmp_path):
+    generation = Generation(seed=1, pushes=3, worlds=WORLDS, rounds=1)
+    counts = []
+    made = list(portions(generation, tmp_path, lambda: NativeSimulator(2), DRAW_WORLD, "here", CONFIG, counts.append))
+
+    def simulate():
+        raise AssertionError("all there is lies there already")
+
+    where = tmp_path, simulate, DRAW_WORLD, "here", CONFIG
+    read = list(portions(generation, *where))
+    assert counts[-1] == sum(len(part.object) for part in made) >= 3
+    for a, b in zip(jax.tree.leaves(made), jax.tree.leaves(read), strict=True):
+        np.testing.assert_array_equal(a, b)
+    # What only other actions depend on may have changed since.
+    later = dataclasses.replace(CONFIG, actions=dataclasses.replace(CONFIG.actions, clearance=0.01))
+    list(portions(generation, tmp_path, simulate, DRAW_WORLD, "here", later))
+    # Another portion would be needed now: scenes of one seed are none of another's.
+    with pytest.raises(InputError, match="made otherwise"):
+        list(portions(dataclasses.replace(generation, seed=2), *where))
+    with pytest.raises(InputError, match="made otherwise"):
+        list(portions(generation, tmp_path, simulate, DRAW_WORLD, "elsewhere", CONFIG))
+    (tmp_path / "pushes-000.npz").write_bytes(b"PK nothing of the kind")
+    with pytest.raises(InputError, match="is damaged") as refused:
+        list(portions(generation, *where))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("wrong", [{"pushes": 0}, {"worlds": 0}, {"rounds": 0}, {"seed": -1}])
+def test_impossible_generations_are_refused(wrong):
+    with pytest.raises(InputError):
+        Generation(**{"seed": 0, "pushes": 5, "worlds": 8, **wrong})
+
+
+@pytest.mark.parametrize("wrong", [{"planned": 1.5}, {"lengths": (0.1, 0.05)}, {"tries": 0}])
+def test_impossible_pushes_are_refused(wrong):
+    with pytest.raises(InputError):
+        PushesConfig(**wrong)
+
+
+# --- what is learnt and how it is scored -----------------------------------------------------------------------------
+
+
+def test_the_planar_turn_is_the_turn_about_the_vertical():
+    rng = np.random.default_rng(0)
+    first = Rotation.random(20, random_state=0).as_matrix()
+    yaw = rng.uniform(-3, 3, 20)
+    second = Rotation.from_euler("z", yaw[:, None]).as_matrix() @ first
+    found = planar_turn(jnp.float32(first), jnp.float32(second))
+    np.testing.assert_allclose(found, yaw, atol=1e-5)
+
+
+def test_average_precision_is_the_area_by_hand():
+    score = np.array([0.9, 0.8, 0.7, 0.6, 0.5])
+    assert average_precision(score, np.array([1, 0, 1, 0, 0], bool)) == pytest.approx((1 / 1 + 2 / 3) / 2)
+    assert average_precision(np.ones(4), np.array([1, 0, 0, 1], bool)) == pytest.approx(0.5)
+    assert np.isnan(average_precision(score, np.zeros(5, bool)))
+
+
+def test_a_turn_by_half_a_turn_is_no_error():
+    error = training.turn_error(jnp.float32([0.1, np.pi, 3.0]), jnp.float32([0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(error, [0.1, 0.0, 3.0 - np.pi], atol=1e-6)
+
+
+def test_the_truth_costs_nothing_but_its_scale(pushes):
+    truth = push_truth(jax.tree.map(jnp.asarray, pushes))
+    sure = jnp.where(truth.moved, 30.0, -30.0)
+    exact = training.PushMotion(
+        shift=truth.shift,
+        turn=truth.turn,
+        moves=sure,
+        topples=jnp.where(truth.toppled, 30.0, -30.0),
+        log_scale=jnp.zeros((*truth.turn.shape, 2)),
+    )
+    terms = training.example_loss(exact, truth)
+    assert max(float(terms[name]) for name in ("shift", "turn", "moves", "topples")) < 2e-3
+    wrong = exact.replace(shift=truth.shift + jnp.array([0.03, 0.04])[None, None], moves=-sure)
+    terms = training.example_loss(wrong, truth)
+    assert terms["shift"] == pytest.approx(5.0, rel=1e-3)
+    assert terms["moves"] > 10
+
+
+def test_what_is_left_out_of_a_push_had_no_part_in_it(pushes):
+    task, on_device = task_of(pushes), jax.tree.map(jnp.asarray, pushes)
+    start, truth = task.start(on_device), push_truth(on_device)
+    count = len(pushes.object)
+    varied, kept = VARIED(jax.random.split(jax.random.key(0), count), start, truth)
+    np.testing.assert_array_equal(varied.prints.valid, kept.valid)
+    left_out = np.asarray(truth.valid & ~kept.valid)
+    assert left_out.sum() > 5
+    assert not np.any(left_out & np.asarray(truth.moved))
+    # Without them, the same comes of the push, but for what a nudge would change too.
+    some = np.flatnonzero(left_out.any(axis=1))
+    fewer = jax.tree.map(lambda a: a[some], pushes)
+    fewer = fewer.replace(before=fewer.before.replace(valid=np.asarray(kept.valid)[some]))
+    there = np.asarray(kept.valid & truth.moved & ~truth.toppled)[some]
+
+    def agreement(again):
+        outcome = repeated(again, NativeSimulator(2, generator.push_simulation()), WORLDS)
+        gap = np.linalg.norm((outcome.scene.position - pushes.after.position[some])[..., :2], axis=-1)[there]
+        return np.median(gap), np.mean(gap < 5e-3)
+
+    # That begins at rest, too, where the bodies still moved a little.
+    baseline = agreement(jax.tree.map(lambda a: a[some], pushes))
+    median, close = agreement(fewer)
+    assert median < baseline[0] + 5e-4
+    assert close > baseline[1] - 0.15
+
+
+def test_poses_are_blurred_and_nothing_else(pushes):
+    start = task_of(pushes).start(jax.tree.map(lambda a: jnp.asarray(a[:1]), pushes))
+    start = jax.tree.map(lambda a: a[0], start)
+    keys = jax.random.split(jax.random.key(3), 2000)
+    blurred = jax.vmap(training.blurred, in_axes=(0, None, None))(keys, start, 1e-3)
+    off = np.asarray(blurred.prints.position - start.prints.position[None])
+    turn = np.asarray(blurred.prints.yaw - start.prints.yaw[None])
+    np.testing.assert_allclose(off.std(axis=0), 1e-3, rtol=0.1)
+    np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=1.5e-4)
+    np.testing.assert_allclose(turn.std(axis=0), 1e-3 / 0.08, rtol=0.1)
+    assert abs(np.corrcoef(off[:, 0, 0], turn[:, 0])[0, 1]) < 0.1
+    same = blurred.replace(prints=blurred.prints.replace(position=start.prints.position, yaw=start.prints.yaw))
+    for a, b in zip(jax.tree.leaves(same), jax.tree.leaves(start), strict=True):
+        np.testing.assert_array_equal(np.broadcast_to(a, np.shape(a)), np.broadcast_to(b, np.shape(a)))
+    exactly = training.blurred(keys[0], start, 0.0)
+    np.testing.assert_array_equal(exactly.prints.position, start.prints.position)
+
+
+def test_what_is_sampled_to_learn_from_is_told_blurred(pushes):
+    def sampled(blur):
+        task = dataclasses.replace(task_of(pushes), blur=blur)
+        return jax.jit(lambda key: task.sample(key, 32))(jax.random.key(0))
+
+    assert task_of(pushes).blur > 0
+    sharp, soft = sampled(0.0), sampled(1e-3)
+    for a, b in zip(jax.tree.leaves(sharp.truth), jax.tree.leaves(soft.truth), strict=True):
+        np.testing.assert_array_equal(a, b)
+    off = np.asarray(soft.start.prints.position - sharp.start.prints.position)
+    assert 8e-4 < off.std() < 1.2e-3
+
+
+def row_of_boxes(*gaps):
+    """A push of the first of some boxes in a row along y, which moves by 5 cm; nothing becomes of the others.
+
+    There are four slots, so that rows of any length are compiled once.
+    """
+    half = np.float32([0.03, 0.03, 0.05])
+    y = np.cumsum([-0.1, *(gap + 0.06 for gap in gaps)])
+    count = len(y)
+    position = np.stack([np.full(count, 0.6), y, np.full(count, SHELF.board + half[2])], axis=1)
+    scene = superquadric.Superquadrics(
+        size=jnp.asarray(np.tile(half, (count, 1))),
+        exponents=jnp.full((count, 2), 0.2),
+        position=jnp.float32(position),
+        rotation=jnp.broadcast_to(jnp.eye(3), (count, 3, 3)),
+        valid=jnp.ones(count, bool),
+    )
+    T = transforms.make(
+        gripper_rotation(jnp.float32(0.0), jnp.float32(0.5)), jnp.float32([0.6, -0.17, SHELF.board + 0.05])
+    )
+    scene = superquadric.pad(scene, 4)
+    start = push_start(SHELF, scene, push_tables(CONFIG).pusher, T, jnp.float32([0.0, 0.05, 0.0]))
+    moved = jnp.arange(4) == 0
+    shift = jnp.where(moved[:, None], jnp.float32([[0.0, 0.05]]), 0.0)
+    none = jnp.zeros(4)
+    return start, training.PushTruth(shift, none, moved, none > 0, scene.valid)
+
+
+@pytest.mark.parametrize(
+    # Between circles around the boxes there are 25 mm less than between their sides.
+    ("gaps", "kept"),
+    [((0.2,), [True, False]), ((0.06, 0.02, 0.2), [True, True, True, False])],
+)
+def test_what_may_have_held_something_in_place_is_never_left_out(gaps, kept):
+    start, truth = row_of_boxes(*gaps)
+    keys = jax.random.split(jax.random.key(0), 64)
+    _, left = VARIED_MUCH(keys, start, truth)
+    there = left.valid[:, : len(kept)]
+    np.testing.assert_array_equal(there.all(axis=0), kept)
+    assert there.any(axis=0).all()
+
+
+def test_walls_are_set_elsewhere_only_where_nothing_meets_them(pushes):
+    task, on_device = task_of(pushes), jax.tree.map(jnp.asarray, pushes)
+    start, truth = task.start(on_device), push_truth(on_device)
+    count = len(pushes.object)
+    varied, kept = VARIED(jax.random.split(jax.random.key(1), count), start, truth)
+    moved = np.asarray(varied.faces - start.faces)
+    assert (moved > 0).any()
+    assert (moved < 0).any()
+    for push, wall in zip(*np.nonzero(moved), strict=True):
+        valid = np.asarray(kept.valid)[push]
+        assert not np.asarray(truth.toppled)[push][valid].any()
+        normal, face = NORMALS[wall], np.asarray(varied.faces)[push, wall]
+        for world in (pushes.before, pushes.after):
+            prints = footprints.footprints(superquadrics(jax.tree.map(lambda a, push=push: a[push], world)))
+            toward = reach(prints, jnp.broadcast_to(-jnp.asarray(normal)[None], prints.position.shape))
+            inside = np.asarray(prints.position) @ normal - np.asarray(toward) - face
+            # Those that lean end with other footprints than they began with.
+            assert (inside[valid & (np.asarray(start.tilt)[push] < 1e-3)] > 0).all()
+        if normal[0] <= 0:
+            hand = np.asarray(start.points)[push, :, :2]
+            assert (np.stack([hand, hand + np.asarray(start.displacement)[push]]) @ normal > face).all()
+
+
+def test_a_model_that_knows_the_outcome_scores_best(pushes):
+    after = pushes.after
+
+    # The model recognises a push by where the gripper starts.
+    def oracle(shelf, scene, pusher, T, displacement, q7):
+        row = jnp.argmin(jnp.sum((jnp.asarray(pushes.T_world_gripper)[:, :3, 3] - T[None, :3, 3]) ** 2, axis=1))
+        known = scene.replace(
+            position=jnp.asarray(after.position)[row],
+            rotation=jnp.asarray(after.rotation)[row],
+        )
+        return push_model.PushOutcome(known, jnp.zeros(()), jnp.asarray(pushes.toppled)[row].astype(jnp.float32))
+
+    pusher = push_tables(CONFIG).pusher
+    best = model_scores(oracle, pushes, pusher, batch=8)["all"]
+    assert best["pushes"] == len(pushes.object)
+    assert best["pushed_mm"] < 1e-3
+    assert best["pushed_deg"] < 0.05
+    assert best["still"] == 1.0
+    assert best["topple_ap"] in (None, 1.0)
+    idle = model_scores(training.no_motion, pushes, pusher, batch=8)["all"]
+    truth = push_truth(jax.tree.map(jnp.asarray, pushes))
+    rows = np.arange(len(pushes.object))
+    upright = ~truth.toppled[rows, pushes.object]
+    moved = np.linalg.norm(np.asarray(truth.shift)[rows, pushes.object], axis=1)[upright]
+    assert idle["pushed_mm"] == pytest.approx(1e3 * moved.mean(), abs=2e-3)
+
+
+def task_of(pushes: Pushes) -> PushTask:
+    held = pushes.lane % 2 == 0
+    return PushTask(
+        pushes=jax.tree.map(lambda a: jnp.asarray(a[~held]), pushes),
+        held_out=jax.tree.map(lambda a: a[held], pushes),
+        network=PushConfig(width=16, layers=1),
+    )
+
+
+@pytest.mark.slow
+def test_training_makes_the_loss_smaller(pushes, tmp_path):
+    losses = []
+    train(
+        task_of(pushes),
+        TrainConfig(steps=90, batch=16, rate=5e-3, chunk=30),
+        tmp_path,
+        lambda progress, step, seconds, scalars: losses.append(scalars["loss"]),
+    )
+    assert losses[-1] < 0.8 * losses[0]
+
+
+@pytest.mark.slow
+def test_the_batch_simulator_pushes_as_the_native_one_does(pushes):
+    batch = generate_pushes(jax.random.key(0), WORLDS, 1, generator.engine(True), DRAW_WORLD)
+    lanes, native, mjx = np.intersect1d(
+        pushes.lane[: np.argmax(np.diff(pushes.lane) < 0) + 1], batch.lane, return_indices=True
+    )
+    assert len(lanes) > 4
+    np.testing.assert_allclose(pushes.T_world_gripper[native], batch.T_world_gripper[mjx], atol=1e-5)
+    gap = np.abs(pushes.after.position[native] - batch.after.position[mjx]).max(axis=-1)
+    assert np.median(gap[batch.before.valid[mjx]]) < 1e-3
+
+
+@pytest.mark.slow
+def test_the_command_simulates_trains_scores_and_writes_weights(tmp_path, capsys):
+    from mechsearch_jax.commands import main as cli
+    from mechsearch_jax.dynamics.learned import LearnedPush
+
+    arguments = (
+        f"train push --out {tmp_path} --pushes 30 --worlds 16 --rounds 2 --steps 4 --batch 8 --chunk 2 --width 16"
+        " --decay 0.1"
+    )
+    cli.parse(arguments.split())()
+    card = json.loads((tmp_path / "push.json").read_text())
+    assert set(card["scores"]) == {"network", "quasi-static", "no motion"}
+    assert card["training"]["decay"] == 0.1
+    assert card["data"]["blur"] == PushTask.blur
+    assert card["data"]["found"] >= 30
+    assert card["config"]["width"] == 16
+    model = LearnedPush(tmp_path / "push.npz")
+    world = jax.jit(DRAW_WORLD)(jax.random.key(0))
+    tables = push_tables(CONFIG)
+    T = transforms.upright_pose(jnp.float32([0.6, 0.0, 0.0]), 0.45)
+    outcome = jax.jit(model, static_argnums=0)(
+        SHELF, superquadrics(world), tables.pusher, T, jnp.float32([0.0, 0.1, 0.0]), jnp.zeros(())
+    )
+    assert np.isfinite(outcome.scene.position).all()

@@ -1,0 +1,80 @@
+"""Problems are kept on disk, and a file is believed only if it is whole and of this very problem."""
+
+import jax
+import numpy as np
+import pytest
+
+from mechsearch_jax.planner import cache
+from mechsearch_jax.planner import problem as problems
+from mechsearch_jax.planner.presets import paper
+from mechsearch_jax.workspace.target import Target
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def refuse(**parts):
+    raise AssertionError("the problem was built anew")
+
+
+def assert_same(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(x, y)
+
+
+def test_a_problem_read_from_disk_is_the_one_that_was_built(folder, problem, monkeypatch):
+    assert_same(cache.cached_problem(), problem)
+    (file,) = folder.iterdir()
+    monkeypatch.setattr(problems, "build_problem", refuse)
+    assert_same(cache.cached_problem(), problem)
+    with pytest.raises(AssertionError):
+        cache.cached_problem(Target.box())
+    with pytest.raises(AssertionError):
+        cache.cached_problem(config=paper().problem)
+    # Another version of the source makes another file.
+    monkeypatch.setattr(cache, "_source", lambda: "another")
+    with pytest.raises(AssertionError):
+        cache.cached_problem()
+    assert list(folder.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "altered", "renamed"])
+def test_a_damaged_file_is_built_anew(folder, problem, monkeypatch, damage):
+    monkeypatch.setattr(problems, "build_problem", lambda **parts: problem)
+    cache.cached_problem()
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    if damage == "altered":
+        with np.load(file) as saved:
+            arrays = dict(saved)
+        np.savez(file, **arrays | {"poses": arrays["poses"] + 0.01})
+    elif damage == "renamed":
+        with np.load(file) as saved:
+            np.savez(file, **{name.replace("poses", "places"): array for name, array in saved.items()})
+    else:
+        file.write_bytes({"cut": whole[: len(whole) // 2], "garbage": b"no archive", "empty": b""}[damage])
+    assert cache.cached_problem() is problem
+    monkeypatch.setattr(problems, "build_problem", refuse)
+    assert_same(cache.cached_problem(), problem)
+
+
+def test_without_a_folder_problems_are_built(tmp_path, problem, monkeypatch):
+    monkeypatch.setattr(problems, "build_problem", lambda **parts: problem)
+    monkeypatch.setenv(cache.VARIABLE, "")
+    assert cache.cached_problem() is problem
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file"))
+    assert cache.cached_problem() is problem
+
+
+def test_only_a_few_problems_are_kept(folder, problem, monkeypatch):
+    monkeypatch.setattr(problems, "build_problem", lambda **parts: problem)
+    for version in range(cache.CACHED_PROBLEMS + 2):
+        monkeypatch.setattr(cache, "_source", lambda version=version: str(version))
+        cache.cached_problem()
+    assert len(list(folder.iterdir())) == cache.CACHED_PROBLEMS

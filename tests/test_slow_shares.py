@@ -1,0 +1,82 @@
+"""The share of the slow tests that a run takes: all shares together are all slow tests, and no test is in two."""
+
+import types
+
+import conftest
+import pytest
+
+
+class Item:
+    """Stands in for a collected test."""
+
+    def __init__(self, nodeid, slow):
+        self.nodeid, self.path, self.slow, self.markers = nodeid, nodeid.split("::")[0], slow, []
+
+    def get_closest_marker(self, name):
+        return self.slow if name == "slow" and self.slow else None
+
+    def add_marker(self, marker):
+        self.markers.append(marker)
+
+
+class Config:
+    """Stands in for pytest's configuration."""
+
+    def __init__(self, share):
+        self.option = types.SimpleNamespace(slow_share=share)
+        self.left_out = []
+        self.hook = types.SimpleNamespace(pytest_deselected=lambda items: self.left_out.extend(items))
+
+    def getoption(self, name):
+        return getattr(self.option, name)
+
+
+def collected():
+    return [Item(f"tests/test_{i % 5}.py::test_{i}[{i}]", i % 3 == 0) for i in range(120)]
+
+
+def selected(share):
+    config, items = Config(share), collected()
+    conftest.pytest_configure(config)
+    conftest.pytest_collection_modifyitems(config, items)
+    assert sorted(item.nodeid for item in items + config.left_out) == sorted(item.nodeid for item in collected())
+    return items
+
+
+@pytest.mark.parametrize("parts", [1, 3, 8])
+def test_every_slow_test_is_in_one_part(parts):
+    every = sorted(item.nodeid for item in collected() if item.slow)
+    shares = [[i.nodeid for i in selected(f"{k}/{parts}") if i.slow] for k in range(1, parts + 1)]
+    assert sorted(nodeid for share in shares for nodeid in share) == every
+    assert max(map(len, shares)) < len(every) or parts == 1
+
+
+def test_other_tests_are_in_every_part():
+    others = {item.nodeid for item in collected() if not item.slow}
+    for share in (None, "1/3", "2/3", "auto/3"):
+        assert {item.nodeid for item in selected(share) if not item.slow} == others
+
+
+def test_the_part_changes_from_day_to_day(monkeypatch):
+    parts = []
+    for day in range(20000, 20008):
+        monkeypatch.setattr(conftest.time, "time", lambda day=day: 86400.0 * day + 5)
+        config = Config("auto/4")
+        conftest.pytest_configure(config)
+        parts.append(config.option.slow_share)
+    assert parts == [f"{k}/4" for k in (1, 2, 3, 4) * 2]
+
+
+@pytest.mark.parametrize("wrong", ["", "3", "0/4", "5/4", "auto/0", "auto", "1/many", "-1/4"])
+def test_a_part_that_there_is_none_of_is_refused(wrong):
+    with pytest.raises(pytest.UsageError, match="K/N"):
+        conftest.share_of(wrong)
+
+
+def test_files_that_are_traced_together_stay_together():
+    items = [Item(f"tests/{name}.py::test", False) for name in ("test_readme", "test_viz", "test_planner")]
+    conftest.pytest_collection_modifyitems(Config(None), items)
+    groups = {item.path: item.markers[0].args[0] for item in items}
+    assert groups["tests/test_readme.py"] == groups["tests/test_planner.py"] != groups["tests/test_viz.py"]
+    # What takes longest comes first.
+    assert [item.path for item in items][-1] == "tests/test_viz.py"
