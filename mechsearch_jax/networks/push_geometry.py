@@ -394,6 +394,15 @@ def _swept_band(start: PushStart, level: Array, heading: Array) -> tuple[Array, 
     return jnp.where(level_at_all, 0.5 * (low + high), 0.0), jnp.where(level_at_all, 0.5 * (high - low), 0.0)
 
 
+def _hand_directions(T_world_gripper: Array, axis: Array) -> tuple[Array, Array]:
+    """The hand's approach seen from above, and twice the angle of its closing direction, along and across the push.
+
+    The hand is the same after half a turn about its approach.
+    """
+    approach, closing = (_framed(axis, T_world_gripper[None, :2, i])[0] for i in (2, 1))
+    return approach, jnp.stack([closing[0] ** 2 - closing[1] ** 2, 2.0 * closing[0] * closing[1]])
+
+
 def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") -> PushGeometry:
     """The network's input features of a push.
 
@@ -402,50 +411,41 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
       frame: see `PushConfig`.
     """
     prints, points, T_world_gripper = start.prints, start.points, start.T_world_gripper
-    n = prints.yaw.shape[0]
     length = _norm(start.displacement)
     heading = jnp.where(length > 1e-6, start.displacement / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0]))
     axis = heading if frame == "push" else jnp.array([1.0, 0.0])
     framed = functools.partial(_framed, axis)
 
     def spread(vector):
-        return jnp.broadcast_to(vector[None], (n, *vector.shape))
+        return jnp.broadcast_to(vector[None], (len(prints.yaw), *vector.shape))
 
     distance, level = pusher_distance(prints, points, heading)
     level &= prints.valid[:, None]
     direct = jnp.min(jnp.where(level, distance, REACH), axis=1)
     met = meetings(prints, heading)
     reached, carry = _reached(prints, met, direct, length)
-
     touching = jnp.maximum(1.0 - direct / REACH, 0.0)[:, None]
     base = jnp.concatenate([prints.position, prints.low[:, None]], axis=1)
     contacts = [(c - base) * touching for c in _soft_contacts(distance, level, points, heading)]
     middle, breadth = _swept_band(start, level, heading)
-
-    gripper = T_world_gripper[:2, 3]
-    approach, closing = T_world_gripper[:2, 2], T_world_gripper[:2, 1]
-    # The hand is the same after half a turn about its approach.
-    closing = framed(closing[None])[0]
-    twice = jnp.stack([closing[0] ** 2 - closing[1] ** 2, 2.0 * closing[0] * closing[1]])
-    to_gripper = gripper[None] - prints.position
-    faces = start.faces
+    to_gripper = T_world_gripper[None, :2, 3] - prints.position
     planar = [
         to_gripper,
         contacts[0][:, :2],
         contacts[1][:, :2],
         middle[:, None] * perpendicular(heading)[None],
     ]
-    units = [spread(framed(approach[None])[0]), spread(twice)]
+    units = [spread(direction) for direction in _hand_directions(T_world_gripper, axis)]
     if frame == "world":
-        room = 0.5 * jnp.stack([faces[3] - faces[0], faces[1] - faces[2]])
+        back, right, left, front = start.faces
+        room = 0.5 * jnp.stack([front - back, right - left])
         planar += [prints.position - room[None], carry[:, None] * heading[None], to_gripper + (length * heading)[None]]
         units += [spread(framed(heading[None])[0])]
     vectors = jnp.concatenate([framed(jnp.stack(planar, axis=1)) / _LENGTH, jnp.stack(units, axis=1)], axis=1)
-    tall = prints.high - prints.low
     lengths = jnp.stack(
         [
             prints.low - start.board,
-            tall,
+            prints.high - prints.low,
             spread(length),
             direct,
             reached,
@@ -468,8 +468,7 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
         ],
         axis=1,
     )
-    extents = _extents(prints, axis)
-    walls, near = _walls(prints, faces, axis)
+    extents, (walls, near) = _extents(prints, axis), _walls(prints, start.faces, axis)
     return PushGeometry(
         objects=Parity(
             even=jnp.concatenate([lengths / _LENGTH, plain, vectors[..., 0], extents.even / _LENGTH], axis=1),

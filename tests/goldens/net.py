@@ -23,6 +23,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import re
 import sys
 import tempfile
 from pathlib import Path
@@ -38,6 +39,8 @@ import numpy as np
 HERE = Path(__file__).parent
 PUBLISHED = HERE.parents[2] / "shared" / "scenarios" / "published"
 TOLERANCE = 1e-5
+# With a decimal point: whole numbers in texts are compared as texts.
+NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
 METHODS = ("search-for-grasp", "search-and-grasp")
 RECOGNITIONS = ("oracle", "masks", "full")
 
@@ -314,6 +317,10 @@ def differences(old, new, where=""):
                 yield f"{where}: differs by up to {np.nanmax(np.abs(new - old)):.3g}"
         elif not np.array_equal(old, new):
             yield f"{where}: {np.sum(old != new)} of {old.size} differ"
+    elif isinstance(old, str) and isinstance(new, str):
+        if NUMBER.split(old) != NUMBER.split(new):
+            yield f"{where}: {old!r} before, {new!r} after"
+        yield from differences(*(np.array(NUMBER.findall(text), float) for text in (old, new)), where)
     elif old != new:
         yield f"{where}: {old!r} before, {new!r} after"
 
