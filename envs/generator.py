@@ -200,8 +200,8 @@ class ScenarioGenerator:
         before = np.asarray(self._simulator.reset(scene).position)
         outcome = self._simulator.settle()
         world = self._simulator.world
-        still = world is not None and np.abs(np.asarray(world.position) - before).max() <= self.config.drift
-        return outcome.settled and still and self._is_hidden(self._simulator.scenario(scene.name))
+        still = world is not None and bool(np.abs(np.asarray(world.position) - before).max() <= self.config.drift)
+        return bool(outcome.settled) and still and self._is_hidden(self._simulator.scenario(scene.name))
 
 
 def _draw_shape(rng: np.random.Generator) -> tuple[str, tuple[float, float, float]]:
