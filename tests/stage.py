@@ -61,10 +61,10 @@ class Stage:
         return self._gather()
 
     def load(self, world, only=None):
-        raise NotImplementedError
+        raise AssertionError("an episode begins with scenarios; it never loads a world")
 
     def settle(self, active=None):
-        raise NotImplementedError
+        raise AssertionError("an episode acts; it never just lets time pass")
 
     def execute(self, actions, active=None):
         count = len(self.names)
