@@ -1,22 +1,26 @@
 """The share of the slow tests that a run takes: all shares together are all slow tests, and no test is in two."""
 
+import re
+import subprocess
+import sys
 import types
+from collections import defaultdict
+from pathlib import Path
 
 import conftest
 import pytest
+
+ROOT = Path(__file__).parents[1]
 
 
 class Item:
     """Stands in for a collected test."""
 
     def __init__(self, nodeid, slow):
-        self.nodeid, self.path, self.slow, self.markers = nodeid, nodeid.split("::")[0], slow, []
+        self.nodeid, self.path, self.slow = nodeid, nodeid.split("::")[0], slow
 
     def get_closest_marker(self, name):
         return self.slow if name == "slow" and self.slow else None
-
-    def add_marker(self, marker):
-        self.markers.append(marker)
 
 
 class Config:
@@ -73,10 +77,21 @@ def test_a_part_that_there_is_none_of_is_refused(wrong):
         conftest.share_of(wrong)
 
 
-def test_files_that_are_traced_together_stay_together():
-    items = [Item(f"tests/{name}.py::test", False) for name in ("test_readme", "test_viz", "test_planner")]
+def test_what_takes_longest_comes_first():
+    items = [Item(f"tests/{name}.py::test", False) for name in ("test_viz", "test_readme", "test_planner")]
     conftest.pytest_collection_modifyitems(Config(None), items)
-    groups = {item.path: item.markers[0].args[0] for item in items}
-    assert groups["tests/test_readme.py"] == groups["tests/test_planner.py"] != groups["tests/test_viz.py"]
-    # What takes longest comes first.
-    assert [item.path for item in items][-1] == "tests/test_viz.py"
+    assert [item.path for item in items] == [f"tests/{n}.py" for n in ("test_planner", "test_readme", "test_viz")]
+
+
+def test_files_that_are_traced_together_run_in_one_process():
+    """As pytest does it: the workers that it names are the same for all files of a group."""
+    quick = "options_are_changed or papers_preset or fits_a_few or two_commands or upright or backing_off"
+    files = ["test_planner", "test_readme", "test_geometry_transforms"]
+    command = ["-m", "pytest", "-vv", "-p", "no:cacheprovider", *(f"tests/{name}.py" for name in files), "-k", quick]
+    ran = subprocess.run([sys.executable, *command], cwd=ROOT, capture_output=True, text=True, check=True)
+    workers = defaultdict(set)
+    for worker, file in re.findall(r"^\[(gw\d)\].* PASSED tests/(\w+)\.py", ran.stdout, re.MULTILINE):
+        workers[file].add(worker)
+    assert workers["test_planner"] == workers["test_readme"]
+    assert {len(w) for w in workers.values()} == {1}
+    assert workers["test_geometry_transforms"] != workers["test_planner"]
