@@ -96,6 +96,11 @@ def test_with_a_mask_the_objects_of_the_scenario_are_found_in_their_slots(masked
     assert np.abs(height[:3]).max() < 0.001
 
 
+def test_nothing_of_an_observation_has_a_weak_type(masked):
+    """Else a plan that was compiled for true shapes would be compiled again for these."""
+    assert not any(leaf.weak_type for leaf in jax.tree.leaves(masked))
+
+
 def test_without_a_measurement_is_zero_or_nan(see, images, masked):
     holes = np.where(images.depth == 0.0, np.nan, images.depth)
     assert same(see(KEY, holes, mask=images.mask), masked)

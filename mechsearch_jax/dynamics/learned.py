@@ -19,7 +19,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.networks.push import PushNetwork, apply_network
 from mechsearch_jax.networks.push_geometry import push_start
-from mechsearch_jax.networks.weights import Weights, load_weights
+from mechsearch_jax.networks.weights import Weights, load_weights, read_card
 from mechsearch_jax.workspace.shelf import Shelf
 
 NAME = "push"
@@ -34,9 +34,7 @@ SLACK = 0.02
 @functools.cache
 def _weights(path: Path, digest: str) -> Weights:
     """The network in a file whose card states this digest."""
-    # Called while a plan is traced, it still has to give numbers.
-    with jax.ensure_compile_time_eval():
-        return load_weights(path, NAME)
+    return load_weights(path, NAME)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +65,8 @@ class LearnedPush:
         path = self.path or Path(str(importlib.resources.files("mechsearch_jax") / "networks" / f"{NAME}.npz"))
         # What a frozen instance derives from its arguments can be set in no other way.
         object.__setattr__(self, "path", path)
-        object.__setattr__(self, "digest", load_weights(path, NAME).card["sha256"])
+        object.__setattr__(self, "digest", str(read_card(path, NAME).get("sha256")))
+        _weights(path, self.digest)
 
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array

@@ -123,7 +123,17 @@ def save_weights(path: PathLike, name: str, config: Any, parameters: Any, card: 
         file.write((json.dumps(head | card, indent=1) + "\n").encode())
 
 
-def _read_card(path: Path, name: str) -> dict[str, Any]:
+def read_card(archive: PathLike, name: str) -> dict[str, Any]:
+    """What the card beside an archive says.
+
+    Args:
+      archive: NAME.npz.
+      name: of the architecture.
+
+    Raises:
+      InputError: the card is missing, is none, or is of another network.
+    """
+    path = Path(archive).with_suffix(".json")
     try:
         card = json.loads(path.read_text())
     except OSError as error:
@@ -148,7 +158,7 @@ def load_weights(path: PathLike, name: str) -> Weights:
       InputError: a file is missing, corrupt, or of another network.
     """
     path = Path(path)
-    card = _read_card(path.with_suffix(".json"), name)
+    card = read_card(path, name)
     architecture = ARCHITECTURES[name]
     try:
         data = path.read_bytes()
@@ -172,8 +182,10 @@ def load_weights(path: PathLike, name: str) -> Weights:
             raise InputError(f"{path}: {key} has the shape {found} where the network needs {expected}; train anew")
         if not np.isfinite(arrays[key]).all():
             raise InputError(f"{path}: {key} holds NaN or infinite numbers; train anew")
-    parameters = unflatten_dict({key: jnp.asarray(a, jnp.float32) for key, a in arrays.items()}, sep="/")
-    return Weights(architecture.network(config), parameters, card)
+    # Numbers, also where the caller is traced.
+    with jax.ensure_compile_time_eval():
+        parameters = {key: jnp.asarray(np.asarray(a, np.float32)) for key, a in arrays.items()}
+    return Weights(architecture.network(config), unflatten_dict(parameters, sep="/"), card)
 
 
 def shipped_weights(name: str) -> Weights:

@@ -209,6 +209,8 @@ def _labelled(
 
     share = camera.width * camera.height / (1280 * 720)
     visible = jnp.sum(of_target) * view.stride**2 > VISIBLE_PIXELS * share
+    # With a weak type, all that takes the observation would be compiled once more than for another recogniser's.
+    visible = visible.astype(bool)
     return LabelledImage(points, seen, labels, of_target & above_board(shelf, points)), visible
 
 
