@@ -24,10 +24,11 @@ from mechsearch_jax.envs.mjx_model import MjxConfig
 from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.outcome import Outcome
-from mechsearch_jax.envs.world import CYLINDER, World, from_scenario, true_superquadrics
+from mechsearch_jax.envs.world import World, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.planner import Problem, build_problem
+from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Scenario
 
@@ -52,7 +53,8 @@ class Case:
       native_moved, batch_moved: how far the object was displaced [m].
       native_steps, batch_steps: simulated time steps.
       position_difference: between the final positions of a body, the largest of all bodies [m].
-      rotation_difference: between the final rotations, likewise [degrees]; a cylinder's spin about its axis is nothing.
+      rotation_difference: between the final rotations, likewise [degrees]; how far a round body has spun about its axis
+        does not count.
       spin_difference: the same with the spin.
       overflow: flags of `outcome.Overflow`.
       nudged_position_difference, nudged_rotation_difference: between the native simulator and itself with the objects
@@ -224,14 +226,14 @@ def pose_differences(a: World, b: World) -> tuple[Float[np.ndarray, " worlds"], 
       a, b: the same bodies; fields with a leading axis for the worlds.
 
     Returns:
-      Distances; angles, of cylinders between their axes; angles between rotations.
+      Distances; angles, of what is round between the axes; angles between rotations.
     """
     a, b = jax.tree.map(np.asarray, (a, b))
     distance = np.linalg.norm(a.position - b.position, axis=-1)
     turn = _angle((np.einsum("wnij,wnij->wn", a.rotation, b.rotation) - 1) / 2)
     tilt = _angle(np.einsum("wni,wni->wn", a.rotation[..., 2], b.rotation[..., 2]))
     valid = a.valid
-    angle = np.where(a.kind == CYLINDER, tilt, turn)
+    angle = np.where(by_shape(a.kind, lambda shape: shape.round, np), tilt, turn)
     return tuple(np.where(valid, value, 0.0).max(axis=1) for value in (distance, angle, turn))
 
 

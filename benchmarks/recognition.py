@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from mechsearch_jax.benchmarks import ems
 from mechsearch_jax.benchmarks.images import NOISES, Look, Scene, Shown, image_of, named, save_rows
-from mechsearch_jax.envs.world import CYLINDER, TARGET, World, true_superquadrics
+from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -29,6 +29,7 @@ from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.perception.recognition import recognise
 from mechsearch_jax.perception.refinement import RefinementConfig, refine, select
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
+from mechsearch_jax.shapes import by_shape, in_order
 from mechsearch_jax.train.scenes import PIXELS
 from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.camera import Camera
@@ -65,13 +66,13 @@ class Row:
 
     Attributes:
       source, scene, object: which object of which scene.
-      shape: "box" or "cylinder".
+      shape: name of its shape.
       noise, method: their names.
       pixels, visible: as in `Look`.
       outcome: "answered"; "nothing" where the method had no answer; "not finite" where it had one with NaN or infinity.
       iou: intersection over union with the true body; 0 where nothing finite was answered.
       centre: distance of the centres [m]; None there.
-      right: whether a box was called a box and a cylinder a cylinder; None there.
+      right: whether what is round was called round, and nothing else; None there.
     """
 
     source: str
@@ -273,7 +274,7 @@ def _judge(world: World, answer: Superquadrics) -> _Judged:
         finite=finite,
         iou=intersection_over_union(sharpened(truth), answer),
         centre=centre_error(truth, answer),
-        right=(answer.exponents[:, 1] > EDGE) == (world.kind[:TARGET] == CYLINDER),
+        right=(answer.exponents[:, 1] > EDGE) == by_shape(world.kind[:TARGET], lambda shape: shape.round, jnp),
     )
 
 
@@ -291,7 +292,7 @@ def _rows(scene: Scene, noise: str, method: str, image: Look, answer: Superquadr
                 source=scene.source,
                 scene=scene.name,
                 object=int(i),
-                shape="cylinder" if kind[i] == CYLINDER else "box",
+                shape=in_order()[kind[i]].name,
                 noise=noise,
                 method=method,
                 pixels=int(image.pixels[i]),

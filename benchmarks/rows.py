@@ -34,7 +34,7 @@ class Row:
     Attributes:
       scenario: its name.
       objects: number of surrounding objects.
-      target: "cylinder" or "box".
+      target: name of its shape.
       policy, recognition, gamma, horizon, sequences, actions, seed: the options it ran with; the kinds of action are
         joined by "+".
       found_step, graspable_step, retrieved, failure: as in `Episode`.

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs import model as models
-from mechsearch_jax.envs.world import BODIES, CYLINDER
+from mechsearch_jax.envs.world import BODIES
+from mechsearch_jax.shapes import in_order
 
 
 class BodyFields(flax.struct.PyTreeNode):
@@ -49,8 +50,7 @@ def body_fields(
       kind, half_size, valid: of the bodies, as in a `World`.
     """
     worlds = len(kind)
-    cylinder = kind == CYLINDER
-    mass, inertia = models.masses_and_inertias(cylinder, half_size, jnp)
+    mass, inertia = models.masses_and_inertias(kind, half_size, jnp)
     mass = jnp.where(valid, mass, models.EMPTY_MASS)
     inertia = jnp.where(valid[..., None], inertia, models.EMPTY_INERTIA)
 
@@ -77,17 +77,12 @@ def body_fields(
     dof = np.concatenate([np.arange(6) + blank.joint(f"body{i}").dofadr[0] for i in range(BODIES)])
     put("dof_invweight0", dof, jnp.repeat(inverse, 3, axis=-1).reshape(worlds, -1))
 
-    for shape in ("box", "cylinder"):
-        geom = np.array([blank.geom(f"{shape}{i}").id for i in range(BODIES)])
-        used = valid & (cylinder == (shape == "cylinder"))
+    for shape in in_order():
+        geom = np.array([blank.geom(models.geometry_name(shape, i)).id for i in range(BODIES)])
+        used = valid & (kind == shape.code)
         half = jnp.where(used[..., None], half_size - models.MARGIN, models.TINY)
-        x, y, z = half[..., 0], half[..., 1], half[..., 2]
-        if shape == "box":
-            size, radius = half, jnp.sqrt(x**2 + y**2 + z**2)
-        else:
-            size, radius = jnp.stack([x, z, jnp.zeros_like(x)], axis=-1), jnp.sqrt(x**2 + z**2)
-        put("geom_size", geom, size)
-        put("geom_rbound", geom, radius)
+        put("geom_size", geom, shape.geometry_size(half, jnp))
+        put("geom_rbound", geom, shape.bounding_radius(half, jnp))
         put("geom_aabb", geom, jnp.concatenate([jnp.zeros_like(half), half], axis=-1))
     fields["geom_aabb"] = fields["geom_aabb"].reshape(worlds, -1, 2, 3)
     return BodyFields(**fields)

@@ -46,14 +46,11 @@ from mechsearch_jax.planner import Belief, Decision, Policy, Problem
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.target import Target
 
-# How finely the yaw of a box is searched, over half a turn.
-BOX_YAWS = 6
-
 
 def target_of(scenario: Scenario) -> Target:
     """The target of a scenario as the planner knows it: its shape, and how finely its yaw is searched."""
     body = scenario.target
-    return Target(shape=body.shape, half_size=body.half_size, yaws=BOX_YAWS if body.shape == "box" else 1)
+    return Target.of(body.shape, body.half_size)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,12 +15,13 @@ from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.graspability import GraspConfig, grasp_tables
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Full sizes [m]; a box's x and y may be swapped.
+# Full sizes [m].
 BOXES = (
     (0.104, 0.058, 0.076),
     (0.084, 0.036, 0.07),
@@ -31,6 +32,11 @@ BOXES = (
 )
 # Radius and height [m].
 CYLINDERS = ((0.034, 0.214), (0.032, 0.134), (0.032, 0.122), (0.024, 0.134), (0.028, 0.06))
+# The shapes and half-extents of the paper's eleven objects; the x and y of those that are not round may be swapped.
+CATALOGUE = (
+    *(("box", (x / 2, y / 2, z / 2)) for x, y, z in BOXES),
+    *(("cylinder", (radius, radius, height / 2)) for radius, height in CYLINDERS),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,13 +62,8 @@ class GeneratorConfig:
 
 def outline(body: Body) -> Float[np.ndarray, "corners 2"]:
     """The body's outline seen from above, as a convex polygon that holds it [m]."""
-    a, b, c = body.half_size
-    if body.shape == "box":
-        rim = np.array([(a, b), (-a, b), (-a, -b), (a, -b)])
-    else:
-        angle = np.arange(24) * (2 * np.pi / 24)
-        rim = np.stack([np.cos(angle), np.sin(angle)], axis=1) * a / np.cos(np.pi / 24)
-    corners = np.concatenate([np.insert(rim, 2, z, axis=1) for z in (-c, c)])
+    rim = shape_of(body.shape).rim(body.half_size)
+    corners = np.concatenate([np.insert(rim, 2, z, axis=1) for z in (-body.half_size[2], body.half_size[2])])
     flat = (corners @ rotation_matrix(body.quaternion).T + np.array(body.position))[:, :2]
     return flat[ConvexHull(flat).vertices]
 
@@ -106,13 +107,13 @@ class ScenarioGenerator:
         graspable: Callable[[Float[np.ndarray, " 3"]], bool] | None = None,
     ):
         """Args:
-        target: what is hidden; the cylinder by default.
+        target: what is hidden; the usual one by default.
         shelf, camera: the scene.
         config: how scenarios are made.
         graspable: tells from a candidate pose (x, y [m], yaw [rad]) whether the shelf alone leaves the target
           graspable there; by default `graspable_alone`.
         """
-        self.target = target or Target.cylinder()
+        self.target = target or Target()
         self.config = config or GeneratorConfig()
         self._shelf = shelf or Shelf()
         self._camera = camera or Camera()
@@ -206,21 +207,15 @@ class ScenarioGenerator:
 
 def _draw_shape(rng: np.random.Generator) -> tuple[str, tuple[float, float, float]]:
     """One of the paper's eleven objects and its half-extents."""
-    kind = int(rng.integers(len(BOXES) + len(CYLINDERS)))
-    if kind < len(BOXES):
-        x, y, z = (side / 2 for side in BOXES[kind])
-        return "box", (y, x, z) if rng.random() < 0.5 else (x, y, z)
-    radius, height = CYLINDERS[kind - len(BOXES)]
-    return "cylinder", (radius, radius, height / 2)
+    name, (x, y, z) = CATALOGUE[int(rng.integers(len(CATALOGUE)))]
+    swapped = not shape_of(name).round and rng.random() < 0.5
+    return name, (y, x, z) if swapped else (x, y, z)
 
 
 def generate_scenario(seed: int, objects: int, target: str = "cylinder", name: str | None = None) -> Scenario:
-    """One scenario with the paper's cylinder or box as its target; see `ScenarioGenerator.generate`.
+    """One scenario with the usual target of a shape; see `ScenarioGenerator.generate`.
 
     Raises:
-      InputError: the target is neither "cylinder" nor "box", or as `ScenarioGenerator.generate`.
+      InputError: there is no such shape, or as `ScenarioGenerator.generate`.
     """
-    targets = {"cylinder": Target.cylinder, "box": Target.box}
-    if target not in targets:
-        raise InputError(f'target: "{target}" is unknown; use "cylinder" or "box"')
-    return ScenarioGenerator(targets[target]()).generate(seed, objects, name)
+    return ScenarioGenerator(Target.of(target)).generate(seed, objects, name)

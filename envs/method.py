@@ -55,7 +55,7 @@ class Method:
         if unknown:
             raise InputError(f'actions: "{unknown[0]}" is unknown; use one or more of {", ".join(kinds)}')
         self.policy()
-        recogniser(self.recognition, Target.cylinder())
+        recogniser(self.recognition, Target())
 
     def options(self) -> dict[str, Any]:
         """What tells this method from others, flat and as JSON values: the policy, the recognition, every option of the

@@ -1,9 +1,9 @@
 """The MuJoCo model: a Panda in front of a shelf with eight object slots and the target (docs/method.md,
 "The simulator").
 
-One MJCF serves every scenario. Each slot is a free body with a box and a cylinder; the one that is not in use is shrunk
-into the inside of the other, and an unused slot is parked in front of the shelf as a weightless millimetre. Sizes,
-masses and inertias are set per world, on a copy of the compiled model.
+One MJCF serves every scenario. Each slot is a free body with a geometry of every shape; those that are not in use are
+shrunk into the inside of the one that is, and an unused slot is parked in front of the shelf as a weightless
+millimetre. Sizes, masses and inertias are set per world, on a copy of the compiled model.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -18,20 +18,20 @@ from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.world import BODIES
 from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
 from mechsearch_jax.robot.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINT_LOWER, JOINT_UPPER, JOINTS
+from mechsearch_jax.shapes import Shape, by_shape, in_order, shape_of
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body
 from mechsearch_jax.workspace.shelf import Shelf
 
-BOX_DENSITY, CYLINDER_DENSITY = 737.0, 585.0
 # Torsional friction of a rubber pad of about 18 x 18 mm that is pressed evenly: two thirds of its mean radius [m].
 FINGER_TORSION = 0.006
-BOX_FRICTION, CYLINDER_FRICTION, FINGER_FRICTION = 0.4, 0.6, 1.0
+FINGER_FRICTION = 1.0
 
 ARM_STIFFNESS = (18000.0, 18000.0, 14000.0, 14000.0, 8000.0, 8000.0, 8000.0)
 ARM_VELOCITY_GAIN = (450.0, 450.0, 350.0, 350.0, 200.0, 200.0, 200.0)
@@ -211,8 +211,14 @@ def _add_bodies(world: ElementTree.Element) -> None:
         body = _element(world, "body", name=f"body{i}", pos=_text(*parking_place(i)), gravcomp="1")
         _element(body, "joint", name=f"body{i}", type="free", damping=_text(BODY_DAMPING))
         _element(body, "inertial", mass=_text(EMPTY_MASS), pos="0 0 0", diaginertia=_text(*[EMPTY_INERTIA] * 3))
-        _element(body, "geom", class_="object", name=f"box{i}", type="box", friction=_text(BOX_FRICTION))
-        _element(body, "geom", class_="object", name=f"cylinder{i}", type="cylinder", friction=_text(CYLINDER_FRICTION))
+        for shape in in_order():
+            name = geometry_name(shape, i)
+            _element(body, "geom", class_="object", name=name, type=shape.geometry, friction=_text(shape.friction))
+
+
+def geometry_name(shape: Shape, slot: int) -> str:
+    """What the geometry of a shape in a slot is called."""
+    return f"{shape.name}{slot}"
 
 
 def parking_place(slot: int) -> tuple[float, float, float]:
@@ -281,27 +287,24 @@ def compile_model(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> mujo
 
 
 def masses_and_inertias(
-    cylinder: Bool[Any, "*batch"], half_size: Float[Any, "*batch 3"], library: Any = np
+    kind: Int[Any, "*batch"], half_size: Float[Any, "*batch 3"], library: Any = np
 ) -> tuple[Float[Any, "*batch"], Float[Any, "*batch 3"]]:
     """Masses [kg] and principal moments of inertia [kg m2] of solid bodies, along their own axes.
 
     Args:
-      cylinder: which are cylinders; the others are boxes.
+      kind: codes of their shapes.
       half_size: half-extents [m].
       library: NumPy or `jax.numpy`, whichever the arrays are of.
     """
-    square = half_size**2
-    volume = 8 * library.prod(half_size, axis=-1) * library.where(cylinder, np.pi / 4, 1.0)
-    mass = volume * library.where(cylinder, CYLINDER_DENSITY, BOX_DENSITY)
-    box = (square.sum(axis=-1, keepdims=True) - square) / 3
-    across = square[..., 0] / 4 + square[..., 2] / 3
-    rod = library.stack([across, across, square[..., 0] / 2], axis=-1)
-    return library.asarray(mass), mass[..., None] * library.where(cylinder[..., None], rod, box)
+    volume = by_shape(kind, lambda shape: shape.volume(half_size, library), library)
+    mass = volume * by_shape(kind, lambda shape: shape.density, library)
+    moments = by_shape(kind[..., None], lambda shape: shape.moments(half_size, library), library)
+    return library.asarray(mass), mass[..., None] * moments
 
 
 def mass_and_inertia(body: Body) -> tuple[float, Float[np.ndarray, " 3"]]:
     """Mass [kg] and principal moments of inertia [kg m2] of a solid body, along its own axes."""
-    mass, inertia = masses_and_inertias(np.array(body.shape == "cylinder"), np.array(body.half_size, float))
+    mass, inertia = masses_and_inertias(np.array(shape_of(body.shape).code), np.array(body.half_size, float))
     return float(mass), inertia
 
 
@@ -319,13 +322,12 @@ def with_bodies(model: mujoco.MjModel, bodies: Sequence[Body | None], skin: floa
         mass, inertia = mass_and_inertia(body) if body else (EMPTY_MASS, np.full(3, EMPTY_INERTIA))
         model.body_mass[index], model.body_inertia[index] = mass, inertia
         model.body_gravcomp[index] = 0.0 if body else 1.0
-        for shape in ("box", "cylinder"):
-            used = body is not None and body.shape == shape
+        for shape in in_order():
+            used = body is not None and body.shape == shape.name
             half = np.array(body.half_size) - skin if body is not None and used else np.full(3, TINY)
-            size = half if shape == "box" else np.array([half[0], half[2], 0.0])
-            geom = model.geom(f"{shape}{i}").id
-            model.geom_size[geom] = size
-            model.geom_rbound[geom] = np.linalg.norm(half) if shape == "box" else np.hypot(half[0], half[2])
+            geom = model.geom(geometry_name(shape, i)).id
+            model.geom_size[geom] = shape.geometry_size(half, np)
+            model.geom_rbound[geom] = shape.bounding_radius(half, np)
             model.geom_aabb[geom] = [0.0, 0.0, 0.0, *half]
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model

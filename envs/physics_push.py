@@ -1,13 +1,13 @@
 """Push models that simulate: `NativePhysics` on the CPU and `MjxPhysics` on a GPU, both `push_model.PushModel`.
 
-The recognised objects become the nearest boxes and cylinders, with the densities and frictions of the environment's
-own bodies, and the arm makes the push as `push_simulation` has it. Objects that are not at rest where they were
-recognised, because their shapes overlap a little or float, come to rest first. What the push has moved is then moved by
-as much from where it was recognised, and everything else stays exactly where it was. The environment's own simulator is
-not involved.
+The recognised objects become bodies of the nearest shapes, with the densities and frictions of the environment's own
+bodies, and the arm makes the push as `push_simulation` has it. Objects that are not at rest where they were recognised,
+because their shapes overlap a little or float, come to rest first. What the push has moved is then moved by as much
+from where it was recognised, and everything else stays exactly where it was. The environment's own simulator is not
+involved.
 
-Two approximations: a superquadric whose exponent e2 is above `ROUND_EXPONENT` is a cylinder, of the same cross-section,
-and any other one a box; and what is not recognised is not there.
+Two approximations: a superquadric whose exponent e2 is above `ROUND_EXPONENT` is a body of a round shape, of the same
+cross-section, and any other one of a shape that is not round; and what is not recognised is not there.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import mujoco
 import mujoco.rollout
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
@@ -38,13 +38,14 @@ from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
 from mechsearch_jax.envs.outcome import Failure, Overflow
 from mechsearch_jax.envs.pushes import push_simulation, toppled
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, controls
-from mechsearch_jax.envs.world import BODIES, BOX, CYLINDER, World, bodies_of
+from mechsearch_jax.envs.world import BODIES, World, bodies_of
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
 from mechsearch_jax.geometry.superquadric import Superquadrics, pad
 from mechsearch_jax.geometry.transforms import matmul, rotate
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference, push_reference
+from mechsearch_jax.shapes import by_shape, in_order
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -88,8 +89,18 @@ def _poses(world: World) -> Poses:
     return Poses(world.position, world.rotation)
 
 
+def _nearest_kind(exponents: Float[Array, "n 2"]) -> Int[Array, " n"]:
+    """Codes of the shapes of superquadrics: as round, or as little, as they are, and of those the nearest in e1."""
+    is_round = exponents[:, 1] > ROUND_EXPONENT
+    apart = [
+        jnp.where(is_round == shape.round, jnp.abs(exponents[:, 0] - shape.exponents[0]), jnp.inf)
+        for shape in in_order()
+    ]
+    return jnp.argmin(jnp.stack(apart), axis=0).astype(jnp.int32)
+
+
 def bodies(scene: Superquadrics) -> World:
-    """The nearest boxes and cylinders of superquadrics, in the slots of a `World`.
+    """The bodies that come nearest to superquadrics, in the slots of a `World`.
 
     Args:
       scene: fields (N, ...), N at most 9.
@@ -101,12 +112,10 @@ def bodies(scene: Superquadrics) -> World:
         raise InputError(f"the simulator has slots for {BODIES} bodies, not for {scene.capacity} superquadrics")
     scene = pad(scene, BODIES)
     size = jnp.maximum(scene.size, THINNEST)
-    is_round = scene.exponents[:, 1] > ROUND_EXPONENT
-    radius = jnp.sqrt(size[:, :1] * size[:, 1:2])
-    cylinder = jnp.concatenate([radius, radius, size[:, 2:]], axis=1)
+    kind = _nearest_kind(scene.exponents)
     return World(
-        kind=jnp.where(is_round, CYLINDER, BOX).astype(jnp.int32),
-        half_size=jnp.where(is_round[:, None], cylinder, size),
+        kind=kind,
+        half_size=by_shape(kind[:, None], lambda shape: shape.nearest(size, jnp), jnp),
         position=scene.position,
         rotation=scene.rotation,
         valid=scene.valid,

@@ -22,7 +22,7 @@ from mechsearch_jax.actions import Action, ActionConfig, ActionKind, ActionTable
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT
 from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.simulator import Simulator, SimulatorConfig
-from mechsearch_jax.envs.world import CYLINDER, TARGET, World, superquadrics
+from mechsearch_jax.envs.world import TARGET, World, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.footprints import bounding_half_extents, footprints
@@ -32,6 +32,7 @@ from mechsearch_jax.networks.push_geometry import pusher_distance
 from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
 from mechsearch_jax.robot.kinematics import path_kinematics
 from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 
 # An object whose vertical has turned by more than this has fallen over [rad].
@@ -230,13 +231,9 @@ def draw_push(
 
 
 def toppled(before: World, after: World) -> Bool[Array, "*batch n"]:
-    """Which bodies stand on another face than before; a lying cylinder that has rolled does not."""
+    """Which bodies stand on another face than before; what lies and has rolled does not."""
     up = before.rotation[..., 2, :], after.rotation[..., 2, :]
-    box = jnp.sum(up[0] * up[1], axis=-1)
-    level = [jnp.clip(jnp.abs(u[..., 2]), 0.0, 1.0) for u in up]
-    # The cosine of the difference of two inclinations.
-    can = level[0] * level[1] + jnp.sqrt((1.0 - level[0] ** 2) * (1.0 - level[1] ** 2))
-    return before.valid & (jnp.where(before.kind == CYLINDER, can, box) < math.cos(TOPPLED))
+    return before.valid & (by_shape(before.kind, lambda shape: shape.fall(*up, jnp), jnp) < math.cos(TOPPLED))
 
 
 def generate_pushes(

@@ -1,4 +1,4 @@
-"""What the camera sees: an exact ray-cast of boxes, cylinders and the shelf.
+"""What the camera sees: an exact ray-cast of the bodies and the shelf.
 
 Every ray is cut with every body in closed form: neither a display nor OpenGL is needed, and depth is exact to float32.
 """
@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.model import shelf_boxes
-from mechsearch_jax.envs.world import BODIES, CYLINDER, TARGET, World
+from mechsearch_jax.envs.world import BODIES, TARGET, World
 from mechsearch_jax.geometry.transforms import rotate
+from mechsearch_jax.shapes import by_shape, in_order, shape_of
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -42,6 +43,8 @@ PALETTE = np.array(
 BACKGROUND_COLOUR = (1.0, 1.0, 1.0)
 LIGHT = (-0.62, 0.25, 0.74)
 AMBIENT = 0.55
+# What the shelf is made of.
+_BOARD = shape_of("box")
 
 
 class Image(flax.struct.PyTreeNode):
@@ -64,38 +67,6 @@ def _local(rotation: Array, vector: Array) -> list[Array]:
     return [rotation[0, i] * x + rotation[1, i] * y + rotation[2, i] * z for i in range(3)]
 
 
-def _slab(origin: Array, direction: Array, low: Array | float, high: Array | float) -> tuple[Array, Array]:
-    """Where rays enter and leave the space between two parallel planes; never, where they run outside along it."""
-    safe = jnp.where(jnp.abs(direction) < 1e-12, 1e-12, direction)
-    a, b = (low - origin) / safe, (high - origin) / safe
-    return jnp.minimum(a, b), jnp.maximum(a, b)
-
-
-def _first(near: Array, far: Array) -> Array:
-    return jnp.where((near <= far) & (near > 0.0), near, jnp.inf)
-
-
-def _cut_box(origin: list[Array], direction: list[Array], half: Array) -> Array:
-    cuts = [_slab(o, d, -half[i], half[i]) for i, (o, d) in enumerate(zip(origin, direction, strict=True))]
-    (near, far), *others = cuts
-    for a, b in others:
-        near, far = jnp.maximum(near, a), jnp.minimum(far, b)
-    return _first(near, far)
-
-
-def _cut_cylinder(origin: list[Array], direction: list[Array], half: Array) -> Array:
-    """The lateral surface is cut at half a chord before and after the point nearest to the axis."""
-    (x, y, z), (u, v, w) = origin, direction
-    square = jnp.maximum(u * u + v * v, 1e-20)
-    middle = -(x * u + y * v) / square
-    miss = x * v - y * u
-    chord = half[0] * half[0] - miss * miss / square
-    reach = jnp.sqrt(jnp.maximum(chord, 0.0) / square)
-    bottom, top = _slab(z, w, -half[2], half[2])
-    near, far = jnp.maximum(middle - reach, bottom), jnp.minimum(middle + reach, top)
-    return jnp.where(chord >= 0.0, _first(near, far), jnp.inf)
-
-
 def cast_body(
     camera: Camera, world: World, slot: Array | int, directions: Float[Array, "*pixels 3"]
 ) -> Float[Array, "*pixels"]:
@@ -109,8 +80,8 @@ def cast_body(
     """
     origin = _local(world.rotation[slot], jnp.array(camera.position) - world.position[slot])
     direction = _local(world.rotation[slot], directions)
-    branches = [partial(cut, origin, direction, world.half_size[slot]) for cut in (_cut_box, _cut_cylinder)]
-    shown = jax.lax.cond(world.kind[slot] == CYLINDER, branches[1], branches[0])
+    cuts = [partial(shape.cut, origin, direction, world.half_size[slot], jnp) for shape in in_order()]
+    shown = jax.lax.switch(world.kind[slot], cuts)
     return jnp.where(world.valid[slot], shown, jnp.inf)
 
 
@@ -140,8 +111,8 @@ def cast_shelf(camera: Camera, shelf: Shelf, directions: Float[Array, "*pixels 3
     for low, high in shelf_boxes(shelf).values():
         centre, half = (low + high) / 2, (high - low) / 2
         origin = [jnp.float32(camera.position[i] - centre[i]) for i in range(3)]
-        box = _cut_box(origin, [directions[..., i] for i in range(3)], jnp.array(half, jnp.float32))
-        depth = jnp.minimum(depth, box)
+        towards = [directions[..., i] for i in range(3)]
+        depth = jnp.minimum(depth, _BOARD.cut(origin, towards, jnp.array(half, jnp.float32), jnp))
     return depth
 
 
@@ -155,11 +126,7 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
     offset = point - world.position[slot]
     local = rotate(jnp.swapaxes(rotation, -1, -2), offset)
     half = world.half_size[slot]
-    share = jnp.abs(local) / half
-    face = jnp.sign(local) * (share >= jnp.max(share, axis=-1, keepdims=True))
-    round_side = jnp.sqrt(local[..., 0] ** 2 + local[..., 1] ** 2) / half[..., 0] >= share[..., 2]
-    side = jnp.where(round_side[..., None], local * jnp.array([[1.0, 1.0, 0.0]]), face * jnp.array([[0.0, 0.0, 1.0]]))
-    chosen = jnp.where((world.kind[slot] == CYLINDER)[..., None], side, face)
+    chosen = by_shape(world.kind[slot][..., None], lambda shape: shape.normal(local, half, jnp), jnp)
     chosen = chosen / jnp.maximum(jnp.linalg.norm(chosen, axis=-1, keepdims=True), 1e-9)
     body = rotate(rotation, chosen)
 

@@ -9,11 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.shapes import in_order, shape_of
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
 
-BOX, CYLINDER = 0, 1
 TARGET = MAX_OBJECTS
 BODIES = MAX_OBJECTS + 1
 
@@ -22,7 +21,7 @@ class World(flax.struct.PyTreeNode):
     """All bodies on the shelf. Every field has the leading axes (..., 9): eight slots for objects, then the target.
 
     Attributes:
-      kind: 0 for a box, 1 for a cylinder, int32.
+      kind: code of the body's shape (`shapes.Shape`), int32.
       half_size: half-extents along the body's own axes [m], shape (..., 9, 3).
       position: `t_world_body` [m], shape (..., 9, 3).
       rotation: `R_world_body`, shape (..., 9, 3, 3).
@@ -54,11 +53,11 @@ def from_scenario(scenario: Scenario) -> World:
     Raises:
       InputError: there are more objects than slots.
     """
-    empty = Body("box", (1e-3, 1e-3, 1e-3), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    empty = Body(in_order()[0].name, (1e-3, 1e-3, 1e-3), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     bodies = slots(scenario)
     filled = [body or empty for body in bodies]
     return World(
-        kind=jnp.array([CYLINDER if b.shape == "cylinder" else BOX for b in filled], jnp.int32),
+        kind=jnp.array([shape_of(b.shape).code for b in filled], jnp.int32),
         half_size=jnp.array([b.half_size for b in filled], jnp.float32),
         position=jnp.array([b.position for b in filled], jnp.float32),
         rotation=jnp.array(np.stack([rotation_matrix(b.quaternion) for b in filled]), jnp.float32),
@@ -76,7 +75,7 @@ def bodies_of(world: World) -> list[Body | None]:
     quaternions = Rotation.from_matrix(np.where(host.valid[:, None, None], host.rotation, np.eye(3))).as_quat()
     return [
         Body(
-            "cylinder" if host.kind[i] == CYLINDER else "box",
+            in_order()[host.kind[i]].name,
             *(tuple(float(v) for v in values) for values in (host.half_size[i], host.position[i])),  # pyright: ignore
             tuple(float(v) for v in quaternions[i, [3, 0, 1, 2]]),  # pyright: ignore
         )
@@ -88,7 +87,7 @@ def bodies_of(world: World) -> list[Body | None]:
 
 def superquadrics(world: World) -> Superquadrics:
     """All bodies, the target last, as a recogniser that knows the truth would report them."""
-    exponents = jnp.array([superquadric.BOX_EXPONENTS, superquadric.CYLINDER_EXPONENTS])
+    exponents = jnp.array([shape.exponents for shape in in_order()])
     return Superquadrics(world.half_size, exponents[world.kind], world.position, world.rotation, world.valid)
 
 

@@ -28,6 +28,7 @@ from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
 from mechsearch_jax.options import option
 from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf, swept_cloud
 from mechsearch_jax.robot.kinematics import line_kinematics
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -123,12 +124,7 @@ def gripper_rotation(yaw: Float[Array, "*batch"], tilt: Float[Array, "*batch"]) 
 
 
 def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):
-    if target.shape == "cylinder":
-        yaws = np.linspace(-config.max_yaw, config.max_yaw, config.yaws) if config.yaws > 1 else np.zeros(1)
-        widths = np.full(len(yaws), 2 * target.half_size[0])
-    else:
-        yaws = np.arange(4) * np.pi / 2
-        widths = 2 * np.array(target.half_size)[[1, 0, 1, 0]]
+    yaws, widths = shape_of(target.shape).grasps(target.half_size, config.yaws, config.max_yaw)
     yaws = yaws[widths <= gripper.usable_opening]
     if len(yaws) == 0:
         raise InputError(
@@ -144,11 +140,7 @@ def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):
 
 def swept_target(target: Target, direction: np.ndarray, distance: float, count: int, erosion: float) -> np.ndarray:
     """Surface of what the target sweeps when it is moved along a direction, in its own frame, shape (count, 3) [m]."""
-    a, b, c = (h - erosion for h in target.half_size)
-    if target.shape == "cylinder":
-        mesh = trimesh.creation.cylinder(radius=a, height=2 * c, sections=32)
-    else:
-        mesh = trimesh.creation.box(extents=(2 * a, 2 * b, 2 * c))
+    mesh = shape_of(target.shape).mesh([h - erosion for h in target.half_size])
     both = np.concatenate([mesh.vertices, mesh.vertices + distance * np.asarray(direction)])
     points = trimesh.sample.sample_surface(trimesh.convex.convex_hull(both), count, seed=0)[0]
     return np.asarray(points, np.float32)

@@ -22,6 +22,7 @@ from mechsearch_jax.dynamics import rigid
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF, GRIPPER, CONFIG = Shelf(), Gripper(), ObjectGraspConfig()
@@ -58,7 +59,7 @@ boxes = st.tuples(st.floats(0.01, 0.08), st.floats(0.01, 0.08), st.floats(0.03, 
 @hypothesis.given(half=boxes, yaw=st.floats(-np.pi, np.pi))
 @hypothesis.settings(deadline=None, max_examples=60)
 def test_a_box_passes_between_the_open_fingers_and_stays_off_the_palm(half, yaw):
-    tips, R, fits = grasps_of(half, superquadric.BOX_EXPONENTS, yaw)
+    tips, R, fits = grasps_of(half, shape_of("box").exponents, yaw)
     for tip, rotation in zip(tips[fits], R[fits], strict=True):
         heading = rotation[:2, 2] / np.linalg.norm(rotation[:2, 2])
         assert abs(np.arctan2(heading[1], heading[0])) <= MAX_YAW + 2e-3
@@ -75,8 +76,8 @@ def test_a_box_passes_between_the_open_fingers_and_stays_off_the_palm(half, yaw)
 @hypothesis.settings(deadline=None, max_examples=30)
 def test_grasps_of_a_round_object_do_not_depend_on_its_yaw_and_pass_through_its_axis(radius, yaw):
     half = (radius, radius, 0.06)
-    tips, R, fits = grasps_of(half, superquadric.CYLINDER_EXPONENTS, yaw)
-    still, _, _ = grasps_of(half, superquadric.CYLINDER_EXPONENTS, 0.0)
+    tips, R, fits = grasps_of(half, shape_of("cylinder").exponents, yaw)
+    still, _, _ = grasps_of(half, shape_of("cylinder").exponents, 0.0)
     assert fits.all()
     np.testing.assert_allclose(tips, still, atol=1e-5)
     np.testing.assert_allclose(np.einsum("ai,ai->a", tips[:, :2], R[:, :2, 1]), 0.0, atol=1e-5)
@@ -85,14 +86,14 @@ def test_grasps_of_a_round_object_do_not_depend_on_its_yaw_and_pass_through_its_
 def test_a_turned_grasp_is_turned_towards_the_front_and_back_by_the_hand():
     half, yaw = (0.03, 0.012, 0.06), np.radians(50)
     way, _, _ = grasp_variants(CONFIG, WRISTS)
-    _, R, fits = grasps_of(half, superquadric.BOX_EXPONENTS, yaw)
+    _, R, fits = grasps_of(half, shape_of("box").exponents, yaw)
     approach = np.arctan2(R[:, 1, 2], R[:, 0, 2])
     square, fully = way == 0, way == CONFIG.boxes.index(BoxGrasp(turn=1.0))
     # The nearest face points 40 degrees to the right; 22 degrees of that are made up.
     np.testing.assert_allclose(np.degrees(approach[square]), -40, atol=0.01)
     np.testing.assert_allclose(np.degrees(approach[fully]), -18, atol=0.01)
     assert fits[fully].all()
-    scene = upright(half, superquadric.BOX_EXPONENTS, yaw)
+    scene = upright(half, shape_of("box").exponents, yaw)
     for rotation in R[fits]:
         held = rigid.in_hand(scene, jnp.int32(0), transforms.make(jnp.float32(rotation), jnp.zeros(3)))
         alignment = np.abs(np.asarray(held)[:2, :2].T @ rotation[:2, 1])
@@ -100,15 +101,15 @@ def test_a_turned_grasp_is_turned_towards_the_front_and_back_by_the_hand():
 
 
 def test_what_is_too_wide_for_the_hand_is_not_grasped():
-    _, _, fits = grasps_of((0.04, 0.04, 0.05), superquadric.BOX_EXPONENTS, 0.1)
+    _, _, fits = grasps_of((0.04, 0.04, 0.05), shape_of("box").exponents, 0.1)
     assert not fits.any()
-    _, _, fits = grasps_of((0.04, 0.04, 0.05), superquadric.CYLINDER_EXPONENTS, 0.1)
+    _, _, fits = grasps_of((0.04, 0.04, 0.05), shape_of("cylinder").exponents, 0.1)
     assert not fits.any()
 
 
 def test_a_box_that_fills_the_hand_is_grasped_square_only():
     way, _, _ = grasp_variants(CONFIG, WRISTS)
-    _, _, fits = grasps_of((0.05, 0.036, 0.05), superquadric.BOX_EXPONENTS, 0.1)
+    _, _, fits = grasps_of((0.05, 0.036, 0.05), shape_of("box").exponents, 0.1)
     turned = np.array([box.turn != 0 for box in CONFIG.boxes])[way]
     assert fits[~turned].all()
     assert not fits[turned].any()

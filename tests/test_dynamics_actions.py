@@ -17,6 +17,7 @@ from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.belief import possible_space
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -49,8 +50,8 @@ def finger_at(x, y):
     return jnp.float32(grid.reshape(-1, 3)), transforms.upright_pose(jnp.float32([x, y, 0.0]), SHELF.board + 0.03)
 
 
-BOX = ((0.03, 0.03, 0.06), superquadric.BOX_EXPONENTS)
-ROUND = ((0.03, 0.03, 0.06), superquadric.CYLINDER_EXPONENTS)
+BOX = ((0.03, 0.03, 0.06), shape_of("box").exponents)
+ROUND = ((0.03, 0.03, 0.06), shape_of("cylinder").exponents)
 
 
 def yaw_of(rotation):

@@ -17,11 +17,13 @@ from mechsearch_jax.envs import push_models as all_push_models
 from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.physics_push import STILL, MjxPhysics, NativePhysics
 from mechsearch_jax.envs.pushes import push_simulation
-from mechsearch_jax.envs.world import BOX, CYLINDER, bodies_of, from_scenario, superquadrics
+from mechsearch_jax.envs.world import bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, PlannerConfig, initial_belief, prediction, search_for_grasp, update_belief
+from mechsearch_jax.shapes.box import CODE as BOX
+from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
 from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()

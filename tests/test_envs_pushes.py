@@ -18,12 +18,14 @@ from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.push_portions import portions
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
-from mechsearch_jax.envs.world import BOX, CYLINDER, TARGET, World, bodies_of, from_scenario, superquadrics
+from mechsearch_jax.envs.world import TARGET, World, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.networks.push import PushConfig
 from mechsearch_jax.networks.push_geometry import NORMALS, push_start, reach
+from mechsearch_jax.shapes.box import CODE as BOX
+from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
 from mechsearch_jax.train import push as training
 from mechsearch_jax.train.loop import TrainConfig, train
 from mechsearch_jax.train.push import PushTask, average_precision, model_scores, planar_turn, push_truth

@@ -13,11 +13,11 @@ from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.noise import measured_depth
 from mechsearch_jax.perception.scores import intersection_over_union, sharpened
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.shelf import Shelf
@@ -54,7 +54,7 @@ def test_true_masks_and_noisy_depth_give_the_shapes(world, seen):
     assert not np.asarray(seen.objects.valid & ~truth.valid).any()
     assert not seen.target_visible
     # As the oracle has them, whatever fits the image best.
-    np.testing.assert_array_equal(seen.objects.exponents[both, 0], np.float32(superquadric.BOX_EXPONENTS[0]))
+    np.testing.assert_array_equal(seen.objects.exponents[both, 0], np.float32(shape_of("box").exponents[0]))
 
 
 def test_the_same_key_gives_the_same_and_another_key_other_noise(world, masks, seen):

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs import simulated_camera, world
 from mechsearch_jax.envs.model import shelf_boxes
-from mechsearch_jax.envs.world import CYLINDER, TARGET
+from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf

@@ -30,6 +30,7 @@ from mechsearch_jax.robot.kinematics import (
     line_kinematics,
 )
 from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -124,7 +125,7 @@ def test_the_model_has_the_robot_of_the_kinematics():
 def test_bodies_have_the_mass_and_inertia_of_their_shape(body):
     kind = "cylinder" if body.shape == "cylinder" else "box"
     size = body.half_size if kind == "box" else (body.half_size[0], body.half_size[2], 0.0)
-    density = model.BOX_DENSITY if kind == "box" else model.CYLINDER_DENSITY
+    density = shape_of(kind).density
     geom = f'<geom type="{kind}" size="{size[0]} {size[1]} {size[2]}" density="{density}"/>'
     alone = mujoco.MjModel.from_xml_string(
         f'<mujoco><worldbody><body name="it"><freejoint/>{geom}</body></worldbody></mujoco>'

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
+from mechsearch_jax.shapes import shape_of
 
 sizes = st.tuples(*[st.floats(0.01, 0.2)] * 3)
 exponents = st.tuples(*[st.floats(0.1, 1.9)] * 2)
@@ -82,8 +83,8 @@ def test_sampled_points_lie_on_the_surface(size, exponents):
 
 def test_samples_leave_no_gap_on_a_box():
     size = jnp.float32([0.05, 0.03, 0.08])
-    points = np.asarray(superquadric.sample_surface(size, jnp.float32(superquadric.BOX_EXPONENTS), 512))
-    dense = np.asarray(superquadric.sample_surface(size, jnp.float32(superquadric.BOX_EXPONENTS), 4096))
+    points = np.asarray(superquadric.sample_surface(size, jnp.float32(shape_of("box").exponents), 512))
+    dense = np.asarray(superquadric.sample_surface(size, jnp.float32(shape_of("box").exponents), 4096))
     nearest = np.min(np.linalg.norm(dense[:, None] - points[None], axis=-1), axis=1)
     assert nearest.max() < 0.013
 

@@ -10,6 +10,7 @@ from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.graspability import GraspConfig
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -128,7 +129,7 @@ def test_a_found_target_in_the_open_is_grasped_and_one_behind_a_wall_of_boxes_is
     for i, y in enumerate(np.linspace(-0.1, 0.3, 5)):
         wall = wall.replace(
             size=wall.size.at[i].set(jnp.float32([0.02, 0.06, 0.15])),
-            exponents=wall.exponents.at[i].set(jnp.float32(superquadric.BOX_EXPONENTS)),
+            exponents=wall.exponents.at[i].set(jnp.float32(shape_of("box").exponents)),
             position=wall.position.at[i].set(jnp.float32([0.5, y, problem.shelf.board + 0.15])),
             valid=wall.valid.at[i].set(True),
         )

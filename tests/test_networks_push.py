@@ -25,13 +25,14 @@ from mechsearch_jax.networks.push import PushConfig, PushNetwork
 from mechsearch_jax.networks.push_geometry import REACH, push_geometry, push_start
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
 # Nothing is within reach of these walls.
 OPEN = Shelf(front=-50.0, back=50.0, right=-50.0, left=50.0)
 CONFIG = PushConfig(width=16, layers=2)
-BOX, ROUND = superquadric.BOX_EXPONENTS, superquadric.CYLINDER_EXPONENTS
+BOX, ROUND = shape_of("box").exponents, shape_of("cylinder").exponents
 
 
 @functools.cache

@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs import simulated_camera, world
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.geometry.superquadric import BOX_EXPONENTS, CYLINDER_EXPONENTS, sample_surface
+from mechsearch_jax.geometry.superquadric import sample_surface
 from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
 from mechsearch_jax.perception import refinement, scores
 from mechsearch_jax.perception.noise import TimeOfFlight, measured_depth
 from mechsearch_jax.perception.refinement import RefinementConfig
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera, back_project, pixel_rays, project
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -147,7 +148,11 @@ def test_a_wrong_class_is_noticed():
     rng = np.random.default_rng(2)
     points, labels, depth, truth = measured([SCENE], rng, 0.001)
     guess = disturbed(truth, rng, yaw=0.0)
-    exponents = jnp.where((truth.exponents[..., 1:] > 0.5), jnp.array(BOX_EXPONENTS), jnp.array(CYLINDER_EXPONENTS))
+    exponents = jnp.where(
+        (truth.exponents[..., 1:] > 0.5),
+        jnp.array(shape_of("box").exponents),
+        jnp.array(shape_of("cylinder").exponents),
+    )
     refined = refiner()(guess.replace(exponents=exponents), points, labels, depth)
     cylinder = np.array([h[1] > 0.5 for h in RefinementConfig().hypotheses])[np.array(refined.hypothesis)]
     clearly = [0, 1, 2, 4]

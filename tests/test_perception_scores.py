@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.special import gamma
 
-from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.perception import scores
+from mechsearch_jax.shapes import shape_of
 
-BOX, CYLINDER = superquadric.BOX_EXPONENTS, superquadric.CYLINDER_EXPONENTS
+BOX, CYLINDER = shape_of("box").exponents, shape_of("cylinder").exponents
 
 
 def bodies(size, exponents, position, rotation):

@@ -12,11 +12,10 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs.world import BOX, CYLINDER
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks import recognition as model
 from mechsearch_jax.networks import segmentation as layers
-from mechsearch_jax.networks.recognition import BASE_ROTATIONS, HYPOTHESES, IS_CYLINDER, RecognitionConfig
+from mechsearch_jax.networks.recognition import BASE_ROTATIONS, HYPOTHESES, IS_ROUND, RecognitionConfig
 from mechsearch_jax.networks.segmentation import (
     SegmentationConfig,
     SegmentationNetwork,
@@ -28,6 +27,8 @@ from mechsearch_jax.perception import segments as clouds
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
 from mechsearch_jax.perception.segments import CLEAR, CONTEXT, HIDDEN_EDGE, INNER, OUTLINE, segment_clouds
+from mechsearch_jax.shapes.box import CODE as BOX
+from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
 from mechsearch_jax.train import loop, recognition, scenes, segmentation
 from mechsearch_jax.train.loop import CHECKPOINT, SCALARS, TrainConfig, initial_state, learning_rate, train
 from mechsearch_jax.workspace.shelf import Shelf
@@ -306,7 +307,7 @@ def test_recognition_does_not_mind_the_order_of_the_points():
     assert (np.asarray(told.size) > 0).all()
     assert (np.asarray(told.exponents) >= 0.05).all()
     assert (np.asarray(told.exponents) <= 1.2).all()
-    cylinders = np.asarray(told.size)[:, IS_CYLINDER]
+    cylinders = np.asarray(told.size)[:, IS_ROUND]
     assert np.array_equal(cylinders[..., 0], cylinders[..., 1])
 
 
@@ -358,7 +359,7 @@ def test_every_answer_describes_the_same_body(kind):
         assert told.right.sum() == 1
         assert (np.asarray(told.right) <= np.asarray(told.taught)).all()
         for k in np.flatnonzero(np.asarray(told.taught)):
-            assert IS_CYLINDER[k] == (kind == CYLINDER)
+            assert IS_ROUND[k] == (kind == CYLINDER)
             turned = BASE_ROTATIONS[k] @ Rotation.from_rotvec(np.asarray(told.turn[k])).as_matrix()
             assert same_body(kind, half, rotation, np.asarray(told.half_size[k]), turned)
         best = np.linalg.norm(told.turn[np.argmax(told.right)])
@@ -372,7 +373,7 @@ def outputs_for(truth):
     right = jax.jit(recognition.answers)(truth.kind, truth.half_size, truth.rotation)
     base = jnp.asarray(BASE_ROTATIONS)
     rotation = model.matmul(base, jax.jit(model.rotation_of)(right.turn))
-    edges = np.stack([np.full(HYPOTHESES, 0.05), np.where(IS_CYLINDER, 1.0, 0.05)], axis=-1)
+    edges = np.stack([np.full(HYPOTHESES, 0.05), np.where(IS_ROUND, 1.0, 0.05)], axis=-1)
     return model.Hypotheses(
         logit=jnp.where(right.right, 20.0, -20.0),
         size=right.half_size,
@@ -425,7 +426,7 @@ def test_height_is_told_relative_to_a_body_at_rest():
     for k in range(HYPOTHESES):
         box = down[k] @ size[k]
         round_one = down[k, 2] * size[k, 2] + np.sqrt(1 - min(down[k, 2], 1.0) ** 2) * size[k, 0]
-        assert told.position[0, k, 2] == pytest.approx(round_one if IS_CYLINDER[k] else box, abs=1e-6)
+        assert told.position[0, k, 2] == pytest.approx(round_one if IS_ROUND[k] else box, abs=1e-6)
     slope = jax.jit(jax.grad(lambda o: jnp.sum(model.decode(o, zero[..., 0]).position)))(zero)
     assert np.isfinite(slope).all()
 

@@ -7,6 +7,7 @@ import pytest
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace import camera, render
 from mechsearch_jax.workspace.camera import Camera
 
@@ -25,8 +26,8 @@ def scene_of(*bodies):
     )
 
 
-BOX = ((0.048, 0.028, 0.08), superquadric.BOX_EXPONENTS, (0.55, 0.1, 0.4845), 0.4)
-CYLINDER = ((0.032, 0.032, 0.067), superquadric.CYLINDER_EXPONENTS, (0.6, -0.05, 0.4715), 0.0)
+BOX = ((0.048, 0.028, 0.08), shape_of("box").exponents, (0.55, 0.1, 0.4845), 0.4)
+CYLINDER = ((0.032, 0.032, 0.067), shape_of("cylinder").exponents, (0.6, -0.05, 0.4715), 0.0)
 
 
 def reference_superquadric_depth(cam, scene):

@@ -22,13 +22,14 @@ from mechsearch_jax.envs import pushes as generator
 from mechsearch_jax.envs.push_portions import portions
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, joined, push_tables
 from mechsearch_jax.envs.simulator import Simulator
-from mechsearch_jax.envs.world import CYLINDER, superquadrics
+from mechsearch_jax.envs.world import superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import matmul
 from mechsearch_jax.networks.push import PushConfig, PushMotion, PushNetwork, apply_network
 from mechsearch_jax.networks.push_geometry import CHAIN, NORMALS, REACH, PushStart, push_start, pusher_distance
 from mechsearch_jax.networks.weights import save_weights
+from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.train.scenes import SceneConfig, origin, random_world
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -84,7 +85,7 @@ def push_truth(pushes: Pushes) -> PushTruth:
     before, after = pushes.before, pushes.after
     shift = (after.position - before.position)[..., :2]
     turn = planar_turn(before.rotation, after.rotation)
-    stands = before.kind == CYLINDER
+    stands = by_shape(before.kind, lambda shape: shape.round, jnp)
     stands &= jnp.abs(before.rotation[..., 2, 2]) > 0.98
     turn = jnp.where(stands, 0.0, turn)
     far = (shift[..., 0] ** 2 + shift[..., 1] ** 2 > STILL**2) | (jnp.abs(turn) > STILL_TURN)
@@ -471,7 +472,7 @@ def _summary(
     here = chosen[:, None] & truth.valid
     upright = here & ~truth.toppled
     pushed = np.arange(truth.valid.shape[1])[None] == pushes.object[:, None]
-    boxes = pushes.before.kind != CYLINDER
+    turns = ~by_shape(np.asarray(pushes.before.kind), lambda shape: shape.round, np)
     still = upright & ~truth.moved
 
     def mean(value, where, unit):
@@ -482,7 +483,7 @@ def _summary(
         "pushes": int(chosen.sum()),
         "failed": int(failed[chosen].sum()),
         "pushed_mm": mean(compared.shift_error, upright & pushed, 1e3),
-        "pushed_deg": mean(compared.turn_error, upright & pushed & boxes, 180 / np.pi),
+        "pushed_deg": mean(compared.turn_error, upright & pushed & turns, 180 / np.pi),
         "other_mm": mean(compared.shift_error, upright & ~pushed & truth.moved, 1e3),
         "still": mean((compared.shift < STILL).astype(float), still, 1.0),
         "topple_ap": None if np.isnan(precision) else round(precision, 4),

@@ -15,13 +15,14 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.envs.world import CYLINDER, TARGET, World, true_superquadrics
+from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.transforms import matmul, rotate
 from mechsearch_jax.networks.recognition import (
     BASE_ROTATIONS,
     HYPOTHESES,
-    IS_CYLINDER,
+    HYPOTHESIS_KINDS,
+    IS_ROUND,
     Hypotheses,
     RecognitionConfig,
     RecognitionNetwork,
@@ -30,8 +31,9 @@ from mechsearch_jax.networks.recognition import (
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.perception.cloud import View, shelf_view
 from mechsearch_jax.perception.recognition import best_hypothesis
-from mechsearch_jax.perception.scores import centre_error, intersection_over_union, sharpened
+from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
+from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import (
     PIXELS,
@@ -77,7 +79,7 @@ class Truth(flax.struct.PyTreeNode):
     """A true body in a segment's frame; every field may have leading axes.
 
     Attributes:
-      kind: BOX or CYLINDER.
+      kind: code of its shape.
       half_size: [m], (..., 3).
       position: `t_segment_object` [m], (..., 3).
       rotation: `R_segment_object`, (..., 3, 3).
@@ -150,11 +152,11 @@ def answers(kind: Int[Array, ""], half_size: Float[Array, "3"], rotation: Float[
     ratio = jnp.where(sine > 1e-6, angle / jnp.maximum(sine, 1e-6), 1.0)
     can_turn = jnp.stack([-axis[:, 1] * ratio, axis[:, 0] * ratio, jnp.zeros_like(ratio)], axis=-1)
 
-    round_ones = jnp.asarray(IS_CYLINDER)
+    round_ones = jnp.asarray(IS_ROUND)
     turn = jnp.where(round_ones[:, None], can_turn, box_turn)
     size = jnp.where(round_ones[:, None], half_size[None], box_size)
     distance = jnp.linalg.norm(turn, axis=-1)
-    fits = round_ones == (kind == CYLINDER)
+    fits = jnp.asarray(HYPOTHESIS_KINDS) == kind
     right = jnp.argmin(jnp.where(fits, distance, jnp.inf)) == jnp.arange(HYPOTHESES)
     near = distance < jnp.min(jnp.where(fits, distance, jnp.inf)) + _OVERLAP
     return Answers(turn, size, fits & near, right)
@@ -268,7 +270,7 @@ def example_loss(told: Hypotheses, truth: Truth) -> dict[str, Float[Array, ""]]:
 
     size_error = told.size - right.half_size
     position_error = told.position - truth.position[None]
-    edges = jnp.stack([jnp.full(HYPOTHESES, _SHARP), jnp.where(jnp.asarray(IS_CYLINDER), _ROUND, _SHARP)], axis=-1)
+    edges = jnp.stack([jnp.full(HYPOTHESES, _SHARP), jnp.where(jnp.asarray(IS_ROUND), _ROUND, _SHARP)], axis=-1)
     errors = jax.lax.stop_gradient(jnp.abs(jnp.concatenate([size_error, position_error], axis=-1)))
     scale = jnp.exp(told.log_scale)
     winner = jnp.argmax(right.right)
@@ -306,7 +308,7 @@ def tear(key: Key[Array, ""], labels: Int[Array, "h w"], reach: int = 2) -> Int[
 class _Scored(flax.struct.PyTreeNode):
     overlap: jax.Array
     centre: jax.Array
-    cylinder: jax.Array
+    right: jax.Array
     share: jax.Array
     counted: jax.Array
     known: jax.Array
@@ -323,7 +325,7 @@ def _score_batch(task: RecognitionTask, parameters: Any, key: Array, batch: int)
     return _Scored(
         overlap=intersection_over_union(truth, found),
         centre=centre_error(truth, found),
-        cylinder=(found.exponents[..., 1] > 0.5) == (worlds.kind[:, :TARGET] == CYLINDER),
+        right=(found.exponents[..., 1] > EDGE) == by_shape(worlds.kind[:, :TARGET], lambda shape: shape.round, jnp),
         share=jax.vmap(visible_share)(seen),
         counted=truth.valid & jax.vmap(lambda s: worth_seeing(s, task.view))(seen),
         known=jax.vmap(is_known)(worlds)[:, :TARGET],
@@ -360,5 +362,5 @@ def _summary(scored: _Scored, chosen: Bool[np.ndarray, " n"]) -> dict[str, float
         "iou_mean": round(float(np.mean(scored.overlap[chosen])), 4),
         "iou_median": round(float(np.median(scored.overlap[chosen])), 4),
         "centre_median_mm": round(1e3 * float(np.median(scored.centre[chosen])), 3),
-        "shape_right": round(float(np.mean(scored.cylinder[chosen])), 4),
+        "shape_right": round(float(np.mean(scored.right[chosen])), 4),
     }

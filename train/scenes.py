@@ -11,26 +11,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.envs.generator import BOXES, CYLINDERS
+from mechsearch_jax.envs.generator import CATALOGUE
 from mechsearch_jax.envs.recognisers import true_labels
 from mechsearch_jax.envs.simulated_camera import cast_body, cast_shelf
-from mechsearch_jax.envs.world import BODIES, BOX, CYLINDER, TARGET, World
+from mechsearch_jax.envs.world import BODIES, TARGET, World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
 from mechsearch_jax.perception.cloud import View, shelf_view
 from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
+from mechsearch_jax.shapes import by_shape, shape_of
 from mechsearch_jax.workspace.camera import Camera, rays
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 # Steps of `_slide`; each shortens the gap to at most about a third.
 _SLIDES = 8
 # What an object must show of itself in the full image to be worth scoring.
 PIXELS = 100
-_TARGETS = np.array([(0.02, 0.02, 0.05), (0.015, 0.02, 0.05)])
+# Codes of the shapes that objects of any size and targets are drawn from: their order decides which random number
+# stands for which. Then the codes and half-extents of the targets and of the paper's objects.
+_OBJECT_KINDS = np.array([shape_of(name).code for name in ("box", "cylinder")], np.int32)
+_TARGETS = tuple(Target.of(name) for name in ("cylinder", "box"))
 _KNOWN = np.array(
-    [(BOX, *half) for w, d, h in BOXES for half in ((w / 2, d / 2, h / 2), (d / 2, w / 2, h / 2))]
-    + [(CYLINDER, r, r, h / 2) for r, h in CYLINDERS for _ in range(2)],
-    np.float32,
+    [(shape_of(name).code, *half) for name, (x, y, z) in CATALOGUE for half in ((x, y, z), (y, x, z))], np.float32
 )
 
 
@@ -41,9 +44,9 @@ class SceneConfig:
     Attributes:
       objects: least and largest number of objects; some may find no room and are left out.
       known: share of objects that are one of the paper's eleven.
-      sides: range of a box's width and depth.
+      sides: range of the width and depth of what is not round.
       heights: range of heights.
-      diameters: range of a cylinder's diameter.
+      diameters: range of the diameter of what is.
       lying: share of objects that lie on their side.
       leaning: share of objects that lean, none of whose faces is level.
       lean: range of the angle by which they lean [rad].
@@ -161,11 +164,13 @@ def _draw_shape(key: Array, config: SceneConfig) -> _Shape:
     keys = jax.random.split(key, 8)
     known = jnp.array(_KNOWN)[jax.random.randint(keys[0], (), 0, len(_KNOWN))]
     is_known = jax.random.bernoulli(keys[1], config.known)
-    kind = jnp.where(is_known, known[0].astype(jnp.int32), jax.random.randint(keys[2], (), 0, 2))
+    drawn = jnp.asarray(_OBJECT_KINDS)[jax.random.randint(keys[2], (), 0, len(_OBJECT_KINDS))]
+    kind = jnp.where(is_known, known[0].astype(jnp.int32), drawn)
     width, depth = _log_uniform(keys[3], config.sides, (2,)) / 2
     radius = _log_uniform(keys[4], config.diameters) / 2
     height = _log_uniform(keys[5], config.heights) / 2
-    free = jnp.where(kind == CYLINDER, jnp.stack([radius, radius, height]), jnp.stack([width, depth, height]))
+    is_round = by_shape(kind, lambda shape: shape.round, jnp)
+    free = jnp.where(is_round, jnp.stack([radius, radius, height]), jnp.stack([width, depth, height]))
     half = jnp.where(is_known, known[1:], free)
     pose = jax.random.uniform(keys[6])
     angle = jnp.where(
@@ -178,11 +183,8 @@ def _draw_shape(key: Array, config: SceneConfig) -> _Shape:
 
 
 def _shape(kind: Array, half: Array, rotation: Array) -> _Shape:
-    extent = jnp.sum(jnp.abs(rotation) * half[None, :], axis=-1)
-    side = jnp.sqrt(jnp.maximum(1.0 - rotation[:, 2] ** 2, 0.0))
-    round_extent = half[0] * side + half[2] * jnp.abs(rotation[:, 2])
-    extent = jnp.where(kind == CYLINDER, round_extent, extent)
-    standing = (kind == CYLINDER) & (rotation[2, 2] > 0.999)
+    extent = by_shape(kind, lambda shape: shape.reach(rotation, half[None, :], jnp), jnp)
+    standing = by_shape(kind, lambda shape: shape.round, jnp) & (rotation[2, 2] > 0.999)
     return _Shape(
         kind, half, rotation, extent[2], jnp.where(standing, 0.0, extent[:2]), jnp.where(standing, half[0], 0.0)
     )
@@ -230,9 +232,11 @@ def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: 
     keys = jax.random.split(key, 5)
     count = jax.random.randint(keys[0], (), config.objects[0], config.objects[1] + 1)
     shapes = jax.vmap(lambda k: _draw_shape(k, config))(jax.random.split(keys[1], TARGET))
-    target_kind = jax.random.randint(keys[2], (), 0, 2)
+    hidden = jax.random.randint(keys[2], (), 0, len(_TARGETS))
     target = _shape(
-        jnp.where(target_kind == 0, CYLINDER, BOX), jnp.array(_TARGETS, jnp.float32)[target_kind], jnp.eye(3)
+        jnp.array([shape_of(target.shape).code for target in _TARGETS])[hidden],
+        jnp.array([target.half_size for target in _TARGETS], jnp.float32)[hidden],
+        jnp.eye(3),
     )
     shapes = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), shapes, target)
     wanted = (jnp.arange(BODIES) < count).at[TARGET].set(jax.random.bernoulli(keys[3], config.target))
@@ -368,21 +372,13 @@ def visible_share(seen: Capture) -> Float[Array, " objects"]:
 def surface_points(
     key: Key[Array, ""], kind: Int[Array, ""], half_size: Float[Array, "3"], count: int
 ) -> Float[Array, "count 3"]:
-    """Points spread uniformly over the surface of a box or cylinder, in its own frame [m]."""
-    a, b, c = half_size
+    """Points spread uniformly over the surface of a body, in its own frame [m]."""
     faces, flat, sign = jax.random.split(key, 3)
-    box_area = jnp.stack([b * c, a * c, a * b])
-    round_area = jnp.stack([2.0 * a * c, 0.0 * a, a * a])
-    area = jnp.where(kind == CYLINDER, round_area, box_area)
+    area = by_shape(kind, lambda shape: shape.areas(half_size, jnp), jnp)
     face = jax.random.categorical(faces, jnp.log(jnp.maximum(area, 1e-12)), shape=(count,))
     u = jax.random.uniform(flat, (count, 3), minval=-1.0)
     side = jnp.where(jax.random.bernoulli(sign, shape=(count,)), 1.0, -1.0)
-    box = jnp.where(face[:, None] == jnp.arange(3)[None], side[:, None], u)
-    angle = jnp.pi * u[:, 0]
-    radius = jnp.where(face == 2, jnp.sqrt(jnp.abs(u[:, 1])), 1.0)
-    height = jnp.where(face == 2, side, u[:, 2])
-    can = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), height], axis=-1)
-    return jnp.where(kind == CYLINDER, can, box) * half_size[None]
+    return by_shape(kind, lambda shape: shape.spread(face, u, side, jnp), jnp) * half_size[None]
 
 
 def worth_seeing(seen: Capture, view: View, pixels: int = PIXELS) -> Bool[Array, " objects"]:

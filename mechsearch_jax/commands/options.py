@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.shapes import SHAPES
 
 if TYPE_CHECKING:
     from mechsearch_jax.envs.method import EngineName, Method
@@ -19,7 +20,10 @@ if TYPE_CHECKING:
 
 PaperMethod = Literal["search-for-grasp", "search-and-grasp"]
 PushModel = Literal["quasi-static", "learned", "physics"]
-TargetShape = Literal["cylinder", "box"]
+if TYPE_CHECKING:
+    TargetShape = str
+else:
+    TargetShape = Literal[tuple(SHAPES)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,6 +171,7 @@ OnePolicy = Annotated[str | None, tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE")
 OneMethod = Annotated[PaperMethod | None, tyro.conf.arg(metavar="{search-for-grasp,search-and-grasp}")]
 Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER ...")]
 
+GivenShape = Annotated[TargetShape | None, tyro.conf.arg(metavar="{" + ",".join(SHAPES) + "}")]
 SomeScenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")]
 JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 WeightsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")]

@@ -30,7 +30,7 @@ def generate(*, objects: int, out: Path, count: int = 1, target: TargetShape = "
     at_least_one("scenarios generate", count=count)
     check_writable(out)
     keep_compilations()
-    generator = ScenarioGenerator(Target.box() if target == "box" else Target.cylinder())
+    generator = ScenarioGenerator(Target.of(target))
     for i in track(range(seed, seed + count), "generating"):
         scenario = generator.generate(i, objects)
         save_scenario(scenario, out / f"{scenario.name}.json")

@@ -10,9 +10,9 @@ import tyro
 from mechsearch_jax.commands.options import (
     DEFAULTS,
     EpisodeOptions,
+    GivenShape,
     OneMethod,
     OnePolicy,
-    TargetShape,
     chosen_policies,
     find_scenario,
 )
@@ -24,7 +24,7 @@ def search(
     /,
     *,
     objects: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
-    target: Annotated[TargetShape | None, tyro.conf.arg(metavar="{cylinder,box}")] = None,
+    target: GivenShape = None,
     method: OneMethod = None,
     policy: OnePolicy = None,
     seed: int = 0,

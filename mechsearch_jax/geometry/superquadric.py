@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import align, inverse, make, transform
 
-BOX_EXPONENTS = (0.2, 0.2)
-CYLINDER_EXPONENTS = (0.2, 1.0)
+# Exponent of the sharpest edges that the paper plans with.
+EDGE_EXPONENT = 0.2
 
 
 class Superquadrics(flax.struct.PyTreeNode):
@@ -69,12 +69,12 @@ def pad(superquadrics: Superquadrics, capacity: int) -> Superquadrics:
 
 
 def standard_edges(superquadrics: Superquadrics) -> Superquadrics:
-    """The same superquadrics with edges no sharper than those of `BOX_EXPONENTS`, which the paper plans with.
+    """The same superquadrics with edges no sharper than `EDGE_EXPONENT`.
 
     What fits an image best has nearly the sharp edges of a real box. It hides more and is hit more than the rounded box
     of the same size that stands for it in plans: with it, f and g would depend on how an object came to be known.
     """
-    return superquadrics.replace(exponents=jnp.maximum(superquadrics.exponents, BOX_EXPONENTS[0]))
+    return superquadrics.replace(exponents=jnp.maximum(superquadrics.exponents, EDGE_EXPONENT))
 
 
 def _power(base: Array, exponent: Array) -> Array:

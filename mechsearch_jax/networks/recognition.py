@@ -24,12 +24,14 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import matmul
 from mechsearch_jax.networks.layers import Attention, FeedForward, fourier_features
 from mechsearch_jax.perception.segments import MARKS
+from mechsearch_jax.shapes import by_shape, shape_of
 
 BOX_YAWS, LYING_YAWS = 6, 6
 HYPOTHESES = BOX_YAWS + 1 + LYING_YAWS
 STANDING = BOX_YAWS
-# Whether each hypothesis is a cylinder.
-IS_CYLINDER = np.arange(HYPOTHESES) >= STANDING
+# The code of each hypothesis' shape, and whether it is round.
+HYPOTHESIS_KINDS = np.repeat([shape_of("box").code, shape_of("cylinder").code], [STANDING, HYPOTHESES - STANDING])
+IS_ROUND = by_shape(HYPOTHESIS_KINDS, lambda shape: shape.round, np)
 EXPONENT_RANGE = (0.05, 1.2)
 # Units of the network's outputs: rotation [rad], logarithm of size, position [m], exponents before their sigmoid.
 _TURN, _SIZE, _SHIFT = 0.3, 0.04, 0.1
@@ -108,15 +110,10 @@ def rotation_of(turn: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
 
 
 def resting_height(
-    size: Float[Array, "*batch 3"], rotation: Float[Array, "*batch 3 3"], cylinder: Array
+    size: Float[Array, "*batch 3"], rotation: Float[Array, "*batch 3 3"], kind: Int[Array, "..."]
 ) -> Float[Array, "*batch"]:
-    """Height of the centre of a box, or where `cylinder` of a cylinder, above its own lowest point [m]."""
-    down = rotation[..., 2, :]
-    box = jnp.sum(jnp.abs(down) * size, axis=-1)
-    square = 1.0 - down[..., 2] ** 2
-    tilted = square > 1e-12
-    side = jnp.where(tilted, jnp.sqrt(jnp.where(tilted, square, 1.0)), 0.0)
-    return jnp.where(cylinder, jnp.abs(down[..., 2]) * size[..., 2] + side * size[..., 0], box)
+    """Height of a body's centre above its own lowest point [m], from the code of its shape."""
+    return by_shape(kind, lambda shape: shape.reach(rotation[..., 2, :], size, jnp), jnp)
 
 
 def _inverse_sigmoid(exponent: float) -> float:
@@ -133,18 +130,18 @@ def decode(outputs: Float[Array, "*batch k o"], logit: Float[Array, "*batch k"])
       logit: of each hypothesis.
     """
     batch = [1] * (outputs.ndim - 2)
-    cylinder = jnp.asarray(IS_CYLINDER).reshape(*batch, HYPOTHESES)
+    is_round = jnp.asarray(IS_ROUND).reshape(*batch, HYPOTHESES)
     turn = _TURN * outputs[..., :3]
-    # A cylinder's rotation about its own axis means nothing, and its radius is one number.
-    turn = jnp.where(cylinder[..., None] & (jnp.arange(3) == 2).reshape(*batch, 1, 3), 0.0, turn)
+    # A round object's rotation about its own axis means nothing, and its radius is one number.
+    turn = jnp.where(is_round[..., None] & (jnp.arange(3) == 2).reshape(*batch, 1, 3), 0.0, turn)
     base = jnp.asarray(BASE_ROTATIONS).reshape(*batch, HYPOTHESES, 3, 3)
     rotation = matmul(base, rotation_of(turn))
-    raw_size = jnp.where(cylinder[..., None], outputs[..., jnp.array([3, 3, 5])], outputs[..., 3:6])
+    raw_size = jnp.where(is_round[..., None], outputs[..., jnp.array([3, 3, 5])], outputs[..., 3:6])
     size = _SIZE * jnp.exp(jnp.clip(raw_size, -3.0, 2.0))
-    rest = resting_height(size, rotation, cylinder)
+    rest = resting_height(size, rotation, jnp.asarray(HYPOTHESIS_KINDS).reshape(*batch, HYPOTHESES))
     position = _SHIFT * outputs[..., 6:9]
     position = position.at[..., 2].add(rest)
-    bias = np.where(IS_CYLINDER, _inverse_sigmoid(_ROUND), _inverse_sigmoid(_SHARP))
+    bias = np.where(IS_ROUND, _inverse_sigmoid(_ROUND), _inverse_sigmoid(_SHARP))
     bias = np.stack([np.full(HYPOTHESES, _inverse_sigmoid(_SHARP)), bias], axis=-1).astype(np.float32)
     low, high = EXPONENT_RANGE
     exponents = low + (high - low) * jax.nn.sigmoid(outputs[..., 9:11] + bias.reshape(*batch, HYPOTHESES, 2))

@@ -442,9 +442,8 @@ def refine(
 
     # Stands in for what is not fitted, so that its slot stays finite in value and derivative.
     middle = ((shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board + 0.05)
-    stand_in = Superquadrics(
-        jnp.full(3, 0.05), jnp.array(superquadric.BOX_EXPONENTS), jnp.array(middle), jnp.eye(3), jnp.array(False)
-    )
+    edges = jnp.full(2, superquadric.EDGE_EXPONENT)
+    stand_in = Superquadrics(jnp.full(3, 0.05), edges, jnp.array(middle), jnp.eye(3), jnp.array(False))
 
     def one(given, label):
         finite = jnp.all(jnp.isfinite(points), axis=-1)

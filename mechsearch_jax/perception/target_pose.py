@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.transforms import yaw_rotation
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -21,28 +22,14 @@ DAMPING = 1e-3
 LONGEST_STEP = (0.01, 0.01, 0.3)
 
 
-def _gap(along: Array) -> Array:
-    """Signed distance of points to a convex prism, from their signed distances to its side and to its ends (..., 2)."""
-    outside = jnp.maximum(along, 0.0)
-    square = jnp.sum(outside**2, axis=-1)
-    beyond = square > 0
-    return jnp.where(beyond, jnp.sqrt(jnp.where(beyond, square, 1.0)), jnp.max(along, axis=-1))
-
-
 def distance(target: Target, shelf: Shelf, pose: Float[Array, " 3"], points: Float[Array, "p 3"]) -> Float[Array, " p"]:
     """Signed distance of world points to the surface of a target that stands at x, y [m] and yaw [rad]; [m]."""
-    half = target.half_size
+    shape = shape_of(target.shape)
     level = points[:, :2] - pose[None, :2]
-    end = jnp.abs(points[:, 2] - target.height(shelf)) - half[2]
-    if target.shape == "cylinder":
-        square = jnp.sum(level**2, axis=-1)
-        apart = square > 0
-        side = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0) - half[0]
-    else:
+    if not shape.round:
         R = yaw_rotation(pose[2])
-        own = level[:, :1] * R[None, 0, :2] + level[:, 1:] * R[None, 1, :2]
-        side = _gap(jnp.abs(own) - jnp.array([half[:2]]))
-    return _gap(jnp.stack([side, end], axis=-1))
+        level = level[:, :1] * R[None, 0, :2] + level[:, 1:] * R[None, 1, :2]
+    return shape.distance(level, points[:, 2] - target.height(shelf), target.half_size, jnp)
 
 
 def _cost(residual, weight):
@@ -60,7 +47,7 @@ def _descend(residuals, weight, start):
         JtJ = jnp.sum(w[:, None, None] * J[:, :, None] * J[:, None, :], axis=0)
         gradient = jnp.sum((w * r)[:, None] * J, axis=0)
         scale = jnp.diag(JtJ)
-        # A direction of which the points say nothing, like the yaw of a cylinder, is left alone.
+        # A direction of which the points say nothing, like the yaw of what is round, is left alone.
         H = JtJ + jnp.diag(damping * scale + jnp.where(scale > 0, 1e-9, 1.0))
         move = jnp.clip(-jnp.linalg.solve(H, gradient), -jnp.array(LONGEST_STEP), jnp.array(LONGEST_STEP))
         trial = pose + move
@@ -84,8 +71,8 @@ def target_pose(
 ) -> Float[Array, " 3"]:
     """Fit an upright target that stands on the board to points on its visible side.
 
-    Robust least squares of the distance between points and surface, from one start for each of eight yaw angles if the
-    target is a box, which leaves its pose free by half a turn.
+    Robust least squares of the distance between points and surface, from one start for each of eight yaw angles unless
+    the target is round; its pose is free by half a turn.
 
     Args:
       target: its known shape; static.
@@ -95,7 +82,7 @@ def target_pose(
       valid: which of them are the target's, shape (P,). If none are, the result means nothing, but is finite.
 
     Returns:
-      x, y [m] and yaw [rad] within half a turn; the yaw of a cylinder is 0.
+      x, y [m] and yaw [rad] within half a turn; the yaw of a round target is 0.
     """
     weight = valid.astype(jnp.float32)
     points = jnp.where(valid[:, None], points, 0.0)
@@ -105,9 +92,10 @@ def target_pose(
     away = away / jnp.maximum(jnp.sqrt(jnp.sum(away**2) + 1e-12), 1e-6)
     # The visible side is nearer to the camera than the centre, by about two thirds of the radius on average.
     xy = centre + away * (0.65 * min(target.half_size[:2]))
-    yaws = jnp.arange(8) * (math.pi / 8) if target.shape == "box" else jnp.zeros(1)
+    is_round = shape_of(target.shape).round
+    yaws = jnp.zeros(1) if is_round else jnp.arange(8) * (math.pi / 8)
     starts = jnp.concatenate([jnp.broadcast_to(xy[None], (len(yaws), 2)), yaws[:, None]], axis=1)
     residuals = lambda pose: distance(target, shelf, pose, points)  # noqa: E731
     poses, costs = jax.vmap(lambda start: _descend(residuals, weight, start))(starts)
     best = poses[jnp.argmin(costs)]
-    return best.at[2].set(jnp.mod(best[2], math.pi) if target.shape == "box" else 0.0)
+    return best.at[2].set(0.0 if is_round else jnp.mod(best[2], math.pi))

@@ -20,6 +20,7 @@ from scipy.spatial import ConvexHull
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -175,15 +176,15 @@ def _number(axes: Axes, place: tuple[float, float], index: int) -> None:
 def draw_target(axes: Axes, pose: Float[np.ndarray, " 3"], target: Target, certain: bool) -> None:
     """The target from above: filled where it has been found, an open outline where only the picture knows it."""
     x, y, yaw = (float(v) for v in pose)
-    a, b, _ = target.half_size
+    shape = shape_of(target.shape)
     style = {"edgecolor": TARGET, "linewidth": 1.6, "zorder": 5, "facecolor": TARGET if certain else "none"}
     if not certain:
         style["linestyle"] = (0, (2, 1.5))
-    if target.shape == "cylinder":
-        outline = patches.Circle((y, x), a, **style)
+    if shape.round:
+        outline = patches.Circle((y, x), target.half_size[0], **style)
     else:
         c, s = np.cos(yaw), np.sin(yaw)
-        corners = np.array([(a, b), (-a, b), (-a, -b), (a, -b)]) @ np.array([[c, s], [-s, c]]) + (x, y)
+        corners = shape.rim(target.half_size) @ np.array([[c, s], [-s, c]]) + (x, y)
         outline = patches.Polygon(corners[:, ::-1], closed=True, **style)
     outline.set_path_effects(_halo(1.6))
     axes.add_patch(outline)

@@ -9,7 +9,7 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,28 +20,28 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import replacing
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 
 FORMAT = "mechsearch-scenario"
 VERSION = 1
 MAX_OBJECTS = 8
 
-_SHAPES = ("box", "cylinder")
 _BODY_KEYS = {"shape": str, "half_size": 3, "position": 3, "quaternion": 4}
 
 
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A rigid box or cylinder on the shelf.
+    """A rigid body on the shelf.
 
     Attributes:
-      shape: "box" or "cylinder"; a cylinder's axis is its own z.
+      shape: name of its shape, such as "box" or "cylinder".
       half_size: half-extents along its own axes [m]; for a cylinder (radius, radius, half its height).
       position: of its centre in the world [m].
       quaternion: (w, x, y, z) of its rotation in the world, a unit quaternion.
     """
 
-    shape: Literal["box", "cylinder"]
+    shape: str
     half_size: tuple[float, float, float]
     position: tuple[float, float, float]
     quaternion: tuple[float, float, float, float]
@@ -89,16 +89,14 @@ def _check_keys(value: Any, keys: Sequence[str], where: str, key: str | None) ->
 def _body(value: Any, where: str, key: str, shelf: Shelf) -> Body:
     _check_keys(value, tuple(_BODY_KEYS), where, key)
     where = f"{where}: {key}"
-    shape = value["shape"]
-    if shape not in _SHAPES:
-        raise InputError(f'{where}.shape: {json.dumps(shape)} is unknown; use "box" or "cylinder"')
+    shape = shape_of(value["shape"], f"{where}.shape")
     half_size = _numbers(value["half_size"], 3, f"{where}.half_size")
     position = _numbers(value["position"], 3, f"{where}.position")
     quaternion = _numbers(value["quaternion"], 4, f"{where}.quaternion")
     if min(half_size) <= 0:
         raise InputError(f"{where}.half_size: {list(half_size)} must be positive lengths in metres")
-    if shape == "cylinder" and half_size[0] != half_size[1]:
-        raise InputError(f"{where}.half_size: a cylinder's first two are its radius and must be equal")
+    if fault := shape.fault(half_size):
+        raise InputError(f"{where}.half_size: {fault}")
     if abs(math.hypot(*quaternion) - 1.0) > 1e-3:
         raise InputError(f"{where}.quaternion: its norm is {math.hypot(*quaternion):.4g}; it must be 1 (w, x, y, z)")
     ranges = ((shelf.front, shelf.back), (shelf.right, shelf.left), (shelf.board, shelf.ceiling))
@@ -107,7 +105,7 @@ def _body(value: Any, where: str, key: str, shelf: Shelf) -> Body:
             raise InputError(
                 f"{where}.position: {axis} = {p:g} is off the board, which reaches from {low:g} to {high:g}"
             )
-    return Body(shape, half_size, position, quaternion)  # pyright: ignore[reportArgumentType]
+    return Body(shape.name, half_size, position, quaternion)  # pyright: ignore[reportArgumentType]
 
 
 def parse_scenario(value: Any, where: str, shelf: Shelf | None = None) -> Scenario:
@@ -198,10 +196,9 @@ def superquadrics(bodies: Sequence[Body], capacity: int = MAX_OBJECTS) -> Superq
     Raises:
       InputError: there are more bodies than slots.
     """
-    exponents = {"box": superquadric.BOX_EXPONENTS, "cylinder": superquadric.CYLINDER_EXPONENTS}
     known = Superquadrics(
         size=jnp.array([b.half_size for b in bodies], jnp.float32).reshape(-1, 3),
-        exponents=jnp.array([exponents[b.shape] for b in bodies], jnp.float32).reshape(-1, 2),
+        exponents=jnp.array([shape_of(b.shape).exponents for b in bodies], jnp.float32).reshape(-1, 2),
         position=jnp.array([b.position for b in bodies], jnp.float32).reshape(-1, 3),
         rotation=jnp.array([rotation_matrix(b.quaternion) for b in bodies], jnp.float32).reshape(-1, 3, 3),
         valid=jnp.ones(len(bodies), bool),

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 
 
@@ -18,40 +17,55 @@ class Target:
     """An upright target of known shape.
 
     Attributes:
-      shape: "cylinder" or "box".
+      shape: name of its shape.
       half_size: half-extents [m].
       grid: number of candidate positions in x and y.
       inset: distance between the outermost candidate positions and the board's edges [m].
-      yaws: number of candidate yaw angles over half a turn; 1 for the cylinder, which looks the same from all sides.
+      yaws: number of candidate yaw angles over half a turn; 1 for what looks the same from all sides.
     """
 
-    shape: Literal["cylinder", "box"] = "cylinder"
+    shape: str = "cylinder"
     half_size: tuple[float, float, float] = (0.02, 0.02, 0.05)
     grid: tuple[int, int] = (18, 44)
     inset: float = 0.05
     yaws: int = 1
 
     def __post_init__(self):
-        if self.shape not in ("cylinder", "box"):
-            raise InputError(f'Target: shape "{self.shape}" is unknown; use "cylinder" or "box"')
+        shape = shape_of(self.shape, "Target: shape")
         if len(self.half_size) != 3 or not all(s > 0 for s in self.half_size):
             raise InputError(f"Target: half_size {self.half_size} must be three positive lengths in metres")
+        if fault := shape.fault(self.half_size):
+            raise InputError(f"Target: half_size {self.half_size}: {fault}")
         if min(self.grid) < 2 or self.yaws < 1:
             raise InputError(
                 f"Target: grid {self.grid} needs at least 2 positions an axis and yaws {self.yaws} at least 1"
             )
 
     @classmethod
+    def of(cls, shape: str, half_size: tuple[float, float, float] | None = None) -> Target:
+        """The target of a shape, with as many candidate yaw angles as that needs.
+
+        Args:
+          shape: its name.
+          half_size: half-extents [m]; the usual ones if left out.
+
+        Raises:
+          InputError: there is no such shape, or the half-extents are none of it.
+        """
+        known = shape_of(shape)
+        return cls(known.name, half_size or known.target_half_size, yaws=known.yaws)
+
+    @classmethod
     def cylinder(cls) -> Target:
-        return cls()
+        return cls.of("cylinder")
 
     @classmethod
     def box(cls) -> Target:
-        return cls(shape="box", half_size=(0.015, 0.02, 0.05), yaws=6)
+        return cls.of("box")
 
     @property
     def exponents(self) -> tuple[float, float]:
-        return superquadric.CYLINDER_EXPONENTS if self.shape == "cylinder" else superquadric.BOX_EXPONENTS
+        return shape_of(self.shape).exponents
 
     def height(self, shelf: Shelf) -> float:
         """z of the centre of a target that stands on the board [m]."""

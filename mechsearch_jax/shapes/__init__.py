@@ -1,0 +1,6 @@
+"""What bodies can be: one file for each shape, and their registry. It does without JAX."""
+
+from mechsearch_jax.shapes.registry import SHAPES, by_shape, in_order, shape_of
+from mechsearch_jax.shapes.shape import Shape
+
+__all__ = ["SHAPES", "Shape", "by_shape", "in_order", "shape_of"]
