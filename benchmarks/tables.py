@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from mechsearch_jax.benchmarks import push, segmentation
+from mechsearch_jax.benchmarks import push, scenes, segmentation
 from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
 from mechsearch_jax.benchmarks.rates import summarise
@@ -229,6 +229,48 @@ def _push_scores_table(title: str, first: str, lines: Mapping[str, Mapping[str, 
         cells = ("-" if line[key] is None else f"{line[key]:.{n}f}" for key, n in digits.items())
         table.add_row(name, str(line["pushes"]), str(line["failed"]), *cells)
     return table
+
+
+def scenes_table(rows: Sequence[scenes.Row]) -> Group:
+    """What scenes are like: a row for each source and number of objects."""
+    table = _plain_table("scenes at their start")
+    table.add_column("source", no_wrap=True)
+    for name in (
+        "objects",
+        "scenes",
+        "f",
+        "10% to 90%",
+        "lost",
+        "hidden",
+        "≤100",
+        ">100",
+        "seen",
+        "visible",
+        "of each",
+    ):
+        table.add_column(name, justify="right", no_wrap=True)
+    for line in scenes.summary(rows):
+        error = line["possible_standard_error"]
+        table.add_row(
+            line["source"],
+            str(line["objects"]),
+            str(line["scenes"]),
+            f"{line['possible_mean']:.0f}" + ("" if error is None else f" ±{error:.0f}"),
+            f"{line['possible_p10']:.0f} to {line['possible_p90']:.0f}",
+            *(
+                str(line[name])
+                for name in ("truth_ruled_out", "target_hidden", "target_below_threshold", "target_found")
+            ),
+            f"{line['target_share_mean']:.3f}",
+            f"{line['visible_mean']:.2f}",
+            f"{line['objects_share_mean']:.2f}",
+        )
+    explanation = (
+        "f: mean number of poses where the target can be, with its standard error. lost: scenes where f rules out the "
+        "pose that is nearest to the target's. hidden, ≤100, >100: scenes by the target's pixels. seen: share of the "
+        "target's pixels. visible: objects that show at least 100 pixels. of each: share of an object's that is seen."
+    )
+    return Group(table, Text(explanation, style="dim"))
 
 
 class EpisodeProgress:
