@@ -16,6 +16,7 @@ from mechsearch_jax.benchmarks.bench import Timing
 from mechsearch_jax.benchmarks.rates import summarise
 from mechsearch_jax.benchmarks.recognition import SHARES, Measured
 from mechsearch_jax.benchmarks.rows import Row
+from mechsearch_jax.envs import scene_sets
 
 
 def rates_table(rows: Sequence[Row]) -> Table:
@@ -271,6 +272,24 @@ def scenes_table(rows: Sequence[scenes.Row]) -> Group:
         "target's pixels. visible: objects that show at least 100 pixels. of each: share of an object's that is seen."
     )
     return Group(table, Text(explanation, style="dim"))
+
+
+def scene_sets_table() -> Table:
+    """The named sets of scenes, with a digest of what each holds."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    for name, justify in (
+        ("set", "left"),
+        ("scenes", "right"),
+        ("objects", "left"),
+        ("target", "left"),
+        ("digest", "left"),
+    ):
+        table.add_column(name, justify=justify, no_wrap=True)
+    table.add_column("what")
+    for one in scene_sets.SETS.values():
+        objects = ", ".join(str(block.objects) for block in one.blocks)
+        table.add_row(one.name, str(one.scenes), objects, one.blocks[0].target, scene_sets.digest(one), one.about)
+    return table
 
 
 class EpisodeProgress:

@@ -8,6 +8,7 @@ import pytest
 
 import mechsearch_jax
 from mechsearch_jax.envs.earlier import EARLIER, RENAMED
+from mechsearch_jax.envs.scene_sets import SETS, digest
 from mechsearch_jax.planner import OPTIONS, PRESETS
 
 ROOT = Path(__file__).parents[1]
@@ -129,6 +130,22 @@ def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
             value = PRESETS[preset]().options().get(name)
             if value is not None and name not in ("actions", "push_distances"):
                 assert said(cell) == (pytest.approx(value) if isinstance(value, list) else value), f"{name}: {cell}"
+
+
+def test_the_scene_sets_are_those_that_there_are():
+    told = {row[0].strip("`"): row[1:] for row in rows("docs/method.md", "| set | scenes | what | seeds | digest |")}
+    whole = [scene_set for scene_set in SETS.values() if scene_set.about]
+    assert list(told) == [scene_set.name for scene_set in whole]
+    for scene_set in whole:
+        scenes, _, seeds, digest_told = told[scene_set.name]
+        first, last = map(int, seeds.split(" to "))
+        assert int(re.match(r"\d+", scenes)[0]) == scene_set.scenes
+        assert {(b.first_seed, b.first_seed + b.scenes - 1) for b in scene_set.blocks} == {(first, last)}
+        assert digest_told == digest(scene_set)
+        counts = re.search(r"(\d+) each with ([\d, ]+) objects", scenes)
+        if counts:
+            each = [(int(counts[1]), int(objects)) for objects in counts[2].split(", ")]
+            assert each == [(b.scenes, b.objects) for b in scene_set.blocks]
 
 
 @pytest.mark.slow
