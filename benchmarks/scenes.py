@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from mechsearch_jax.benchmarks.evaluate import present_code
 from mechsearch_jax.benchmarks.images import save_rows
 from mechsearch_jax.envs.episodes import target_of
 from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS, target_pixels
@@ -189,4 +190,4 @@ def save_scenes(rows: Sequence[Row], path: PathLike) -> None:
     """
     if not rows:
         raise InputError("bench scenes: there are no scenes; name a file, a folder or a scene set")
-    save_rows({"versions": versions(), "summary": summary(rows)}, rows, path)
+    save_rows({"code": present_code(), "versions": versions(), "summary": summary(rows)}, rows, path)

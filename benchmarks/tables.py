@@ -236,20 +236,9 @@ def scenes_table(rows: Sequence[scenes.Row]) -> Group:
     """What scenes are like: a row for each source and number of objects."""
     table = _plain_table("scenes at their start")
     table.add_column("source", no_wrap=True)
-    for name in (
-        "objects",
-        "scenes",
-        "f",
-        "10% to 90%",
-        "lost",
-        "hidden",
-        "≤100",
-        ">100",
-        "seen",
-        "visible",
-        "of each",
-    ):
+    for name in ("objects", "scenes", "f", "lost", "hidden", "≤100", ">100", "seen", "visible", "of each"):
         table.add_column(name, justify="right", no_wrap=True)
+    counts = ("truth_ruled_out", "target_hidden", "target_below_threshold", "target_found")
     for line in scenes.summary(rows):
         error = line["possible_standard_error"]
         table.add_row(
@@ -257,11 +246,7 @@ def scenes_table(rows: Sequence[scenes.Row]) -> Group:
             str(line["objects"]),
             str(line["scenes"]),
             f"{line['possible_mean']:.0f}" + ("" if error is None else f" ±{error:.0f}"),
-            f"{line['possible_p10']:.0f} to {line['possible_p90']:.0f}",
-            *(
-                str(line[name])
-                for name in ("truth_ruled_out", "target_hidden", "target_below_threshold", "target_found")
-            ),
+            *(str(line[name]) for name in counts),
             f"{line['target_share_mean']:.3f}",
             f"{line['visible_mean']:.2f}",
             f"{line['objects_share_mean']:.2f}",
@@ -277,14 +262,10 @@ def scenes_table(rows: Sequence[scenes.Row]) -> Group:
 def scene_sets_table() -> Table:
     """The named sets of scenes, with a digest of what each holds."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    for name, justify in (
-        ("set", "left"),
-        ("scenes", "right"),
-        ("objects", "left"),
-        ("target", "left"),
-        ("digest", "left"),
-    ):
-        table.add_column(name, justify=justify, no_wrap=True)
+    table.add_column("set", no_wrap=True)
+    table.add_column("scenes", justify="right", no_wrap=True)
+    for name in ("objects", "target", "digest"):
+        table.add_column(name, no_wrap=True)
     table.add_column("what")
     for one in scene_sets.SETS.values():
         objects = ", ".join(str(block.objects) for block in one.blocks)

@@ -9,6 +9,7 @@ import pytest
 from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO
 
 from mechsearch_jax.benchmarks import scenes
+from mechsearch_jax.benchmarks.evaluate import present_code
 from mechsearch_jax.benchmarks.scenes import Row, look_at_all, nearest_pose, save_scenes, summary
 from mechsearch_jax.benchmarks.tables import scenes_table
 from mechsearch_jax.envs.simulated_camera import observe
@@ -120,6 +121,7 @@ def test_figures_are_those_of_the_rows(tmp_path):
     assert value["summary"] == summary(rows)
     assert [Row(**dict(zip(value["columns"], each, strict=True))) for each in value["rows"]] == rows
     assert "jax" in value["versions"]
+    assert value["code"] == present_code()
     with pytest.raises(InputError, match="there are no scenes"):
         save_scenes([], tmp_path / "none.json")
     table, _ = scenes_table(rows).renderables
