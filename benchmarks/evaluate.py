@@ -118,9 +118,9 @@ def evaluate(
 
     Args:
       jobs: what is wanted.
-      out: the Parquet file; rows that it holds already are kept, and stand for a job only if every option was the
-        same. (Files of version 0.1.0 do not hold every option: their rows are kept, but run again.) The file says
-        which code ran the episodes, and only that code adds to it.
+      out: the Parquet file; rows that it holds already are kept, and stand for a job only if every option and what
+        the scenario holds were the same. (Files of earlier versions do not say all of that: their rows are kept, but
+        run again.) The file says which code ran the episodes, and only that code adds to it.
       runner: runs the episodes.
       ended: called after every episode with its row and with all rows.
 

@@ -109,7 +109,7 @@ class _Feeder(threading.Thread):
             return job.failed(answer["error"])
         row = Row(**answer["row"])
         if identity(row) != identity(job.failed("")):
-            return job.failed("the worker ran the episode with other options than those asked for")
+            return job.failed("the worker ran another episode than was asked for: other options, or a changed file")
         return row
 
     def _start(self) -> subprocess.Popen[str]:

@@ -63,6 +63,24 @@ def reached(rows: Sequence[Row], goal: str, actions: int) -> list[int]:
     return [sum(step is not None and step <= k for step in steps) for k in range(actions + 1)]
 
 
+def changed_scenarios(rows: Sequence[Row]) -> list[str]:
+    """Names under which rows hold more than one content, or one and an unknown: their files were changed in between."""
+    contents: dict[str, set[str | None]] = {}
+    for row in rows:
+        contents.setdefault(row.scenario, set()).add(row.content_hash)
+    return sorted(name for name, hashes in contents.items() if len(hashes) > 1)
+
+
+def told_of_changes(rows: Sequence[Row]) -> str:
+    """A sentence that names scenarios that changed between rows; empty if there are none."""
+    names = changed_scenarios(rows)
+    if not names:
+        return ""
+    more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+    named = f"{', '.join(names[:5])}{more}"
+    return f"Scenarios whose content is not the same, or not known, in all rows count as several: {named}."
+
+
 @dataclasses.dataclass(frozen=True)
 class Failures:
     """How often episodes ended for a reason.
@@ -115,6 +133,7 @@ def markdown(rows: Sequence[Row]) -> str:
         "attempts to take the target out among them; times are means per action. An episode that ended in an error of "
         "the program counts as a failure.",
         "",
+        *([told_of_changes(rows), ""] if changed_scenarios(rows) else []),
         _row(names),
         _row(["---"] * len(names)),
     ]

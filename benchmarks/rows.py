@@ -42,6 +42,7 @@ class Row:
       planning_seconds, simulation_seconds: wall time in total [s].
       configuration: everything that decides about the episode beside its scenario and its seed, as `configuration`
         writes it; None in files of version 0.1.0, which do not say.
+      content_hash: of the scenario, as in `Episode`; None in files of earlier versions, which do not say.
     """
 
     scenario: str
@@ -62,6 +63,7 @@ class Row:
     planning_seconds: float
     simulation_seconds: float
     configuration: str | None = None
+    content_hash: str | None = None
 
     @classmethod
     def of_episode(cls, episode: Episode) -> Row:
@@ -78,6 +80,7 @@ class Row:
             failure=episode.failure,
             planning_seconds=sum(sum(timings.get(stage, 0.0) for timings in spent) for stage in PLANNING),
             simulation_seconds=sum(timings["simulate"] for timings in spent),
+            content_hash=episode.content_hash,
         )
 
     @classmethod
@@ -94,6 +97,7 @@ class Row:
             failure=f"error: {reason}",
             planning_seconds=0.0,
             simulation_seconds=0.0,
+            content_hash=scenario.content_hash,
         )
 
 
@@ -117,8 +121,8 @@ def _column(kind: Any) -> pyarrow.DataType:
 
 
 SCHEMA = pyarrow.schema([(name, _column(kind)) for name, kind in get_type_hints(Row).items()])
-# What version 0.1.0 wrote.
-_FIRST_COLUMNS = SCHEMA.names[:-1]
+# What was written before rows said what their scenario holds, and before that without the configuration.
+_EARLIER_COLUMNS = (SCHEMA.names[:-1], SCHEMA.names[:-2])
 
 
 def configuration(options: Mapping[str, Any]) -> str:
@@ -131,9 +135,12 @@ def configuration(options: Mapping[str, Any]) -> str:
 
 
 def identity(row: Row) -> tuple[Any, ...]:
-    """What tells the rows of a table apart: the scenario, every option and the seed."""
+    """What tells the rows of a table apart: the scenario, by its name and content, every option and the seed.
+
+    A row that does not say what its scenario held is apart from all that do.
+    """
     known = None if row.configuration is None else configuration(present_options(json.loads(row.configuration)))
-    return row.scenario, *(getattr(row, name) for name in OPTIONS), row.seed, known
+    return row.scenario, row.content_hash, *(getattr(row, name) for name in OPTIONS), row.seed, known
 
 
 def _options(row: Row) -> dict[str, Any]:
@@ -183,7 +190,7 @@ def read_rows(path: PathLike) -> list[Row]:
     """
     table = _parquet(path, pyarrow.parquet.read_table)
     table = table.rename_columns([RENAMED.get(name, name) for name in table.schema.names])
-    if table.schema.names not in (SCHEMA.names, _FIRST_COLUMNS):
+    if table.schema.names not in (SCHEMA.names, *_EARLIER_COLUMNS):
         raise InputError(f"{path}: is a table of something else, not of episodes; use another file")
     return [_with_present_options(Row(**row), path) for row in table.to_pylist()]
 

@@ -10,12 +10,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from mechsearch_jax.benchmarks import push, segmentation
+from mechsearch_jax.benchmarks import push, scenes, segmentation
 from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
 from mechsearch_jax.benchmarks.rates import summarise
 from mechsearch_jax.benchmarks.recognition import SHARES, Measured
 from mechsearch_jax.benchmarks.rows import Row
+from mechsearch_jax.envs import scene_sets
 
 
 def rates_table(rows: Sequence[Row]) -> Table:
@@ -228,6 +229,47 @@ def _push_scores_table(title: str, first: str, lines: Mapping[str, Mapping[str, 
     for name, line in lines.items():
         cells = ("-" if line[key] is None else f"{line[key]:.{n}f}" for key, n in digits.items())
         table.add_row(name, str(line["pushes"]), str(line["failed"]), *cells)
+    return table
+
+
+def scenes_table(rows: Sequence[scenes.Row]) -> Group:
+    """What scenes are like: a row for each source and number of objects."""
+    table = _plain_table("scenes at their start")
+    table.add_column("source", no_wrap=True)
+    for name in ("objects", "scenes", "f", "lost", "hidden", "≤100", ">100", "seen", "visible", "of each"):
+        table.add_column(name, justify="right", no_wrap=True)
+    counts = ("truth_ruled_out", "target_hidden", "target_below_threshold", "target_found")
+    for line in scenes.summary(rows):
+        error = line["possible_standard_error"]
+        table.add_row(
+            line["source"],
+            str(line["objects"]),
+            str(line["scenes"]),
+            f"{line['possible_mean']:.0f}" + ("" if error is None else f" ±{error:.0f}"),
+            *(str(line[name]) for name in counts),
+            f"{line['target_share_mean']:.3f}",
+            f"{line['visible_mean']:.2f}",
+            f"{line['objects_share_mean']:.2f}",
+        )
+    explanation = (
+        "f: mean number of poses where the target can be, with its standard error. lost: scenes where f rules out the "
+        "pose that is nearest to the target's. hidden, ≤100, >100: scenes by the target's pixels. seen: share of the "
+        "target's pixels. visible: objects that show at least 100 pixels. of each: share of an object's that is seen."
+    )
+    return Group(table, Text(explanation, style="dim"))
+
+
+def scene_sets_table() -> Table:
+    """The named sets of scenes, with a digest of what each holds."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    table.add_column("set", no_wrap=True)
+    table.add_column("scenes", justify="right", no_wrap=True)
+    for name in ("objects", "target", "digest"):
+        table.add_column(name, no_wrap=True)
+    table.add_column("what")
+    for one in scene_sets.SETS.values():
+        objects = ", ".join(str(block.objects) for block in one.blocks)
+        table.add_row(one.name, str(one.scenes), objects, one.blocks[0].target, scene_sets.digest(one), one.about)
     return table
 
 

@@ -184,6 +184,7 @@ class EpisodeLog:
             graspable_step=self._graspable_step,
             retrieved=self._retrieved,
             failure=self._failure,
+            content_hash=scenario.content_hash,
         )
 
 

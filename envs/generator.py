@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 from scipy.spatial import ConvexHull
 
 from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.simulated_camera import target_pixels
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.graspability import GraspConfig, grasp_tables
+from mechsearch_jax.geometry.transforms import upright_pose
+from mechsearch_jax.graspability import GraspConfig, GraspTables, find_grasps, grasp_tables
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
@@ -46,18 +50,29 @@ class GeneratorConfig:
     Attributes:
       drop: height above the board from which objects are dropped [m].
       gap: least distance between what is dropped, and between the target and its neighbours, seen from above [m].
-      visible: a target that shows more pixels than this is not hidden.
+      visible: a target that shows more pixels than this is not hidden; the detector needs more than 100.
+      anywhere: whether the target may stand anywhere in the rectangle that its candidate positions span, a box at any
+        yaw, instead of at candidate poses only.
       drift: bodies that move farther than this once the target is in place were not at rest [m].
       placements: how often one object's place is drawn before the scene is given up.
+      target_placements: the same for the target's, where it may stand anywhere.
       attempts: how many scenes are tried for one seed.
     """
 
     drop: float = 0.02
     gap: float = 0.002
     visible: int = 0
+    anywhere: bool = False
     drift: float = 1e-3
     placements: int = 200
+    target_placements: int = 800
     attempts: int = 200
+
+    def __post_init__(self):
+        if not (self.drop >= 0 and self.gap >= 0 and self.visible >= 0 and self.drift > 0):
+            raise InputError("GeneratorConfig: drop, gap and visible must be at least 0, and drift above 0")
+        if min(self.placements, self.target_placements, self.attempts) < 1:
+            raise InputError("GeneratorConfig: placements, target_placements and attempts must be at least 1")
 
 
 def outline(body: Body) -> Float[np.ndarray, "corners 2"]:
@@ -91,6 +106,22 @@ def graspable_alone(shelf: Shelf, target: Target, gripper: Gripper | None = None
     return graspable
 
 
+def graspable_at(shelf: Shelf, target: Target, gripper: Gripper | None = None) -> Callable[[np.ndarray], bool]:
+    """What tells of any pose (x, y [m], yaw [rad]) whether the target could be grasped there if there were no other
+    objects."""
+    gripper = gripper or Gripper()
+    tables = grasp_tables(shelf, gripper, target, GraspConfig(), candidates=False)
+    return lambda pose: bool(_any_grasp(tables, shelf, gripper, target, jnp.asarray(pose, jnp.float32)))
+
+
+@functools.partial(jax.jit, static_argnames=("shelf", "gripper", "target"))
+def _any_grasp(
+    tables: GraspTables, shelf: Shelf, gripper: Gripper, target: Target, pose: Float[Array, " 3"]
+) -> Bool[Array, ""]:
+    T_world_target = upright_pose(pose, target.height(shelf))
+    return jnp.any(find_grasps(tables, shelf, gripper, GraspConfig(), T_world_target).feasible)
+
+
 class ScenarioGenerator:
     """Makes scenarios; the same seed gives the same scenario on the same machine.
 
@@ -110,23 +141,24 @@ class ScenarioGenerator:
         target: what is hidden; the usual one by default.
         shelf, camera: the scene.
         config: how scenarios are made.
-        graspable: tells from a candidate pose (x, y [m], yaw [rad]) whether the shelf alone leaves the target
-          graspable there; by default `graspable_alone`.
+        graspable: tells from a pose (x, y [m], yaw [rad]) whether the shelf alone leaves the target graspable there;
+          by default `graspable_alone`, or `graspable_at` where the target may stand anywhere.
         """
         self.target = target or Target()
         self.config = config or GeneratorConfig()
         self._shelf = shelf or Shelf()
         self._camera = camera or Camera()
         self._simulator = NativeWorld(self._shelf, self._camera)
-        poses = self.target.candidate_poses(self._shelf).astype(float)
-        if graspable is None:
-            allowed = graspable_alone(self._shelf, self.target)
+        self._poses = self.target.candidate_poses(self._shelf).astype(float)
+        if self.config.anywhere:
+            self._graspable = graspable or graspable_at(self._shelf, self.target)
         else:
-            allowed = np.array([graspable(pose) for pose in poses], bool)
-        self._poses = poses[allowed]
+            allowed = graspable_alone(self._shelf, self.target) if graspable is None else map(graspable, self._poses)
+            self._poses = self._poses[np.array([*allowed], bool)]
+            self._graspable = lambda pose: True
 
     def generate(self, seed: int, objects: int, name: str | None = None) -> Scenario:
-        """A scenario whose bodies rest on the board, with a target that the camera does not see.
+        """A scenario whose bodies rest on the board, with a target that the detector does not see.
 
         Args:
           seed: any whole number from 0.
@@ -185,24 +217,35 @@ class ScenarioGenerator:
     def _hide(self, rng: np.random.Generator, scene: Scenario) -> Scenario | None:
         """The scene with the target at a random pose out of the camera's sight, if there is one."""
         outlines = [outline(body) for body in scene.objects]
-        for pose in rng.permutation(self._poses):
+        for pose in self._drawn_poses(rng):
             candidate = dataclasses.replace(scene, target=self._target_at(pose))
             polygon = outline(candidate.target)
             if any(separation(polygon, other) <= self.config.gap for other in outlines):
                 continue
-            if self._is_hidden(candidate) and self._is_at_rest(candidate):
+            if self.is_hidden(candidate) and self._graspable(pose) and self.is_at_rest(candidate):
                 return candidate
         return None
 
-    def _is_hidden(self, scene: Scenario) -> bool:
+    def _drawn_poses(self, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+        """Poses to try for the target, in this order."""
+        if not self.config.anywhere:
+            return rng.permutation(self._poses)
+        low, high = self._poses.min(axis=0), self._poses.max(axis=0)
+        # A cylinder looks the same from all sides, a box as after half a turn.
+        low[2], high[2] = 0.0, np.pi if self.target.yaws > 1 else 0.0
+        return rng.uniform(low, high, (self.config.target_placements, 3))
+
+    def is_hidden(self, scene: Scenario) -> bool:
+        """Whether a scene's target shows no more pixels than `GeneratorConfig.visible`."""
         return int(target_pixels(self._camera, from_scenario(scene))) <= self.config.visible
 
-    def _is_at_rest(self, scene: Scenario) -> bool:
+    def is_at_rest(self, scene: Scenario) -> bool:
+        """Whether a scene's bodies stay where they are when time passes, and its target hidden."""
         before = np.asarray(self._simulator.reset(scene).position)
         outcome = self._simulator.settle()
         world = self._simulator.world
         still = world is not None and bool(np.abs(np.asarray(world.position) - before).max() <= self.config.drift)
-        return bool(outcome.settled) and still and self._is_hidden(self._simulator.scenario(scene.name))
+        return bool(outcome.settled) and still and self.is_hidden(self._simulator.scenario(scene.name))
 
 
 def _draw_shape(rng: np.random.Generator) -> tuple[str, tuple[float, float, float]]:

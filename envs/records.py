@@ -98,6 +98,7 @@ class Episode:
       graspable_step: number of actions before it could also be grasped; None where it never could.
       retrieved: whether the hand took the target out of the shelf and no object fell.
       failure: why the episode ended without a retrieval; None after one.
+      content_hash: of the scenario, see `Scenario.content_hash`; None in files of earlier versions.
     """
 
     scenario: str
@@ -109,6 +110,7 @@ class Episode:
     graspable_step: int | None
     retrieved: bool
     failure: str | None
+    content_hash: str | None = None
 
 
 def save_episode(episode: Episode, path: PathLike) -> None:

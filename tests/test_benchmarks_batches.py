@@ -50,7 +50,8 @@ class Stand:
                 raise error
             scene = start.scenario
             config = {**options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
-            ended([(place, Episode(scene.name, len(scene.objects), config, {}, (), 0, 0, False, "not found"))])
+            facts = (scene.name, len(scene.objects), config, {}, (), 0, 0, False, "not found", scene.content_hash)
+            ended([(place, Episode(*facts))])
 
 
 def test_every_job_becomes_a_row_with_its_options(problem, tmp_path, files, monkeypatch):

@@ -47,7 +47,7 @@ for line in sys.stdin:
     columns = ("policy", "recognition", "gamma", "horizon", "sequences")
     row = dict({column: options[column] for column in columns}, actions="+".join(options["actions"]), scenario=name,
                objects=0, target="cylinder", seed=job["seed"], found_step=1, graspable_step=2, retrieved=True, steps=3,
-               failure=None, planning_seconds=1.0, simulation_seconds=0.5)
+               failure=None, planning_seconds=1.0, simulation_seconds=0.5, content_hash=os.environ["CONTENT"])
     row["configuration"] = json.dumps(options, sort_keys=True)
     if name == "confused":
         row["gamma"] = 0.123
@@ -66,6 +66,7 @@ def files(tmp_path):
 @pytest.fixture
 def command(tmp_path, monkeypatch):
     monkeypatch.setenv("LOG", str(tmp_path / "log"))
+    monkeypatch.setenv("CONTENT", Scenario("any", (), TARGET).content_hash)
     monkeypatch.setenv("OPTIONS", json.dumps({".".join(option.path): option.name for option in OPTIONS}))
     return (sys.executable, "-c", FAKE)
 
@@ -145,15 +146,40 @@ def test_every_option_tells_rows_apart(tmp_path, files, command, other):
     assert [rates.episodes for rates in summarise(both)] == [1] * 4
 
 
-def test_rows_that_do_not_say_how_they_ran_are_kept_but_not_believed(tmp_path, files, command):
+@pytest.mark.parametrize("columns", [["content_hash"], ["configuration", "content_hash"]], ids=len)
+def test_rows_that_do_not_say_all_are_kept_but_not_believed(tmp_path, files, command, columns):
     out = tmp_path / "rows.parquet"
     jobs = make_jobs(files[:1], [Method()], (0,))
     (row,) = evaluate(jobs, out, Processes(1, command))
     table = pyarrow.parquet.read_table(out)
-    pyarrow.parquet.write_table(table.drop_columns(["configuration"]), out)
+    pyarrow.parquet.write_table(table.drop_columns(columns), out)
     evaluate(jobs, out, Processes(1, command))
     assert ran(tmp_path) == ["one", "one"]
-    assert read_rows(out) == [dataclasses.replace(row, configuration=None), row]
+    assert read_rows(out) == [dataclasses.replace(row, **dict.fromkeys(columns)), row]
+
+
+def test_an_edited_file_of_the_same_name_gets_rows_of_its_own(tmp_path, files, command, monkeypatch):
+    out = tmp_path / "rows.parquet"
+    first = evaluate(make_jobs(files[:2], [Method()], (0,)), out, Processes(1, command))
+    edited = Scenario("one", (), dataclasses.replace(TARGET, position=(0.62, 0.08, 0.4545)))
+    save_scenario(edited, files[0])
+    monkeypatch.setenv("CONTENT", edited.content_hash)
+    (row, other) = evaluate(make_jobs(files[:2], [Method()], (0,)), out, Processes(1, command))
+    assert ran(tmp_path) == ["one", "one", "two"]
+    assert (row.scenario, row.failure, row.content_hash) == ("one", None, edited.content_hash)
+    assert other == first[1]
+    assert sorted(read_rows(out), key=identity) == sorted([*first, row], key=identity)
+    # As it was before, it has its rows still; and how a file is written does not matter.
+    save_scenario(Scenario("one", (), TARGET), files[0])
+    files[1].write_text(json.dumps(json.loads(files[1].read_text())))
+    assert evaluate(make_jobs(files[:2], [Method()], (0,)), out, Processes(1, command)) == first
+    assert ran(tmp_path) == ["one", "one", "two"]
+
+
+def test_a_file_that_changes_while_it_waits_is_a_failure(tmp_path, files, command, monkeypatch):
+    monkeypatch.setenv("CONTENT", "another")
+    (row,) = evaluate(make_jobs(files[:1], [Method()], (0,)), tmp_path / "rows.parquet", Processes(1, command))
+    assert row.failure == "error: the worker ran another episode than was asked for: other options, or a changed file"
 
 
 def test_rows_of_other_code_are_not_added_to(tmp_path, files, command, monkeypatch):
@@ -206,7 +232,7 @@ def test_a_worker_that_ran_something_else_is_not_believed(tmp_path, command):
     save_scenario(Scenario("confused", (), TARGET), tmp_path / "confused.json")
     jobs = make_jobs([tmp_path / "confused.json"], [Method()], (0,))
     (row,) = evaluate(jobs, tmp_path / "rows.parquet", Processes(1, command))
-    assert row.failure == "error: the worker ran the episode with other options than those asked for"
+    assert row.failure == "error: the worker ran another episode than was asked for: other options, or a changed file"
 
 
 def test_a_method_that_cannot_be_used_is_told_of_before_any_episode(tmp_path, files):

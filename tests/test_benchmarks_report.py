@@ -86,3 +86,15 @@ def test_an_episode_counts_once(tmp_path):
     write_rows([], tmp_path / "none.parquet")
     with pytest.raises(InputError, match="no episodes"):
         report.read_tables([tmp_path / "none.parquet"])
+
+
+def test_scenarios_that_changed_between_rows_are_named(tmp_path):
+    same, other, unknown = (dataclasses.replace(WON, seed=i, content_hash=h) for i, h in enumerate(("1", "2", None)))
+    assert report.changed_scenarios([same, dataclasses.replace(same, seed=5), LOST]) == []
+    for rows in ([same, other, LOST], [same, unknown, LOST]):
+        assert report.changed_scenarios(rows) == ["a"]
+        report.write_report(rows, tmp_path)
+        assert "not the same, or not known, in all rows count as several: a." in (tmp_path / "report.md").read_text()
+    many = [dataclasses.replace(row, scenario=f"s{i}") for i in range(7) for row in (same, other)]
+    assert report.told_of_changes(many).endswith("s0, s1, s2, s3, s4 and 2 more.")
+    assert report.told_of_changes([same]) == ""

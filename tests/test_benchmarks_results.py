@@ -164,11 +164,27 @@ def test_rows_are_read_back(tmp_path):
     assert pyarrow.parquet.read_schema(tmp_path / "new" / "rows.parquet").equals(SCHEMA)
 
 
-def test_rows_of_the_first_version_are_read(tmp_path):
-    write_rows([ROW], tmp_path / "rows.parquet")
+@pytest.mark.parametrize("columns", [["content_hash"], ["configuration", "content_hash"]], ids=len)
+def test_rows_of_earlier_versions_are_read(tmp_path, columns):
+    row = dataclasses.replace(ROW, content_hash="0123456789ab", configuration=configuration({**EARLIER, "gamma": 0.9}))
+    write_rows([row], tmp_path / "rows.parquet")
     table = pyarrow.parquet.read_table(tmp_path / "rows.parquet")
-    pyarrow.parquet.write_table(table.drop_columns(["configuration"]), tmp_path / "rows.parquet")
-    assert read_rows(tmp_path / "rows.parquet") == [ROW]
+    pyarrow.parquet.write_table(table.drop_columns(columns), tmp_path / "rows.parquet")
+    assert read_rows(tmp_path / "rows.parquet") == [dataclasses.replace(row, **dict.fromkeys(columns))]
+
+
+def test_what_a_scenario_holds_tells_rows_apart():
+    rows = [dataclasses.replace(ROW, content_hash=content) for content in ("0123456789ab", "ba9876543210", None)]
+    assert len({identity(row) for row in rows}) == 3
+    assert len({identity(dataclasses.replace(row, steps=7)) for row in rows[:1] * 2}) == 1
+
+
+def test_an_episode_that_does_not_say_what_its_scenario_held_is_read(tmp_path):
+    save_episode(dataclasses.replace(EPISODE, content_hash="0123456789ab"), tmp_path / "episode.json")
+    value = json.loads((tmp_path / "episode.json").read_text())
+    assert value.pop("content_hash") == "0123456789ab"
+    (tmp_path / "episode.json").write_text(json.dumps(value))
+    assert load_episode(tmp_path / "episode.json") == EPISODE
 
 
 @pytest.mark.parametrize("text", ["{", "3"])
@@ -313,8 +329,8 @@ def test_confidence_intervals_are_those_of_the_formula():
 
 
 def test_the_columns_are_those_of_earlier_tables_but_for_names():
-    assert SCHEMA.types == OLD_SCHEMA.types
-    assert SCHEMA.names == [RENAMED.get(name, name) for name in OLD_SCHEMA.names]
+    assert SCHEMA.types == [*OLD_SCHEMA.types, pyarrow.string()]
+    assert SCHEMA.names == [*(RENAMED.get(name, name) for name in OLD_SCHEMA.names), "content_hash"]
     assert SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
 
 

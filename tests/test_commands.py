@@ -109,6 +109,27 @@ WRONG = {
     "unknown subject": (["bench", "speed"], "speed"),
     "no table to report": (["report", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
     "no scenarios": (["scenarios", "generate", "--objects", "2", "--count", "0", "--out", "new"], "--count 0"),
+    "negative scenario": (
+        ["scenarios", "generate", "--objects", "2", "--seed", "-1", "--out", "out"],
+        "-1 is negative",
+    ),
+    "nothing to generate": (["scenarios", "generate", "--out", "new"], "give either --objects N or --set NAME"),
+    "both to generate": (
+        ["scenarios", "generate", "--objects", "2", "--set", "c2", "--out", "new"],
+        "give either --objects N or --set NAME, not both",
+    ),
+    "unknown set": (["scenarios", "generate", "--set", "c9", "--out", "new"], "c9: there is no such scene set"),
+    "seed of a set": (
+        ["scenarios", "generate", "--set", "d1", "--seed", "3", "--out", "new"],
+        "--count, --target and --seed are not for a set",
+    ),
+    "set to search": (
+        ["search", "c2-4", "--out", "out"],
+        "c2-4: is a set of 180 scenes; name one of them, as c2-4-000",
+    ),
+    "no scene of a set": (["inspect", "c2-4-180", "--out", "out"], "c2-4-180: there is no such file"),
+    "no scenes to look at": (["bench", "scenes", "none.json"], "none.json: there is no such file"),
+    "the same source twice": (["bench", "scenes", "empty", "out/../empty"], "two sources are called empty"),
     "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
     "no repeats": (["bench", "plan", "--repeats", "0"], "--repeats 0"),
     "no worlds": (["bench", "simulate", "--worlds", "0"], "worlds 0 must be at least 1"),

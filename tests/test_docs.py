@@ -1,5 +1,6 @@
 """The guides: their links lead somewhere, their code runs, and what the source cites of them is there."""
 
+import json
 import math
 import re
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 
 import mechsearch_jax
 from mechsearch_jax.envs.earlier import EARLIER, RENAMED
+from mechsearch_jax.envs.scene_sets import SETS, digest, recorded
 from mechsearch_jax.planner import OPTIONS, PRESETS
 
 ROOT = Path(__file__).parents[1]
@@ -129,6 +131,58 @@ def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
             value = PRESETS[preset]().options().get(name)
             if value is not None and name not in ("actions", "push_distances"):
                 assert said(cell) == (pytest.approx(value) if isinstance(value, list) else value), f"{name}: {cell}"
+
+
+def test_the_scene_sets_are_those_that_there_are():
+    told = {row[0].strip("`"): row[1:] for row in rows("docs/method.md", "| set | scenes | what | seeds | digest |")}
+    whole = [scene_set for scene_set in SETS.values() if scene_set.about]
+    assert list(told) == [scene_set.name for scene_set in whole]
+    for scene_set in whole:
+        scenes, _, seeds, digest_told = told[scene_set.name]
+        first, last = map(int, seeds.split(" to "))
+        assert int(re.match(r"\d+", scenes)[0]) == scene_set.scenes
+        assert {(b.first_seed, b.first_seed + b.scenes - 1) for b in scene_set.blocks} == {(first, last)}
+        assert digest_told == digest(scene_set)
+        counts = re.search(r"(\d+) each with ([\d, ]+) objects", scenes)
+        if counts:
+            each = [(int(counts[1]), int(objects)) for objects in counts[2].split(", ")]
+            assert each == [(b.scenes, b.objects) for b in scene_set.blocks]
+
+
+def test_the_table_of_scenes_is_the_stored_result():
+    stored = json.loads((ROOT / "benchmarks/results/scenes-cpu.json").read_text())
+    told = {
+        (row[0].strip("`"), row[1]): row[2:]
+        for row in rows(
+            "docs/results.md",
+            "| set | objects | scenes | size of f | targets with 0, 1 to 100, more pixels | share of the target seen "
+            "| objects seen (100 pixels or more) | share of each object seen |",
+        )
+    }
+    lines = {(line["source"], str(line["objects"])): line for line in stored["summary"]}
+    assert told.keys() == lines.keys()
+    for key, line in lines.items():
+        scenes, possible, targets, target_share, visible, objects_share = told[key]
+        assert int(scenes) == line["scenes"]
+        assert possible.startswith(f"{line['possible_mean']:.0f} ± {line['possible_standard_error']:.0f}")
+        counts = [line[f"target_{name}"] for name in ("hidden", "below_threshold", "found")]
+        assert [int(count) for count in targets.split(", ")] == counts
+        assert target_share == f"{line['target_share_mean']:.3f}"
+        assert visible == f"{line['visible_mean']:.2f}"
+        assert objects_share.startswith(f"{line['objects_share_mean']:.2f} ± ")
+
+
+def test_stored_scenes_are_those_on_record():
+    stored = json.loads((ROOT / "benchmarks/results/scenes-cpu.json").read_text())
+    made = {(row[1], row[2]) for row in stored["rows"] if row[0] in SETS}
+    sets = [SETS[name] for name in ("c2", "d1", "d2", "d3")]
+    on_record = {
+        (block.scene_name(i), content)
+        for scene_set in sets
+        for block in scene_set.blocks
+        for i, content in enumerate(recorded()[block.name])
+    }
+    assert made == on_record
 
 
 @pytest.mark.slow

@@ -69,7 +69,7 @@ def test_the_row_of_a_job_is_that_of_its_episode():
     job = Job("", Scenario("one", (), TARGET), METHODS[1], 3)
     # As `run_episodes` writes it.
     config = {**METHODS[1].options(), "target": "cylinder", "simulator": "MjxSimulator", "seed": 3}
-    episode = Episode("one", 0, config, {}, (), None, None, False, "error: no")
+    episode = Episode("one", 0, config, {}, (), None, None, False, "error: no", job.scenario.content_hash)
     assert Row.of_episode(episode) == job.failed("no")
 
 

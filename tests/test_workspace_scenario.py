@@ -76,6 +76,34 @@ def test_the_file_format_does_not_drift():
     assert scenarios.parse_scenario(json.loads(GOLDEN), "golden") == scene
 
 
+def test_the_content_hash_does_not_drift():
+    assert Scenario("one-thing", SCENE.objects[:1], SCENE.target).content_hash == "cb0dbb995539"
+
+
+def test_the_content_hash_is_of_what_stands_where():
+    hashes = {SCENE.content_hash}
+    for change in (
+        lambda b: dataclasses.replace(b, shape="cylinder" if b.shape == "box" else "box"),
+        lambda b: dataclasses.replace(b, half_size=(*b.half_size[:2], b.half_size[2] + 1e-6)),
+        lambda b: dataclasses.replace(b, position=(b.position[0], b.position[1] + 1e-6, b.position[2])),
+        lambda b: dataclasses.replace(b, quaternion=(b.quaternion[0], 1e-9, *b.quaternion[2:])),
+    ):
+        hashes.add(dataclasses.replace(SCENE, objects=(change(SCENE.objects[0]), SCENE.objects[1])).content_hash)
+        hashes.add(dataclasses.replace(SCENE, target=change(SCENE.target)).content_hash)
+    hashes.add(dataclasses.replace(SCENE, objects=SCENE.objects[::-1]).content_hash)
+    hashes.add(dataclasses.replace(SCENE, objects=SCENE.objects[:1]).content_hash)
+    assert len(hashes) == 11
+    assert all(len(h) == 12 for h in hashes)
+
+
+def test_the_content_hash_is_not_of_name_or_writing(tmp_path):
+    value = json.loads(scenarios.format_scenario(SCENE))
+    value["name"] = "another"
+    value["target"]["quaternion"] = [1, 0, -0.0, 0]
+    (tmp_path / "tight.json").write_text(json.dumps(value, sort_keys=True))
+    assert scenarios.load_scenario(tmp_path / "tight.json").content_hash == SCENE.content_hash
+
+
 def test_what_is_written_is_read_back(tmp_path):
     scenarios.save_scenario(SCENE, tmp_path / "new" / "scene.json")
     assert scenarios.load_scenario(tmp_path / "new" / "scene.json") == SCENE

@@ -11,6 +11,7 @@ import tyro
 
 from mechsearch_jax.commands.options import (
     JsonFile,
+    Scenarios,
     SomeScenarios,
     WeightsFile,
     at_least_one,
@@ -48,7 +49,8 @@ def bench_agreement(
     """Compare the batch simulator with the native one: random pushes and pick-and-places, executed by both.
 
     Args:
-      scenarios: scenario files, folders of them, or names of shipped ones; scenes are generated if there are none.
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets; scenes are generated if there
+        are none.
       actions: how many; they are as many worlds of one batch.
       scenes: how many are generated, with 1 to 8 objects in turn.
       seed: of the scenes and of the actions.
@@ -95,7 +97,7 @@ def bench_recognition(
     """Compare recognisers, given true masks, with the truth: the network, refinement and the classical EMS.
 
     Args:
-      scenarios: scenario files, folders of them, or names of shipped ones, beside the generated scenes.
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets, beside the generated scenes.
       scenes: how many are generated, with a seed that training cannot have; may be 0 if there are scenarios.
       seed: of the generated scenes, of the noise and of the methods.
       noise: of the depth image, one or more; "gaussian" is the paper's, 1 mm.
@@ -157,7 +159,7 @@ def bench_segmentation(
     """Measure how well the objects of depth images are told apart, against their true masks.
 
     Args:
-      scenarios: scenario files, folders of them, or names of shipped ones, beside the generated scenes.
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets, beside the generated scenes.
       scenes: how many are generated, with a seed that training cannot have; may be 0 if there are scenarios.
       seed: of the generated scenes and of the noise.
       noise: of the depth image, one or more; "gaussian" is the paper's, 1 mm.
@@ -243,7 +245,39 @@ def bench_push(
     console.print(push_scores_tables(measured))
 
 
+def bench_scenes(scenarios: Scenarios, /, *, out: JsonFile = None) -> None:
+    """Tell what scenes are like at their start: size of f, and what is seen of the target and of the objects.
+
+    Args:
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets; each is a source of its own.
+      out: JSON file for the figures and for every scene's row.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import scenes
+    from mechsearch_jax.benchmarks.tables import scenes_table
+    from mechsearch_jax.planner.cache import keep_compilations
+
+    names = [Path(name).resolve().name for name in scenarios]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"bench scenes: two sources are called {twice}; rename one")
+    sources = {name: _loaded([given]) for name, given in zip(names, scenarios, strict=True)}
+    if not sources:
+        find_scenarios([])
+    check_files(out)
+    keep_compilations()
+    console = Console(highlight=False)
+    total = sum(map(len, sources.values()))
+    with console.status("looking") as status:
+        rows = scenes.look_at_all(sources, lambda done: status.update(f"looking {done}/{total}"))
+    if out is not None:
+        scenes.save_scenes(rows, out)
+    console.print(scenes_table(rows))
+
+
 COMMANDS = {
+    "scenes": bench_scenes,
     "agreement": bench_agreement,
     "recognition": bench_recognition,
     "segmentation": bench_segmentation,

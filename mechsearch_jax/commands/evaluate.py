@@ -38,7 +38,7 @@ def evaluate(
     On a GPU they run in batches in this process, on a CPU one after the other in worker processes.
 
     Args:
-      scenarios: scenario files, folders of them, or names of shipped ones.
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
       out: Parquet file with one row for each episode; rows that it already holds are not run again.
       method: one or more; search-for-grasp by default.
       policy: instead of methods, names of policies ("random" is one more), or import paths of others, one or more.

@@ -18,7 +18,7 @@ def inspect(
     """Write maps of f and g at the start of scenarios, as NAME.npz and NAME.png.
 
     Args:
-      scenarios: scenario files, folders of them, or names of shipped ones.
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
       out: folder for the maps.
       seed: of the recogniser.
       options: how the planner decides.

@@ -43,7 +43,9 @@ COMMANDS: Commands = {
     "inspect": inspect_scenarios,
     "evaluate": evaluate,
     "report": report,
-    "scenarios": _only_described("Generate and check scenario files: mechsearch scenarios generate|check."),
+    "scenarios": _only_described(
+        "List scene sets, generate and check scenarios: mechsearch scenarios list|generate|check."
+    ),
     "train": _only_described("Train the networks: mechsearch train segmentation|recognition|push."),
     "bench": _only_described("Measure the parts, one command each."),
 }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,6 +16,7 @@ from mechsearch_jax.shapes import SHAPES
 
 if TYPE_CHECKING:
     from mechsearch_jax.envs.method import EngineName, Method
+    from mechsearch_jax.envs.scene_sets import Block
     from mechsearch_jax.planner import Config, Option
 
 PaperMethod = Literal["search-for-grasp", "search-and-grasp"]
@@ -169,10 +170,10 @@ def has_gpu() -> bool:
 
 OnePolicy = Annotated[str | None, tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE")]
 OneMethod = Annotated[PaperMethod | None, tyro.conf.arg(metavar="{search-for-grasp,search-and-grasp}")]
-Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER ...")]
+Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER|SET ...")]
 
 GivenShape = Annotated[TargetShape | None, tyro.conf.arg(metavar="{" + ",".join(SHAPES) + "}")]
-SomeScenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER ...]")]
+SomeScenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER|SET ...]")]
 JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 WeightsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")]
 
@@ -209,45 +210,105 @@ def forget_kept_compilations() -> None:
 
 
 def find_scenario(name: str) -> Path:
-    """The file that a scenario's path, or the name of one that ships with the package, stands for.
+    """The file that a scenario's path, or the name of one that ships with the package or is in a scene set, stands for.
 
     Raises:
-      InputError: there is neither.
+      InputError: there is none.
     """
+    from mechsearch_jax.envs.scene_sets import SETS, find_scene
     from mechsearch_jax.workspace.scenario import example_scenarios
 
     shipped = example_scenarios()
     if Path(name).is_file():
+        _tell_what_is_taken(name)
         return Path(name)
     if name in shipped:
         return shipped[name]
-    raise InputError(f"{name}: there is no such file, nor a shipped scenario of that name ({', '.join(shipped)})")
+    if name in SETS:
+        first = SETS[name].blocks[0].scene_name(0)
+        raise InputError(f"{name}: is a set of {SETS[name].scenes} scenes; name one of them, as {first}")
+    scene = find_scene(name)
+    if scene is None:
+        raise InputError(
+            f"{name}: there is no such file, nor a shipped scenario of that name ({', '.join(shipped)}), nor a scene "
+            "set (mechsearch scenarios list)"
+        )
+    return _files_of([scene])[0]
 
 
 def find_scenarios(names: Sequence[str]) -> list[Path]:
     """The files that paths, folders and names stand for.
 
-    In a folder, JSON files that are plainly something else, as the episode.json that `search` writes beside its
-    scenario, are left out; each is named on standard error.
+    A folder without scenario files stands for the folders in it. JSON files in a folder that are plainly something
+    else, as the episode.json that `search` writes beside its scenario, are left out; each is named on standard error.
 
     Raises:
       InputError: there is nothing for one of them.
     """
-    from mechsearch_jax.workspace.scenario import is_another_format
+    from mechsearch_jax.envs.scene_sets import SETS, set_scenes
 
     files: list[Path] = []
     for name in names:
         if Path(name).is_dir():
-            inside = sorted(Path(name).glob("*.json"))
-            others = [file for file in inside if is_another_format(file)]
-            for file in others:
-                print(f"{file}: is not a scenario file and is left out", file=sys.stderr)
-            inside = [file for file in inside if file not in others]
-            if not inside:
-                raise InputError(f"{name}: there are no scenario files (*.json) in this folder")
-            files += inside
+            _tell_what_is_taken(name)
+            files += _files_in(Path(name))
+        elif name in SETS and not Path(name).exists():
+            files += _files_of(set_scenes(SETS[name]))
         else:
             files.append(find_scenario(name))
     if not files:
-        raise InputError("no scenario is given; name a file, a folder or a shipped scenario")
+        raise InputError("no scenario is given; name a file, a folder, a shipped scenario or a scene set")
     return files
+
+
+def _tell_what_is_taken(name: str) -> None:
+    """Say so where what a path leads to goes before a scene set, or a scene of one, of the same name."""
+    from mechsearch_jax.envs.scene_sets import SETS, find_scene
+
+    if name in SETS or find_scene(name):
+        what = "folder" if Path(name).is_dir() else "file"
+        print(f"{name}: the {what} of this name is taken, not the scene set's", file=sys.stderr)
+
+
+def _files_in(folder: Path) -> list[Path]:
+    """Scenario files in a folder, or else in the folders in it.
+
+    Raises:
+      InputError: there are none.
+    """
+    from mechsearch_jax.workspace.scenario import is_another_format
+
+    for pattern in ("*.json", "*/**/*.json"):
+        inside = sorted(folder.glob(pattern))
+        others = [file for file in inside if is_another_format(file)]
+        for file in others:
+            print(f"{file}: is not a scenario file and is left out", file=sys.stderr)
+        if len(inside) > len(others):
+            return [file for file in inside if file not in others]
+    raise InputError(f"{folder}: there are no scenario files (*.json) in this folder or those in it")
+
+
+def _files_of(scenes: Sequence[tuple[Block, int]]) -> list[Path]:
+    """Files of scenes of sets; making them shows its progress on standard error."""
+    from mechsearch_jax.envs.scene_sets import scene_files
+    from mechsearch_jax.planner.cache import keep_compilations
+
+    def progress(missing: Sequence[Any]) -> Iterable[Any]:
+        from rich.console import Console
+        from rich.progress import track
+
+        keep_compilations()
+        return track(missing, "generating scenes", console=Console(stderr=True)) if missing else ()
+
+    found = scene_files(scenes, progress=progress)
+    tell_strange(found.strange)
+    return found.files
+
+
+def tell_strange(scenes: Sequence[str]) -> None:
+    """Say so where scenes of sets are not what is on record."""
+    if scenes:
+        who = f"{scenes[0]} and {len(scenes) - 1} more" if scenes[1:] else scenes[0]
+        print(
+            f"{who}: made here, not what is on record; results are not those of these scenes elsewhere", file=sys.stderr
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,7 @@ def report(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.report import read_tables, write_report
+    from mechsearch_jax.benchmarks.report import read_tables, told_of_changes, write_report
     from mechsearch_jax.benchmarks.tables import rates_table
 
     rows = read_tables(tables)
@@ -30,5 +31,7 @@ def report(
         write_report(rows, out)
     console = Console(highlight=False)
     console.print(rates_table(rows))
+    if told_of_changes(rows):
+        print(f"report: {told_of_changes(rows)}", file=sys.stderr)
     if out is not None:
         console.print(str(out / "report.md"), soft_wrap=True)

@@ -1,47 +1,100 @@
-"""`mechsearch scenarios`: generate and check scenario files."""
+"""`mechsearch scenarios`: list scene sets, generate and check scenario files."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Annotated
 
-from mechsearch_jax.commands.options import Scenarios, TargetShape, at_least_one, find_scenarios
+import tyro
+
+from mechsearch_jax.commands.options import Scenarios, TargetShape, at_least_one, find_scenarios, tell_strange
 from mechsearch_jax.errors import InputError
 
 
-def generate(*, objects: int, out: Path, count: int = 1, target: TargetShape = "cylinder", seed: int = 0) -> None:
+def list_sets() -> None:
+    """List the named sets of scenes: how many scenes, with how many objects, and what they hold."""
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.tables import scene_sets_table
+
+    Console(highlight=False).print(scene_sets_table())
+
+
+def generate(
+    *,
+    objects: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    scene_set: Annotated[str | None, tyro.conf.arg(name="set", metavar="NAME")] = None,
+    out: Path,
+    count: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    target: Annotated[TargetShape | None, tyro.conf.arg(metavar="{cylinder,box}")] = None,
+    seed: Annotated[int | None, tyro.conf.arg(metavar="SEED")] = None,
+) -> None:
     """Generate scenarios: objects dropped on the shelf, and a target that the camera cannot see.
 
     Args:
       objects: surrounding objects in each.
+      scene_set: instead, the name of a set of scenes (mechsearch scenarios list).
       out: folder for the files.
-      count: number of scenarios.
-      target: shape of the target.
-      seed: of the first scenario; the next ones follow.
+      count: number of scenarios; 1 if not given.
+      target: shape of the target; a cylinder if not given.
+      seed: of the first scenario, 0 if not given; the next ones follow.
     """
+    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.planner.cache import keep_compilations
+
+    if (objects is None) == (scene_set is None):
+        raise InputError("scenarios generate: give either --objects N or --set NAME, not both")
+    if scene_set is not None and (count, target, seed) != (None, None, None):
+        raise InputError("scenarios generate: --count, --target and --seed are not for a set, which has its own")
+    at_least_one("scenarios generate", count=count)
+    if scene_set is not None:
+        made = _generate_set(scene_set, out)
+    else:
+        check_writable(out)
+        keep_compilations()
+        made = count or 1
+        _generate_more(range(seed or 0, (seed or 0) + made), objects or 0, target or "cylinder", out)
+    print(f"{made} scenario{'s' if made > 1 else ''} generated: {out}")
+
+
+def _generate_more(seeds: range, objects: int, target: TargetShape, out: Path) -> None:
     from rich.progress import track
 
     from mechsearch_jax.envs.generator import ScenarioGenerator
-    from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import save_scenario
     from mechsearch_jax.workspace.target import Target
 
-    at_least_one("scenarios generate", count=count)
+    generator = ScenarioGenerator(Target.of(target))
+    for seed in track(seeds, "generating"):
+        scenario = generator.generate(seed, objects)
+        save_scenario(scenario, out / f"{scenario.name}.json")
+
+
+def _generate_set(name: str, out: Path) -> int:
+    """Write a set's scenes into a folder; how many they are."""
+    from rich.progress import track
+
+    from mechsearch_jax.envs.scene_sets import find_set, holds, scene_files, set_scenes
+    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.planner.cache import keep_compilations
+
+    scenes = set_scenes(find_set(name))
+    for block, index in scenes:
+        file = out / f"{block.scene_name(index)}.json"
+        if file.exists() and not holds(file, block, index):
+            raise InputError(f"{file}: is there already and holds something else; give another folder")
     check_writable(out)
     keep_compilations()
-    generator = ScenarioGenerator(Target.of(target))
-    for i in track(range(seed, seed + count), "generating"):
-        scenario = generator.generate(i, objects)
-        save_scenario(scenario, out / f"{scenario.name}.json")
-    print(f"{count} scenario{'s' if count > 1 else ''} generated: {out}")
+    tell_strange(scene_files(scenes, out, lambda missing: track(missing, "generating")).strange)
+    return len(scenes)
 
 
 def check(scenarios: Scenarios, /) -> None:
     """Check scenario files; every one that is malformed is named with its reason.
 
     Args:
-      scenarios: scenario files, folders of them, or names of shipped ones.
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
     """
     from mechsearch_jax.workspace.scenario import load_scenario
 
@@ -58,4 +111,4 @@ def check(scenarios: Scenarios, /) -> None:
         raise SystemExit(2)
 
 
-COMMANDS = {"generate": generate, "check": check}
+COMMANDS = {"list": list_sets, "generate": generate, "check": check}

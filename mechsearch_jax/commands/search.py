@@ -34,7 +34,7 @@ def search(
     """Run one episode: look, decide, act, until the target is found, graspable and taken out.
 
     Args:
-      scenario: a scenario file, or the name of one that ships with the package.
+      scenario: a scenario file, or the name of one that ships with the package or is in a scene set, as c2-4-017.
       objects: instead of a scenario, generate one with so many objects.
       target: shape of a generated target; a cylinder if not given.
       method: "search-for-grasp", the default, minds the grasp while it searches, "search-and-grasp" only afterwards.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib.resources
 import json
 import math
@@ -26,6 +27,8 @@ from mechsearch_jax.workspace.shelf import Shelf
 FORMAT = "mechsearch-scenario"
 VERSION = 1
 MAX_OBJECTS = 8
+# Enough for thousands of scenes: 48 bits.
+HASH_DIGITS = 12
 
 _BODY_KEYS = {"shape": str, "half_size": 3, "position": 3, "quaternion": 4}
 
@@ -60,6 +63,20 @@ class Scenario:
     name: str
     objects: tuple[Body, ...]
     target: Body
+
+    @property
+    def content_hash(self) -> str:
+        """Twelve hexadecimal digits that tell contents apart: every shape, size and pose, in the objects' order.
+
+        The name does not count, nor how a file writes its numbers. The order of the objects does: random numbers go
+        by it.
+        """
+        # Adding 0 makes -0 the 0 that it equals.
+        bodies = [
+            [body.shape, *([float(v) + 0.0 for v in part] for part in (body.half_size, body.position, body.quaternion))]
+            for body in (*self.objects, self.target)
+        ]
+        return hashlib.sha256(json.dumps(bodies, allow_nan=False).encode()).hexdigest()[:HASH_DIGITS]
 
 
 def rotation_matrix(quaternion: Sequence[float] | Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 3 3"]:

@@ -1,0 +1,211 @@
+"""Named scene sets: what they hold is on record, a scene depends on its seed alone, files hold what is on record."""
+
+import dataclasses
+import itertools
+import re
+
+import numpy as np
+import pytest
+
+from mechsearch_jax.envs import scene_sets, simulated_camera, world
+from mechsearch_jax.envs.generator import GeneratorConfig, outline, separation
+from mechsearch_jax.envs.native import NativeWorld
+from mechsearch_jax.envs.scene_sets import SETS, Block, find_scene, find_set, make_scene, recorded, scene_files
+from mechsearch_jax.envs.three_objects import LineConfig, LineGenerator
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import cache
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
+
+# Those that are not a part of another.
+WHOLE = ("c2", "d1", "d2", "d3", "development", "development-box")
+BLOCKS = [block for name in WHOLE for block in SETS[name].blocks]
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+def pixels(scene):
+    return int(simulated_camera.target_pixels(Camera(), world.from_scenario(scene)))
+
+
+def test_the_sets_are_those_of_the_paper():
+    told = {name: [(b.objects, b.scenes, b.target) for b in SETS[name].blocks] for name in WHOLE}
+    assert told["c2"] == [(n, 180, "cylinder") for n in (2, 4, 6, 8)]
+    assert told["d1"] == [(2, 200, "cylinder")]
+    assert told["d2"] == [(n, 75, "cylinder") for n in (4, 8)]
+    assert told["d3"] == [(n, 40, "box") for n in (4, 8)]
+    assert [SETS[name].scenes for name in ("c2", "c2-6", "d2", "d3-8")] == [720, 180, 150, 40]
+    assert {"c2-2", "c2-8", "d2-4", "d3-4", "development-4", "development-box-8"} < set(SETS)
+
+
+def test_no_two_experiments_share_a_seed():
+    seeds = {name: {b.first_seed + i for b in SETS[name].blocks for i in range(b.scenes)} for name in WHOLE}
+    for one, other in itertools.combinations(WHOLE, 2):
+        assert not seeds[one] & seeds[other], (one, other)
+    # What examples, tests and timings take.
+    assert min(min(each) for each in seeds.values()) >= 1000
+
+
+def test_every_scene_is_on_record_and_no_two_are_alike():
+    assert {name: len(hashes) for name, hashes in recorded().items()} == {b.name: b.scenes for b in BLOCKS}
+    hashes = [content for each in recorded().values() for content in each]
+    assert len(set(hashes)) == len(hashes) == 1390
+    assert all(re.fullmatch("[0-9a-f]{12}", content) for content in hashes)
+
+
+def test_digests_do_not_drift():
+    assert {name: scene_sets.digest(SETS[name]) for name in WHOLE} == DIGESTS
+
+
+DIGESTS = {
+    "c2": "87d316443d3b",
+    "d1": "f9a03a5d69d2",
+    "d2": "c3ec98190e98",
+    "d3": "c533bcf7ecfa",
+    "development": "3af2a9ae9f30",
+    "development-box": "1bc8aba34a0e",
+}
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.name)
+def test_some_scenes_are_what_is_on_record(block):
+    """Fails where the generator changed; `scene_sets.record` is for changes that are meant to change the sets."""
+    index = block.scenes // 3
+    scene = make_scene(block, index)
+    assert scene_sets.is_recorded(block, index, scene), scene.name
+    assert (scene.name, len(scene.objects), scene.target.shape) == (
+        f"{block.name}-{index:03d}", block.objects, block.target,
+    )  # fmt: skip
+    assert pixels(scene) <= 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.name)
+def test_all_scenes_are_what_is_on_record(block):
+    made = [make_scene(block, index).content_hash for index in range(block.scenes)]
+    assert made == recorded()[block.name]
+
+
+def test_two_cylinders_in_line_hide_the_target_each_by_itself():
+    camera, gripper = Camera(), Gripper()
+    sizes = []
+    for index in range(0, 200, 20):
+        scene = make_scene(SETS["d1"].blocks[0], index)
+        assert scene.target.position[:2] == LineConfig().target
+        assert scene.target.half_size == (0.02, 0.02, 0.05)
+        eye = np.array(camera.position[:2])
+        places = np.array([body.position[:2] for body in (*scene.objects, scene.target)]) - eye
+        cross = places[:, 0] * places[2, 1] - places[:, 1] * places[2, 0]
+        assert np.abs(cross).max() < 1e-5
+        assert (np.diff(np.linalg.norm(places, axis=1)) > 0).all()
+        for body in scene.objects:
+            assert body.shape == "cylinder"
+            assert 2 * body.half_size[0] <= gripper.usable_opening
+            assert body.half_size[0] > scene.target.half_size[0]
+            assert pixels(dataclasses.replace(scene, objects=(body,))) <= 100
+        bodies = (*scene.objects, scene.target)
+        assert all(separation(outline(a), outline(b)) > 0.003 for a, b in itertools.combinations(bodies, 2))
+        simulator = NativeWorld()
+        before = simulator.reset(scene).position
+        outcome = simulator.settle()
+        assert outcome.settled
+        assert not outcome.fallen.any()
+        assert np.abs(np.asarray(simulator.world.position - before)).max() < 1.5e-3
+        sizes += [(body.half_size[0], body.half_size[2]) for body in scene.objects]
+    assert np.ptp(sizes, axis=0) == pytest.approx([0.01, 0.045], rel=0.4)
+
+
+def test_what_cannot_be_in_line_is_one_line():
+    with pytest.raises(InputError, match="seed: -1 is negative"):
+        LineGenerator().generate(-1)
+    thin = LineGenerator(LineConfig(radius=(0.005, 0.006), attempts=5), GeneratorConfig(visible=100))
+    with pytest.raises(InputError, match="mine: no scene fits in 5 attempts"):
+        thin.generate(0, "mine")
+    for wrong in ({"radius": (0.0, 0.1)}, {"height": (0.2, 0.1)}, {"gap": -1.0}, {"attempts": 0}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            LineConfig(**wrong)
+
+
+def test_names_of_scenes():
+    block, index = find_scene("c2-4-017")
+    assert (block.name, index, block.scene_name(index)) == ("c2-4", 17, "c2-4-017")
+    assert find_scene("d1-199") == (SETS["d1"].blocks[0], 199)
+    for none in ("d1-200", "c2-017", "c2-4-17", "c2-4", "c2-5-000", "first-light", ""):
+        assert find_scene(none) is None, none
+    assert find_set("d3-4").blocks == (SETS["d3"].blocks[0],)
+    with pytest.raises(InputError, match="c9: there is no such scene set; there are c2, c2-2, "):
+        find_set("c9")
+    for index in (-1, 180):
+        with pytest.raises(InputError, match=f"c2-4: there is no scene {index}; there are 180"):
+            make_scene(block, index)
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """A block whose scenes cost nothing, and the numbers of those that were made."""
+    block, made = Block("quick", 4, 0, "cylinder", 1000), []
+
+    def make(block, index):
+        made.append(index)
+        where = (0.6, 0.01 * index, 0.4545)
+        return Scenario(block.scene_name(index), (), Body("cylinder", (0.02, 0.02, 0.05), where, UPRIGHT))
+
+    record = {"quick": [make(block, index).content_hash for index in range(4)]}
+    monkeypatch.setattr(scene_sets, "make_scene", make)
+    monkeypatch.setattr(scene_sets, "recorded", lambda: record)
+    made.clear()
+    return block, made, record["quick"]
+
+
+def test_files_are_made_once_and_hold_what_is_on_record(tmp_path, monkeypatch, quick):
+    block, made, record = quick
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
+    told = []
+
+    def progress(missing):
+        told.append(len(missing))
+        return iter(missing)
+
+    some = scene_files([(block, 2), (block, 0)], progress=progress)
+    assert [file.name for file in some.files] == ["quick-002.json", "quick-000.json"]
+    assert [load_scenario(file).content_hash for file in some.files] == [record[2], record[0]]
+    everything = scene_files([(block, i) for i in range(4)], progress=progress)
+    assert made == [2, 0, 1, 3]
+    assert told == [2, 2]
+    assert all(tmp_path / "cache" in file.parents for file in everything.files)
+    assert everything.strange == []
+    # What was damaged, edited or is another scene is made anew.
+    everything.files[0].write_text("{")
+    text = everything.files[1].read_text()
+    everything.files[1].write_text(text.replace("0.02", "0.03"))
+    everything.files[2].write_text(text)
+    again = scene_files([(block, i) for i in range(4)], progress=progress)
+    assert made[4:] == [0, 1, 2]
+    assert [load_scenario(file).content_hash for file in again.files] == record
+    assert scene_files([(block, 1)], tmp_path / "mine").files == [tmp_path / "mine" / "quick-001.json"]
+
+
+def test_scenes_that_are_not_what_is_on_record_are_told(tmp_path, quick):
+    block, _, record = quick
+    record[1] = "0123456789ab"
+    found = scene_files([(block, i) for i in range(4)], tmp_path)
+    assert found.strange == ["quick-001"]
+    assert len(found.files) == 4
+
+
+def test_without_a_cache_files_are_there_while_the_process_is(monkeypatch, quick):
+    block, made, _ = quick
+    monkeypatch.setenv(cache.VARIABLE, "")
+    (file,) = scene_files([(block, 3)]).files
+    assert load_scenario(file).name == "quick-003"
+    assert scene_files([(block, 3)]).files == [file]
+    assert made == [3]
+
+
+def test_a_record_is_written_and_read(tmp_path, monkeypatch):
+    block = dataclasses.replace(SETS["d1"].blocks[0], scenes=2)
+    monkeypatch.setattr(scene_sets, "_EXPERIMENTS", (SETS["d1"]._replace(blocks=(block,)),))
+    monkeypatch.setattr(scene_sets, "_BLOCKS", {"d1": block})
+    scene_sets.record(path=tmp_path / "record.json")
+    monkeypatch.setattr(scene_sets, "RECORD", tmp_path / "record.json")
+    assert scene_sets.recorded.__wrapped__() == {"d1": recorded()["d1"][:2]}
