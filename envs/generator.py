@@ -98,11 +98,13 @@ def _on_board(polygon: np.ndarray, shelf: Shelf, gap: float) -> bool:
     return bool((low >= inner[0]).all() and (high <= inner[1]).all())
 
 
+@functools.cache
 def graspable_alone(shelf: Shelf, target: Target, gripper: Gripper | None = None) -> Bool[np.ndarray, " x"]:
-    """At which of its candidate poses the target could be grasped if there were no other objects."""
+    """At which of its candidate poses the target could be grasped if there were no other objects; read-only."""
     tables = grasp_tables(shelf, gripper or Gripper(), target, GraspConfig())
     graspable = np.zeros(len(tables.T_world_target), bool)
     graspable[np.asarray(tables.pair_pose)] = True
+    graspable.setflags(write=False)
     return graspable
 
 
