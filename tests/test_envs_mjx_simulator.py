@@ -212,7 +212,7 @@ def test_a_push_ends_where_the_native_simulator_has_it_and_other_worlds_stay(sim
     assert outcomes.tracking_error[1:3].tolist() == [0.0, 0.0]
     held_up, _ = native_of(starts[3], into_the_wall)
     assert held_up.reason() == outcomes.reason(3)
-    assert float(outcomes.tracking_error[3]) == pytest.approx(float(held_up.tracking_error), rel=0.3)
+    assert float(outcomes.tracking_error[3]) == pytest.approx(float(held_up.tracking_error), rel=0.5)
     assert np.abs(np.asarray(sim.world.position[0] - world.position)).max() < 2e-3
     assert angle(sim.world.rotation[0], world.rotation).max() < 1.5
     assert float(sim.world.position[0, 0, 1]) > 0.2
