@@ -256,7 +256,7 @@ class EpisodeLog:
         """
         step = self.steps[-1]
         if final:
-            return step.failure
+            return step.failure or self.spoilt
         # Nothing is left to be learned: it is known whether the target could be grasped, and it will not be retrieved.
         if self.spoilt and self._graspable_step is not None:
             return self.spoilt
