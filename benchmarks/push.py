@@ -23,7 +23,6 @@ from mechsearch_jax.benchmarks.agreement import NUDGE
 from mechsearch_jax.dynamics.learned import NAME, LearnedPush
 from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
 from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, push_tables, toppled
 from mechsearch_jax.envs.simulator import Simulator
@@ -230,7 +229,7 @@ def repeated(
         outcomes = simulator.execute(_actions(some), jnp.asarray(index < count))
         after = simulator.world
         assert after is not None
-        failed = (outcomes.failure != int(Failure.NONE)) | (outcomes.overflow != 0)
+        failed = ~outcomes.took_place | (outcomes.overflow != 0)
         over = (toppled(some.before, after) | outcomes.fallen) & some.before.valid & ~failed[:, None]
         before, after = superquadrics(some.before), superquadrics(after)
         scene = before.replace(

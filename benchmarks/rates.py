@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import scipy.stats
 
 from mechsearch_jax.benchmarks.rows import Row, label_variants
+
+# The shares in `Events`, in the words of tables.
+EVENTS = {
+    "truth_lost": "truth ruled out",
+    "looks_truth_lost": "of all looks",
+    "restarted": "f started anew",
+    "fallen": "objects fallen",
+    "held_up": "arm held up",
+    "unsettled": "never at rest",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +50,33 @@ class Rates:
     simulation_seconds: float
 
 
+@dataclasses.dataclass(frozen=True)
+class Events:
+    """What happened on the way, in the episodes of a method that say so.
+
+    Attributes:
+      method: as in `Rates`.
+      objects: number of surrounding objects; None for all.
+      episodes: how many episodes say so.
+      truth_lost: share of them in which f ruled out the target's true pose at some step.
+      looks_truth_lost: share of all steps before the target was found at which it did.
+      restarted: share of the episodes in which f became empty and was started anew.
+      fallen: in which an object left the board.
+      held_up: in which the arm was held up.
+      unsettled: in which something never came to rest after an action.
+    """
+
+    method: str
+    objects: int | None
+    episodes: int
+    truth_lost: float
+    looks_truth_lost: float
+    restarted: float
+    fallen: float
+    held_up: float
+    unsettled: float
+
+
 def wilson(successes: int, count: int) -> tuple[float, float]:
     """Wilson's 95% confidence interval of a share: low and high; (0, 1) if nothing was counted."""
     if count == 0:
@@ -56,30 +93,63 @@ def is_error(row: Row) -> bool:
 def summarise(rows: Sequence[Row]) -> list[Rates]:
     """Rates by method (and what else differs) and number of objects, and for each method over all of them."""
     summary = []
+    for method, objects, group in _groups(rows):
+        actions = max(sum(row.steps for row in group), 1)
+        found = sum(row.found_step is not None for row in group)
+        graspable = sum(row.graspable_step is not None for row in group)
+        retrieved = sum(row.retrieved for row in group)
+        summary.append(
+            Rates(
+                method=method,
+                objects=objects,
+                episodes=len(group),
+                errors=sum(is_error(row) for row in group),
+                found=found / len(group),
+                graspable=graspable / len(group),
+                retrieved=retrieved / len(group),
+                found_interval=wilson(found, len(group)),
+                graspable_interval=wilson(graspable, len(group)),
+                retrieved_interval=wilson(retrieved, len(group)),
+                steps=sum(row.steps for row in group) / len(group),
+                planning_seconds=sum(row.planning_seconds for row in group) / actions,
+                simulation_seconds=sum(row.simulation_seconds for row in group) / actions,
+            )
+        )
+    return summary
+
+
+def summarise_events(rows: Sequence[Row]) -> list[Events]:
+    """What happened on the way, grouped as `summarise` does; groups of which nothing is known are left out."""
+    summary = []
+    for method, objects, group in _groups(rows):
+        known = [row for row in group if row.looks is not None]
+        if not known:
+            continue
+
+        def share(column: str, known: Sequence[Row] = known) -> float:
+            return sum(getattr(row, column) > 0 for row in known) / len(known)
+
+        looks, lost = (sum(getattr(row, column) for row in known) for column in ("looks", "truth_lost"))
+        summary.append(
+            Events(
+                method=method,
+                objects=objects,
+                episodes=len(known),
+                truth_lost=share("truth_lost"),
+                looks_truth_lost=lost / max(looks, 1),
+                restarted=share("restarts"),
+                fallen=share("objects_fallen"),
+                held_up=share("held_up"),
+                unsettled=share("unsettled"),
+            )
+        )
+    return summary
+
+
+def _groups(rows: Sequence[Row]) -> Iterator[tuple[str, int | None, list[Row]]]:
+    """The rows of every method, by their number of objects, and then, with None, all of them."""
     labels = label_variants(rows)
     for method in sorted(set(labels)):
         of_method = [row for row, label in zip(rows, labels, strict=True) if label == method]
         for objects in [*sorted({row.objects for row in of_method}), None]:
-            group = [row for row in of_method if objects is None or row.objects == objects]
-            actions = max(sum(row.steps for row in group), 1)
-            found = sum(row.found_step is not None for row in group)
-            graspable = sum(row.graspable_step is not None for row in group)
-            retrieved = sum(row.retrieved for row in group)
-            summary.append(
-                Rates(
-                    method=method,
-                    objects=objects,
-                    episodes=len(group),
-                    errors=sum(is_error(row) for row in group),
-                    found=found / len(group),
-                    graspable=graspable / len(group),
-                    retrieved=retrieved / len(group),
-                    found_interval=wilson(found, len(group)),
-                    graspable_interval=wilson(graspable, len(group)),
-                    retrieved_interval=wilson(retrieved, len(group)),
-                    steps=sum(row.steps for row in group) / len(group),
-                    planning_seconds=sum(row.planning_seconds for row in group) / actions,
-                    simulation_seconds=sum(row.simulation_seconds for row in group) / actions,
-                )
-            )
-    return summary
+            yield method, objects, [row for row in of_method if objects is None or row.objects == objects]

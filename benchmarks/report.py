@@ -7,6 +7,7 @@ import csv
 import dataclasses
 import io
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,14 +16,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from mechsearch_jax.benchmarks.rates import Rates, summarise, wilson
+from mechsearch_jax.benchmarks.rates import EVENTS, Events, Rates, summarise, summarise_events, wilson
 from mechsearch_jax.benchmarks.rows import Row, identity, label_variants, read_rows
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, check_writable, replacing
 from mechsearch_jax.viz.drawing import INK, MUTED, save_figure
 
 # What a report consists of.
-FILES = ("report.md", "rates.csv", "rates.json", "failures.csv", "success.png")
+FILES = ("report.md", "rates.csv", "rates.json", "failures.csv", "events.csv", "success.png")
+# Which action it was is no reason of its own.
+_WHICH_ACTION = re.compile(r" at action \d+$")
 GOALS = {"found": "found", "graspable": "found and graspable", "retrieved": "retrieved"}
 # Told apart without colour vision too (Okabe and Ito).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
@@ -104,7 +107,8 @@ def failures(rows: Sequence[Row]) -> list[Failures]:
     result = []
     for method in sorted(set(labels)):
         group = [row for row, label in zip(rows, labels, strict=True) if label == method]
-        reasons = collections.Counter(row.failure or "unknown" for row in group if not row.retrieved)
+        told = [row.failure or "unknown" for row in group if not row.retrieved]
+        reasons = collections.Counter(_WHICH_ACTION.sub("", reason) for reason in told)
         result += [Failures(method, reason, n, n / len(group)) for reason, n in reasons.most_common()]
     return result
 
@@ -113,7 +117,7 @@ def _share(value: float, interval: tuple[float, float]) -> str:
     return f"{value:.2f} ({interval[0]:.2f} to {interval[1]:.2f})"
 
 
-def _objects(rates: Rates) -> str:
+def _objects(rates: Rates | Events) -> str:
     return "all" if rates.objects is None else str(rates.objects)
 
 
@@ -148,12 +152,32 @@ def markdown(rows: Sequence[Row]) -> str:
         lines += [_row((f.method, f.reason, str(f.episodes), f"{f.share:.2f}")) for f in reasons]
     else:
         lines.append("None did.")
+    lines += ["", "## What happened on the way", "", *_events(rows)]
     lines += ["", "## Success over the number of actions", "", "![Success over the number of actions](success.png)", ""]
     return "\n".join(lines)
 
 
-def _flat(rates: Rates) -> dict[str, object]:
-    """Rates with one value a column."""
+def _events(rows: Sequence[Row]) -> list[str]:
+    """What happened on the way, as lines of the report."""
+    summary = summarise_events(rows)
+    if not summary:
+        return ["These episodes do not say: an earlier version ran them, or they ended in errors."]
+    names = ("method", "objects", "episodes", *EVENTS.values())
+    lines = [
+        "Shares of the episodes that say so; *of all looks* is the share of the steps before the target was found at "
+        "which f ruled out its true pose.",
+        "",
+        _row(names),
+        _row(["---"] * len(names)),
+    ]
+    for events in summary:
+        shares = [f"{getattr(events, name):.3f}" for name in EVENTS]
+        lines.append(_row([events.method, _objects(events), str(events.episodes), *shares]))
+    return lines
+
+
+def _flat(rates: Rates | Events) -> dict[str, object]:
+    """Rates or events with one value a column."""
     flat: dict[str, object] = {}
     for name, value in dataclasses.asdict(rates).items():
         if isinstance(value, tuple):
@@ -228,11 +252,13 @@ def write_report(rows: Sequence[Row], out: PathLike) -> None:
     figure = success_figure(rows)
     flat = [_flat(rates) for rates in summarise(rows)]
     reasons = [dataclasses.asdict(f) for f in failures(rows)]
+    events = [_flat(each) for each in summarise_events(rows)]
     texts = (
         markdown(rows),
         _csv(flat, list(flat[0])),
-        json.dumps({"rates": flat, "failures": reasons}, indent=1, allow_nan=False) + "\n",
+        json.dumps({"rates": flat, "failures": reasons, "events": events}, indent=1, allow_nan=False) + "\n",
         _csv(reasons, [field.name for field in dataclasses.fields(Failures)]),
+        _csv(events, [field.name for field in dataclasses.fields(Events)]),
     )
     *written, picture = (folder / name for name in FILES)
     for path, text in zip(written, texts, strict=True):

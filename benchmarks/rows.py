@@ -12,7 +12,7 @@ import pyarrow
 import pyarrow.parquet
 
 from mechsearch_jax.envs.earlier import RENAMED, present_options
-from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.envs.records import Episode, Step
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.workspace.scenario import Scenario
@@ -21,6 +21,11 @@ from mechsearch_jax.workspace.scenario import Scenario
 PLANNING = ("recognise", "believe", "grasp", "plan", "judge")
 # Options that have a column of their own.
 OPTIONS = ("target", "policy", "recognition", "gamma", "horizon", "sequences", "actions")
+# What happened on the way.
+EVENTS = (
+    *("looks", "truth_lost", "truth_lost_step", "restarts"),
+    *("objects_fallen", "fallen_step", "held_up", "unsettled"),
+)
 # Between kinds of action in their column.
 ACTIONS_BETWEEN = "+"
 # Where the table's metadata say what ran the episodes.
@@ -43,6 +48,17 @@ class Row:
       configuration: everything that decides about the episode beside its scenario and its seed, as `configuration`
         writes it; None in files of version 0.1.0, which do not say.
       content_hash: of the scenario, as in `Episode`; None in files of earlier versions, which do not say.
+      looks: number of steps at which the target was not found and stood on the board.
+      truth_lost: at how many of them f ruled out the candidate pose nearest to the target's true pose.
+      truth_lost_step: number of actions before the first of these; None where there was none.
+      restarts: how often f was started anew.
+      objects_fallen: number of objects that left the board.
+      fallen_step: number of actions after which the first of them was off it; None where none fell.
+      held_up: number of actions in which the arm was held up.
+      unsettled: number of actions after which something never came to rest.
+
+    From `looks` on they are None where that is not known: in files of earlier versions, and of an episode that could
+    not be run to its end.
     """
 
     scenario: str
@@ -64,6 +80,14 @@ class Row:
     simulation_seconds: float
     configuration: str | None = None
     content_hash: str | None = None
+    looks: int | None = None
+    truth_lost: int | None = None
+    truth_lost_step: int | None = None
+    restarts: int | None = None
+    objects_fallen: int | None = None
+    fallen_step: int | None = None
+    held_up: int | None = None
+    unsettled: int | None = None
 
     @classmethod
     def of_episode(cls, episode: Episode) -> Row:
@@ -81,6 +105,7 @@ class Row:
             planning_seconds=sum(sum(timings.get(stage, 0.0) for timings in spent) for stage in PLANNING),
             simulation_seconds=sum(timings["simulate"] for timings in spent),
             content_hash=episode.content_hash,
+            **_event_columns(episode.steps),
         )
 
     @classmethod
@@ -99,6 +124,24 @@ class Row:
             simulation_seconds=0.0,
             content_hash=scenario.content_hash,
         )
+
+
+def _event_columns(steps: Sequence[Step]) -> dict[str, int | None]:
+    """The columns `EVENTS`; all None where the steps do not say, as those of earlier versions."""
+    if any(step.restarts is None for step in steps):
+        return dict.fromkeys(EVENTS)
+    lost = [i for i, step in enumerate(steps) if step.truth_possible is False]
+    fell = [i + 1 for i, step in enumerate(steps) if step.fallen]
+    return {
+        "looks": sum(step.truth_possible is not None for step in steps),
+        "truth_lost": len(lost),
+        "truth_lost_step": min(lost, default=None),
+        "restarts": max((step.restarts or 0 for step in steps), default=0),
+        "objects_fallen": sum(len(step.fallen or ()) for step in steps),
+        "fallen_step": min(fell, default=None),
+        "held_up": sum(bool(step.held_up) for step in steps),
+        "unsettled": sum(step.at_rest is False for step in steps),
+    }
 
 
 def _option_columns(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -121,8 +164,11 @@ def _column(kind: Any) -> pyarrow.DataType:
 
 
 SCHEMA = pyarrow.schema([(name, _column(kind)) for name, kind in get_type_hints(Row).items()])
-# What was written before rows said what their scenario holds, and before that without the configuration.
-_EARLIER_COLUMNS = (SCHEMA.names[:-1], SCHEMA.names[:-2])
+# The last column before rows said what happened on the way, before that what their scenario holds, and before that
+# the configuration.
+_EARLIER_COLUMNS = tuple(
+    SCHEMA.names[: SCHEMA.names.index(last) + 1] for last in ("content_hash", "configuration", "simulation_seconds")
+)
 
 
 def configuration(options: Mapping[str, Any]) -> str:

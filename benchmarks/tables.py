@@ -13,7 +13,7 @@ from rich.text import Text
 from mechsearch_jax.benchmarks import push, scenes, segmentation
 from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
-from mechsearch_jax.benchmarks.rates import summarise
+from mechsearch_jax.benchmarks.rates import EVENTS, summarise, summarise_events
 from mechsearch_jax.benchmarks.recognition import SHARES, Measured
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.envs import scene_sets
@@ -35,6 +35,26 @@ def rates_table(rows: Sequence[Row]) -> Table:
             f"{rates.planning_seconds:.2f}",
             f"{rates.simulation_seconds:.2f}",
             style="bold" if rates.objects is None else None,
+        )
+    return table
+
+
+def events_table(rows: Sequence[Row]) -> Table | None:
+    """What happened on the way, by method and number of objects; None where no row says it."""
+    summary = summarise_events(rows)
+    if not summary:
+        return None
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    table.add_column("method", no_wrap=True)
+    for name in ("objects", "runs", *EVENTS.values()):
+        table.add_column(name, justify="right", no_wrap=True)
+    for events in summary:
+        table.add_row(
+            events.method,
+            "all" if events.objects is None else str(events.objects),
+            str(events.episodes),
+            *(f"{getattr(events, name):.3f}" for name in EVENTS),
+            style="bold" if events.objects is None else None,
         )
     return table
 

@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.actions import Action, ActionKind, kind_of
-from mechsearch_jax.envs.outcome import Outcome, Overflow
+from mechsearch_jax.envs.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.records import Episode, Step, record_action
+from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.planner import Decision
 from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.scenario import Scenario
@@ -74,6 +75,46 @@ def overflow_trouble(outcome: Outcome, i: int) -> str | None:
     return f"error: the simulator's buffers were too small ({names})"
 
 
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What the simulator said of what was decided, in the words of a record.
+
+    Attributes:
+      failure: why it was not carried out as chosen; None if it was.
+      takes_target: whether it was an attempt to take the target out.
+      retrieved: whether that succeeded and nothing fell meanwhile.
+      final: whether trying once more would not mend it.
+      off_board: bodies that are off the board now, since then or before.
+      held_up, at_rest, tracking_error: as in `Step`.
+    """
+
+    failure: str | None
+    takes_target: bool
+    retrieved: bool
+    final: bool
+    off_board: frozenset[int]
+    held_up: bool
+    at_rest: bool
+    tracking_error: float
+
+
+def result_of(choice: Choice, outcome: Outcome, i: int) -> Result:
+    """What came of the action in world `i`."""
+    code, takes = Failure(int(outcome.failure[i])), takes_target(choice)
+    # The same grasp stays out of reach, what fell stays off the board, and a target that is out cannot be taken out.
+    final = code in (Failure.UNREACHABLE, Failure.FALLEN) or bool(outcome.held[i] & outcome.outside[i])
+    return Result(
+        failure=failure_of(choice, outcome, i),
+        takes_target=takes,
+        retrieved=bool(outcome.retrieved[i]),
+        final=takes and final,
+        off_board=frozenset(np.flatnonzero(outcome.fallen[i]).tolist()),
+        held_up=code is Failure.HELD_UP,
+        at_rest=bool(outcome.settled[i]),
+        tracking_error=float(outcome.tracking_error[i]),
+    )
+
+
 def failure_of(choice: Choice, outcome: Outcome, i: int) -> str | None:
     """Why the action in world `i` was not carried out as chosen, in the words of a record; None if it was."""
     kind, reason = kind_of(int(choice.action.kind)), outcome.reason(i)
@@ -82,7 +123,14 @@ def failure_of(choice: Choice, outcome: Outcome, i: int) -> str | None:
     return f"retrieval: {reason}" if reason and kind.takes_target else reason
 
 
-def record(found: bool, belief_size: int, graspable: bool, choice: Choice | None) -> Step:
+def record(
+    found: bool,
+    belief_size: int,
+    graspable: bool,
+    choice: Choice | None,
+    truth_possible: bool | None = None,
+    restarts: int | None = None,
+) -> Step:
     """A step as it is decided: what comes of it is filled in later.
 
     Args:
@@ -90,6 +138,7 @@ def record(found: bool, belief_size: int, graspable: bool, choice: Choice | None
       belief_size: number of poses where it can be.
       graspable: whether it truly is.
       choice: None where nothing is done.
+      truth_possible, restarts: as in `Step`.
     """
     cost = predicted = action = None
     sequences = 0
@@ -110,6 +159,8 @@ def record(found: bool, belief_size: int, graspable: bool, choice: Choice | None
         sequences=sequences,
         failure=None,
         timings={},
+        truth_possible=truth_possible,
+        restarts=restarts,
     )
 
 
@@ -120,10 +171,13 @@ class EpisodeLog:
 
     Attributes:
       steps: those that are over, and the one that was decided.
+      spoilt: why the target cannot be retrieved any more, whatever is done: an object has left the board; None before.
     """
 
     def __init__(self, max_steps: int) -> None:
         self.steps: list[Step] = []
+        self.spoilt: str | None = None
+        self._off_board: frozenset[int] = frozenset()
         self._max_steps = max_steps
         self._index = 0
         self._found_step: int | None = None
@@ -157,20 +211,58 @@ class EpisodeLog:
         self.steps.append(step)
         return step
 
-    def act(self, retrieved: bool, failure: str | None, trouble: str | None, timings: dict[str, float]) -> bool:
+    def act(self, result: Result | None, trouble: str | None, timings: dict[str, float]) -> bool:
         """Note what came of the decision; whether the episode ends with it.
 
         Args:
-          retrieved: whether it took the target out.
-          failure: why the action was not carried out as chosen; None if it was, or if nothing was done.
+          result: of what was executed; None where nothing was.
           trouble: why the episode cannot go on, unless it was a success; None if it can.
           timings: of the step's stages [s].
         """
-        step = self.steps[-1] = dataclasses.replace(self.steps[-1], failure=failure, timings=timings)
-        self._retrieved = retrieved and not (trouble or "").startswith("error")
-        self._failure = None if self._retrieved else trouble or _end(step, self.last)
+        self.steps[-1] = dataclasses.replace(self.steps[-1], timings=timings)
+        if result is not None:
+            self._note(result)
+        error = trouble is not None and trouble.startswith("error")
+        self._retrieved = result is not None and result.retrieved and not error and self.spoilt is None
+        self._failure = None if self._retrieved else trouble or self._end(result is not None and result.final)
+        if self._failure and self.spoilt and not error:
+            self._failure = self.spoilt
         self._index += 1
         return self._retrieved or self._failure is not None
+
+    def _note(self, result: Result) -> None:
+        """Write down what came of what was executed."""
+        left = result.off_board - self._off_board
+        self._off_board |= result.off_board
+        objects = tuple(sorted(left - {TARGET}))
+        self.steps[-1] = dataclasses.replace(
+            self.steps[-1],
+            failure=result.failure,
+            fallen=objects,
+            target_fallen=TARGET in left,
+            held_up=result.held_up,
+            at_rest=result.at_rest,
+            tracking_error=result.tracking_error,
+        )
+        if objects and self.spoilt is None:
+            blamed = "retrieval: " if result.takes_target else ""
+            self.spoilt = f"{blamed}an object fell off the board at action {self._index + 1}"
+
+    def _end(self, final: bool) -> str | None:
+        """Why an episode without a retrieval ends here; None if it goes on.
+
+        Args:
+          final: whether the present failure ends it.
+        """
+        step = self.steps[-1]
+        if final:
+            return step.failure or self.spoilt
+        # Nothing is left to be learned: it is known whether the target could be grasped, and it will not be retrieved.
+        if self.spoilt and self._graspable_step is not None:
+            return self.spoilt
+        if not self.last:
+            return None
+        return step.failure or ("found, but not graspable" if step.found else "not found")
 
     def episode(self, scenario: Scenario, options: dict[str, Any]) -> Episode:
         """The record of the episode, which has ended."""
@@ -186,13 +278,3 @@ class EpisodeLog:
             failure=self._failure,
             content_hash=scenario.content_hash,
         )
-
-
-def _end(step: Step, last: bool) -> str | None:
-    """Why an episode without a retrieval ends here; None if it goes on."""
-    # Trying once more would neither make the same grasp reachable nor put a fallen object back on the board.
-    if step.failure in ("retrieval: unreachable", "retrieval: fallen"):
-        return step.failure
-    if not last:
-        return None
-    return step.failure or ("found, but not graspable" if step.found else "not found")

@@ -6,8 +6,10 @@ neither on its slot nor on its neighbours. An episode alone is a pool of one slo
 scene, and which can be watched.
 
 Two verdicts are passed on an episode, both on the true state: `graspable` (the target is in sight and a collision-free
-grasp exists) and `retrieved` (the hand took it out of the shelf, and no object fell). An action that fails costs a step
-and leaves the world as it made it.
+grasp exists) and `retrieved` (the hand took it out of the shelf, and no object fell, neither then nor before). An
+action that fails costs a step and leaves the world as it made it. Once an object has left the board nothing can be
+retrieved any more: the episode goes on until it is known whether the target is found and graspable, and takes nothing
+out.
 """
 
 from __future__ import annotations
@@ -28,9 +30,9 @@ from mechsearch_jax.envs.episode_log import (
     Choice,
     EpisodeLog,
     distrust,
-    failure_of,
     overflow_trouble,
     record,
+    result_of,
     takes_target,
     target_trouble,
 )
@@ -275,8 +277,9 @@ class _EpisodePool:
         planner_keys, environment_keys = _keys_at(jnp.asarray(self._keys), jnp.array(steps, jnp.int32))
 
         with clock("recognise", list(logs)):
-            found, possible = self._known.look(world, environment_keys, list(logs))
-        trouble = self._target_troubles(world, [r for r in logs if found[r]])
+            known = self._known.look(world, environment_keys, list(logs))
+        found, lost = known.found, self._target_troubles(world, list(logs))
+        trouble = {r: reason for r, reason in lost.items() if found[r]}
         sought = [r for r in logs if found[r] and r not in trouble]
         # After the last action the target may still be taken out, where it is found.
         asked = [r for r in logs if r in sought or not (found[r] or logs[r].last)]
@@ -288,9 +291,14 @@ class _EpisodePool:
 
         trouble |= {r: reason for r, choice in choices.items() if (reason := distrust(choice))}
         for r, log in logs.items():
-            size = 1 if found[r] else int(possible[r])
-            log.decide(record(bool(found[r]), size, graspable.get(r, False), None if r in trouble else choices.get(r)))
-        return self._act(clock, choices, trouble)
+            # Where an object has left the board, an episode goes on for what else is to be known of it, no further.
+            if log.spoilt and (graspable.get(r) or (r in choices and takes_target(choices[r]))):
+                trouble.setdefault(r, log.spoilt)
+            choice = None if r in trouble else choices.get(r)
+            size = 1 if found[r] else int(known.size[r])
+            truth = None if found[r] or r in lost else bool(known.truth[r])
+            log.decide(record(bool(found[r]), size, graspable.get(r, False), choice, truth, int(known.restarts[r])))
+        return self._act(clock, {r: choice for r, choice in choices.items() if r not in trouble}, trouble)
 
     def _target_troubles(self, world: World, rows: Sequence[int]) -> dict[int, str]:
         """In which of these slots the target can no longer be taken out, and why."""
@@ -316,11 +324,10 @@ class _EpisodePool:
 
         done: list[tuple[int, tuple[int, Episode]]] = []
         for r, slot in running.items():
-            retrieved, failure, why = False, None, trouble.get(r)
+            result, why = None, trouble.get(r)
             if outcome is not None and r in acting:
-                retrieved, failure = bool(outcome.retrieved[r]), failure_of(choices[r], outcome, r)
-                why = overflow_trouble(outcome, r)
-            if slot.log.act(retrieved, failure, why, clock.timings(r)):
+                result, why = result_of(choices[r], outcome, r), overflow_trouble(outcome, r)
+            if slot.log.act(result, why, clock.timings(r)):
                 done.append((r, (slot.place, slot.log.episode(slot.start.scenario, self._options(slot.start)))))
                 self._slots[r] = None
         if self._run.watcher is not None and moment is not None:

@@ -241,7 +241,8 @@ class MjxSimulator:
         world, fallen = taken_over(self.shelf, world, data.qpos, everywhere)
         failure = jnp.where(progress.diverged, int(Failure.UNSTABLE), int(Failure.NONE)).astype(jnp.int32)
         none = ~everywhere
-        return data, world, Outcome(failure, progress.steps, none, fallen, none, none, none, progress.overflow)
+        told = (progress.steps, none, fallen, none, none, none, progress.overflow, progress.error)
+        return data, world, Outcome(failure, *told)
 
     def _one_step(self, fields: BodyFields, task: Task):
         step = functools.partial(self._model.step, fields)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.actions import KINDS, Action, ActionKind, Kind
 from mechsearch_jax.envs.mjx_model import overflow_of, where
 from mechsearch_jax.envs.outcome import Failure, Outcome
-from mechsearch_jax.envs.simulator import ARM, LAG, ROBOT, SimulatorConfig
+from mechsearch_jax.envs.simulator import ARM, LAG, ROBOT, SimulatorConfig, unhindered
 from mechsearch_jax.envs.world import BODIES, TARGET, World
 from mechsearch_jax.robot.kinematics import gripper_pose
 from mechsearch_jax.robot.motion import Reference
@@ -57,6 +57,8 @@ class Progress(flax.struct.PyTreeNode):
       steps: simulated so far.
       overflow: flags of `Overflow` so far.
       at_grasp, at_release: configurations when the hand has closed, and when it is to open, shape (W, nq).
+      reference: where the arm's joints would be if nothing held them up [rad], shape (W, 7).
+      error: the largest distance of a joint from there so far [rad].
     """
 
     done: jax.Array
@@ -67,6 +69,8 @@ class Progress(flax.struct.PyTreeNode):
     overflow: jax.Array
     at_grasp: jax.Array
     at_release: jax.Array
+    reference: jax.Array
+    error: jax.Array
 
 
 def commands(reference: Reference) -> Float[Array, "worlds steps 9"]:
@@ -125,7 +129,8 @@ def begin(task: Task, data: Any) -> Progress:
     """No step yet; done where there is nothing to do."""
     none = jnp.zeros(len(task.moves), bool)
     zero = jnp.zeros(len(task.moves), jnp.int32)
-    return Progress(~task.moves, ~task.moves, none, none, zero, zero, data.qpos, data.qpos)
+    q = data.qpos[:, :ARM]
+    return Progress(~task.moves, ~task.moves, none, none, zero, zero, data.qpos, data.qpos, q, jnp.zeros_like(q[:, 0]))
 
 
 def advance(
@@ -176,6 +181,9 @@ def advance(
     looks = (resting >= 1) & (resting % config.settle_block == 0)
     rests = looks & ~moving
     late = resting >= config.settle_steps // config.settle_block * config.settle_block
+    reference = unhindered(progress.reference, row[:, :ARM], config.motion.timestep)
+    off = jnp.max(jnp.abs(qpos[:, :ARM] - reference), axis=1)
+    follows = ~frozen & ~diverged & (i < task.length)
     grasps, releases = (i + 1 == step for step in (config.motion.grasp_step, config.motion.release_step))
     return data, Progress(
         done=frozen | diverged | rests | late,
@@ -186,13 +194,21 @@ def advance(
         overflow=progress.overflow | jnp.where(frozen, 0, overflow_of(after._impl.overflow)),
         at_grasp=jnp.where(grasps, qpos, progress.at_grasp),
         at_release=jnp.where(releases, qpos, progress.at_release),
+        reference=reference,
+        error=jnp.where(follows, jnp.maximum(progress.error, off), progress.error),
     )
+
+
+def off_board(shelf: Shelf, valid: Bool[Array, "worlds 9"], qpos: Float[Array, "worlds nq"]) -> Bool[Array, "worlds 9"]:
+    """Which bodies are off the board in a configuration."""
+    position = qpos[:, ROBOT:].reshape(-1, BODIES, 7)[..., :3]
+    return valid & ((position[..., 0] < shelf.front) | (position[..., 2] < shelf.board))
 
 
 def taken_over(shelf: Shelf, world: World, qpos: Array, moves: Bool[Array, " worlds"]) -> tuple[World, Array]:
     """The worlds with the bodies where a state has them, and which bodies have fallen off the board."""
     poses = qpos[:, ROBOT:].reshape(-1, BODIES, 7)
-    fallen = world.valid & ((poses[..., 0] < shelf.front) | (poses[..., 2] < shelf.board))
+    fallen = off_board(shelf, world.valid, qpos)
     changed = moves[:, None] & world.valid
     quaternion = poses[..., np.array([4, 5, 6, 3])].reshape(-1, 4)
     rotation = Rotation.from_quat(quaternion).as_matrix().reshape(world.rotation.shape)
@@ -216,7 +232,7 @@ def verdicts(
 
     Args:
       shelf: whose front edge and board things fall off.
-      config: how far a held object may slip.
+      config: how far a held object may slip, and a joint be from its reference.
       task, progress: what was to be done, and how far it got.
       world: before.
       qpos: the configuration afterwards.
@@ -230,14 +246,17 @@ def verdicts(
     held = retrieves & in_hand
     outside = retrieves & (qpos[:, ROBOT:].reshape(-1, BODIES, 7)[:, TARGET, 0] < shelf.front)
     fallen = fallen & ~(held[:, None] & (jnp.arange(BODIES) == TARGET)[None])
+    gone = off_board(shelf, world.valid, task.before)
+    error = jnp.where(progress.diverged, 0.0, progress.error)
     holds = _is_one_of(kind, [each for each in KINDS.values() if each.holds_object])
     dropped = holds & (_slip(progress, task.object) >= config.slip)
     failure = jnp.zeros_like(kind)
     for code, applies in (
-        (Failure.FALLEN, retrieves & jnp.any(fallen, axis=1)),
+        (Failure.FALLEN, retrieves & jnp.any(fallen & ~gone, axis=1)),
         (Failure.INSIDE, retrieves & ~outside),
         (Failure.MISSED, retrieves & ~held),
         (Failure.DROPPED, dropped),
+        (Failure.HELD_UP, error > config.tracking_bound),
         (Failure.UNSTABLE, progress.diverged),
         (Failure.UNREACHABLE, (kind != ActionKind.NONE) & ~task.moves),
         (Failure.UNKNOWN, ~_is_one_of(kind, list(KINDS.values()))),
@@ -252,6 +271,7 @@ def verdicts(
         outside=outside,
         retrieved=retrieves & (failure == Failure.NONE),
         overflow=progress.overflow,
+        tracking_error=error,
     )
 
 

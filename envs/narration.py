@@ -10,7 +10,7 @@ from rich.status import Status
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.envs import pictures
 from mechsearch_jax.envs.episodes import Moment
-from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.envs.records import Episode, Step
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.viz.filmstrip import Frame
 
@@ -31,6 +31,7 @@ class Narrator:
 
     def __init__(self, console: Console, status: Status, problem: Problem):
         self.frames: list[Frame] = []
+        self._restarts = 0
         self._console = console
         self._status = status
         self._problem = problem
@@ -62,6 +63,8 @@ class Narrator:
             self._sees(moment)
         if record.failure:
             self._line("failed", record.failure, "red")
+        for event in events(record):
+            self._line("but", event, "red")
         stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in record.timings.items())
         self._line("time", stages, "dim")
         self._status.update("drawing")
@@ -80,11 +83,30 @@ class Narrator:
             known = f"the target at x {x:.3f}, y {y:.3f} m"
         else:
             known = f"no target; it can be at {moment.record.belief_size} of {len(moment.belief.exists)} poses"
+            if (moment.record.restarts or 0) > self._restarts:
+                known += ", after there were none left"
+            if moment.record.truth_possible is False:
+                known += ", and none of them is where it is"
+        self._restarts = moment.record.restarts or 0
         self._console.print(f"\n[bold]step {moment.index + 1}[/bold]")
         self._line("sees", f"{seen} of {len(objects)} objects, {known}")
 
     def _line(self, label: str, text: str, style: str = "") -> None:
         self._console.print(f"  [cyan]{label:>6}[/cyan]  [{style or 'default'}]{escape(text)}[/]", soft_wrap=True)
+
+
+def events(record: Step) -> list[str]:
+    """What happened in a step that was not intended, beside what its `failure` says."""
+    told = []
+    if record.fallen:
+        several = len(record.fallen) > 1
+        which = " and ".join(map(str, record.fallen))
+        told.append(f"object{'s' if several else ''} {which} fell off the board: nothing can be retrieved any more")
+    if record.target_fallen:
+        told.append("the target fell off the board")
+    if record.at_rest is False:
+        told.append("something never came to rest, and was stopped as it moved")
+    return told
 
 
 def verdict(episode: Episode) -> str:
@@ -93,9 +115,15 @@ def verdict(episode: Episode) -> str:
     def after(step: int) -> str:
         return f"after {step} action{'' if step == 1 else 's'}"
 
+    parts = []
     if episode.found_step is None:
-        return f"{episode.scenario}: not found ({episode.failure})"
-    parts = [f"found {after(episode.found_step)}"]
-    parts.append("never graspable" if episode.graspable_step is None else f"graspable {after(episode.graspable_step)}")
-    parts.append("retrieved" if episode.retrieved else f"not retrieved ({episode.failure})")
+        parts.append(f"not found ({episode.failure})")
+    else:
+        graspable = episode.graspable_step
+        parts.append(f"found {after(episode.found_step)}")
+        parts.append("never graspable" if graspable is None else f"graspable {after(graspable)}")
+        parts.append("retrieved" if episode.retrieved else f"not retrieved ({episode.failure})")
+    restless = [str(i + 1) for i, step in enumerate(episode.steps) if step.at_rest is False]
+    if restless:
+        parts.append(f"something never came to rest after action {', '.join(restless)}")
     return f"{episode.scenario}: {', '.join(parts)}"

@@ -113,8 +113,9 @@ class NativeWorld:
         reference, reachable = motion
         if not reachable:
             return self._finish(Failure.UNREACHABLE, True)
-        before = copy.copy(self._data)
+        before, gone = copy.copy(self._data), self._fallen()
         states = self._follow(reference)
+        error = float(np.abs(states[:, 1 : 1 + ARM] - np.asarray(reference.q, float)).max())
         dropped = kind.holds_object and not self._slip(states, int(action.object)) < self.config.slip
         if kind.returns_home:
             self._go_home()
@@ -122,9 +123,11 @@ class NativeWorld:
         if self._diverged():
             self._data = before
             return self._finish(Failure.UNSTABLE, False)
+        failure = Failure.DROPPED if dropped else Failure.NONE
+        failure = Failure.HELD_UP if error > self.config.tracking_bound else failure
         if kind.takes_target:
-            return self._finish_retrieval(settled)
-        return self._finish(Failure.DROPPED if dropped else Failure.NONE, settled)
+            return self._finish_retrieval(failure, settled, gone).replace(tracking_error=jnp.float32(error))
+        return self._finish(failure, settled).replace(tracking_error=jnp.float32(error))
 
     def settle(self) -> Outcome:
         """Let time pass, with the robot where it is, until everything is at rest or the time for that is over."""
@@ -234,13 +237,14 @@ class NativeWorld:
         valid = np.array([body is not None for body in self._bodies])
         return valid & ((position[:, 0] < self.shelf.front) | (position[:, 2] < self.shelf.board))
 
-    def _finish_retrieval(self, settled: bool) -> Outcome:
-        """Say what became of an attempt to take the target out."""
+    def _finish_retrieval(self, failure: Failure, settled: bool, gone: Bool[np.ndarray, " 9"]) -> Outcome:
+        """Say what became of an attempt to take the target out, before which some bodies were gone."""
         held = self._holds(TARGET)
         outside = bool(self._data.joint(f"body{TARGET}").qpos[0] < self.shelf.front)
         self._take_over()
         fallen = self._fallen() & ~(held & (np.arange(BODIES) == TARGET))
-        checks = ((Failure.MISSED, not held), (Failure.INSIDE, not outside), (Failure.FALLEN, fallen.any()))
+        lost = (fallen & ~gone).any()
+        checks = ((failure, failure), (Failure.MISSED, not held), (Failure.INSIDE, not outside), (Failure.FALLEN, lost))
         failure = next((failure for failure, applies in checks if applies), Failure.NONE)
         return _outcome(failure, self._recorder.steps, settled, fallen, held, outside)
 
@@ -274,6 +278,7 @@ def _outcome(
         outside=jnp.array(outside),
         retrieved=jnp.array(held and failure is Failure.NONE),
         overflow=jnp.int32(0),
+        tracking_error=jnp.float32(0.0),
     )
 
 

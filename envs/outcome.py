@@ -6,6 +6,7 @@ import enum
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 
 
 class Failure(enum.IntEnum):
@@ -13,10 +14,14 @@ class Failure(enum.IntEnum):
 
     `UNREACHABLE`: the arm cannot follow the motion; nothing moved. `DROPPED`: the object slipped out of the hand on
     its way. `UNSTABLE`: the simulation diverged; the world is as before. `UNKNOWN`: there is no such kind of action;
-    nothing moved. In any other case the world is as it became.
+    nothing moved. `HELD_UP`: something was in the arm's way, so that a joint was farther from its reference than
+    `SimulatorConfig.tracking_bound`. In any other case the world is as it became.
 
     Of an action that takes the target out: `MISSED`: the target is not between the closed fingers. `INSIDE`: it is, but
-    not outside the shelf. `FALLEN`: some body has fallen off the board.
+    not outside the shelf. `FALLEN`: some body fell off the board meanwhile.
+
+    Where several apply, the first of `UNKNOWN`, `UNREACHABLE`, `UNSTABLE`, `HELD_UP`, `DROPPED`, `MISSED`, `INSIDE`,
+    `FALLEN` is told.
     """
 
     NONE = 0
@@ -27,6 +32,14 @@ class Failure(enum.IntEnum):
     INSIDE = 5
     FALLEN = 6
     UNKNOWN = 7
+    HELD_UP = 8
+
+    @property
+    def text(self) -> str | None:
+        """What records say of it; None for `NONE`."""
+        if self is Failure.NONE:
+            return None
+        return "the arm was held up" if self is Failure.HELD_UP else self.name.lower()
 
 
 class Overflow(enum.IntFlag):
@@ -49,12 +62,14 @@ class Outcome(flax.struct.PyTreeNode):
     Attributes:
       failure: a `Failure`, int32.
       steps: simulated time steps, int32; 0 where nothing was to be done, or it was out of reach.
-      settled: whether everything was at rest at the end.
-      fallen: which bodies have fallen off the board, the target last, shape (..., 9); never a target in the hand.
+      settled: whether everything came to rest in the time that there is for it; what did not was stopped as it moved.
+      fallen: which bodies are off the board, since then or before, the target last, shape (..., 9); never a target in
+        the hand.
       held: after a retrieval, whether the target is between the closed fingers; False after anything else.
       outside: after a retrieval, whether the target is outside the shelf; False after anything else.
-      retrieved: whether a retrieval took the target out and no body fell off the board.
+      retrieved: whether a retrieval took the target out and no body fell off the board meanwhile.
       overflow: flags of `Overflow`, int32; always 0 in the native simulator.
+      tracking_error: how far the joint that was farthest from its reference was from it [rad]; 0 where nothing moved.
     """
 
     failure: jax.Array
@@ -65,8 +80,14 @@ class Outcome(flax.struct.PyTreeNode):
     outside: jax.Array
     retrieved: jax.Array
     overflow: jax.Array
+    tracking_error: jax.Array
+
+    @property
+    def took_place(self) -> jax.Array:
+        """Whether the world is what the action made of it; False where a failure left or put everything as it was."""
+        undone = (Failure.UNREACHABLE, Failure.UNKNOWN, Failure.UNSTABLE)
+        return jnp.all(jnp.stack([self.failure != int(code) for code in undone]), axis=0)
 
     def reason(self, i: int | tuple[int, ...] = ()) -> str | None:
-        """Why the action failed, in a word, or None; of a batch, that at index `i`."""
-        failure = Failure(int(self.failure[i]))
-        return None if failure is Failure.NONE else failure.name.lower()
+        """Why the action failed, in a few words, or None; of a batch, that at index `i`."""
+        return Failure(int(self.failure[i])).text

@@ -35,7 +35,7 @@ from mechsearch_jax.actions import Action, ActionKind, no_action
 from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
-from mechsearch_jax.envs.outcome import Failure, Overflow
+from mechsearch_jax.envs.outcome import Overflow
 from mechsearch_jax.envs.pushes import push_simulation, toppled
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, controls
 from mechsearch_jax.envs.world import BODIES, World, bodies_of
@@ -237,7 +237,7 @@ def _batched(shelf: Shelf, config: MjxConfig) -> Callable[[World, Action], Simul
         loose = _differ(_poses(world), _poses(rested), LOOSE, LOOSE_TURN).any(axis=-1)
         world = jax.tree.map(lambda a, b: jnp.where(loose.reshape(-1, *[1] * (a.ndim - 1)), a, b), rested, world)
         after, pushed = simulator.simulate(world, action)
-        failed = (waited.failure != Failure.NONE) | (pushed.failure != Failure.NONE)
+        failed = ~(waited.took_place & pushed.took_place)
         failed |= (waited.overflow | pushed.overflow) != Overflow.NONE
         return Simulated(_poses(world), _poses(after), failed)
 

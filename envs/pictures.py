@@ -30,7 +30,7 @@ def frame(moment: Moment, problem: Problem) -> Frame:
     """A step of an episode, ready to be drawn."""
     record, belief, image = moment.record, moment.belief, moment.snapshot.image
     objects = jax.tree.map(np.asarray, moment.observation.objects)
-    sketch, after, does, why = Sketch(), objects, "give up", "no actions are left"
+    sketch, after, does, why = Sketch(), objects, "give up", "nothing is left to be done"
     if moment.decision is not None and record.action is not None:
         decision, kind = moment.decision, kind_of(int(moment.decision.action.kind))
         after = jax.tree.map(np.asarray, decision.predicted)
@@ -41,6 +41,7 @@ def frame(moment: Moment, problem: Problem) -> Frame:
             why = f"cost {record.cost:.0f}{expected}, best of {record.sequences} sequences"
     known = "target found" if record.found else f"target can be at {record.belief_size} poses"
     outcome = f" · {record.failure}" if record.failure else ""
+    outcome += " · an object fell off the board" if record.fallen else ""
     nowhere = np.zeros(problem.poses.shape[0], bool)
     return Frame(
         title=f"{moment.index + 1}  {does}",

@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Key
 
 from mechsearch_jax.actions import Action, ActionConfig, ActionKind, ActionTables, action_tables
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT
-from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import TARGET, World, superquadrics
 from mechsearch_jax.errors import InputError
@@ -286,7 +285,7 @@ def generate_pushes(
         assert after is not None
         fallen = outcome.fallen & before.valid
         over = fell_over(before, after) | fallen
-        sound = np.asarray(possible & (outcome.failure == int(Failure.NONE)) & (outcome.overflow == 0))
+        sound = np.asarray(possible & outcome.took_place & (outcome.overflow == 0))
         # What is stopped in its fall would go on falling in the next push.
         lost = np.asarray(jnp.any(fallen, axis=1) | ~outcome.settled) | ~sound
         chance = np.where(np.asarray(jnp.any(over, axis=1)), config.renewed_toppled, config.renewed)

@@ -70,6 +70,16 @@ class Step:
       sequences: number of valid action sequences that the plan was chosen from.
       failure: why the action could not be carried out as planned; None if it was.
       timings: wall time of each stage [s].
+      truth_possible: whether f holds the candidate pose that is nearest to the target's true pose; None once the target
+        is found, and where it has fallen, so that no candidate is near its pose.
+      restarts: how often f had become empty and was started anew.
+      fallen: indices in the scenario of the objects that left the board in this step; () where none did.
+      target_fallen: whether the target did; never one that is in the hand.
+      held_up: whether the arm was held up: see `SimulatorConfig.tracking_bound`.
+      at_rest: whether everything came to rest after the action; False also where the simulation diverged.
+      tracking_error: how far the joint that was farthest from its reference was from it [rad].
+
+    From `fallen` on they are None where nothing was executed, from `truth_possible` on in files of earlier versions.
     """
 
     belief_size: int
@@ -82,6 +92,13 @@ class Step:
     sequences: int
     failure: str | None
     timings: dict[str, float]
+    truth_possible: bool | None = None
+    restarts: int | None = None
+    fallen: tuple[int, ...] | None = None
+    target_fallen: bool | None = None
+    held_up: bool | None = None
+    at_rest: bool | None = None
+    tracking_error: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,8 +113,9 @@ class Episode:
       steps: one for each observation.
       found_step: number of actions before the target was found; None where it never was.
       graspable_step: number of actions before it could also be grasped; None where it never could.
-      retrieved: whether the hand took the target out of the shelf and no object fell.
-      failure: why the episode ended without a retrieval; None after one.
+      retrieved: whether the hand took the target out of the shelf and no object fell, neither then nor before.
+      failure: why the episode ended without a retrieval; None after one. Where an object left the board, this is the
+        reason, with the number of the action.
       content_hash: of the scenario, see `Scenario.content_hash`; None in files of earlier versions.
     """
 
@@ -137,10 +155,19 @@ def load_episode(path: PathLike) -> Episode:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
     try:
-        steps = tuple(
-            Step(**{**step, "action": None if step["action"] is None else ActionRecord(**step["action"])})
-            for step in value["steps"]
-        )
+        steps = tuple(_step(step) for step in value["steps"])
         return Episode(**{**value, "steps": steps, "config": present_options(value["config"])})
     except (TypeError, KeyError) as error:
         raise InputError(f"{path}: is not the record of an episode ({error})") from error
+
+
+def _step(value: dict[str, Any]) -> Step:
+    """A step from what a file keeps of it."""
+    action, fallen = value["action"], value.get("fallen")
+    return Step(
+        **{
+            **value,
+            "action": None if action is None else ActionRecord(**action),
+            "fallen": None if fallen is None else tuple(fallen),
+        }
+    )

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -35,6 +37,9 @@ class SimulatorConfig:
       settle_steps: after an action the bodies are given at most so many steps to come to rest.
       settle_block: how many steps pass between looks at whether they have.
       slip: an object that has moved farther than this in the closed hand was dropped [m].
+      tracking_bound: an arm with a joint farther than this from its reference is held up, and its action fails [rad].
+        Ordinary actions stay below 0.01, a few reach 0.027; a hand that shoves a box against a wall reaches 0.065 and
+        more.
       trace_every: a trace keeps the state of every so many steps; only the native simulator has traces.
     """
 
@@ -43,7 +48,14 @@ class SimulatorConfig:
     settle_steps: int = 1500
     settle_block: int = 50
     slip: float = 0.03
+    tracking_bound: float = 0.05
     trace_every: int = 25
+
+    def __post_init__(self):
+        for name in ("rest_speed", "settle_steps", "settle_block", "slip", "tracking_bound", "trace_every"):
+            value = getattr(self, name)
+            if not (value > 0 and math.isfinite(value)):
+                raise InputError(f"SimulatorConfig: {name} {value} must be a positive number")
 
 
 @runtime_checkable
@@ -135,3 +147,17 @@ def controls(reference: Reference) -> Float[np.ndarray, "steps 9"]:
     arm = np.asarray(reference.q, float) + LAG * np.asarray(reference.velocity, float)
     fingers = np.asarray(reference.fingers, float)[:, None]
     return np.concatenate([arm, fingers, fingers], axis=1)
+
+
+def unhindered(
+    q: Float[Array, "*batch 7"], told: Float[Array, "*batch 7"], timestep: float
+) -> Float[Array, "*batch 7"]:
+    """Where the joints are a time step later if nothing holds them up: what `controls` were made of.
+
+    Args:
+      q: where they were [rad].
+      told: what their actuators are told [rad].
+      timestep: of the simulation [s].
+    """
+    gain = jnp.asarray(timestep / (timestep + LAG), q.dtype)
+    return q + (told - q) * jnp.broadcast_to(gain, q.shape)

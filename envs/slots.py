@@ -7,6 +7,7 @@ traceable.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
@@ -18,10 +19,33 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.envs.episode_log import Choice, chosen
-from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, objects_on_the_board, true_target_pose
+from mechsearch_jax.envs.snapshot import (
+    Recogniser,
+    Snapshot,
+    nearest_candidate,
+    objects_on_the_board,
+    true_target_pose,
+)
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, graspable_at, initial_belief, update_belief
+
+
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """What is known of the target in every slot after a look; S of them.
+
+    Attributes:
+      found: whether it is found, shape (S,).
+      size: at how many candidate poses it can be.
+      truth: whether it can be at the one that is nearest to its true pose.
+      restarts: how often f was started anew.
+    """
+
+    found: Bool[np.ndarray, " slots"]
+    size: Int[np.ndarray, " slots"]
+    truth: Bool[np.ndarray, " slots"]
+    restarts: Int[np.ndarray, " slots"]
 
 
 class Slots(Protocol):
@@ -31,18 +55,13 @@ class Slots(Protocol):
         """Let the fresh slots know nothing."""
         ...
 
-    def look(
-        self, world: World, keys: Array, rows: Sequence[int]
-    ) -> tuple[Bool[np.ndarray, " slots"], Int[np.ndarray, " slots"]]:
-        """Recognise and update the belief in some slots.
+    def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
+        """Recognise and update the belief in some slots; what is known then in all of them.
 
         Args:
           world: the true state, fields (S, ...).
           keys: the environment's, one for each slot.
           rows: the slots.
-
-        Returns:
-          For all slots, whether the target is found, and at how many poses it can be.
         """
         ...
 
@@ -77,15 +96,13 @@ class OneSlot:
         if fresh[0]:
             self.belief = initial_belief(self._problem)
 
-    def look(
-        self, world: World, keys: Array, rows: Sequence[int]
-    ) -> tuple[Bool[np.ndarray, " 1"], Int[np.ndarray, " 1"]]:
+    def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
         """See `Slots`."""
         snapshot = self._snapshot(world)
         observation = self._recogniser(keys[0], snapshot)
         self.belief = update_belief(self._problem, self.belief, observation)
         self.snapshot, self.observation, self.decision = snapshot, observation, None
-        return np.array([bool(self.belief.found)]), np.array([int(jnp.sum(self.belief.exists))])
+        return _known(self._problem, jax.tree.map(lambda a: a[None], self.belief), world)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`."""
@@ -149,15 +166,11 @@ class ManySlots:
         """See `Slots`."""
         self._state = _forget(self._problem, self._state, jnp.asarray(fresh))
 
-    def look(
-        self, world: World, keys: Array, rows: Sequence[int]
-    ) -> tuple[Bool[np.ndarray, " slots"], Int[np.ndarray, " slots"]]:
+    def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
         """See `Slots`."""
         for _, padded in self._chunks(rows):
             self._state = _look(self._problem, self._state, world, keys, padded, self._recogniser)
-        belief = self._state.belief
-        found, possible = jax.device_get((belief.found, jnp.sum(belief.exists, axis=1)))
-        return found, possible
+        return _known(self._problem, self._state.belief, world)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`."""
@@ -193,6 +206,19 @@ def _some_worlds(world: World, rows: Int[Array, " n"]) -> World:
     """The worlds in the slots `rows`, empty ones for rows beyond the end."""
     here = _some(world, rows)
     return here.replace(valid=here.valid & (rows < len(world.kind))[:, None])
+
+
+def _known(problem: Problem, belief: Belief, world: World) -> Known:
+    """What is known in all slots; fields of belief and world have a leading axis for them."""
+    size, truth = _told(problem.poses, belief.exists, world)
+    return Known(*jax.device_get((belief.found, size, truth, belief.restarts)))
+
+
+@jax.jit
+def _told(poses: Array, exists: Bool[Array, "slots x"], world: World) -> tuple[Array, Array]:
+    """At how many candidate poses the target can be, and whether at the one nearest to the truth."""
+    nearest = jax.vmap(lambda here: nearest_candidate(poses, true_target_pose(here)))(world)
+    return jnp.sum(exists, axis=1), jnp.take_along_axis(exists, nearest[:, None], axis=1)[:, 0]
 
 
 @jax.jit

@@ -12,6 +12,7 @@ from mechsearch_jax.envs.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world import BODIES, TARGET, from_scenario
 from mechsearch_jax.planner import Decision, Sequences, graspable_at
 from mechsearch_jax.workspace.scenario import Body, Scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 BOX = Body("box", (0.048, 0.028, 0.08), (0.5, 0.135, 0.4845), UPRIGHT)
@@ -31,8 +32,15 @@ def topple(world):
     return reveal(world).replace(rotation=world.rotation.at[TARGET].set(lying))
 
 
+def push_off(world):
+    """The box stands before the shelf, and no more in front of the target."""
+    return world.replace(position=world.position.at[0].set(jnp.array([0.39, -0.2, 0.4845])))
+
+
 class Stage:
     """A simulator in which actions do what a test says: for all worlds, or by the scenario that a world began with.
+
+    A retrieval that is held up has the target in the hand and outside all the same.
 
     Attributes:
       actions: those that moved an object, one by one.
@@ -41,10 +49,13 @@ class Stage:
 
     engine = "Stage"
 
-    def __init__(self, acts=None, failures=Failure.NONE, retrievals=Failure.NONE, overflows=Overflow.NONE):
+    def __init__(
+        self, acts=None, failures=Failure.NONE, retrievals=Failure.NONE, overflows=Overflow.NONE, restless=False
+    ):
         self.world = None
         self.actions, self.executed, self.names = [], [], []
         self._told = {"acts": acts, "failures": failures, "retrievals": retrievals, "overflows": overflows}
+        self._told["restless"] = restless
 
     def _of(self, what, name, default):
         told = self._told[what]
@@ -73,18 +84,22 @@ class Stage:
         outcome = Outcome(
             *(np.zeros(count, np.int32), np.ones(count, np.int32), np.ones(count, bool)),
             *(np.zeros((count, BODIES), bool), np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, bool)),
-            np.zeros(count, np.int32),
+            *(np.zeros(count, np.int32), np.full(count, 0.001, np.float32)),
         )
         for i in np.flatnonzero(active):
             name = self.names[i]
             outcome.overflow[i] = self._of("overflows", name, Overflow.NONE)
+            outcome.settled[i] = not self._of("restless", name, False)
             if KINDS[ActionKind(int(actions.kind[i]))].takes_target:
                 outcome.failure[i] = self._of("retrievals", name, Failure.NONE)
                 outcome.retrieved[i] = outcome.failure[i] == Failure.NONE
+                outcome.held[i] = outcome.outside[i] = outcome.failure[i] in (Failure.NONE, Failure.HELD_UP)
             else:
                 self.actions.append(jax.tree.map(lambda a, i=i: a[i], actions))
                 outcome.failure[i] = self._of("failures", name, Failure.NONE)
                 self._worlds[i] = self._of("acts", name, lambda world: world)(self._worlds[i])
+            here = self._worlds[i]
+            outcome.fallen[i] = here.valid & (here.position[:, 0] < Shelf().front)
         self._gather()
         return jax.tree.map(jnp.asarray, outcome)
 

@@ -15,7 +15,7 @@ from mechsearch_jax.benchmarks import tables
 from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs, present_code
 from mechsearch_jax.benchmarks.processes import Processes
 from mechsearch_jax.benchmarks.rates import summarise
-from mechsearch_jax.benchmarks.rows import identity, read_code, read_rows, write_rows
+from mechsearch_jax.benchmarks.rows import EVENTS, identity, read_code, read_rows, write_rows
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS
@@ -146,7 +146,7 @@ def test_every_option_tells_rows_apart(tmp_path, files, command, other):
     assert [rates.episodes for rates in summarise(both)] == [1] * 4
 
 
-@pytest.mark.parametrize("columns", [["content_hash"], ["configuration", "content_hash"]], ids=len)
+@pytest.mark.parametrize("columns", [["content_hash", *EVENTS], ["configuration", "content_hash", *EVENTS]], ids=len)
 def test_rows_that_do_not_say_all_are_kept_but_not_believed(tmp_path, files, command, columns):
     out = tmp_path / "rows.parquet"
     jobs = make_jobs(files[:1], [Method()], (0,))

@@ -9,7 +9,8 @@ from matplotlib import image
 
 from mechsearch_jax.benchmarks import report
 from mechsearch_jax.benchmarks.rates import summarise, wilson
-from mechsearch_jax.benchmarks.rows import Row, write_rows
+from mechsearch_jax.benchmarks.rows import EVENTS, Row, write_rows
+from mechsearch_jax.benchmarks.tables import events_table
 from mechsearch_jax.errors import InputError
 
 WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)
@@ -65,6 +66,44 @@ def test_a_report_of_one_success_has_no_failures(tmp_path):
     report.write_report([WON], tmp_path)
     assert "None did." in (tmp_path / "report.md").read_text()
     assert (tmp_path / "failures.csv").read_text() == "method,reason,episodes,share\n"
+
+
+KNOWN = {
+    **dict.fromkeys(EVENTS, 0),
+    **{"looks": 4, "truth_lost_step": None, "fallen_step": None},
+}
+
+
+def test_a_report_says_what_happened_on_the_way(tmp_path):
+    """Of three episodes one does not say it; the others had eight looks together."""
+    fell = "an object fell off the board"
+    rows = [
+        dataclasses.replace(WON, seed=1, **KNOWN),
+        dataclasses.replace(
+            LOST, **{**KNOWN, "truth_lost": 3, "objects_fallen": 2, "fallen_step": 4}, failure=f"{fell} at action 4"
+        ),
+        dataclasses.replace(LOST, seed=2, failure=f"{fell} at action 10"),
+    ]
+    report.write_report(rows, tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    assert "| search-for-grasp | all | 2 | 0.500 | 0.375 | 0.000 | 0.500 | 0.000 | 0.000 |" in text
+    with open(tmp_path / "events.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [(line["objects"], line["episodes"], line["fallen"]) for line in lines] == [
+        ("2", "2", "0.5"),
+        ("all", "2", "0.5"),
+    ]
+    assert json.loads((tmp_path / "rates.json").read_text())["events"][1]["truth_lost"] == 0.5
+    assert report.failures(rows) == [report.Failures("search-for-grasp", fell, 2, 2 / 3)]
+    assert events_table(rows).row_count == 2
+
+
+def test_rows_of_earlier_versions_have_no_events(tmp_path):
+    report.write_report(ROWS, tmp_path)
+    assert "These episodes do not say" in (tmp_path / "report.md").read_text()
+    assert (tmp_path / "events.csv").read_text().startswith("method,objects,episodes,truth_lost,")
+    assert json.loads((tmp_path / "rates.json").read_text())["events"] == []
+    assert events_table(ROWS) is None
 
 
 def test_configurations_do_not_mix():

@@ -14,6 +14,7 @@ import pytest
 from mechsearch_jax.actions import ActionKind, no_action
 from mechsearch_jax.benchmarks.rates import summarise, wilson
 from mechsearch_jax.benchmarks.rows import (
+    EVENTS,
     SCHEMA,
     Row,
     configuration,
@@ -72,6 +73,36 @@ def test_an_episode_is_read_back(tmp_path):
     save_episode(EPISODE, tmp_path / "new" / "episode.json")
     assert load_episode(tmp_path / "new" / "episode.json") == EPISODE
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["episode.json"]
+
+
+def test_what_happened_on_the_way_is_read_back_and_counted(tmp_path):
+    before, after = STEPS
+    told = dataclasses.replace(before, truth_possible=True, restarts=0, fallen=(), held_up=False, at_rest=True)
+    steps = (
+        told,
+        dataclasses.replace(told, truth_possible=False, restarts=1, fallen=(1, 0), held_up=True, at_rest=False),
+        dataclasses.replace(told, truth_possible=False, restarts=1, target_fallen=True, tracking_error=0.25),
+        dataclasses.replace(after, restarts=1),
+    )
+    save_episode(
+        dataclasses.replace(EPISODE, config={**OLD, "target": "box", "seed": 3}, steps=steps), tmp_path / "episode.json"
+    )
+    episode = load_episode(tmp_path / "episode.json")
+    assert episode.steps == steps
+    row = Row.of_episode(episode)
+    assert [getattr(row, name) for name in EVENTS] == [3, 2, 1, 1, 2, 2, 1, 1]
+    unknown = Row.of_episode(dataclasses.replace(episode, steps=STEPS))
+    assert [getattr(unknown, name) for name in EVENTS] == [None] * len(EVENTS)
+
+
+def test_an_episode_of_an_earlier_version_does_not_say_what_happened_on_the_way(tmp_path):
+    save_episode(EPISODE, tmp_path / "episode.json")
+    value = json.loads((tmp_path / "episode.json").read_text())
+    for step in value["steps"]:
+        for name in ("truth_possible", "restarts", "fallen", "target_fallen", "held_up", "at_rest", "tracking_error"):
+            assert step.pop(name) is None
+    (tmp_path / "episode.json").write_text(json.dumps(value))
+    assert load_episode(tmp_path / "episode.json") == EPISODE
 
 
 def test_an_episode_has_the_documented_keys(tmp_path):
@@ -164,9 +195,17 @@ def test_rows_are_read_back(tmp_path):
     assert pyarrow.parquet.read_schema(tmp_path / "new" / "rows.parquet").equals(SCHEMA)
 
 
-@pytest.mark.parametrize("columns", [["content_hash"], ["configuration", "content_hash"]], ids=len)
+EARLIER_LACKED = [[*EVENTS], ["content_hash", *EVENTS], ["configuration", "content_hash", *EVENTS]]
+
+
+@pytest.mark.parametrize("columns", EARLIER_LACKED, ids=len)
 def test_rows_of_earlier_versions_are_read(tmp_path, columns):
-    row = dataclasses.replace(ROW, content_hash="0123456789ab", configuration=configuration({**EARLIER, "gamma": 0.9}))
+    row = dataclasses.replace(
+        ROW,
+        content_hash="0123456789ab",
+        configuration=configuration({**EARLIER, "gamma": 0.9}),
+        **dict.fromkeys(EVENTS, 3),
+    )
     write_rows([row], tmp_path / "rows.parquet")
     table = pyarrow.parquet.read_table(tmp_path / "rows.parquet")
     pyarrow.parquet.write_table(table.drop_columns(columns), tmp_path / "rows.parquet")
@@ -329,8 +368,8 @@ def test_confidence_intervals_are_those_of_the_formula():
 
 
 def test_the_columns_are_those_of_earlier_tables_but_for_names():
-    assert SCHEMA.types == [*OLD_SCHEMA.types, pyarrow.string()]
-    assert SCHEMA.names == [*(RENAMED.get(name, name) for name in OLD_SCHEMA.names), "content_hash"]
+    assert SCHEMA.types == [*OLD_SCHEMA.types, pyarrow.string(), *[pyarrow.int64()] * len(EVENTS)]
+    assert SCHEMA.names == [*(RENAMED.get(name, name) for name in OLD_SCHEMA.names), "content_hash", *EVENTS]
     assert SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
 
 

@@ -6,19 +6,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, reveal, topple
+from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, push_off, reveal, topple
 
 from mechsearch_jax.actions import no_action
-from mechsearch_jax.envs.episode_log import Choice, EpisodeLog, distrust, record
+from mechsearch_jax.envs.episode_log import Choice, EpisodeLog, Result, distrust, record
 from mechsearch_jax.envs.episodes import Start, run_episode, run_episodes
 from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.outcome import Failure, Overflow
 from mechsearch_jax.envs.simulator import Simulator
+from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import search_for_grasp
 
 AT_ONCE = 2
+WON = Result(
+    failure=None,
+    takes_target=True,
+    retrieved=True,
+    final=True,
+    off_board=frozenset(),
+    held_up=False,
+    at_rest=True,
+    tracking_error=0.001,
+)
 
 
 def run(problem, scenarios, simulator, slots, policy=grab, seeds=None, **options):
@@ -99,12 +110,41 @@ def test_what_fails_belongs_to_its_own_row(problem):
     assert [e.retrieved for e in episodes] == [False, True, False]
 
 
+def test_what_falls_belongs_to_its_own_row(problem):
+    stage = Stage({"hidden": push_off, "two": reveal}, restless={"two": True})
+    episodes, _ = run(problem, [TWO, HIDDEN, dataclasses.replace(OPEN, name="open again")], stage, 3)
+    assert [e.failure for e in episodes] == [None, "an object fell off the board at action 1", None]
+    assert [[step.fallen for step in e.steps] for e in episodes] == [[(), ()], [(0,), None], [()]]
+    assert [[step.at_rest for step in e.steps] for e in episodes] == [[False, False], [True, None], [True]]
+    assert all(step.restarts == 0 for e in episodes for step in e.steps)
+
+
 def test_a_success_that_cannot_be_trusted_is_none():
     log = EpisodeLog(2)
     log.decide(record(True, 1, True, None))
-    assert log.act(True, None, "error: no", {})
+    assert log.act(WON, "error: no", {})
     episode = log.episode(OPEN, {})
     assert (episode.retrieved, episode.failure) == (False, "error: no")
+
+
+def test_a_retrieval_does_not_count_once_an_object_has_left_the_board():
+    log = EpisodeLog(2)
+    fell = dataclasses.replace(WON, takes_target=False, retrieved=False, final=False, off_board=frozenset({1, TARGET}))
+    log.decide(record(False, 9, False, None))
+    assert not log.act(fell, None, {})
+    assert log.spoilt == "an object fell off the board at action 1"
+    log.decide(record(True, 1, False, None))
+    assert log.act(dataclasses.replace(WON, off_board=frozenset({1, 2})), None, {})
+    episode = log.episode(OPEN, {})
+    assert (episode.retrieved, episode.failure) == (False, "an object fell off the board at action 1")
+    assert [(step.fallen, step.target_fallen) for step in episode.steps] == [((1,), True), ((2,), False)]
+
+
+def test_an_error_is_told_before_what_fell():
+    log = EpisodeLog(2)
+    log.decide(record(False, 9, False, None))
+    assert log.act(dataclasses.replace(WON, off_board=frozenset({0})), "error: no", {})
+    assert log.episode(OPEN, {}).failure == "error: no"
 
 
 def test_decisions_that_cannot_be_trusted_are_named():

@@ -6,19 +6,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stage import BOX, CYLINDER, HIDDEN, OPEN, UPRIGHT, Stage, grab, idle, reveal, topple
+from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO, UPRIGHT, Stage, grab, idle, push_off, reveal, topple
 
 from mechsearch_jax.actions import kind_of
+from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.envs.episodes import run_episode, target_of
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.narration import events, verdict
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.records import load_episode, save_episode
-from mechsearch_jax.envs.snapshot import Snapshot, oracle
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.envs.snapshot import Snapshot, nearest_candidate, oracle
+from mechsearch_jax.envs.world import TARGET, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import search_for_grasp
 from mechsearch_jax.workspace.scenario import Body, Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+METHOD = Method().options()
 
 
 class Diary:
@@ -105,6 +112,112 @@ def test_what_trying_again_would_not_mend_is_not_tried_again(problem, failure):
     episode = run(problem, OPEN, Stage(retrievals=failure))
     assert len(episode.steps) == 1
     assert episode.failure == f"retrieval: {failure.name.lower()}"
+
+
+def test_once_an_object_has_left_the_board_nothing_is_retrieved(problem):
+    """The episode goes on until it is known whether the target is found and graspable."""
+    diary, stage = Diary(), Stage(push_off)
+    episode = run(problem, HIDDEN, stage, watcher=diary)
+    assert (episode.found_step, episode.graspable_step, episode.retrieved) == (1, 1, False)
+    assert episode.failure == "an object fell off the board at action 1"
+    first, second = episode.steps
+    assert (first.fallen, first.target_fallen, first.failure) == ((0,), False, None)
+    assert (second.graspable, second.action, second.fallen) == (True, None, None)
+    assert len(stage.executed) == 1
+    assert (diary.moments[-1].decision, diary.moments[-1].outcome) == (None, None)
+
+
+def test_a_search_goes_on_after_an_object_has_left_the_board(problem):
+    """At the second action it has long been off it, and the target is not found."""
+
+    def away(world):
+        """The other box, which hides nothing."""
+        return world.replace(position=world.position.at[1].set(jnp.array([0.39, -0.2, 0.4845])))
+
+    episode = run(problem, TWO, Stage(away))
+    assert [step.action is not None for step in episode.steps] == [True, True, False]
+    assert [step.fallen for step in episode.steps] == [(1,), (), None]
+    assert (episode.found_step, episode.failure) == (None, "an object fell off the board at action 1")
+
+
+def test_an_object_that_falls_in_a_retrieval_is_blamed_on_it(problem):
+    """Thrown down, it has the failure of its own action; before or beside that, it does not."""
+    stage = Stage(retrievals=Failure.FALLEN)
+    stage.replace = lambda scenarios: off(Stage.replace(stage, scenarios))
+
+    def off(world):
+        stage._worlds[0] = push_off(stage._worlds[0])
+        return world
+
+    episode = run(problem, OPEN, stage)
+    assert [(step.fallen, step.failure) for step in episode.steps] == [((0,), "retrieval: fallen")]
+    assert episode.failure == "retrieval: an object fell off the board at action 1"
+
+
+@pytest.mark.parametrize("failing", ["failures", "retrievals"])
+def test_an_arm_that_is_held_up_has_failed(problem, failing):
+    """A target that is out of the shelf all the same cannot be taken out once more."""
+    start = HIDDEN if failing == "failures" else OPEN
+    episode = run(problem, start, Stage(**{failing: Failure.HELD_UP}))
+    retrieval = "" if failing == "failures" else "retrieval: "
+    assert episode.steps[0].failure == f"{retrieval}the arm was held up"
+    assert episode.steps[0].held_up
+    assert episode.steps[0].tracking_error == pytest.approx(0.001)
+    assert not episode.retrieved
+    assert len(episode.steps) == (3 if failing == "failures" else 1)
+    assert episode.failure == ("not found" if failing == "failures" else "retrieval: the arm was held up")
+
+
+def test_what_never_comes_to_rest_is_told_and_is_no_error(problem):
+    episode = run(problem, HIDDEN, Stage(reveal, restless=True))
+    assert episode.retrieved
+    assert [step.at_rest for step in episode.steps] == [False, False]
+    assert verdict(episode).endswith("retrieved, something never came to rest after action 1, 2")
+    assert events(episode.steps[0]) == ["something never came to rest, and was stopped as it moved"]
+    calm = run(problem, HIDDEN, Stage(push_off))
+    assert "rest" not in verdict(calm)
+    assert events(calm.steps[0]) == ["object 0 fell off the board: nothing can be retrieved any more"]
+    assert events(calm.steps[1]) == []
+
+
+def test_every_step_says_whether_the_truth_is_possible(problem):
+    """Unseen, the target moves to where it was not hidden before; and back into the open."""
+    elsewhere = jnp.array([0.55, -0.1, 0.4545])
+    stage = Stage(lambda world: world.replace(position=world.position.at[TARGET].set(elsewhere)))
+
+    def blind(key, snapshot):
+        return dataclasses.replace(oracle(key, snapshot), target_visible=jnp.array(False))
+
+    episode = run(problem, HIDDEN, stage, recogniser=blind)
+    assert [step.truth_possible for step in episode.steps] == [True, False, False]
+    assert [step.restarts for step in episode.steps] == [0, 0, 0]
+    row = Row.of_episode(dataclasses.replace(episode, config={**METHOD, **episode.config}))
+    assert (row.looks, row.truth_lost, row.truth_lost_step, row.restarts) == (3, 2, 1, 0)
+    found = run(problem, HIDDEN, Stage(reveal))
+    assert [step.truth_possible for step in found.steps] == [True, None]
+    tipped = run(problem, HIDDEN, Stage(lambda world: reveal(topple(world))), recogniser=blind)
+    assert [step.truth_possible for step in tipped.steps] == [True, None, None]
+
+
+def test_an_f_that_becomes_empty_is_counted(problem):
+    def nowhere(key, snapshot):
+        """Nothing stands, and the target is not seen: it can be nowhere."""
+        seen = oracle(key, snapshot)
+        nothing = seen.objects.replace(valid=jnp.zeros_like(seen.objects.valid))
+        return Observation(nothing, jnp.array(False), seen.target_pose)
+
+    episode = run(problem, HIDDEN, Stage(), recogniser=nowhere)
+    assert [step.restarts for step in episode.steps] == [1, 2, 3]
+
+
+@pytest.mark.parametrize("target", [Target.cylinder(), Target.box()], ids=lambda target: target.shape)
+def test_the_candidate_nearest_to_a_pose(target):
+    poses = target.candidate_poses(Shelf())
+    step = target.cell(Shelf())
+    for i in np.random.default_rng(0).integers(len(poses), size=50):
+        for turns in (0, 1, -1) if target.yaws > 1 else (0, 0.3):
+            off = 0.4 * np.array(step) * [1, -1, 1] + [0, 0, np.pi * turns]
+            assert int(nearest_candidate(jnp.asarray(poses), jnp.asarray(poses[i] + off, jnp.float32))) == i
 
 
 def test_after_the_last_action_only_a_retrieval_is_executed(problem):

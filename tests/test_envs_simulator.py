@@ -242,6 +242,24 @@ def test_a_hand_that_closes_on_nothing_reports_a_drop(sim):
     assert np.abs(moved(sim, before)).max() < 1e-3
 
 
+@pytest.mark.parametrize("name", ["tracking_bound", "settle_steps", "slip"])
+@pytest.mark.parametrize("value", [0, -1.0, math.nan])
+def test_settings_that_make_no_sense_are_refused(name, value):
+    with pytest.raises(InputError, match=f"SimulatorConfig: {name} .* must be a positive number"):
+        simulator.SimulatorConfig(**{name: value})
+
+
+def test_a_body_that_never_comes_to_rest_is_told():
+    """In 0.2 s it has not fallen from 10 cm above the board; in 6 s it has."""
+    high = dataclasses.replace(TARGET_BODY, position=(0.6, 0.1, BOARD + 0.15))
+    for steps, rests in ((50, False), (1500, True)):
+        single = NativeWorld(config=simulator.SimulatorConfig(settle_steps=steps))
+        single.reset(scene(target=high))
+        outcome = single.settle()
+        assert bool(outcome.settled) == rests
+        assert outcome.reason() is None
+
+
 def test_what_is_out_of_reach_moves_nothing(sim):
     before = sim.reset(scene(standing("cylinder", (0.024, 0.024, 0.067), 0.6, 0.1)))
     far = pose(1.3, 0.1, 0.1)
@@ -300,6 +318,14 @@ def test_an_object_that_leaves_the_board_has_fallen(sim):
     assert not outcome.fallen[1:].any()
 
 
+def test_an_object_that_is_pushed_over_the_front_edge_has_fallen(sim):
+    sim.reset(scene(standing("cylinder", (0.024, 0.024, 0.067), 0.43, 0.1)))
+    outcome = sim.execute(push(pose(0.505, 0.1 - 0.1365, 0.04, tilt=math.radians(30)), (-0.05, 0.12, 0.0)))
+    assert outcome.fallen[0]
+    assert not outcome.fallen[1:].any()
+    assert outcome.reason() is None
+
+
 @pytest.mark.parametrize("place", [(0.6, 0.1), (0.7, 0.2), (0.65, 0.25)])
 @pytest.mark.parametrize("shape", ["cylinder", "box"])
 def test_a_retrieval_takes_the_target_out(sim, shape, place):
@@ -327,15 +353,44 @@ def test_a_retrieval_that_grasps_beside_the_target_misses(sim):
 
 def test_a_retrieval_that_throws_an_object_down_does_not_count(sim):
     target = standing("cylinder", (0.02, 0.02, 0.05), 0.6, 0.1)
-    in_front = standing("cylinder", (0.024, 0.024, 0.067), 0.5, 0.1)
-    sim.reset(scene(in_front, target=target))
-    sim.execute(pick_and_place(pose(0.496, 0.1, 0.1), pose(0.39, 0.1, 0.1)))
-    grasp = pose(0.6, 0.1, 0.06)
-    retrieval = sim.execute(take_out(grasp))
+    at_the_edge = standing("cylinder", (0.024, 0.024, 0.03), 0.425, 0.1)
+    sim.reset(scene(at_the_edge, target=target))
+    retrieval = sim.execute(take_out(pose(0.6, 0.1, 0.06)))
     assert retrieval.held
+    assert retrieval.outside
     assert retrieval.fallen[0]
     assert retrieval.reason() == "fallen"
     assert not retrieval.retrieved
+
+
+def test_a_retrieval_is_not_blamed_for_what_fell_before(sim):
+    target = standing("cylinder", (0.02, 0.02, 0.05), 0.6, 0.1)
+    in_front = standing("cylinder", (0.024, 0.024, 0.067), 0.5, 0.1)
+    sim.reset(scene(in_front, target=target))
+    assert sim.execute(pick_and_place(pose(0.496, 0.1, 0.1), pose(0.39, 0.3, 0.1))).fallen[0]
+    retrieval = sim.execute(take_out(pose(0.6, 0.1, 0.06)))
+    assert retrieval.fallen[0]
+    assert retrieval.reason() is None
+    assert retrieval.retrieved
+
+
+def test_an_arm_that_shoves_a_box_against_the_wall_is_held_up(sim):
+    """The hand is to go 8 cm farther than the wall lets the box go; the box stays where that leaves it."""
+    box = standing("box", (0.078, 0.048, 0.1), 0.6, Shelf().left - 0.078)
+    before = sim.reset(scene(box))
+    start = pose(0.62, box.position[1] - 0.048 - 0.1125, 0.06, tilt=math.radians(30))
+    action = push(start, (0.0, 0.05, 0.0)).replace(displacement=jnp.array([0.0, 0.12, 0.0]))
+    outcome = sim.execute(action.replace(T_world_place=start.at[1, 3].add(0.12)))
+    assert outcome.reason() == "the arm was held up"
+    assert outcome.tracking_error > 2 * sim.config.tracking_bound
+    assert np.abs(moved(sim, before)).max() > 0.005
+
+
+def test_an_arm_that_only_shoves_an_object_is_not_held_up(sim):
+    sim.reset(scene(standing("box", (0.078, 0.022, 0.096), 0.55, 0.1)))
+    outcome = sim.execute(push(pose(0.595, 0.1 - 0.1345, 0.04, tilt=math.radians(30)), (0.0, 0.15, 0.0)))
+    assert outcome.reason() is None
+    assert 0 < outcome.tracking_error < sim.config.tracking_bound / 2
 
 
 def test_the_same_actions_give_the_same_world():

@@ -17,20 +17,26 @@ def report(
 ) -> None:
     """Print rates by method and number of objects from results of `evaluate`, and write them with plots.
 
+    What happened on the way is told too: the truth ruled out, objects fallen, the arm held up, bodies never at rest.
+
     Args:
       tables: Parquet files.
-      out: folder for report.md, rates.csv, rates.json, failures.csv and success.png; only prints if not given.
+      out: folder for report.md, rates.csv, rates.json, failures.csv, events.csv and success.png; only prints if not
+        given.
     """
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.report import read_tables, told_of_changes, write_report
-    from mechsearch_jax.benchmarks.tables import rates_table
+    from mechsearch_jax.benchmarks.tables import events_table, rates_table
 
     rows = read_tables(tables)
     if out is not None:
         write_report(rows, out)
     console = Console(highlight=False)
     console.print(rates_table(rows))
+    if (events := events_table(rows)) is not None:
+        console.print()
+        console.print(events)
     if told_of_changes(rows):
         print(f"report: {told_of_changes(rows)}", file=sys.stderr)
     if out is not None:
