@@ -127,8 +127,8 @@ class Row:
 
 
 def _event_columns(steps: Sequence[Step]) -> dict[str, int | None]:
-    """The columns `EVENTS`; all None where the steps do not say, as those of earlier versions."""
-    if any(step.restarts is None for step in steps):
+    """The columns `EVENTS`; all None where there are no steps, or they do not say, as those of earlier versions."""
+    if not steps or any(step.restarts is None for step in steps):
         return dict.fromkeys(EVENTS)
     lost = [i for i, step in enumerate(steps) if step.truth_possible is False]
     fell = [i + 1 for i, step in enumerate(steps) if step.fallen]
