@@ -126,7 +126,7 @@ class Row:
         )
 
 
-def _event_columns(steps: Sequence[Step]) -> dict[str, int | None]:
+def _event_columns(steps: Sequence[Step]) -> dict[str, Any]:
     """The columns `EVENTS`; all None where there are no steps, or they do not say, as those of earlier versions."""
     if not steps or any(step.restarts is None for step in steps):
         return dict.fromkeys(EVENTS)
