@@ -244,8 +244,8 @@ class NativeWorld:
         self._take_over()
         fallen = self._fallen() & ~(held & (np.arange(BODIES) == TARGET))
         lost = (fallen & ~gone).any()
-        checks = ((failure, failure), (Failure.MISSED, not held), (Failure.INSIDE, not outside), (Failure.FALLEN, lost))
-        failure = next((failure for failure, applies in checks if applies), Failure.NONE)
+        checks = ((Failure.MISSED, not held), (Failure.INSIDE, not outside), (Failure.FALLEN, lost))
+        failure = failure or next((code for code, applies in checks if applies), Failure.NONE)
         return _outcome(failure, self._recorder.steps, settled, fallen, held, outside)
 
     def _finish(self, failure: Failure, settled: bool) -> Outcome:

@@ -40,7 +40,7 @@ class Block:
     name: str
     scenes: int
     objects: int
-    target: Literal["cylinder", "box"]
+    target: str
     first_seed: int
     layout: Literal["clutter", "line"] = "clutter"
 
@@ -74,7 +74,7 @@ class SceneSet(NamedTuple):
 
 
 def _blocks(
-    name: str, scenes: int, counts: Sequence[int], first_seed: int, target: Literal["cylinder", "box"] = "cylinder"
+    name: str, scenes: int, counts: Sequence[int], first_seed: int, target: str = "cylinder"
 ) -> tuple[Block, ...]:
     """One block for each number of objects, all from the same seeds: the number of objects is part of a seed."""
     return tuple(Block(f"{name}-{count}", scenes, count, target, first_seed) for count in counts)
@@ -123,7 +123,8 @@ def find_scene(name: str) -> tuple[Block, int] | None:
 
 
 @functools.cache
-def _generator(layout: str, target: str) -> Any:
+def _generate(layout: str, target: str) -> Callable[[int, int, str], Scenario]:
+    """What makes a scene from its seed, its number of objects and its name."""
     # They take long to import and to make, and nothing is made where all files are there.
     from mechsearch_jax.envs.generator import GeneratorConfig, ScenarioGenerator
     from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS
@@ -132,8 +133,9 @@ def _generator(layout: str, target: str) -> Any:
 
     config = GeneratorConfig(visible=FOUND_PIXELS, anywhere=True)
     if layout == "line":
-        return LineGenerator(checks=config)
-    return ScenarioGenerator(Target.of(target), config=config)
+        line = LineGenerator(checks=config)
+        return lambda seed, objects, name: line.generate(seed, name)
+    return ScenarioGenerator(Target.of(target), config=config).generate
 
 
 def make_scene(block: Block, index: int) -> Scenario:
@@ -148,9 +150,8 @@ def make_scene(block: Block, index: int) -> Scenario:
     """
     if not 0 <= index < block.scenes:
         raise InputError(f"{block.name}: there is no scene {index}; there are {block.scenes}, counted from 0")
-    generator = _generator(block.layout, block.target)
-    seed, name = block.first_seed + index, block.scene_name(index)
-    return generator.generate(seed, name) if block.layout == "line" else generator.generate(seed, block.objects, name)
+    generate = _generate(block.layout, block.target)
+    return generate(block.first_seed + index, block.objects, block.scene_name(index))
 
 
 @functools.cache

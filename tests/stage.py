@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action
+from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world import BODIES, TARGET, from_scenario
 from mechsearch_jax.planner import Decision, Sequences, graspable_at
@@ -35,6 +36,16 @@ def topple(world):
 def push_off(world):
     """The box stands before the shelf, and no more in front of the target."""
     return world.replace(position=world.position.at[0].set(jnp.array([0.39, -0.2, 0.4845])))
+
+
+def stays_put(scene):
+    """Let the bodies of a scene settle: nothing moves or falls."""
+    simulator = NativeWorld()
+    before = simulator.reset(scene).position
+    outcome = simulator.settle()
+    assert outcome.settled
+    assert not outcome.fallen.any()
+    assert np.abs(np.asarray(simulator.world.position - before)).max() < 1.5e-3
 
 
 class Stage:

@@ -6,10 +6,10 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from stage import stays_put
 
 from mechsearch_jax.envs import generator, simulated_camera, world
 from mechsearch_jax.envs.generator import BOXES, CYLINDERS, GeneratorConfig, ScenarioGenerator, outline, separation
-from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, format_scenario, parse_scenario
@@ -55,12 +55,7 @@ def check(scene, objects, target, allowed):
 
 def at_rest(scene):
     """What every scenario promises that is made: nothing moves, falls or overlaps, and its file is good."""
-    simulator = NativeWorld()
-    before = simulator.reset(scene).position
-    outcome = simulator.settle()
-    assert outcome.settled
-    assert not outcome.fallen.any()
-    assert np.abs(np.asarray(simulator.world.position - before)).max() < 1.5e-3
+    stays_put(scene)
     footprint = outline(scene.target)
     assert all(separation(footprint, outline(body)) > 0.001 for body in scene.objects)
     assert parse_scenario(json.loads(format_scenario(scene)), "made") == scene

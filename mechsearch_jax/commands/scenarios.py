@@ -8,7 +8,14 @@ from typing import Annotated
 
 import tyro
 
-from mechsearch_jax.commands.options import Scenarios, TargetShape, at_least_one, find_scenarios, tell_strange
+from mechsearch_jax.commands.options import (
+    GivenShape,
+    Scenarios,
+    TargetShape,
+    at_least_one,
+    find_scenarios,
+    tell_strange,
+)
 from mechsearch_jax.errors import InputError
 
 
@@ -27,7 +34,7 @@ def generate(
     scene_set: Annotated[str | None, tyro.conf.arg(name="set", metavar="NAME")] = None,
     out: Path,
     count: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
-    target: Annotated[TargetShape | None, tyro.conf.arg(metavar="{cylinder,box}")] = None,
+    target: GivenShape = None,
     seed: Annotated[int | None, tyro.conf.arg(metavar="SEED")] = None,
 ) -> None:
     """Generate scenarios: objects dropped on the shelf, and a target that the camera cannot see.
