@@ -94,6 +94,7 @@ def test_impossible_comparisons_are_refused(wrong):
         Bench(GENERATION, **wrong)
 
 
+@pytest.mark.slow
 def test_pushes_to_time_are_real_and_among_as_many_objects_as_asked_for(drawn):
     world, action = drawn
     np.testing.assert_array_equal(action.kind, ActionKind.PUSH)
@@ -249,10 +250,8 @@ def test_the_learned_model_is_looked_at_closely_if_there_is_one():
     assert told.best == "learned"
 
 
-@pytest.mark.parametrize(
-    "model",
-    ["learned", *(pytest.param(name, marks=pytest.mark.slow) for name in ("quasi-static", "physics"))],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["learned", "quasi-static", "physics"])
 def test_predicting_is_timed(model, drawn, weights, tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "drawn_pushes", lambda count, objects: jax.tree.map(lambda a: a[:count], drawn))
     timing = bench.bench_predict(model, 3, batch=4, repeats=2, weights=weights if model == "learned" else None)

@@ -112,7 +112,7 @@ def test_what_fails_belongs_to_its_own_row(problem):
 
 def test_what_falls_belongs_to_its_own_row(problem):
     stage = Stage({"hidden": push_off, "two": reveal}, restless={"two": True})
-    episodes, _ = run(problem, [TWO, HIDDEN, dataclasses.replace(OPEN, name="open again")], stage, 3)
+    episodes, _ = run(problem, [TWO, HIDDEN, dataclasses.replace(OPEN, name="open again")], stage, 2)
     assert [e.failure for e in episodes] == [None, "an object fell off the board at action 1", None]
     assert [[step.fallen for step in e.steps] for e in episodes] == [[(), ()], [(0,), None], [()]]
     assert [[step.at_rest for step in e.steps] for e in episodes] == [[False, False], [True, None], [True]]

@@ -136,6 +136,7 @@ def test_turning_and_moving_everything_turns_and_moves_the_answer(seed, yaw, x, 
     assert_same(before, after.replace(shift=turned_back(yaw, after.shift)))
 
 
+@pytest.mark.slow
 def test_the_baseline_is_not_equivariant():
     config = dataclasses.replace(CONFIG, frame="world")
     case = cluttered(1)

@@ -31,6 +31,7 @@ def test_the_first_screen_has_the_picture():
     assert (ROOT / picture).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_the_lines_of_python_lead_from_images_to_a_joint_trajectory(capsys):
     (code,) = blocks("python")
     names = {}

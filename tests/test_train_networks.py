@@ -188,6 +188,7 @@ def test_overlap_of_instances_counts_points():
     assert np.allclose(overlap[present], [60 / 70, 20 / 40])
 
 
+@pytest.mark.slow
 def test_held_out_scores_tell_apart_what_shows_enough():
     task = segmentation.SegmentationTask(network=SEGMENTATION, points=256, precision=jnp.float32)
     scored = segmentation.held_out_scores(task, parameters("segmentation"), 8, batch=8)
@@ -266,6 +267,7 @@ def some_segments():
     return task, jax.jit(jax.vmap(task.scene))(keys)
 
 
+@pytest.mark.slow
 def test_segments_hold_their_own_points_in_their_frame():
     task, (_, seen, examples) = some_segments()
     one = jax.tree.map(lambda a: np.asarray(a[0]), examples.segments)
@@ -295,6 +297,7 @@ def test_segments_hold_their_own_points_in_their_frame():
 # --- recognition -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_recognition_does_not_mind_the_order_of_the_points():
     task, (_, _, examples) = some_segments()
     segments = jax.tree.map(lambda a: a[0], examples.segments)
