@@ -155,7 +155,9 @@ def f_of(problem: Problem, scene: Superquadrics) -> Bool[Array, " x"]:
     """f of a single state, for all poses."""
     everywhere = jnp.ones(problem.poses.shape[0], bool)
     views = object_views(problem.existence, problem.camera, scene, everywhere, problem.config.existence)
-    return existence(problem.existence, problem.camera, views, everywhere, problem.config.existence)
+    config = problem.config.existence
+    allowed = jnp.full(problem.existence.corner.shape[:2], config.allowed, jnp.int32)
+    return existence(problem.existence, problem.camera, views, everywhere, allowed, config)
 
 
 def g_of(problem: Problem, belief: Belief, scene: Superquadrics) -> Int[Array, " x"]:

@@ -46,11 +46,11 @@ def test_options_are_flat_and_complete():
 
 def test_what_is_no_option_tells_methods_apart_too():
     problem = dataclasses.replace(
-        METHODS[0].config.problem, existence=ExistenceConfig(spread=((0.0, 0.0),)), retrieval=GraspConfig(yaws=5)
+        METHODS[0].config.problem, existence=ExistenceConfig(found_pixels=80), retrieval=GraspConfig(yaws=5)
     )
     method = Method(config=dataclasses.replace(METHODS[0].config, problem=problem))
     unusual = {name: value for name, value in method.options().items() if "." in name}
-    assert unusual.pop("problem.existence.spread") == [[0.0, 0.0]]
+    assert unusual.pop("problem.existence.found_pixels") == 80
     assert unusual.pop("problem.retrieval.yaws") == 5
     assert set(unusual) == {"problem.retrieval.wrists"}
     assert Method.from_json(json.loads(json.dumps(method.to_json()))) == method
@@ -62,7 +62,9 @@ def test_the_default_is_what_earlier_files_ran_with_by_default():
         "criterion": "detector", "push_distances": [0.05, 0.10, 0.15], "caution": 1.0, "topple_charge": 0.0,
         "push_model": "learned", "focus": 0.7, "max_steps": 10, "recognition": "oracle",
     }  # fmt: skip
-    assert present_options(earlier) == Method().options()
+    # What changed since: f keeps what the target's cell and a closer look allow.
+    since = {"cell_reach": [1.0], "closer_look": 3}
+    assert present_options(earlier) | since == Method().options()
 
 
 def test_the_row_of_a_job_is_that_of_its_episode():

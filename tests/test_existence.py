@@ -1,5 +1,6 @@
 """f against a brute-force reference in float64, and its promises on shipped and published scenes."""
 
+import dataclasses
 import itertools
 
 import jax
@@ -11,6 +12,7 @@ from test_workspace_camera_render import reference_superquadric_depth
 
 from mechsearch_jax import existence, planner
 from mechsearch_jax.envs.generator import ScenarioGenerator
+from mechsearch_jax.envs.scene_sets import find_scene, make_scene
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import superquadric
@@ -23,6 +25,13 @@ UNSEEN, NOWHERE = jnp.array(False), jnp.zeros(3)
 def look(problem, objects, belief=None):
     seen = Observation(objects, UNSEEN, NOWHERE)
     return planner.update_belief(problem, belief or planner.initial_belief(problem), seen)
+
+
+def coarsely(problem, views, exists, config=None):
+    """f by the coarse image alone."""
+    config = config or problem.config.existence
+    allowed = jnp.full(problem.existence.corner.shape[:2], config.allowed)
+    return existence.existence(problem.existence, problem.camera, views, exists, allowed, config)
 
 
 def every_scenario():
@@ -44,7 +53,7 @@ def reference_existence(problem, objects, poses, config):
     result = []
     for pose in poses:
         possible = False
-        for a, b in config.spread:
+        for a, b, _ in config.places:
             position = np.array([pose[0] + a * cell[0] / 2, pose[1] + b * cell[1] / 2, target.height(shelf)])
             one = superquadric.Superquadrics(
                 size=jnp.float32(half)[None],
@@ -74,7 +83,9 @@ def reference_existence(problem, objects, poses, config):
 def test_f_is_that_of_a_brute_force_reference(problem):
     loaded = scenario.load_scenario(scenario.example_scenarios()["first-light"])
     objects = scenario.superquadrics(loaded.objects)
-    exists = np.asarray(look(problem, objects).exists)
+    config, everywhere = problem.config.existence, jnp.ones(problem.poses.shape[0], bool)
+    views = existence.object_views(problem.existence, problem.camera, objects, everywhere, config)
+    exists = np.asarray(coarsely(problem, views, everywhere))
     rng = np.random.default_rng(0)
     chosen = np.concatenate(
         [rng.choice(np.flatnonzero(exists), 12, False), rng.choice(np.flatnonzero(~exists), 12, False)]
@@ -84,25 +95,80 @@ def test_f_is_that_of_a_brute_force_reference(problem):
     assert np.mean(exists[chosen] == expected) >= 0.95
 
 
-def test_f_never_loses_the_true_pose_at_the_start(problem):
+# Their targets show 6 to 58 pixels, which are 4 to 10 coarse ones or more; by the coarse image alone all would be lost.
+SLIVERS = ("c2-2-103", "c2-4-006", "c2-4-049")
+
+
+@pytest.fixture(scope="module")
+def slivers():
+    scenes = []
+    for name in SLIVERS:
+        block, index = find_scene(name)
+        scenes.append(make_scene(block, index))
+    return scenes
+
+
+def test_f_never_loses_the_true_pose_at_the_start(problem, slivers):
     poses = np.asarray(problem.poses)
-    for one in every_scenario():
+    for one in [*every_scenario()[::5], *slivers]:
         exists = np.asarray(look(problem, scenario.superquadrics(one.objects)).exists)
         nearest = np.argmin(np.hypot(*(poses[:, :2] - np.array(one.target.position[:2])).T))
         assert exists[nearest], one.name
 
 
+def test_a_closer_look_keeps_what_the_coarse_image_loses(problem, slivers):
+    poses, config = np.asarray(problem.poses), problem.config.existence
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+    lost = 0
+    for one in slivers:
+        objects = scenario.superquadrics(one.objects)
+        views = existence.object_views(problem.existence, problem.camera, objects, everywhere, config)
+        coarse, fine = coarsely(problem, views, everywhere), look(problem, objects)
+        assert not np.any(coarse & ~fine.exists)
+        nearest = np.argmin(np.hypot(*(poses[:, :2] - np.array(one.target.position[:2])).T))
+        lost += not coarse[nearest]
+        # What is predicted for the state that is seen is what is believed of it.
+        same = existence.existence(problem.existence, problem.camera, views, everywhere, fine.allowed, config)
+        np.testing.assert_array_equal(same, fine.exists)
+        # Only what was looked at again may show more.
+        more = np.asarray(fine.allowed) > config.allowed
+        assert np.any(more)
+        assert np.mean(more) < 0.1
+        assert np.all(np.asarray(fine.allowed)[more] <= existence.DOUBTFUL)
+    assert lost == len(slivers)
+
+
+def test_without_a_closer_look_every_place_may_show_the_same(problem):
+    objects = scenario.superquadrics(scenario.load_scenario(scenario.example_scenarios()["first-light"]).objects)
+    config = dataclasses.replace(problem.config.existence, closer_look=0)
+    views = existence.object_views(problem.existence, problem.camera, objects, None, config)
+    told = existence.allowances(problem.existence, problem.camera, problem.target, objects, views, config)
+    np.testing.assert_array_equal(told, np.full(told.shape, 2))
+
+
+def test_places_are_the_middle_and_the_corners():
+    old = ExistenceConfig(cell_reach=(0.5,)).places
+    np.testing.assert_array_equal(old[:, :2], [(0, 0), (-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
+    assert not old[:, 2].any()
+    corners = ExistenceConfig(cell_reach=(1.0,)).places
+    np.testing.assert_array_equal(np.abs(corners[1:]), 1.0)
+    assert len(np.unique(corners, axis=0)) == 5
+    assert corners[:, 2].sum() == 0.0
+    assert ExistenceConfig(cell_reach=()).places.shape == (1, 3)
+
+
 @pytest.mark.slow
-def test_f_grows_the_possible_set_by_no_more_than_a_third(problem):
-    """Against one place a cell, without margins, at a third of the camera's resolution instead of a seventh."""
-    exact = ExistenceConfig(spread=((0.0, 0.0),), erosion=0.0, depth_margin=0.0, downscale=3, window=(110, 110))
+def test_f_is_little_larger_than_what_must_stay_possible(problem):
+    """Against nine places a cell, without margins, at a third of the camera's resolution instead of a seventh."""
+    exact = ExistenceConfig(cell_reach=(0.5, 1.0), closer_look=0, downscale=3, window=(110, 110))
     tables = existence.existence_tables(problem.camera, problem.shelf, problem.target, exact)
     everywhere = jnp.ones(problem.poses.shape[0], bool)
+    allowed = jnp.full(tables.corner.shape[:2], exact.allowed)
 
     @jax.jit
     def exactly(objects):
         views = existence.object_views(tables, problem.camera, objects, everywhere, exact)
-        return existence.existence(tables, problem.camera, views, everywhere, exact)
+        return existence.existence(tables, problem.camera, views, everywhere, allowed, exact)
 
     ours = theirs = 0
     generator = ScenarioGenerator()
@@ -112,7 +178,7 @@ def test_f_grows_the_possible_set_by_no_more_than_a_third(problem):
         ours += int(jnp.sum(look(problem, objects).exists))
         theirs += int(jnp.sum(exactly(objects)))
     assert theirs > 500
-    assert ours <= 1.35 * theirs
+    assert theirs <= ours <= 1.2 * theirs
 
 
 def test_f_never_grows(problem):
@@ -185,14 +251,12 @@ def test_collisions_need_not_count(problem):
     assert without.collides is None
     empty = existence.object_views(tables, problem.camera, objects, nowhere, config)
     whole = existence.object_views(tables, problem.camera, objects, everywhere, config)
-    hidden, same, free = (
-        existence.existence(tables, problem.camera, views, everywhere, config) for views in (without, empty, whole)
-    )
+    hidden, same, free = (coarsely(problem, views, everywhere) for views in (without, empty, whole))
     np.testing.assert_array_equal(hidden, same)
     assert int(jnp.sum(free)) < int(jnp.sum(hidden))
     # Of the poses that are asked about, the others do not change the answer.
     some = jnp.arange(everywhere.size) % 3 == 0
-    np.testing.assert_array_equal(existence.existence(tables, problem.camera, without, some, config), hidden & some)
+    np.testing.assert_array_equal(coarsely(problem, without, some), hidden & some)
 
 
 @pytest.mark.parametrize("criterion", ["depth-mse", pytest.param("depth-norm", marks=pytest.mark.slow)])
@@ -210,6 +274,10 @@ def test_bad_settings_are_refused_with_what_would_do():
         ExistenceConfig(criterion="guess")
     with pytest.raises(InputError, match="downscale"):
         ExistenceConfig(downscale=0)
+    with pytest.raises(InputError, match="closer_look 7 must be 0 or more and below downscale 7"):
+        ExistenceConfig(closer_look=7)
+    with pytest.raises(InputError, match="cell_reach"):
+        ExistenceConfig(cell_reach=(1.5,))
 
 
 def test_the_candidate_poses_cover_the_board(problem):

@@ -86,6 +86,8 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "avoid_unseen": True,
         "object_grasp_tilts": pytest.approx([np.radians(20), np.radians(30)]),
         "criterion": "detector",
+        "cell_reach": [1.0],
+        "closer_look": 3,
         "grasp_tilts": pytest.approx([np.radians(20), np.radians(25), np.radians(30)]),
         "retrieval_tilts": pytest.approx(np.radians([20, 22.5, 25, 27.5, 30]).tolist()),
         "push_model": "learned",
@@ -98,7 +100,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
         0.5,
     )
     assert (GraspConfig().yaws, len(GraspConfig().wrists), GraspConfig.dense().yaws) == (7, 3, 25)
-    assert (ExistenceConfig().found_pixels, len(ExistenceConfig().spread)) == (100, 5)
+    assert (ExistenceConfig().found_pixels, len(ExistenceConfig().places)) == (100, 5)
 
 
 def test_the_papers_preset_is_as_the_paper_describes_it():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
-from mechsearch_jax.existence import existence, object_views
+from mechsearch_jax.existence import allowances, existence, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import FoundGrasps, find_grasps, grasp_hits, graspability, split_found
@@ -23,6 +23,8 @@ class Belief(flax.struct.PyTreeNode):
       exists: f_t, shape (X,). It only ever shrinks, unless it contradicts every pose: see `update_belief`.
       found: c_t, whether the target has been seen.
       found_pose: where, as x, y [m], yaw [rad].
+      allowed: how many coarse pixels the target may show at each place of its candidate poses while it is hidden, shape
+        (X, S); see `existence.allowances`.
       grasps: the grasps that arm and shelf allow there.
       restarts: how often f became empty and was started anew.
     """
@@ -30,6 +32,7 @@ class Belief(flax.struct.PyTreeNode):
     exists: jax.Array
     found: jax.Array
     found_pose: jax.Array
+    allowed: jax.Array
     grasps: FoundGrasps
     restarts: jax.Array
 
@@ -41,6 +44,7 @@ def initial_belief(problem: Problem) -> Belief:
         exists=jnp.ones(problem.poses.shape[0], bool),
         found=jnp.array(False),
         found_pose=jnp.zeros(3),
+        allowed=jnp.full(problem.existence.corner.shape[:2], problem.config.existence.allowed, jnp.int32),
         grasps=FoundGrasps(jnp.eye(4), jnp.zeros(g, bool)),
         restarts=jnp.int32(0),
     )
@@ -62,7 +66,8 @@ def update_belief(problem: Problem, belief: Belief, observation: Observation) ->
     everywhere = jnp.ones_like(belief.exists)
     settings, found = problem.config.existence, jnp.asarray(observation.target_visible)
     views = object_views(problem.existence, problem.camera, observation.objects, everywhere, settings)
-    now = existence(problem.existence, problem.camera, views, everywhere, settings)
+    allowed = allowances(problem.existence, problem.camera, problem.target, observation.objects, views, settings)
+    now = existence(problem.existence, problem.camera, views, everywhere, allowed, settings)
     both = belief.exists & now
     seen = belief.found | found
     contradiction = ~jnp.any(both) & ~seen
@@ -74,6 +79,7 @@ def update_belief(problem: Problem, belief: Belief, observation: Observation) ->
         exists=jnp.where(seen, belief.exists, exists),
         found=seen,
         found_pose=pose,
+        allowed=allowed,
         grasps=grasps.replace(feasible=grasps.feasible & seen),
         restarts=belief.restarts + contradiction,
     )

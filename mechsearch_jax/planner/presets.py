@@ -33,6 +33,8 @@ def paper(**changes: Any) -> Config:
     tilt = (math.radians(20),)
     settings = {
         "criterion": "depth-mse",
+        "cell_reach": (0.5,),
+        "closer_look": 0,
         "predicted_collisions": True,
         "grasp_tilts": tilt,
         "retrieval_tilts": tilt,

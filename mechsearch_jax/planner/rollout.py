@@ -86,7 +86,7 @@ class Rollout:
         views = object_views(
             problem.existence, problem.camera, objects, counts_collisions, settings, state.views, moved
         )
-        exists = existence(problem.existence, problem.camera, views, state.exists, settings)
+        exists = existence(problem.existence, problem.camera, views, state.exists, self.belief.allowed, settings)
         counts = self.objective.needs_graspability(self.belief, exists)
         hits = grasp_hits(problem.grasps, self.belief.grasps, objects, counts, state.hits, moved)
         return state.replace(exists=exists, views=views, hits=hits)
