@@ -26,6 +26,7 @@ EARLIER: Mapping[str, Any] = {
     "avoid_unseen": True,
     "cell_reach": [0.5],
     "closer_look": 0,
+    "push_directions": [math.radians(angle) for angle in (90, -90)],
     "grasp_tilts": [math.radians(angle) for angle in (20, 25, 30)],
     "retrieval_tilts": [math.radians(angle) for angle in (20, 22.5, 25, 27.5, 30)],
     "object_grasp_tilts": [math.radians(angle) for angle in (20, 30)],

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Key
 
 from mechsearch_jax.actions import Action, ActionConfig, ActionKind, ActionTables, action_tables
+from mechsearch_jax.actions.push_starts import away_from_robot, contact_height
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT
 from mechsearch_jax.envs.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import TARGET, World, superquadrics
@@ -144,8 +145,7 @@ def _draw(key: Array, config: PushesConfig, shelf: Shelf, approach: float, table
     ahead = jax.random.uniform(keys[3], minval=-config.forward, maxval=config.forward)
     angle = jnp.where(sideways, quarter, ahead)
     heading = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-    # Across the push, away from the robot.
-    across = jnp.stack([jnp.abs(heading[1]), -heading[0] * jnp.where(heading[1] < 0, -1.0, 1.0)])
+    across = away_from_robot(heading, jnp)
     length = jax.random.uniform(keys[4], minval=config.lengths[0], maxval=config.lengths[1])
     yaw = jax.random.uniform(keys[5], minval=-config.yaw, maxval=config.yaw)
     rotation = gripper_rotation(yaw, jnp.float32(actions.push_tilt))
@@ -158,8 +158,7 @@ def _draw(key: Array, config: PushesConfig, shelf: Shelf, approach: float, table
 
     tall = one.high - one.low
     along = jnp.abs(heading[0]) * extent[0] + jnp.abs(heading[1]) * extent[1]
-    leverage = jnp.where(one.round, actions.push_leverage[1], actions.push_leverage[0]) * along
-    planned = jnp.clip(jnp.minimum(leverage, 0.75 * tall), LOW_CONTACT, actions.push_height)
+    planned, _ = contact_height(actions, one.round, along, tall)
     any_height = jax.random.uniform(
         keys[7], minval=LOW_CONTACT, maxval=jnp.clip(tall, LOW_CONTACT + 1e-3, config.highest)
     )

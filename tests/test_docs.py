@@ -79,7 +79,7 @@ def said(cell):
     """The value, or list of angles, that a cell begins with."""
     cell = cell.strip('`"')
     if "°" in cell:
-        return [math.radians(float(angle)) for angle in re.findall(r"([\d.]+)°", cell)]
+        return [math.radians(float(angle)) for angle in re.findall(r"(-?[\d.]+)°", cell)]
     word = re.match(r"[\w.-]+", cell)[0]
     return WORDS.get(word.lower(), float(word) if word[0].isdigit() else word)
 

@@ -9,7 +9,6 @@ import pytest
 
 from mechsearch_jax import actions, planner
 from mechsearch_jax.actions import SAMPLED_KINDS, ActionConfig, ActionKind
-from mechsearch_jax.actions.push import push_variants
 from mechsearch_jax.dynamics import quasi_static, rigid
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import footprints, superquadric, transforms
@@ -210,19 +209,16 @@ def test_only_present_objects_are_moved(sampled):
     assert np.all(np.asarray(objects.valid)[moved])
 
 
-def test_pushes_go_left_and_right_by_the_given_distances(sampled, problem):
-    objects, options, samples = sampled
-    action = samples.action
-    d = action.displacement[action.kind == ActionKind.PUSH]
-    np.testing.assert_array_equal(d[:, [0, 2]], 0.0)
-    assert set(np.rint(np.abs(d[:, 1]) * 1000)) <= {50, 100, 150}
-    # They start on the other side of the object.
-    side, _ = push_variants(problem.config.actions, problem.space.wrists)
-    assert set(side) == {-1.0, 1.0}
-    from_object = np.asarray(of_kind(options, "push").T_world_gripper[..., 1, 3] - objects.position[:, None, 1])
-    assert np.all((from_object * side < 0)[np.asarray(objects.valid)])
-    y = action.T_world_gripper[:, 1, 3] - np.asarray(objects.position)[action.object, 1]
-    assert np.all((y * action.displacement[:, 1])[action.kind == ActionKind.PUSH] < 0)
+def test_pushes_go_in_the_given_directions_by_the_given_distances(sampled, problem):
+    _, _, samples = sampled
+    d = samples.action.displacement[samples.action.kind == ActionKind.PUSH]
+    np.testing.assert_array_equal(d[:, 2], 0.0)
+    assert set(np.rint(np.linalg.norm(d, axis=1) * 1000)) <= {50, 100, 150}
+    config = problem.config.actions
+    angles = np.arctan2(d[:, 1], d[:, 0])
+    apart = np.abs(angles[:, None] - np.asarray(config.push_directions)[None])
+    assert apart.min(axis=1).max() < 1e-5
+    assert len(np.unique(apart.argmin(axis=1))) > 2
 
 
 def test_placed_objects_stand_clear_of_each_other_on_the_board(sampled, problem):
@@ -259,6 +255,14 @@ def test_settings_that_make_no_sense_are_refused():
         planner.build_problem(config=planner.standard(actions=("throw",)).problem)
     with pytest.raises(InputError, match="push_distances"):
         ActionConfig(push_distances=())
+    for directions in ((), (0.0, 0.0), (3.2,), (float("nan"),)):
+        with pytest.raises(InputError, match=r"push_directions .* one or more different angles within 3.1416 rad"):
+            ActionConfig(push_directions=directions)
+    with pytest.raises(InputError, match=r"push_offsets .* shares from -1 to 1"):
+        ActionConfig(push_offsets=(1.1,))
+    for postures in ((), ((0.0, 3),)):
+        with pytest.raises(InputError, match=r"push_postures .* pairs of a yaw and an index"):
+            ActionConfig(push_postures=postures)
     with pytest.raises(InputError, match="contact_tolerance"):
         ActionConfig(contact_tolerance=-0.001)
     with pytest.raises(InputError, match="give as many each"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 
 import pytest
 
@@ -56,15 +57,14 @@ def test_what_is_no_option_tells_methods_apart_too():
     assert Method.from_json(json.loads(json.dumps(method.to_json()))) == method
 
 
-def test_the_default_is_what_earlier_files_ran_with_by_default():
+def test_what_earlier_files_ran_with_by_default_is_the_default_but_for_what_is_new():
     earlier = {
         "method": "search-for-grasp", "gamma": 0.9, "horizon": 3, "sequences": 30, "actions": "both",
         "criterion": "detector", "push_distances": [0.05, 0.10, 0.15], "caution": 1.0, "topple_charge": 0.0,
         "push_model": "learned", "focus": 0.7, "max_steps": 10, "recognition": "oracle",
     }  # fmt: skip
-    # What changed since: f keeps what the target's cell and a closer look allow.
-    since = {"cell_reach": [1.0], "closer_look": 3}
-    assert present_options(earlier) | since == Method().options()
+    then = PRESETS["standard"](cell_reach=(0.5,), closer_look=0, push_directions=(math.pi / 2, -math.pi / 2))
+    assert present_options(earlier) == Method(config=then).options()
 
 
 def test_the_row_of_a_job_is_that_of_its_episode():

@@ -32,15 +32,21 @@ class ActionConfig:
 
     Attributes:
       actions: names of the kinds that are sampled: "push", "pick-and-place" or both.
+      push_directions: in which directions, as angles from +x, which is straight into the shelf, towards +y, which is to
+        the left [rad]; the paper's are left and right.
       push_distances: how far the gripper travels in a push [m].
       push_tilt: angle by which the pushing gripper points downwards [rad].
       push_wrists: angles of joint 7 relative to 45 degrees that pushes are tried with [rad].
-      push_yaws: angles between the gripper's approach and +x in a push, seen from above [rad].
+      push_yaws: angles between the gripper's approach and +x in a push to a side, seen from above [rad].
       push_height: largest height of the finger tips above the board in a push [m].
       push_leverage: largest height at which a push may begin to touch; see `push_model.LEVERAGE`.
       topple: a push is not executed if an object is predicted to fall over with a probability above this.
       push_gap: distance between gripper and object where a push starts [m].
-      push_depths: how far the finger tips reach past the object's front, or past its centre, in a push [m].
+      push_depths: how far the finger tips reach past the object's front, or past its centre, in a push to a side [m].
+      push_offsets: how far the finger tips are from the object's centre in other pushes, across the push and away from
+        the robot, as shares of its half extent there.
+      push_postures: yaw of the gripper, and index of its wrist in `push_wrists`, in other pushes. Of all pairs of five
+        yaws and three wrists these keep most of the pushes that can be made in published scenes.
       grasps: the ways in which an object is grasped.
       placements: how many places are tried for a picked object, and how many of those are tested for collision.
       place_yaw: largest angle by which a picked object is turned [rad].
@@ -56,6 +62,10 @@ class ActionConfig:
     """
 
     actions: tuple[str, ...] = option(("push", "pick-and-place"), "kinds of action that are sampled")
+    push_directions: tuple[float, ...] = option(
+        tuple(math.radians(angle) for angle in (90, -90, 0, 35, -35, 65, -65)),
+        "directions of pushes, from straight into the shelf to the left [rad]; the paper's are 1.571 and -1.571",
+    )
     push_distances: tuple[float, ...] = option((0.05, 0.10, 0.15), "how far pushes go [m]")
     push_tilt: float = math.radians(30)
     push_wrists: tuple[float, ...] = (math.radians(-45), math.radians(-15), math.radians(30))
@@ -65,6 +75,8 @@ class ActionConfig:
     topple: float = 0.5
     push_gap: float = 0.01
     push_depths: tuple[float, float] = (0.02, 0.02)
+    push_offsets: tuple[float, ...] = (-0.7, 0.0, 0.4)
+    push_postures: tuple[tuple[float, int], ...] = ((math.radians(-25), 2), (0.0, 2), (math.radians(25), 1))
     grasps: ObjectGraspConfig = dataclasses.field(default_factory=ObjectGraspConfig)
     placements: tuple[int, int] = (32, 4)
     place_yaw: float = math.radians(30)
@@ -83,10 +95,20 @@ class ActionConfig:
             raise InputError(f"actions {self.actions!r}: give a tuple of one or more kinds of action")
         if not self.contact_tolerance >= 0.0:
             raise InputError(f"contact_tolerance {self.contact_tolerance} m must not be negative")
-        if not self.push_distances or not all(0.0 < d <= LONGEST_PUSH for d in self.push_distances):
+        self._check_pushes()
+
+    def _check_pushes(self):
+        angles, distances = self.push_directions, self.push_distances
+        if not angles or len(set(angles)) < len(angles) or not all(abs(angle) <= math.pi for angle in angles):
+            raise InputError(f"push_directions {angles} must be one or more different angles within {math.pi:.4f} rad")
+        if not distances or not all(0.0 < d <= LONGEST_PUSH for d in distances):
             raise InputError(
-                f"push_distances {self.push_distances} must be one or more lengths above 0 and at most {LONGEST_PUSH} m"
+                f"push_distances {distances} must be one or more lengths above 0 and at most {LONGEST_PUSH} m"
             )
+        if not self.push_offsets or not all(abs(share) <= 1.0 for share in self.push_offsets):
+            raise InputError(f"push_offsets {self.push_offsets} must be one or more shares from -1 to 1")
+        if not self.push_postures or not all(wrist in range(len(self.push_wrists)) for _, wrist in self.push_postures):
+            raise InputError(f"push_postures {self.push_postures} must be pairs of a yaw and an index in push_wrists")
 
 
 class ActionTables(flax.struct.PyTreeNode):

@@ -1,8 +1,9 @@
-"""Pushes: the closed hand travels sideways behind an object, and what it meets gives way (paper appendix B.5)."""
+"""Pushes: the closed hand travels along the board, and what it meets gives way (paper appendix B.5)."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -11,21 +12,19 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, PLACES, gripper_hits, object_clouds
 from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace, ActionTables
-from mechsearch_jax.actions.object_grasps import PASSING_GAP
+from mechsearch_jax.actions.push_starts import PushStarts, object_pushes, push_starts
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.types import Action, Draft, Prediction, Ways
 from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
-from mechsearch_jax.dynamics.push_model import LOW_CONTACT, TOUCH, PushModel
+from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.dynamics.rigid import moved_objects
-from mechsearch_jax.geometry.footprints import Footprints, bounding_half_extents, turned
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import back_off, make, transform, translate
-from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
 from mechsearch_jax.robot.motion import MotionConfig, Reference, push_reference
-from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
+from mechsearch_jax.workspace.shelf import hits_shelf
 
 CODE = 1
 # Number of places on the way of a push that are tested for collision.
@@ -36,87 +35,10 @@ EDGE = 0.01
 SHOWN_WAY_IN = 0.12
 
 
-def _exit_distance(half, is_round, points, direction):
-    """How far points must move along a direction to leave a footprint, in its own frame; 0 if they never are inside."""
-    safe = jnp.where(jnp.abs(direction) < 1e-6, 1e-6, direction)
-    a, b = (-half - points) / safe, (half - points) / safe
-    enter, leave = jnp.max(jnp.minimum(a, b), axis=-1), jnp.min(jnp.maximum(a, b), axis=-1)
-    flat = jnp.where(enter < leave, leave, 0.0)
-    p, d = points / half, direction / half
-    dd, pd, pp = jnp.sum(d * d, axis=-1), jnp.sum(p * d, axis=-1), jnp.sum(p * p, axis=-1)
-    square = pd**2 - dd * (pp - 1.0)
-    meets = square > 0
-    circle = jnp.where(meets, (-pd + jnp.sqrt(jnp.where(meets, square, 1.0))) / dd, 0.0)
-    return jnp.maximum(jnp.where(is_round, circle, flat), 0.0)
-
-
-def _push_grid(config: ActionConfig, wrists: int):
-    """Side, depth, yaw and wrist of each push of an object."""
-    grid = np.meshgrid([1.0, -1.0], [0, 1], np.asarray(config.push_yaws), np.arange(wrists), indexing="ij")
-    return [g.reshape(-1) for g in grid]
-
-
-def push_variants(config: ActionConfig, wrists: int) -> tuple[np.ndarray, np.ndarray]:
-    """Side (+1 or -1 along y) and wrist of each push of `object_pushes`, each of shape (V,)."""
-    side, _, _, wrist = _push_grid(config, wrists)
-    return np.asarray(side, np.float32), wrist
-
-
-def object_pushes(
-    shelf: Shelf,
-    tables: ActionTables,
-    scene: Superquadrics,
-    prints: Footprints,
-    config: ActionConfig,
-    fresh: Bool[Array, " n"],
-) -> tuple[Float[Array, "n v 4 4"], Bool[Array, "n v"]]:
-    """Gripper poses where pushes start, beside each object at `push_gap` from it, and whether it would stay upright.
-
-    Only for `fresh` objects. For each side (pushing towards +y, then -y), for two depths (fingers just past the
-    object's front, then past its centre so that the palm pushes), for each yaw of the gripper, for each wrist.
-    """
-    wrists = tables.q7.shape[1]
-    side, deep, yaw, _ = _push_grid(config, wrists)
-    rotation = gripper_rotation(jnp.float32(yaw), jnp.full(len(yaw), config.push_tilt, jnp.float32))
-    extent = bounding_half_extents(scene)
-    x = jnp.where(
-        jnp.asarray(deep == 0)[None],
-        (prints.position[:, 0] - extent[:, 0] + config.push_depths[0])[:, None],
-        (prints.position[:, 0] + config.push_depths[1])[:, None],
-    )
-    height = prints.high - shelf.board
-    leverage = jnp.where(prints.round, config.push_leverage[1], config.push_leverage[0]) * extent[:, 1]
-    limit = jnp.minimum(leverage, 0.75 * height)
-    shape = (scene.capacity, len(side))
-    z = jnp.broadcast_to(shelf.board + jnp.clip(limit, LOW_CONTACT, config.push_height)[:, None], shape)
-    centre = jnp.stack([x, jnp.broadcast_to(prints.position[:, 1:2], shape), z], axis=-1)
-    T = make(jnp.broadcast_to(rotation[None], (*shape, 3, 3)), centre)
-
-    def beside(tables, row, i):
-        k, variant = i // len(side), i % len(side)
-        one = jax.tree.map(lambda a: a[k], row[0])
-        world = transform(row[1][k, variant], tables.pusher)
-        level = (world[:, 2] > one.low - config.push_gap) & (world[:, 2] < one.high + config.push_gap)
-        local = turned(-one.yaw, world[:, :2] - one.position[None])
-        heading = turned(-one.yaw, jnp.array([0.0, 1.0]) * -jnp.float32(side)[variant])
-        # In front of the object the palm may pass close by; only sideways does it keep the whole gap.
-        grown = one.half + PASSING_GAP
-        away = _exit_distance(grown[None], one.round, local, jnp.broadcast_to(heading[None], local.shape))
-        away = jnp.where(level, away, 0.0)
-        farthest = jnp.max(away)
-        touching = level & (away > farthest - TOUCH)
-        lowest = jnp.min(jnp.where(touching, world[:, 2], jnp.inf))
-        return farthest + config.push_gap - PASSING_GAP, lowest - shelf.board
-
-    beside_all = masked_vmap(beside, jnp.repeat(fresh, len(side)), tables, (prints, T))
-    distance, contact = (a.reshape(shape) for a in beside_all)
-    stable = contact <= jnp.maximum(leverage, LOW_CONTACT)[:, None]
-    return T.at[..., 1, 3].add(-jnp.float32(side)[None] * distance), stable
-
-
-def _sideways(length):
-    """Lengths along the world's y as vectors (..., 3)."""
-    return jnp.stack([jnp.zeros_like(length), length, jnp.zeros_like(length)], axis=-1)
+def _displacements(config: ActionConfig, heading: Float[np.ndarray, "*batch 2"]) -> Float[Array, "*batch d 3"]:
+    """The ways of the gripper along planar unit vectors, by every distance [m]."""
+    level = np.concatenate([heading, np.zeros_like(heading[..., :1])], axis=-1)
+    return jnp.asarray(level[..., None, :] * np.asarray(config.push_distances, np.float32)[:, None])
 
 
 def motion_feasible(space: ActionSpace, action: Action) -> Bool[Array, ""]:
@@ -158,9 +80,17 @@ def push_hits_others(
     return jnp.any(gripper_hits(tables, CLOSED, jnp.broadcast_to(wrist, PUSH_PLACES), T, scene, mask))
 
 
+def _in_words(displacement: Float[np.ndarray, " 3"]) -> str:
+    """A direction as the robot sees it, to the nearest eighth of a turn."""
+    eighth = round(math.atan2(displacement[1], displacement[0]) / (math.pi / 4))
+    ahead = {0: "forward", 1: "forward", 3: "back", 4: "back"}.get(abs(eighth))
+    side = {1: "to the left", -1: "to the right"}.get(np.sign(eighth)) if abs(eighth) in (1, 2, 3) else None
+    return " and ".join(part for part in (ahead, side) if part)
+
+
 @dataclasses.dataclass(frozen=True)
 class Push:
-    """A `kind.SampledKind`: a push to either side by one of a few distances."""
+    """A `kind.SampledKind`: a push in one of a few directions by one of a few distances."""
 
     code: int = CODE
     name: str = "push"
@@ -171,20 +101,21 @@ class Push:
     opening: int = CLOSED
     surrounds_object: bool = False
 
+    def _starts(self, space: ActionSpace) -> PushStarts:
+        return push_starts(space.config, space.wrists)
+
     def wrists(self, space: ActionSpace) -> Int[np.ndarray, " v"]:
-        return push_variants(space.config, space.wrists)[1]
+        return self._starts(space).wrist
 
     def distances(self, space: ActionSpace) -> int:
         return len(space.config.push_distances)
 
     def propose(self, space, tables, scene, prints, fresh):
         """See `object_pushes`."""
-        return object_pushes(space.shelf, tables, scene, prints, space.config, fresh)
+        return object_pushes(space, tables, scene, prints, fresh)
 
     def _displacements(self, space: ActionSpace, capacity: int) -> Float[Array, "k d 3"]:
-        side, _ = push_variants(space.config, space.wrists)
-        lengths = jnp.asarray(np.tile(side, capacity))[:, None] * jnp.float32(space.config.push_distances)[None]
-        return _sideways(lengths)
+        return _displacements(space.config, np.tile(self._starts(space).heading, (capacity, 1)))
 
     def travels(self, space: ActionSpace, tables: ActionTables, T, near) -> Bool[Array, "k d"]:
         """Whether the arm follows the push and its retreat, and nothing of it touches the shelf where it ends."""
@@ -240,9 +171,9 @@ class Push:
         _, v, d = ways.reached.shape
         way = jnp.clip(way, 0, v * d - 1)
         push, distance = way // d, way % d
-        side, wrists = (jnp.asarray(a) for a in push_variants(space.config, space.wrists))
-        T, wrist = ways.T_world_gripper[index, push], wrists[push]
-        displacement = _sideways(side[push] * jnp.float32(space.config.push_distances)[distance])
+        starts = self._starts(space)
+        T, wrist = ways.T_world_gripper[index, push], jnp.asarray(starts.wrist)[push]
+        displacement = _displacements(space.config, starts.heading)[push, distance]
         action = Action(
             kind=jnp.int32(CODE),
             object=index.astype(jnp.int32),
@@ -302,5 +233,4 @@ class Push:
 
     def describe(self, action: Action) -> str:
         d = np.asarray(action.displacement)
-        side = "to the left" if d[1] > 0 else "to the right"
-        return f"push object {int(action.object)} by {100 * np.linalg.norm(d):.0f} cm {side}"
+        return f"push object {int(action.object)} by {100 * np.linalg.norm(d):.0f} cm {_in_words(d)}"

@@ -1,0 +1,166 @@
+"""Where pushes begin: the closed hand beside an object, or behind it as seen along the push (paper appendix B.5)."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Shaped
+
+from mechsearch_jax.actions.config import ActionConfig, ActionSpace, ActionTables
+from mechsearch_jax.actions.object_grasps import PASSING_GAP
+from mechsearch_jax.dynamics.push_model import LOW_CONTACT, TOUCH
+from mechsearch_jax.geometry.footprints import Footprints, extents, turned
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import make, transform
+from mechsearch_jax.graspability import gripper_rotation
+
+# A push whose direction is nearer than this to +x or -x begins behind the object, any other beside it [rad].
+BEHIND = (math.radians(75), math.radians(45))
+
+
+class PushStarts(NamedTuple):
+    """The ways in which a push of an object can begin; constants.
+
+    Attributes:
+      heading: unit vector of the push, seen from above, shape (V, 2).
+      across: unit vector across it, away from the robot, shape (V, 2).
+      share: where the finger tips are across the push, as a share of the object's half extent, shape (V,).
+      depth: and how much further [m], shape (V,).
+      yaw: angle between the gripper's approach and +x, seen from above [rad], shape (V,).
+      wrist: index of the wrist angle, shape (V,).
+    """
+
+    heading: Float[np.ndarray, "v 2"]
+    across: Float[np.ndarray, "v 2"]
+    share: Float[np.ndarray, " v"]
+    depth: Float[np.ndarray, " v"]
+    yaw: Float[np.ndarray, " v"]
+    wrist: Int[np.ndarray, " v"]
+
+
+def planar_unit(angle: float) -> Float[np.ndarray, "2"]:
+    """The unit vector at an angle from +x towards +y [rad]; exact along the axes."""
+    vector = np.array([math.cos(angle), math.sin(angle)])
+    return np.where(np.abs(vector) < 1e-12, 0.0, vector).astype(np.float32)
+
+
+def away_from_robot(heading: Shaped[Any, "2"], xp: Any) -> Shaped[Any, "2"]:
+    """The unit vector across a planar one that does not point towards the robot, with the arrays of a module `xp`."""
+    return xp.stack([xp.abs(heading[1]), -heading[0] * xp.where(heading[1] < 0, -1.0, 1.0)])
+
+
+def contact_height(
+    config: ActionConfig, is_round: Bool[Array, "*batch"], along: Float[Array, "*batch"], tall: Float[Array, "*batch"]
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """How high above the board the finger tips are in a push, and how high it may begin to touch [m].
+
+    Args:
+      config: static.
+      is_round: of the object that is pushed.
+      along: its half extent along the push [m].
+      tall: its height [m].
+    """
+    leverage = jnp.where(is_round, config.push_leverage[1], config.push_leverage[0]) * along
+    return jnp.clip(jnp.minimum(leverage, 0.75 * tall), LOW_CONTACT, config.push_height), leverage
+
+
+def push_starts(config: ActionConfig, wrists: int) -> PushStarts:
+    """The ways to begin a push: for each direction, each place across it, each yaw of the gripper and wrist.
+
+    Beside an object the finger tips reach just past its front, or past its centre so that the palm pushes. Behind it
+    there are places along its whole width.
+
+    Args:
+      config: static.
+      wrists: number of angles of joint 7.
+    """
+    rows = []
+    for angle in config.push_directions:
+        if BEHIND[0] < abs(angle) < math.pi - BEHIND[1]:
+            places = zip((-1.0, 0.0), config.push_depths, strict=True)
+            postures = tuple(itertools.product(config.push_yaws, range(wrists)))
+        else:
+            places = ((share, 0.0) for share in config.push_offsets)
+            postures = config.push_postures
+        heading = planar_unit(angle)
+        for (share, depth), (yaw, wrist) in itertools.product(places, postures):
+            rows.append((heading, away_from_robot(heading, np), share, depth, yaw, wrist))
+    heading, across, share, depth, yaw, wrist = zip(*rows, strict=True)
+    numbers = (np.asarray(a, np.float32) for a in (heading, across, share, depth, yaw))
+    return PushStarts(*numbers, np.asarray(wrist))
+
+
+def _exit_distance(half, is_round, points, direction):
+    """How far points must move along a direction to leave a footprint, in its own frame; 0 if they never are inside."""
+    safe = jnp.where(jnp.abs(direction) < 1e-6, 1e-6, direction)
+    a, b = (-half - points) / safe, (half - points) / safe
+    enter, leave = jnp.max(jnp.minimum(a, b), axis=-1), jnp.min(jnp.maximum(a, b), axis=-1)
+    flat = jnp.where(enter < leave, leave, 0.0)
+    p, d = points / half, direction / half
+    dd, pd, pp = jnp.sum(d * d, axis=-1), jnp.sum(p * d, axis=-1), jnp.sum(p * p, axis=-1)
+    square = pd**2 - dd * (pp - 1.0)
+    meets = square > 0
+    circle = jnp.where(meets, (-pd + jnp.sqrt(jnp.where(meets, square, 1.0))) / dd, 0.0)
+    return jnp.maximum(jnp.where(is_round, circle, flat), 0.0)
+
+
+def _half_extents(scene: Superquadrics, vectors: Float[np.ndarray, "v 2"]) -> Float[Array, "n v"]:
+    """How far objects reach from their centres along planar unit vectors, of which many are alike [m]."""
+    different, row = np.unique(vectors, axis=0, return_inverse=True)
+    return extents(scene, jnp.asarray(np.pad(different, ((0, 0), (0, 1))).T))[:, row.reshape(-1)]
+
+
+def object_pushes(
+    space: ActionSpace, tables: ActionTables, scene: Superquadrics, prints: Footprints, fresh: Bool[Array, " n"]
+) -> tuple[Float[Array, "n v 4 4"], Bool[Array, "n v"]]:
+    """Gripper poses where pushes start, at `push_gap` from each object, and whether it would stay upright.
+
+    Only for `fresh` objects; in the order of `push_starts`.
+    """
+    shelf, config = space.shelf, space.config
+    starts = push_starts(config, space.wrists)
+    n, v = scene.capacity, len(starts.yaw)
+    rotation = gripper_rotation(jnp.asarray(starts.yaw), jnp.full(v, config.push_tilt, jnp.float32))
+    wide = _half_extents(scene, starts.across)
+    along = _half_extents(scene, starts.heading)
+    x, y = (
+        (prints.position[:, i, None] + starts.share[None] * wide * starts.across[None, :, i])
+        + (starts.depth * starts.across[:, i])[None]
+        for i in range(2)
+    )
+    tall = jnp.broadcast_to((prints.high - shelf.board)[:, None], (n, v))
+    height, leverage = contact_height(config, jnp.broadcast_to(prints.round[:, None], (n, v)), along, tall)
+    centre = jnp.stack([x, y, shelf.board + height], axis=-1)
+    T = make(jnp.broadcast_to(rotation[None], (n, v, 3, 3)), centre)
+    # The hand and the fingers are where they are whatever the wrist's angle.
+    told = np.column_stack([starts.heading, starts.share, starts.depth, starts.yaw])
+    _, first, alike = np.unique(told, axis=0, return_index=True, return_inverse=True)
+    headings = starts.heading[first]
+
+    def clear(tables, row, i):
+        k, variant = i // len(first), i % len(first)
+        one = jax.tree.map(lambda a: a[k], row[0])
+        world = transform(row[1][k, variant], tables.pusher)
+        level = (world[:, 2] > one.low - config.push_gap) & (world[:, 2] < one.high + config.push_gap)
+        local = turned(-one.yaw, world[:, :2] - one.position[None])
+        heading = turned(-one.yaw, -jnp.asarray(headings)[variant])
+        # In front of the object the palm may pass close by; only along the push does it keep the whole gap.
+        grown = one.half + PASSING_GAP
+        away = _exit_distance(grown[None], one.round, local, jnp.broadcast_to(heading[None], local.shape))
+        away = jnp.where(level, away, 0.0)
+        farthest = jnp.max(away)
+        touching = level & (away > farthest - TOUCH)
+        lowest = jnp.min(jnp.where(touching, world[:, 2], jnp.inf))
+        return farthest + config.push_gap - PASSING_GAP, lowest - shelf.board
+
+    found = masked_vmap(clear, jnp.repeat(fresh, len(first)), tables, (prints, T[:, first]))
+    distance, contact = (a.reshape(n, len(first))[:, alike.reshape(-1)] for a in found)
+    stable = contact <= jnp.maximum(leverage, LOW_CONTACT)
+    back = -distance[..., None] * starts.heading[None]
+    return T.at[..., :2, 3].add(back), stable
