@@ -255,6 +255,19 @@ def test_what_is_given_goes_before_the_preset(preset):
     assert given.config() == PRESETS[preset](gamma=0.5, actions=("push",), push_distances=(0.1, 0.2))
 
 
+def test_actions_go_by_the_name_of_a_set():
+    standard, paper = PRESETS["standard"]().options(), PRESETS["paper"]().options()
+    names = ("actions", "push_directions", "push_distances", "object_grasp_tilts")
+    of_paper = {name: paper[name] for name in names}
+    assert of_paper != {name: standard[name] for name in names}
+    assert options_of("--actions", "paper").config() == PRESETS["standard"](**of_paper)
+    assert options_of("--preset", "paper", "--actions", "paper").config() == PRESETS["paper"]()
+    given = options_of("--actions", "paper", "--push-distances", "0.2", "--draws", "3")
+    assert given.config() == PRESETS["standard"](**{**of_paper, "push_distances": (0.2,), "draws": 3})
+    with pytest.raises(InputError, match="--actions: paper is a whole set of actions; give it alone"):
+        options_of("--actions", "push", "paper").config()
+
+
 def test_the_default_preset_is_the_standard():
     assert options_of().config() == PRESETS["standard"]()
     assert options.DEFAULTS.config() == PRESETS["standard"]()

@@ -61,7 +61,9 @@ class ActionConfig:
       object_points: points on an object.
     """
 
-    actions: tuple[str, ...] = option(("push", "pick-and-place"), "kinds of action that are sampled")
+    actions: tuple[str, ...] = option(
+        ("push", "pick-and-place"), "kinds of action that are sampled; or, on the command line, those of a preset"
+    )
     push_directions: tuple[float, ...] = option(
         tuple(math.radians(angle) for angle in (90, -90, 0, 35, -35, 65, -65)),
         "directions of pushes, from straight into the shelf to the left [rad]; the paper's are 1.571 and -1.571",

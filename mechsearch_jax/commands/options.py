@@ -47,11 +47,16 @@ class EpisodeOptions:
         Raises:
           InputError: an option is impossible.
         """
-        from mechsearch_jax.planner import OPTIONS, PRESETS
+        from mechsearch_jax.planner import OPTIONS, PRESETS, action_set
 
-        given = {option.name: getattr(self, option.name, None) for option in OPTIONS}
-        preset = PRESETS[getattr(self, "preset", DEFAULT_PRESET)]
-        return preset().with_options(**{name: value for name, value in given.items() if value is not None})
+        named = {option.name: getattr(self, option.name, None) for option in OPTIONS}
+        given = {name: value for name, value in named.items() if value is not None}
+        sets = [name for name in given.get("actions", ()) if name in PRESETS]
+        if sets:
+            if len(given["actions"]) > 1:
+                raise InputError(f"--actions: {sets[0]} is a whole set of actions; give it alone")
+            given = {**action_set(sets[0]), **{name: given[name] for name in given if name != "actions"}}
+        return PRESETS[getattr(self, "preset", DEFAULT_PRESET)]().with_options(**given)
 
     def methods(self, policies: Sequence[str], engine: EngineName = "NativeSimulator") -> list[Method]:
         """What episodes are run with: one for each policy.

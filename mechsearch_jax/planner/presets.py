@@ -56,3 +56,12 @@ def paper(**changes: Any) -> Config:
 
 
 PRESETS: Mapping[str, Callable[..., Config]] = {"standard": standard, "paper": paper}
+
+# The options that say which actions there are, and not how they are chosen.
+ACTION_OPTIONS = ("actions", "push_directions", "push_distances", "object_grasp_tilts")
+
+
+def action_set(name: str) -> dict[str, Any]:
+    """The options that say which actions there are, as in a preset."""
+    options = PRESETS[name]().options()
+    return {option: options[option] for option in ACTION_OPTIONS}
