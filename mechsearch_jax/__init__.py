@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.planner.cache import cached_problem
     from mechsearch_jax.planner.config import Config
     from mechsearch_jax.planner.policies import Policy, random_action, search_and_grasp, search_for_grasp
-    from mechsearch_jax.planner.presets import paper, standard
+    from mechsearch_jax.planner.presets import best, paper, standard
     from mechsearch_jax.planner.problem import Problem, build_problem
     from mechsearch_jax.planner.state import Decision
     from mechsearch_jax.robot.gripper import Gripper
@@ -57,6 +57,7 @@ _ROOMS = {
     "Shelf": "workspace.shelf",
     "Superquadrics": "geometry.superquadric",
     "Target": "workspace.target",
+    "best": "planner.presets",
     "build_problem": "planner.problem",
     "cached_problem": "planner.cache",
     "example_images": "perception.examples",
@@ -89,6 +90,7 @@ __all__ = [
     "Shelf",
     "Superquadrics",
     "Target",
+    "best",
     "build_problem",
     "cached_problem",
     "example_images",

@@ -76,8 +76,10 @@ def rows(page, header):
 
 
 def said(cell):
-    """The value, or list of angles, that a cell begins with."""
+    """The value, list of angles or list of numbers in brackets that a cell begins with."""
     cell = cell.strip('`"')
+    if cell.startswith("["):
+        return [float(number) for number in cell.strip("[]").split()]
     if "°" in cell:
         return [math.radians(float(angle)) for angle in re.findall(r"(-?[\d.]+)°", cell)]
     word = re.match(r"[\w.-]+", cell)[0]

@@ -121,6 +121,11 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     assert planner.paper(gamma=0.5).planner.gamma == 0.5
 
 
+def test_the_best_preset_is_the_standard_with_more_draws_and_actions():
+    assert planner.best() == planner.standard(draws=4, max_steps=20)
+    assert planner.best(max_steps=10, gamma=0.8) == planner.standard(draws=4, gamma=0.8)
+
+
 def test_options_are_changed_by_name_and_survive_json():
     config = planner.standard(gamma=0.5, criterion="depth-norm", push_distances=(0.05, 0.2), max_steps=3)
     again = planner.Config().with_options(**json.loads(json.dumps(config.options())))

@@ -91,9 +91,9 @@ def push_starts(config: ActionConfig, wrists: int) -> PushStarts:
         heading = planar_unit(angle)
         for (share, depth), (yaw, wrist) in itertools.product(places, postures):
             rows.append((heading, away_from_robot(heading, np), share, depth, yaw, wrist))
-    heading, across, share, depth, yaw, wrist = zip(*rows, strict=True)
-    numbers = (np.asarray(a, np.float32) for a in (heading, across, share, depth, yaw))
-    return PushStarts(*numbers, np.asarray(wrist))
+    *numbers, wrist = zip(*rows, strict=True)
+    heading, across, share, depth, yaw = (np.asarray(a, np.float32) for a in numbers)
+    return PushStarts(heading, across, share, depth, yaw, np.asarray(wrist))
 
 
 def _exit_distance(half, is_round, points, direction):

@@ -13,7 +13,7 @@ from mechsearch_jax.planner.policies import (
     search_and_grasp,
     search_for_grasp,
 )
-from mechsearch_jax.planner.presets import PRESETS, action_set, paper, standard
+from mechsearch_jax.planner.presets import PRESETS, action_set, best, paper, standard
 from mechsearch_jax.planner.problem import Problem, build_problem
 from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at
 from mechsearch_jax.planner.state import Decision, Sequences
@@ -35,6 +35,7 @@ __all__ = [
     "Search",
     "Sequences",
     "action_set",
+    "best",
     "build_problem",
     "graspability_map",
     "graspable_at",
