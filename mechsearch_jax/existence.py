@@ -114,7 +114,7 @@ class ExistenceConfig:
 
 
 def _corners(share: float) -> list[tuple[float, float]]:
-    return list(itertools.product((-share, share), repeat=2))
+    return [(x, y) for x in (-share, share) for y in (-share, share)]
 
 
 class ExistenceTables(flax.struct.PyTreeNode):
@@ -376,12 +376,13 @@ def _counted(
     scale = config.closer_look
     closer = camera.scaled(scale)
     grown = config.downscale / scale
-    windows = [tuple(math.ceil(n * grown) for n in shape) for shape in (config.window, tables.depth.shape[-2:])]
-
+    (rows, columns), (h, w) = config.window, tables.depth.shape[-2:]
+    of_objects = math.ceil(rows * grown), math.ceil(columns * grown)
+    of_target = math.ceil(h * grown), math.ceil(w * grown)
     scene = scene.replace(size=scene.size + ROUNDED)
 
     def view(_, scene, i):
-        return render.object_window(closer, jax.tree.map(lambda a: a[i], scene), windows[0])
+        return render.object_window(closer, jax.tree.map(lambda a: a[i], scene), of_objects)
 
     depth, corner = masked_vmap(view, scene.valid, None, scene, block=1)
     image = render.merge_windows(closer, jnp.where(scene.valid[:, None, None], depth, jnp.inf), corner)
@@ -395,8 +396,8 @@ def _counted(
             rotation=T[:3, :3],
             valid=jnp.array(True),
         )
-        depth, corner = render.object_window(closer, one, windows[1])
-        behind, inside = _in_window(closer, image, corner, windows[1])
+        depth, corner = render.object_window(closer, one, of_target)
+        behind, inside = _in_window(closer, image, corner, of_target)
         return jnp.sum(inside & (depth + config.depth_margin < behind)) * float(scale**2)
 
     return masked_vmap(counted, doubtful.reshape(-1), tables, image, block=64).reshape(doubtful.shape)

@@ -94,7 +94,7 @@ WRONG = {
     "nowhere to report to": (["report", "table.parquet", "--out", "good.json"], "good.json: cannot be written to"),
     "the same table twice": (["report", "table.parquet", "table.parquet"], "report them one by one"),
     "unknown preset": (["search", "good.json", "--out", "out", "--preset", "worst"], "'worst'"),
-    "best preset": (["search", "good.json", "--out", "out", "--preset", "best"], "'best'"),
+    "best preset": (["search", "good.json", "--out", "out", "--preset", "finest"], "'finest'"),
     "both method and policy": (
         ["search", "good.json", "--out", "out", "--method", "search-for-grasp", "--policy", "random"],
         "search: give either --method or --policy, not both",
@@ -298,7 +298,9 @@ def test_help_names_options_with_their_defaults(capsys):
     assert not end.value.code
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "--gamma FLOAT" in shown
-    assert "(default: 0.7 in preset standard, 0.0 in preset paper)" in shown
+    assert "(default: 0.7, in preset paper 0.0)" in shown
+    assert "(default: 1, in preset paper 8, in preset best 4)" in shown
+    assert "(default: 30)" in shown
     assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)
 
 

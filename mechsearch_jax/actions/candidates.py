@@ -41,6 +41,7 @@ def candidates(
     possible: PossibleSpace,
     previous: Candidates | None = None,
     moved: Bool[Array, " n"] | None = None,
+    available: Bool[Array, " n"] | None = None,
 ) -> Candidates:
     """All ways to move all objects, and what stands in their way.
 
@@ -54,6 +55,7 @@ def candidates(
       possible: where the target may be.
       previous: candidates before some objects moved.
       moved: which moved since; only what concerns them is computed anew.
+      available: which objects may be moved; all if left out. What the ways of the others enter is not looked at.
     """
     n = scene.capacity
     previous = no_candidates(space, n) if previous is None else previous
@@ -93,7 +95,9 @@ def candidates(
         hits |= kind.swept_hits(space, scene, flat[part], mask[part] & ~hits)
         hits = jnp.where(concerns[:, None, :], hits.reshape(*T.shape[:2], n), before.hits)
         ways = Ways(T, arrives, hits, before.enters)
-        found.append(ways.replace(enters=kind.entering(space, tables, scene, possible, ways)))
+        movable = arrives if available is None else arrives & available[:, None, None]
+        looked_at = ways.replace(reached=movable)
+        found.append(ways.replace(enters=kind.entering(space, tables, scene, possible, looked_at)))
     return tuple(found)
 
 

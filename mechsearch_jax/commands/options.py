@@ -141,9 +141,9 @@ def _usual(option: Option) -> str:
 
     values = {name: preset().options()[option.name] for name, preset in PRESETS.items()}
     said = {name: " ".join(map(str, value)) if isinstance(value, list) else value for name, value in values.items()}
-    if len(set(said.values())) == 1:
-        return f"(default: {said[DEFAULT_PRESET]})"
-    return f"(default: {', '.join(f'{value} in preset {name}' for name, value in said.items())})"
+    usual = said.pop(DEFAULT_PRESET)
+    others = [f", in preset {name} {value}" for name, value in said.items() if value != usual]
+    return f"(default: {usual}{''.join(others)})"
 
 
 _METAVARS: dict[Any, str] = {

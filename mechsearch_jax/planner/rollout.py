@@ -94,7 +94,8 @@ class Rollout:
     def options(self, state: State, moved: Bool[Array, " n"]):
         """What can be done in a state after some objects moved."""
         possible = possible_space(self.problem, self.belief, state.exists)
-        return candidates(self.problem.space, self.problem.actions, state.scene, possible, state.options, moved)
+        able = state.available & state.alive
+        return candidates(self.problem.space, self.problem.actions, state.scene, possible, state.options, moved, able)
 
     def cost(self, state: State) -> Float[Array, ""]:
         """J of a state that is up to date."""
@@ -114,8 +115,11 @@ class Rollout:
         blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
 
         def again(carry):
-            i, _ = carry
-            return i + 1, attempt(jax.random.fold_in(key, i))
+            i, (_, told) = carry
+            # In a batch, those that have an action go round with the others. Without objects they have little to do.
+            needed = state.alive & ~told.possible
+            here = state.replace(scene=state.scene.replace(valid=state.scene.valid & needed))
+            return i + 1, self._attempt(first, here, jax.random.fold_in(key, i))
 
         def wanted(carry):
             i, (_, prediction) = carry
