@@ -265,6 +265,7 @@ def test_progress_and_rates_are_shown(tmp_path, files, command):
     assert everything.split()[:6] == ["search-for-grasp", "all", "3", "0.67", "0.67", "0.67"]
 
 
+@pytest.mark.slow
 def test_a_policy_of_another_module_reaches_the_worker(tmp_path, files, monkeypatch):
     source = (
         "import os",

@@ -337,6 +337,7 @@ def test_inspecting_writes_maps_and_a_picture(folder):
     assert sorted(path.name for path in (folder / "maps").iterdir()) == ["one-box.npz", "one-box.png"]
 
 
+@pytest.mark.slow
 def test_generated_scenarios_are_good_and_reproducible(folder):
     for out in ("a", "b"):
         answer = mechsearch(

@@ -83,6 +83,7 @@ def test_what_takes_longest_comes_first():
     assert [item.path for item in items] == [f"tests/{n}.py" for n in ("test_planner", "test_readme", "test_viz")]
 
 
+@pytest.mark.slow
 def test_files_that_are_traced_together_run_in_one_process():
     """As pytest does it: the workers that it names are the same for all files of a group."""
     quick = "options_are_changed or papers_preset or fits_a_few or two_commands or upright or backing_off"

@@ -47,6 +47,7 @@ def parameters(name):
 # --- segmentation ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_segmentation_follows_the_order_of_the_points():
     points = jax.random.uniform(jax.random.key(0), (2, 96, 3)) * 0.2 + jnp.array([[[0.5, 0.0, 0.42]]])
     order = jax.random.permutation(jax.random.key(1), 96)

@@ -150,6 +150,7 @@ def test_a_view_is_every_so_many_rays_of_the_camera():
         view(camera, (700, 800), (0, 10))
 
 
+@pytest.mark.slow
 def test_drawing_takes_true_elements_evenly():
     rng = np.random.default_rng(0)
     chosen = jnp.asarray(rng.random(5000) < 0.3)
