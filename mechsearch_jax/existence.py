@@ -20,13 +20,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+from collections.abc import Callable
 from typing import Any, Literal
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
@@ -279,6 +280,33 @@ def _in_window(camera: Camera, image: Any, corner: Array, window: tuple[int, int
     return image[jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1)], inside
 
 
+def _at_places(
+    tables: ExistenceTables,
+    coarse: Camera,
+    image: Float[Array, "h w"],
+    exists: Bool[Array, " x"],
+    measure: Callable[[Array, Array, Array], Array],
+) -> Shaped[Array, "x s"]:
+    """What a function tells of a target's window at each place of the poses that matter; 0 at the others.
+
+    Args:
+      tables: constants of the problem.
+      coarse: the camera at the coarse resolution; static.
+      image: its depth image of the objects.
+      exists: the poses that matter.
+      measure: of the target's depth, the depth behind it, and which pixels are in the image; closes over no array.
+    """
+
+    def told(tables, image, i):
+        def at(depth, corner):
+            return measure(depth, *_in_window(coarse, image, corner, depth.shape))
+
+        return jax.vmap(at)(tables.depth[i], tables.corner[i])
+
+    # All of them at once, for every state of a batch, would be most of a plan's memory.
+    return masked_vmap(told, exists, tables, image, block=512)
+
+
 def _shown(
     tables: ExistenceTables,
     coarse: Camera,
@@ -288,17 +316,10 @@ def _shown(
 ) -> Int[Array, "x s"]:
     """How many coarse pixels the target would show at each place of the poses that matter; 0 at the others."""
 
-    def shown(tables, image, i):
-        depth, corner = tables.depth[i], tables.corner[i]
+    def shown(depth, behind, inside):
+        return jnp.sum(inside & (depth + config.depth_margin < behind))
 
-        def at(depth, corner):
-            behind, inside = _in_window(coarse, image, corner, depth.shape)
-            return jnp.sum(inside & (depth + config.depth_margin < behind))
-
-        return jax.vmap(at)(depth, corner)
-
-    # All of them at once, for every state of a batch, would be most of a plan's memory.
-    return masked_vmap(shown, exists, tables, image, block=512)
+    return _at_places(tables, coarse, image, exists, shown)
 
 
 def _alike(
@@ -310,20 +331,14 @@ def _alike(
 ) -> Bool[Array, "x s"]:
     """Whether the depth image with the target at each place of the poses that matter is like the one without."""
 
-    def alike(tables, image, i):
-        depth, corner = tables.depth[i], tables.corner[i]
-
-        def at(depth, corner):
-            behind, inside = _in_window(coarse, image, corner, depth.shape)
-            difference = jnp.where(inside, jnp.maximum(jnp.minimum(behind, FAR) - depth, 0.0), 0.0)
-            return jnp.sum(jnp.where(jnp.isfinite(depth), difference, 0.0) ** 2)
-
-        square = jax.vmap(at)(depth, corner)
+    def alike(depth, behind, inside):
+        difference = jnp.where(inside, jnp.maximum(jnp.minimum(behind, FAR) - depth, 0.0), 0.0)
+        square = jnp.sum(jnp.where(jnp.isfinite(depth), difference, 0.0) ** 2)
         if config.criterion == "depth-mse":
             return square / (coarse.height * coarse.width) < config.depth_threshold
         return jnp.sqrt(square) < config.depth_threshold
 
-    return masked_vmap(alike, exists, tables, image, block=512)
+    return _at_places(tables, coarse, image, exists, alike)
 
 
 def allowances(

@@ -129,14 +129,11 @@ def object_pushes(
     rotation = gripper_rotation(jnp.asarray(starts.yaw), jnp.full(v, config.push_tilt, jnp.float32))
     wide = _half_extents(scene, starts.across)
     along = _half_extents(scene, starts.heading)
-    x, y = (
-        (prints.position[:, i, None] + starts.share[None] * wide * starts.across[None, :, i])
-        + (starts.depth * starts.across[:, i])[None]
-        for i in range(2)
-    )
+    place = prints.position[:, None] + (starts.share[None] * wide)[..., None] * starts.across[None]
+    place = place + (starts.depth[:, None] * starts.across)[None]
     tall = jnp.broadcast_to((prints.high - shelf.board)[:, None], (n, v))
     height, leverage = contact_height(config, jnp.broadcast_to(prints.round[:, None], (n, v)), along, tall)
-    centre = jnp.stack([x, y, shelf.board + height], axis=-1)
+    centre = jnp.concatenate([place, (shelf.board + height)[..., None]], axis=-1)
     T = make(jnp.broadcast_to(rotation[None], (n, v, 3, 3)), centre)
     # The hand and the fingers are where they are whatever the wrist's angle.
     told = np.column_stack([starts.heading, starts.share, starts.depth, starts.yaw])
