@@ -170,6 +170,10 @@ WRONG = {
         "none.json: cannot be read",
     ),
     "nothing to agree on": (["bench", "agreement", "--actions", "0"], "--actions 0 must be at least 1"),
+    "nothing to learn from": (["train", "recognition", "--out", "new", "--batch", "0"], "--batch 0 must be at least 1"),
+    "no pushes to learn from": (["train", "push", "--out", "new", "--rounds", "0"], "train push: --rounds 0"),
+    "a file to train into": (["train", "segmentation", "--out", "good.json"], "good.json: cannot be written to"),
+    "pushes kept in a file": (["train", "push", "--out", "new", "--data", "good.json"], "good.json: cannot be written"),
     "file for a folder": (["search", "good.json", "--out", "good.json"], "good.json: cannot be written to"),
 }
 

@@ -1,18 +1,20 @@
 """The closed loop: verdicts on the true state, failures that cost a step, and a record that says what happened."""
 
 import dataclasses
+import io
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rich.console import Console
 from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO, UPRIGHT, Stage, grab, idle, push_off, reveal, topple
 
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.envs.episodes import run_episode, target_of
 from mechsearch_jax.envs.method import Method
-from mechsearch_jax.envs.narration import events, verdict
+from mechsearch_jax.envs.narration import Narrator, events, verdict
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.records import load_episode, save_episode
@@ -84,6 +86,24 @@ def test_a_search_goes_on_until_the_target_is_out(problem, tmp_path, policy):
     assert diary.stages == ["recognise", "plan", "simulate", "recognise", "plan", "judge", "simulate"]
     save_episode(episode, tmp_path / "episode.json")
     assert load_episode(tmp_path / "episode.json").steps == episode.steps
+
+
+def test_what_is_told_of_an_episode_is_what_its_record_says(problem):
+    console = Console(record=True, width=200, file=io.StringIO())
+    narrator = Narrator(console, console.status("begins"), problem)
+    episode = run(problem, HIDDEN, Stage(reveal, retrievals=Failure.MISSED), watcher=narrator)
+    narrator.ended(episode)
+    first, *others = console.export_text().split("step 2")
+    told = others[0]
+    assert f"no target; it can be at {episode.steps[0].belief_size} of 792 poses" in first
+    assert f"cost {episode.steps[0].cost:.0f} now" in first
+    assert "the target at x" in told
+    assert "a grasp that hits nothing is known" in told
+    assert "failed  retrieval: missed" in told
+    assert told.strip().endswith(verdict(episode))
+    assert len(narrator.frames) == len(episode.steps)
+    assert [frame.found for frame in narrator.frames] == [False, True, True]
+    assert "retrieval: missed" in narrator.frames[1].caption
 
 
 def test_failed_actions_cost_steps_and_nothing_is_rolled_back(problem):
