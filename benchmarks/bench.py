@@ -396,7 +396,7 @@ def plough(worlds: int, steps: int) -> tuple[Float[Array, "steps worlds 9"], Flo
     reference, reachable = build(T, shift, jnp.full(worlds, WRIST_ORIGIN + np.radians(30), jnp.float32))
     if not reachable.all():
         raise InputError("bench simulate: the arm cannot make its sweep")
-    told = jnp.swapaxes(commands(reference), 0, 1)
+    told = jnp.swapaxes(commands(reference), 0, 1)[: int(reference.length.max())]
     # Back along the same way at its end, where the next sweep would begin elsewhere.
     last = len(told) - 1
     index = np.arange(steps) % (2 * last)

@@ -31,6 +31,7 @@ class Task(flax.struct.PyTreeNode):
     Attributes:
       controls: of the actuators; the last row is held, shape (steps, W, 9).
       length: time steps of the motion, after which the bodies come to rest.
+      closed, opens: the time steps, counted from 1, after which the hand has closed and begins to open.
       home: whether the robot is then set to its home configuration.
       moves: whether there is anything to simulate.
       kind: of the action; NONE where there is none.
@@ -40,6 +41,8 @@ class Task(flax.struct.PyTreeNode):
 
     controls: jax.Array
     length: jax.Array
+    closed: jax.Array
+    opens: jax.Array
     home: jax.Array
     moves: jax.Array
     kind: jax.Array
@@ -74,7 +77,10 @@ class Progress(flax.struct.PyTreeNode):
 
 
 def commands(reference: Reference) -> Float[Array, "worlds steps 9"]:
-    """What the actuators are told at each step; as `simulator.controls`, for references with a leading axis."""
+    """What the actuators are told at each step; as `simulator.controls`, for references with a leading axis.
+
+    When a motion is over, its last row goes on.
+    """
     arm = reference.q + jnp.asarray(LAG, jnp.float32)[None, None] * reference.velocity
     fingers = reference.fingers[..., None]
     return jnp.concatenate([arm, fingers, fingers], axis=-1)
@@ -83,7 +89,7 @@ def commands(reference: Reference) -> Float[Array, "worlds steps 9"]:
 def waiting(data: Any, active: Bool[Array, " worlds"]) -> Task:
     """Hold still: the robot is told what it was told before."""
     none = jnp.zeros(len(active), jnp.int32)
-    return Task(data.ctrl[None], none, none > 0, active, none, none, data.qpos)
+    return Task(data.ctrl[None], none, none, none, none > 0, active, none, none, data.qpos)
 
 
 def acting(
@@ -110,19 +116,24 @@ def acting(
     steps = max(reference.fingers.shape[1] for _, reference, _ in motions) + 1
     controls = jnp.broadcast_to(data.ctrl, (steps, *data.ctrl.shape))
     start, length = data.qpos[:, :ROBOT], jnp.zeros_like(kind)
+    closed = opens = length
     moves = goes_home = jnp.zeros(len(kind), bool)
     for each, reference, reached in motions:
         this = (kind == int(each.code)) & reached
         told = jnp.moveaxis(commands(reference), 1, 0)
         after = jnp.broadcast_to(home, told[-1].shape) if each.returns_home else told[-1]
+        over = jnp.arange(len(told))[:, None] >= reference.length[None]
+        told = jnp.where(over[..., None], after[None], told)
         padded = jnp.concatenate([told, jnp.broadcast_to(after, (steps - len(told), *after.shape))])
         controls = jnp.where(this[None, :, None], padded, controls)
         finger = jnp.maximum(reference.start[:, ARM:], 0.0)
         start = where(this, jnp.concatenate([reference.start[:, :ARM], finger, finger], axis=1), start)
-        length = jnp.where(this, len(told), length)
+        length = jnp.where(this, reference.length, length)
+        closed = jnp.where(this, reference.closed, closed)
+        opens = jnp.where(this, reference.opens, opens)
         goes_home |= this & each.returns_home
         moves |= this
-    return Task(controls, length, goes_home, moves, kind, actions.object, data.qpos), start
+    return Task(controls, length, closed, opens, goes_home, moves, kind, actions.object, data.qpos), start
 
 
 def begin(task: Task, data: Any) -> Progress:
@@ -145,7 +156,7 @@ def advance(
     """One time step, the `i`-th, of all worlds that are not done.
 
     Args:
-      config: when a world is at rest, and when the hand grasps and releases.
+      config: when a world is at rest.
       step: steps all worlds.
       home: the robot's home configuration.
       task: what they are to do.
@@ -184,7 +195,6 @@ def advance(
     reference = unhindered(progress.reference, row[:, :ARM], config.motion.timestep)
     off = jnp.max(jnp.abs(qpos[:, :ARM] - reference), axis=1)
     follows = ~frozen & ~diverged & (i < task.length)
-    grasps, releases = (i + 1 == step for step in (config.motion.grasp_step, config.motion.release_step))
     return data, Progress(
         done=frozen | diverged | rests | late,
         settled=jnp.where(frozen, progress.settled, rests & ~diverged),
@@ -192,8 +202,8 @@ def advance(
         moving=moving & ~looks,
         steps=progress.steps + ~frozen,
         overflow=progress.overflow | jnp.where(frozen, 0, overflow_of(after._impl.overflow)),
-        at_grasp=jnp.where(grasps, qpos, progress.at_grasp),
-        at_release=jnp.where(releases, qpos, progress.at_release),
+        at_grasp=where(i + 1 == task.closed, qpos, progress.at_grasp),
+        at_release=where(i + 1 == task.opens, qpos, progress.at_release),
         reference=reference,
         error=jnp.where(follows, jnp.maximum(progress.error, off), progress.error),
     )

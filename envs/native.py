@@ -115,8 +115,8 @@ class NativeWorld:
             return self._finish(Failure.UNREACHABLE, True)
         before, gone = copy.copy(self._data), self._fallen()
         states = self._follow(reference)
-        error = float(np.abs(states[:, 1 : 1 + ARM] - np.asarray(reference.q, float)).max())
-        dropped = kind.holds_object and not self._slip(states, int(action.object)) < self.config.slip
+        error = float(np.abs(states[:, 1 : 1 + ARM] - np.asarray(reference.q[: len(states)], float)).max())
+        dropped = kind.holds_object and not self._slip(states, reference, int(action.object)) < self.config.slip
         if kind.returns_home:
             self._go_home()
         settled = self._come_to_rest()
@@ -172,15 +172,14 @@ class NativeWorld:
         return states[0]
 
     def _follow(self, reference: Reference) -> np.ndarray:
-        """Put the robot where a reference starts, and run it; the states after each step."""
+        """Put the robot where a reference starts, and run it until its motion is over; the states after each step."""
         start = np.asarray(reference.start, float)
         self._set_robot(start[:ARM], float(start[ARM]))
         return self._run(controls(reference))
 
-    def _slip(self, states: np.ndarray, body: int) -> float:
+    def _slip(self, states: np.ndarray, reference: Reference, body: int) -> float:
         """How far a body has moved in the hand between when it closed and when it was to open [m]."""
-        plan = self.config.motion
-        held = [self._in_gripper(states[step - 1], body) for step in (plan.grasp_step, plan.release_step)]
+        held = [self._in_gripper(states[int(step) - 1], body) for step in (reference.closed, reference.opens)]
         return float(np.linalg.norm(held[1] - held[0]))
 
     def _in_gripper(self, state: np.ndarray, body: int) -> np.ndarray:

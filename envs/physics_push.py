@@ -325,7 +325,7 @@ class _Rollouts:
             robot = np.asarray(reference.start, float)[rows][:, [*range(ARM + 1), ARM]]
             robot[:, ARM:] = np.maximum(robot[:, ARM:], 0.0)
             _set_robot(states, robot, self.blank.nq)
-            told_arm = np.stack([controls(jax.tree.map(lambda a, row=row: a[row], reference)) for row in rows])
+            told_arm = [controls(jax.tree.map(lambda a, row=row: a[row], reference)) for row in rows]
             states, broke = self._step(pool, each, states, told_arm)
             _set_robot(states, home[scene], self.blank.nq)
             states, unsound = self._come_to_rest(pool, each, states, home[scene])
@@ -348,21 +348,29 @@ class _Rollouts:
         pool: mujoco.rollout.Rollout,
         each: Sequence[mujoco.MjModel],
         states: Float[np.ndarray, "n size"],
-        told: Float[np.ndarray, "n steps 9"],
+        told: Sequence[Float[np.ndarray, "_ 9"]],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The states after so many steps, and where MuJoCo gave up before."""
-        trajectory = self._trajectory(pool, each, states, told)
-        return trajectory[:, -1].copy(), self._stopped(states, trajectory)
+        """The states after as many steps as each has rows, and where MuJoCo gave up before."""
+        lengths = np.array([len(rows) for rows in told])
+        # All are stepped as long as the longest, holding still.
+        padded = np.stack([np.pad(rows, ((0, lengths.max() - len(rows)), (0, 0)), mode="edge") for rows in told])
+        trajectory = self._trajectory(pool, each, states, padded)
+        return self._after(trajectory, lengths).copy(), self._stopped(states, trajectory, lengths)
+
+    def _after(self, trajectory: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+        """The states after so many steps of each."""
+        return trajectory[np.arange(len(trajectory)), lengths - 1]
 
     def _trajectory(self, pool, each, states, told) -> np.ndarray:
         data = [mujoco.MjData(self.blank) for _ in range(self.threads)]
         trajectory, _ = pool.rollout(list(each), data, states, told)
         return trajectory
 
-    def _stopped(self, states: np.ndarray, trajectory: np.ndarray) -> Bool[np.ndarray, " n"]:
+    def _stopped(self, states: np.ndarray, trajectory: np.ndarray, lengths: np.ndarray) -> Bool[np.ndarray, " n"]:
         # After any warning of MuJoCo a rollout stands still, and so does its clock.
-        late = states[:, 0] + (trajectory.shape[1] - 0.5) * self.config.motion.timestep
-        return ~(np.isfinite(trajectory[:, -1]).all(axis=1) & (trajectory[:, -1, 0] > late))
+        late = states[:, 0] + (lengths - 0.5) * self.config.motion.timestep
+        after = self._after(trajectory, lengths)
+        return ~(np.isfinite(after).all(axis=1) & (after[:, 0] > late))
 
     def _come_to_rest(
         self,
@@ -379,7 +387,8 @@ class _Rollouts:
         for _ in range(config.settle_steps // config.settle_block):
             told = np.repeat(robot[moving, None], config.settle_block, axis=1)
             trajectory = self._trajectory(pool, [each[i] for i in moving.tolist()], states[moving], told)
-            broke[moving] |= self._stopped(states[moving], trajectory)
+            lengths = np.full(len(moving), trajectory.shape[1])
+            broke[moving] |= self._stopped(states[moving], trajectory, lengths)
             states[moving] = trajectory[:, -1]
             first = 1 + nq + ROBOT
             speed = np.abs(trajectory[:, :, first : first + 6 * BODIES]).reshape(len(moving), -1, BODIES, 6)

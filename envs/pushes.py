@@ -113,7 +113,7 @@ def push_simulation() -> SimulatorConfig:
     Approximations: what the hand would drag along on the rest of the way out stays where it is, and what has not come
     to rest 0.4 s after the retreat is taken to rest where it is.
     """
-    motion = dataclasses.replace(MotionConfig(), approach=0.03, approach_steps=50)
+    motion = dataclasses.replace(MotionConfig(), approach=0.03, approach_longest=150)
     return SimulatorConfig(motion=motion, settle_steps=100)
 
 

@@ -143,9 +143,13 @@ def check_actions(name: str, actions: Action, worlds: int) -> None:
 
 
 def controls(reference: Reference) -> Float[np.ndarray, "steps 9"]:
-    """What the actuators are told at each step so that the arm follows a reference without lag: ahead by `LAG`."""
-    arm = np.asarray(reference.q, float) + LAG * np.asarray(reference.velocity, float)
-    fingers = np.asarray(reference.fingers, float)[:, None]
+    """What the actuators are told at each step so that the arm follows a reference without lag: ahead by `LAG`.
+
+    One row for each step until the motion is over.
+    """
+    length = int(reference.length)
+    arm = np.asarray(reference.q[:length], float) + LAG * np.asarray(reference.velocity[:length], float)
+    fingers = np.asarray(reference.fingers[:length], float)[:, None]
     return np.concatenate([arm, fingers, fingers], axis=1)
 
 

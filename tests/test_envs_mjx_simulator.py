@@ -74,7 +74,8 @@ def test_the_fields_of_every_world_are_those_that_mujoco_computes():
 def test_commands_are_those_of_the_native_simulator():
     draw = np.random.default_rng(0).normal
     shapes = {"q": (20, 7), "velocity": (20, 7), "fingers": (20,), "start": (8,)}
-    reference = Reference(**{name: jnp.asarray(draw(size=shape), jnp.float32) for name, shape in shapes.items()})
+    drawn = {name: jnp.asarray(draw(size=shape), jnp.float32) for name, shape in shapes.items()}
+    reference = Reference(**drawn, **dict.fromkeys(("length", "closed", "opens"), jnp.int32(20)))
     batch = mjx_step.commands(jax.tree.map(lambda leaf: leaf[None], reference))
     np.testing.assert_allclose(batch[0], simulator.controls(reference), atol=1e-6)
 
@@ -86,7 +87,8 @@ def test_commands_say_where_the_arm_would_be_if_nothing_held_it_up():
     q = np.stack([np.sin(phase + world) for world in range(worlds)])
     velocity = np.diff(q, axis=1, prepend=q[:, :1]) / timestep
     start = np.concatenate([q[:, 0], np.zeros((worlds, 1))], axis=1)
-    reference = Reference(*(jnp.asarray(a, jnp.float32) for a in (q, velocity, q[..., 0], start)))
+    over = [jnp.full(worlds, q.shape[1], jnp.int32)] * 3
+    reference = Reference(*(jnp.asarray(a, jnp.float32) for a in (q, velocity, q[..., 0], start)), *over)
     told = mjx_step.commands(reference)[..., :7]
 
     def one(last, now):

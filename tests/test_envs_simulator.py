@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from published import published_scenarios
 
-from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action, retrieve_action
+from mechsearch_jax.actions import KINDS, Action, ActionKind, kind_of, no_action, retrieve_action
+from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs import model, simulator, world
 from mechsearch_jax.envs.native import NativeSimulator, NativeWorld
 from mechsearch_jax.envs.world import BODIES, TARGET
@@ -224,10 +225,12 @@ def test_a_pick_and_place_puts_the_object_where_commanded(sim, body, depth, heig
 def test_a_held_object_stays_where_it_is_in_the_hand(sim):
     body = standing("cylinder", (0.032, 0.032, 0.067), 0.6, 0.1)
     sim.reset(scene(body))
-    sim.execute(pick_and_place(pose(0.59, 0.1, 0.1), pose(0.5, 0.2, 0.1)))
-    plan = sim.config.motion
+    action, plan = pick_and_place(pose(0.59, 0.1, 0.1), pose(0.5, 0.2, 0.1)), sim.config.motion
+    sim.execute(action)
     trace = sim.trace
-    held = (trace.time > plan.grasp_step * plan.timestep + 0.1) & (trace.time < plan.release_step * plan.timestep)
+    reference, _ = reference_motion(kind_of(int(action.kind)), action, plan)
+    closed, opens = (float(step) * plan.timestep for step in (reference.closed, reference.opens))
+    held = (trace.time > closed + 0.1) & (trace.time < opens)
     T = np.asarray(gripper_pose(trace.q[held]))
     offset = trace.position[held, 0] - T[:, :3, 3]
     local = np.einsum("fji,fj->fi", T[:, :3, :3], offset)
@@ -423,7 +426,7 @@ def test_the_arm_follows_its_reference(sim):
     outcome = sim.execute(action)
     assert outcome.reason() == "dropped"
     steps = np.rint(sim.trace.time / plan.timestep).astype(int)
-    inside = steps <= len(reference.q)
+    inside = steps <= int(reference.length)
     reached = np.asarray(gripper_pose(sim.trace.q[inside]))[:, :3, 3]
     wanted = np.asarray(gripper_pose(reference.q[steps[inside] - 1]))[:, :3, 3]
     ahead = np.asarray(gripper_pose(reference.q[np.minimum(steps[inside], len(reference.q) - 1)]))[:, :3, 3]
@@ -440,7 +443,8 @@ def test_references_are_fixed_in_length_and_continuous():
     build = jax.jit(jax.vmap(lambda *a: motion.pick_and_place_reference(*a, plan)))
     batch, reachable = build(grasps, places, q7, opening)
     assert reachable.all()
-    assert batch.q.shape[1] > plan.release_step
+    assert (batch.q.shape[1] > batch.length).all()
+    assert (batch.length > batch.opens).all()
     for i in range(3):
         single, _ = motion.pick_and_place_reference(grasps[i], places[i], q7[i], opening[i], plan)
         np.testing.assert_allclose(batch.q[i], single.q, atol=1e-5)
@@ -448,7 +452,7 @@ def test_references_are_fixed_in_length_and_continuous():
     assert float(jnp.abs(batch.velocity).max()) * plan.timestep < 0.03
     np.testing.assert_allclose(batch.q[:, 0], batch.start[:, :7], atol=0.01)
     closed = simulator.controls(jax.tree.map(lambda a: a[0], batch))
-    assert closed.shape == (batch.q.shape[1], 9)
+    assert closed.shape == (int(batch.length[0]), 9)
 
 
 def test_a_motion_config_that_makes_no_sense_is_refused():
@@ -456,6 +460,8 @@ def test_a_motion_config_that_makes_no_sense_is_refused():
         MotionConfig(timestep=0.0)
     with pytest.raises(InputError, match="at least 2 waypoints"):
         MotionConfig(waypoints=1)
+    with pytest.raises(InputError, match=r"carry_pace 1\.5 must be"):
+        MotionConfig(carry_pace=1.5)
 
 
 def test_home_is_clear_of_the_shelf():

@@ -51,7 +51,7 @@ def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[
 def joint_trajectory(problem, action: Action, config: MotionConfig | None = None) -> JointTrajectory:
     """The joint trajectory of a decision's action: a push, a pick-and-place or a retrieval.
 
-    Not to be called inside `jit`: its length depends on the kind of action. For the action that does nothing it is a
+    Not to be called inside `jit`: its length depends on the action. For the action that does nothing it is a
     single row, the home configuration.
 
     Args:
@@ -60,7 +60,7 @@ def joint_trajectory(problem, action: Action, config: MotionConfig | None = None
       config: lengths and durations; the problem's approach and the defaults if left out.
 
     Raises:
-      InputError: the kind of action is unknown, or the arm does not reach all of the motion.
+      InputError: the kind of action is unknown, or the arm does not reach all of the motion, or not in time.
     """
     config = config or MotionConfig(approach=problem.gripper.approach)
     kind = kind_of(int(action.kind))
@@ -71,10 +71,10 @@ def joint_trajectory(problem, action: Action, config: MotionConfig | None = None
     reference, reachable = found
     if not reachable:
         raise InputError(f"{kind.name}: the arm does not reach all of this motion; decide anew")
-    steps = reference.q.shape[0]
+    steps = int(reference.length)
     return JointTrajectory(
         time=(jnp.arange(steps) + 1.0) * config.timestep,
-        position=reference.q,
-        velocity=reference.velocity,
-        gripper=2.0 * jnp.maximum(reference.fingers, 0.0),
+        position=reference.q[:steps],
+        velocity=reference.velocity[:steps],
+        gripper=2.0 * jnp.maximum(reference.fingers[:steps], 0.0),
     )

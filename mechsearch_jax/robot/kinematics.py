@@ -26,6 +26,10 @@ Numbers = Array | np.ndarray
 
 JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973], np.float32)
 JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973], np.float32)
+# What the maker allows each joint: velocity [rad/s], acceleration [rad/s2], jerk [rad/s3].
+VELOCITY_LIMIT = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61], np.float32)
+ACCELERATION_LIMIT = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0], np.float32)
+JERK_LIMIT = 500.0 * ACCELERATION_LIMIT
 HOME = np.array([0.0301, -1.4702, 0.0279, -2.4376, 0.1466, 2.3087, 0.7012], np.float32)
 
 # One row for each joint: distance a [m] and angle alpha [quarter turns] along the previous x, distance d [m] along z.

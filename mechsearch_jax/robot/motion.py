@@ -1,13 +1,15 @@
 """Motion primitives: what arm and fingers do at every time step of a push, a pick-and-place or a retrieval.
 
 Each primitive is a path of gripper poses, solved once by `path_kinematics` so that the arm stays in one configuration,
-and a schedule: which stretch of the path is travelled in how many steps, and what the fingers do meanwhile. All lengths
-are fixed by the `MotionConfig`, so that references can be computed, stacked and followed for many worlds at once.
+and a schedule: which stretches of the path follow each other, and what the fingers do meanwhile. Each stretch takes as
+long as the joints' limits ask for (`time_scaling`), up to a longest duration. Those are fixed by the `MotionConfig`,
+and references are padded to their sum, so that they can be computed, stacked and followed for many worlds at once.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 
 import flax.struct
@@ -15,13 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy.interpolate import CubicSpline
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import translate
 from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
-
-# Added to the turn between two waypoints, so that a stretch along which no joint turns has a length too [rad].
-LEAST_TURN = 1e-3
+from mechsearch_jax.robot.time_scaling import angles_along, progress, smooth_curve, timing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,14 +38,19 @@ class MotionConfig:
       clearance: how far above the commanded pose an object is released [m].
       squeeze: how far beyond closed the fingers are commanded when they hold something [m]; sets the grip's force, here
         60 to 70 N, which the hand can hold for long. With 40 N long boxes slip.
-      approach_steps: duration of an approach or a retreat with free fingers [time steps].
-      push_steps: of a push.
-      release_steps: of backing away after a push.
-      close_steps: of closing the fingers.
-      carry_steps: of an approach or a retreat with an object in the hand.
-      leave_steps: of the way between the end of the retreat and the outside.
-      transfer_steps: of the way, outside, to in front of where an object is placed.
-      open_steps: of opening the fingers; opened at once, they turn a narrow box that they leave one after the other.
+      approach_longest: most that an approach or a retreat with free fingers may take [time steps]; an arm that would
+        need longer, here or below, does not reach all of the motion.
+      push_longest: the same of a push.
+      push_least: least that a push takes; what it moves is to stop with the hand.
+      release_longest, release_least: the same of backing away after a push.
+      close_steps: duration of closing the fingers.
+      carry_longest: most that an approach or a retreat with an object in the hand may take.
+      leave_longest: the same of the way between the end of the retreat and the outside.
+      transfer_longest: the same of the way, outside, to in front of where an object is placed.
+      open_steps: duration of opening the fingers; opened at once, they turn a narrow box that they leave one after the
+        other.
+      carry_pace: with an object in the hand, the arm goes at this share of the highest pace that the joints' limits
+        allow: velocities stay below this share of them, accelerations below its square, and jerks below its cube.
       waypoints: number of poses on each stretch of a path, where inverse kinematics is solved.
     """
 
@@ -54,14 +60,17 @@ class MotionConfig:
     release: float = 0.01
     clearance: float = 0.002
     squeeze: float = 0.05
-    approach_steps: int = 250
-    push_steps: int = 175
-    release_steps: int = 50
+    approach_longest: int = 500
+    push_longest: int = 400
+    push_least: int = 175
+    release_longest: int = 150
+    release_least: int = 50
     close_steps: int = 100
-    carry_steps: int = 325
-    leave_steps: int = 150
-    transfer_steps: int = 275
+    carry_longest: int = 500
+    leave_longest: int = 300
+    transfer_longest: int = 1000
     open_steps: int = 120
+    carry_pace: float = 0.7
     waypoints: int = 31
 
     def __post_init__(self):
@@ -69,76 +78,103 @@ class MotionConfig:
             raise InputError(f"MotionConfig: timestep {self.timestep} and approach {self.approach} must be positive")
         if self.waypoints < 2 or not self.outside:
             raise InputError("MotionConfig: needs at least 2 waypoints and one place outside")
-
-    @property
-    def grasp_step(self) -> int:
-        """The time step, counted from 1, after which the fingers have closed, in a pick-and-place or a retrieval."""
-        return self.approach_steps + self.close_steps
-
-    @property
-    def release_step(self) -> int:
-        """The time step, counted from 1, after which the fingers begin to open, in a pick-and-place."""
-        return self.grasp_step + 2 * (self.carry_steps + self.leave_steps) + self.transfer_steps
+        if not 0 < self.carry_pace <= 1:
+            raise InputError(f"MotionConfig: carry_pace {self.carry_pace} must be above 0 and at most 1")
 
 
 class Reference(flax.struct.PyTreeNode):
-    """What the controller follows; one row for each time step.
+    """What the controller follows; one row for each time step. When the motion is over, the last row is repeated.
 
     Attributes:
       q: joint angles [rad], shape (..., steps, 7).
       velocity: their rate of change [rad/s], shape (..., steps, 7).
       fingers: commanded distance of each finger from the middle [m], shape (..., steps); below 0 it squeezes.
       start: joint angles and finger distance before the first step, shape (..., 8).
+      length: the time step, counted from 1, after which the motion is over, shape (...).
+      closed: the one after which the fingers have closed; 0 where they are closed from the beginning.
+      opens: the one after which they begin to open; `length` where they stay closed.
     """
 
     q: jax.Array
     velocity: jax.Array
     fingers: jax.Array
     start: jax.Array
+    length: jax.Array
+    closed: jax.Array
+    opens: jax.Array
 
 
 @dataclasses.dataclass(frozen=True)
 class _Stretch:
-    """Part of a schedule: from waypoint `first` to `last`, while the fingers go from one distance to another."""
+    """Part of a schedule: from waypoint `first` to `last`, while the fingers go from one distance to another.
 
-    steps: int
+    It takes at least `least` and at most `longest` time steps; within them, as long as the joints' limits ask for,
+    divided by `pace`. Where `first` is `last`, the arm waits for `longest`.
+    """
+
+    longest: int
     first: int
     last: int
     fingers: tuple[Array | float, Array | float]
+    least: int = 1
+    pace: float = 1.0
 
 
-def _ease(steps: int) -> np.ndarray:
-    """Progress from 0 (exclusive) to 1 with rest at both ends."""
-    u = np.arange(1, steps + 1) / steps
-    return (u * u * (3 - 2 * u)).astype(np.float32)
+def _ease(u: Array) -> Array:
+    """Progress of the fingers from 0 to 1 with rest at both ends."""
+    return u * u * (3 - 2 * u)
 
 
-def _travel(q: Array, stretch: _Stretch) -> Array:
-    """Joint angles on a stretch, timed so that the fastest joint speeds up and slows down once, smoothly.
-
-    Near a singularity the joints must turn far for a short way of the hand; timed by the hand's way they would have to
-    turn faster than the motors can make them.
-    """
+def _points(q: Array, stretch: _Stretch, count: int) -> Array:
+    """The waypoints of a stretch, made `count` of where there are others."""
     if stretch.first == stretch.last:
-        return jnp.broadcast_to(q[stretch.first], (stretch.steps, q.shape[1]))
+        return jnp.broadcast_to(q[stretch.first], (count, q.shape[1]))
     direction = 1 if stretch.last > stretch.first else -1
     points = q[np.arange(stretch.first, stretch.last + direction, direction)]
-    turned = jnp.max(jnp.abs(jnp.diff(points, axis=0)), axis=1) + LEAST_TURN
-    passed = jnp.concatenate([jnp.zeros(1), jnp.cumsum(turned)])
-    now = jnp.asarray(_ease(stretch.steps)) * passed[-1]
-    return jax.vmap(lambda joint: jnp.interp(now, passed, joint), in_axes=1, out_axes=1)(points)
+    if len(points) == count:
+        return points
+    return jnp.matmul(jnp.asarray(_respaced(len(points), count)), points, precision="highest")
 
 
-def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float) -> Reference:
-    """Travel along the joint angles `q` (waypoints, 7) as the stretches say."""
-    travelled = jnp.concatenate([_travel(q, s) for s in stretches])
-    fingers = jnp.concatenate(
-        [s.fingers[0] + (s.fingers[1] - s.fingers[0]) * jnp.asarray(_ease(s.steps)) for s in stretches]
-    )
+@functools.cache
+def _respaced(given: int, count: int) -> np.ndarray:
+    """What makes `count` evenly spaced points of the natural spline through those given; through two it is a line."""
+    spline = CubicSpline(np.arange(given), np.eye(given), bc_type="natural")
+    return spline(np.linspace(0, given - 1, count)).astype(np.float32)
+
+
+def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float) -> tuple[Reference, Array]:
+    """Travel along the joint angles `q` (waypoints, 7) as the stretches say, one following the other at once.
+
+    Returns:
+      The reference, and whether no stretch needs more than its longest time.
+    """
+    count = max(2, *(abs(s.last - s.first) + 1 for s in stretches))
+    pace = jnp.array([s.pace for s in stretches], jnp.float32)
+    least = np.array([s.longest if s.first == s.last else s.least for s in stretches])
+    longest = np.array([s.longest for s in stretches])
+    curves = jax.vmap(smooth_curve)(jnp.stack([_points(q, s, count) for s in stretches]))
+    seconds, ramp = jax.vmap(timing)(curves, jnp.asarray(least * timestep, jnp.float32), pace)
+
+    # A little less than the duration, so that rounding adds no step.
+    needed = jnp.ceil(seconds / timestep - 1e-2)
+    in_time = needed <= longest
+    steps = jnp.where(in_time, jnp.maximum(needed, 1.0), longest).astype(jnp.int32)
+    ends = jnp.cumsum(steps)
+    row = jnp.arange(int(longest.sum()))
+    now = jnp.minimum(jnp.sum(row[:, None] >= ends[None], axis=1), len(stretches) - 1)
+    u = jnp.minimum((row + 1 - (ends - steps)[now]) / steps[now], 1.0)
+    travelled = angles_along(curves, now, progress(u, ramp[now]))
+    first, last = (jnp.stack([jnp.asarray(s.fingers[i], jnp.float32) for s in stretches]) for i in (0, 1))
+    fingers = first[now] + (last - first)[now] * _ease(u)
+
     start = q[stretches[0].first]
     velocity = jnp.diff(travelled, axis=0, prepend=start[None]) / timestep
-    opening = jnp.asarray(stretches[0].fingers[0], jnp.float32)
-    return Reference(travelled, velocity, fingers, jnp.concatenate([start, opening[None]]))
+    waits = [i for i, s in enumerate(stretches) if s.first == s.last]
+    closed = ends[waits[0]] if waits else jnp.zeros_like(ends[0])
+    opens = ends[waits[1] - 1] if len(waits) > 1 else ends[-1]
+    begin = jnp.concatenate([start, first[:1]])
+    return Reference(travelled, velocity, fingers, begin, ends[-1], closed, opens), jnp.all(in_time)
 
 
 def _straight(start: Array, end: Array, waypoints: int) -> Array:
@@ -168,7 +204,7 @@ def push_reference(
       config: lengths and durations.
 
     Returns:
-      The reference, and whether the arm reaches all of it.
+      The reference, and whether the arm reaches all of it, in time.
     """
     n, approach = config.waypoints, jnp.float32(config.approach)
     length = jnp.sqrt(jnp.sum(displacement**2))
@@ -185,12 +221,13 @@ def push_reference(
     q, reachable = path_kinematics(path, q7)
     closed = (0.0, 0.0)
     stretches = (
-        _Stretch(config.approach_steps, 0, n - 1, closed),
-        _Stretch(config.push_steps, n - 1, 2 * n - 2, closed),
-        _Stretch(config.release_steps, 2 * n - 2, 3 * n - 3, closed),
-        _Stretch(config.approach_steps, 3 * n - 3, 4 * n - 4, closed),
+        _Stretch(config.approach_longest, 0, n - 1, closed),
+        _Stretch(config.push_longest, n - 1, 2 * n - 2, closed, config.push_least),
+        _Stretch(config.release_longest, 2 * n - 2, 3 * n - 3, closed, config.release_least),
+        _Stretch(config.approach_longest, 3 * n - 3, 4 * n - 4, closed),
     )
-    return _schedule(q, stretches, config.timestep), reachable
+    reference, in_time = _schedule(q, stretches, config.timestep)
+    return reference, reachable & in_time
 
 
 def retrieve_reference(
@@ -205,10 +242,11 @@ def retrieve_reference(
       config: lengths and durations.
 
     Returns:
-      The reference, and whether the arm reaches all of it.
+      The reference, and whether the arm reaches all of it, in time.
     """
     q, reachable = _entries(T_world_gripper, q7, config)
-    return _schedule(q[::-1], _pick_stretches(opening, config), config.timestep), reachable
+    reference, in_time = _schedule(q[::-1], _pick_stretches(opening, config), config.timestep)
+    return reference, reachable & in_time
 
 
 def pick_and_place_reference(
@@ -228,35 +266,36 @@ def pick_and_place_reference(
       config: lengths and durations.
 
     Returns:
-      The reference, and whether the arm reaches all of it.
+      The reference, and whether the arm reaches all of it, in time.
     """
     raised = translate(T_world_place, jnp.array([0.0, 0.0, config.clearance]))
     pick, pick_reachable = _entries(T_world_gripper, q7, config)
     place, place_reachable = _entries(raised, q7, config)
     q = jnp.concatenate([pick[::-1], place])
 
-    opened, held = opening / 2, -config.squeeze
+    opened, held, pace = opening / 2, -config.squeeze, config.carry_pace
     outside = pick.shape[0]
     front, last = outside + config.waypoints - 1, 2 * outside - 1
     stretches = (
         *_pick_stretches(opening, config),
-        _Stretch(config.transfer_steps, outside - 1, outside, (held, held)),
-        _Stretch(config.leave_steps, outside, front, (held, held)),
-        _Stretch(config.carry_steps, front, last, (held, held)),
+        _Stretch(config.transfer_longest, outside - 1, outside, (held, held), pace=pace),
+        _Stretch(config.leave_longest, outside, front, (held, held), pace=pace),
+        _Stretch(config.carry_longest, front, last, (held, held), pace=pace),
         _Stretch(config.open_steps, last, last, (held, opened)),
-        _Stretch(config.approach_steps, last, front, (opened, opened)),
+        _Stretch(config.approach_longest, last, front, (opened, opened)),
     )
-    return _schedule(q, stretches, config.timestep), pick_reachable & place_reachable
+    reference, in_time = _schedule(q, stretches, config.timestep)
+    return reference, pick_reachable & place_reachable & in_time
 
 
 def _pick_stretches(opening: Array, config: MotionConfig) -> tuple[_Stretch, ...]:
     """Along a path that begins where the fingers close, passes the start of the approach, and ends outside."""
-    front, opened, held = config.waypoints - 1, opening / 2, -config.squeeze
+    front, opened, held, pace = config.waypoints - 1, opening / 2, -config.squeeze, config.carry_pace
     return (
-        _Stretch(config.approach_steps, front, 0, (opened, opened)),
+        _Stretch(config.approach_longest, front, 0, (opened, opened)),
         _Stretch(config.close_steps, 0, 0, (opened, held)),
-        _Stretch(config.carry_steps, 0, front, (held, held)),
-        _Stretch(config.leave_steps, front, 2 * front, (held, held)),
+        _Stretch(config.carry_longest, 0, front, (held, held), pace=pace),
+        _Stretch(config.leave_longest, front, 2 * front, (held, held), pace=pace),
     )
 
 

@@ -1,0 +1,183 @@
+"""How fast the arm may travel: smooth curves through waypoints, timed within the joints' limits.
+
+A stretch of a motion begins and ends at rest. Its waypoints are joined by a natural cubic spline (of class C2, so that
+accelerations do not jump at the waypoints), whose parameter s from 0 to 1 grows by about the least time that the limits
+allow for each part: by joint turns over velocity limits, and by the root of the bends over acceleration limits. Places
+near singularities, where joints turn far or bend sharply for a short way of the hand, are so passed slowly. Along it
+goes a progress profile of unit duration, at rest and without acceleration at both ends: the speed rises as a cubic
+smoothstep, is constant, and falls likewise. The longer the time, the lower are all velocities, accelerations and jerks:
+by its first, second and third power. So the largest of the three ratios to the limits, over all joints and places,
+gives the duration.
+
+Approximation: peaks are looked for at `PLACES` places of the curve. Differences of sampled references are averages of
+the derivatives, so that sampling raises no peak.
+"""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from mechsearch_jax.robot.kinematics import ACCELERATION_LIMIT, JERK_LIMIT, VELOCITY_LIMIT
+
+# Shares of a stretch's time in which its speed rises, and falls. Short ones suit long ways, on which velocities are
+# what limits; of those that take equally long, the first is taken, which is closest to 3 u^2 - 2 u^3.
+RAMPS = (1 / 3, 1 / 2, 0.42, 0.26, 0.2, 0.15)
+PLACES = 257
+# Added to the least time for the way between two waypoints [s], so that a still one has a length too; and the share
+# of the mean that each has at least, so that the spline's knots do not lie too unevenly.
+LEAST_TIME = 1e-4
+LEAST_SHARE = 0.5
+# How often each of those times is averaged with its neighbours, so that the parameter has no kinks.
+SMOOTHINGS = 4
+
+
+class Curve(flax.struct.PyTreeNode):
+    """A natural cubic spline through joint angles.
+
+    Attributes:
+      knots: its parameter at the waypoints, rising from 0 to 1, shape (..., n).
+      q: joint angles there [rad], shape (..., n, 7).
+      bend: second derivatives there [rad], shape (..., n, 7).
+    """
+
+    knots: jax.Array
+    q: jax.Array
+    bend: jax.Array
+
+
+def smooth_curve(q: Float[Array, "n 7"]) -> Curve:
+    """The curve through joint angles [rad] at waypoints, evenly spaced along the hand's way; n is at least 2."""
+    turn = jnp.diff(q, axis=0) / VELOCITY_LIMIT[None]
+    bend = jnp.pad(jnp.diff(q, n=2, axis=0) / ACCELERATION_LIMIT[None], ((1, 1), (0, 0)))
+    bend = jnp.sum(bend**2, axis=1)
+    # A norm of high order instead of the largest over the joints, which would make kinks; q's bends are those of s^2.
+    fourth = jnp.sum(turn**4, axis=1) + (bend[1:] + bend[:-1]) / 2
+    least = LEAST_SHARE * jnp.mean((fourth + LEAST_TIME**4) ** 0.25) + LEAST_TIME
+    taken = (fourth + least**4) ** 0.25
+    for _ in range(SMOOTHINGS):
+        padded = jnp.concatenate([taken[:1], taken, taken[-1:]])
+        taken = (padded[:-2] + 2 * taken + padded[2:]) / 4
+    step = taken / jnp.sum(taken)
+    knots = jnp.concatenate([jnp.zeros(1, step.dtype), jnp.cumsum(step)])
+    return Curve(knots / knots[-1], q, _bends(step, q))
+
+
+def timing(
+    curve: Curve, least: Float[Array, ""] | float, pace: Float[Array, ""] | float = 1.0
+) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """How long the way along a curve takes, and with which profile.
+
+    Args:
+      curve: without leading axes.
+      least: it takes no less than this [s].
+      pace: share of the limits that velocities may reach; accelerations reach its square, and jerks its cube.
+
+    Returns:
+      The duration [s], and which of `RAMPS` needs the least.
+    """
+    segment = jnp.searchsorted(curve.knots, jnp.asarray(_PLACES), side="right", method="scan_unrolled") - 1
+    _, d1, d2, d3 = _derivatives(curve, jnp.clip(segment, 0, curve.knots.shape[0] - 2), jnp.asarray(_PLACES))
+    d1, d2, d3 = d1[None], d2[None], d3[None]
+    rate, rate2, rate3 = (jnp.asarray(table)[..., None] for table in _RATES)
+    velocity = d1 * rate
+    acceleration = d2 * rate**2 + d1 * rate2
+    jerk = d3 * rate**3 + 3.0 * d2 * rate * rate2 + d1 * rate3
+    # So little that its roots are far below a time step.
+    ratios = [
+        jnp.maximum(jnp.max(jnp.abs(peak) / limit[None, None], axis=(1, 2)), 1e-12)
+        for peak, limit in ((velocity, VELOCITY_LIMIT), (acceleration, ACCELERATION_LIMIT), (jerk, JERK_LIMIT))
+    ]
+    needed = jnp.maximum(ratios[0], jnp.maximum(ratios[1] ** (1 / 2), ratios[2] ** (1 / 3)))
+    needed = jnp.maximum(needed / pace, least)
+    best = jnp.argmin(needed)
+    return needed[best], best
+
+
+def progress(u: Float[Array, "*n"], ramp: Int[Array, "*#n"]) -> Float[Array, "*n"]:
+    """How far along a curve a profile is, from 0 to 1, when the share `u` of its time has passed."""
+    return _profile(u, jnp.asarray(RAMPS, jnp.float32)[ramp])
+
+
+def angles_along(curves: Curve, which: Int[Array, " m"], s: Float[Array, " m"]) -> Float[Array, "m 7"]:
+    """Joint angles [rad] at places of several curves.
+
+    Args:
+      curves: with one leading axis.
+      which: of the curves each place is on.
+      s: parameters, from 0 to 1.
+    """
+    count, n = curves.knots.shape
+    flat: Curve = jax.tree.map(lambda a: a.reshape(count * n, *a.shape[2:]), curves)
+    # One sorted array for all curves, so that a single search serves all places.
+    apart = (curves.knots + 2.0 * jnp.arange(count)[:, None]).reshape(-1)
+    segment = jnp.searchsorted(apart, s + 2.0 * which, side="right", method="scan_unrolled") - 1
+    return _derivatives(flat, jnp.clip(segment, which * n, which * n + n - 2), s)[0]
+
+
+def _derivatives(curve: Curve, segment: Array, s: Array) -> tuple[Array, Array, Array, Array]:
+    """Joint angles and their first three derivatives with respect to the parameter, given the knots before it."""
+    low, high = curve.knots[segment], curve.knots[segment + 1]
+    step = (high - low)[:, None]
+    a, b = (high - s)[:, None] / step, (s - low)[:, None] / step
+    q0, q1, bend0, bend1 = curve.q[segment], curve.q[segment + 1], curve.bend[segment], curve.bend[segment + 1]
+    q = q0 + b * (q1 - q0) + step**2 / 6 * ((a**3 - a) * bend0 + (b**3 - b) * bend1)
+    d1 = (q1 - q0) / step + step / 6 * ((1 - 3 * a**2) * bend0 + (3 * b**2 - 1) * bend1)
+    return q, d1, a * bend0 + b * bend1, (bend1 - bend0) / step
+
+
+def _bends(step: Array, q: Array) -> Array:
+    """Second derivatives of the natural spline at its knots, by cyclic reduction of its equations."""
+    slope = jnp.diff(q, axis=0) / step[:, None]
+    right = 6 * jnp.diff(slope, axis=0)
+    before, after = step[:-1, None], step[1:, None]
+    middle = 2 * (before + after)
+    shift = 1
+    while shift < right.shape[0]:
+        # Each equation less those `shift` above and below, so that it no longer knows their unknowns.
+        up = [_shifted(a, shift, fill) for a, fill in ((before, 0.0), (middle, 1.0), (after, 0.0), (right, 0.0))]
+        down = [_shifted(a, -shift, fill) for a, fill in ((before, 0.0), (middle, 1.0), (after, 0.0), (right, 0.0))]
+        above = jnp.where(jnp.arange(right.shape[0])[:, None] < shift, 0.0, before / up[1])
+        below = jnp.where(jnp.arange(right.shape[0])[::-1, None] < shift, 0.0, after / down[1])
+        middle = middle - above * up[2] - below * down[0]
+        right = right - above * up[3] - below * down[3]
+        before, after = -above * up[0], -below * down[2]
+        shift *= 2
+    return jnp.pad(right / middle, ((1, 1), (0, 0)))
+
+
+def _shifted(a: Array, by: int, fill: float) -> Array:
+    """Rows moved down, or up if negative."""
+    rows = jnp.full((abs(by), a.shape[1]), fill, a.dtype)
+    return jnp.concatenate([rows, a[:-by]]) if by > 0 else jnp.concatenate([a[-by:], rows])
+
+
+def _profile(u, ramp):
+    """Progress at the share `u` of the time, of a profile whose speed rises during the share `ramp`."""
+    clip = np.clip if isinstance(u, np.ndarray) else jnp.clip
+    rising, falling = (clip(v / ramp, 0.0, 1.0) for v in (u, 1.0 - u))
+    rest = 0.5 + rising**3 * (1 - rising / 2) - falling**3 * (1 - falling / 2)
+    return (ramp * rest + clip(u - ramp, 0.0, 1.0 - 2.0 * ramp)) / (1.0 - ramp)
+
+
+def _tables() -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Places on a curve, dense at its ends, and the first three derivatives of the progress of each profile there."""
+    place = (1 - np.cos(np.linspace(0.0, np.pi, PLACES))) / 2
+    rows: list[list[np.ndarray]] = [[], [], []]
+    dense = (1 - np.cos(np.linspace(0.0, np.pi, 40_001))) / 2
+    for ramp in RAMPS:
+        u = np.interp(place, _profile(dense, ramp), dense)
+        top, early = 1 / (1 - ramp), u <= 0.5
+        share = np.clip(np.where(early, u, 1 - u) / ramp, 0.0, 1.0)
+        inside = share < 1
+        rows[0].append(top * share**2 * (3 - 2 * share))
+        rows[1].append(np.where(early, 1, -1) * top / ramp * 6 * share * (1 - share))
+        rows[2].append(np.where(inside, top / ramp**2 * 6 * (1 - 2 * share), 0.0))
+    first, second, third = (np.array(row, np.float32) for row in rows)
+    return place.astype(np.float32), (first, second, third)
+
+
+_PLACES, _RATES = _tables()
