@@ -158,7 +158,7 @@ class MjxModel:
         Each is counted as often as it lies in memory when one becomes the next.
         """
         plan = self._config.simulator.motion
-        longest = plan.release_step + plan.open_steps + plan.approach_steps
+        longest = plan.release_step + plan.open_steps + plan.approach_steps + plan.leave_steps
         # One row of commands for each kind of motion, the chosen one, and the joint angles that they came from.
         commands = 8 * longest * ROBOT * np.dtype(np.float32).itemsize
         return 3 * sum(leaf.nbytes for leaf in jax.tree.leaves(self._one(self._config.contacts))) + commands

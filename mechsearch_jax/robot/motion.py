@@ -18,7 +18,9 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import translate
-from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
+from mechsearch_jax.robot.entry import way_in, ways_in
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.robot.kinematics import path_kinematics
 
 # Added to the turn between two waypoints, so that a stretch along which no joint turns has a length too [rad].
 LEAST_TURN = 1e-3
@@ -30,9 +32,7 @@ class MotionConfig:
 
     Attributes:
       timestep: of the simulation and of the references [s].
-      approach: length of the straight approach and retreat along the gripper's z [m].
-      outside: the gripper leaves the shelf with an object until its x is at most one of these, the first that is in
-        reach [m].
+      gripper: says how long an approach is and which places are outside the shelf; the planner's.
       release: how far the gripper backs away from what it has pushed before it retreats, not to drag it along [m].
       clearance: how far above the commanded pose an object is released [m].
       squeeze: how far beyond closed the fingers are commanded when they hold something [m]; sets the grip's force, here
@@ -42,15 +42,14 @@ class MotionConfig:
       release_steps: of backing away after a push.
       close_steps: of closing the fingers.
       carry_steps: of an approach or a retreat with an object in the hand.
-      leave_steps: of the way between the end of the retreat and the outside.
+      leave_steps: of the way along x between the outside and where the approach begins.
       transfer_steps: of the way, outside, to in front of where an object is placed.
       open_steps: of opening the fingers; opened at once, they turn a narrow box that they leave one after the other.
       waypoints: number of poses on each stretch of a path, where inverse kinematics is solved.
     """
 
     timestep: float = 0.004
-    approach: float = 0.3
-    outside: tuple[float, ...] = (0.3, 0.34, 0.38, 0.42, 0.46)
+    gripper: Gripper = dataclasses.field(default_factory=Gripper)
     release: float = 0.01
     clearance: float = 0.002
     squeeze: float = 0.05
@@ -65,15 +64,15 @@ class MotionConfig:
     waypoints: int = 31
 
     def __post_init__(self):
-        if self.timestep <= 0 or self.approach <= 0:
-            raise InputError(f"MotionConfig: timestep {self.timestep} and approach {self.approach} must be positive")
-        if self.waypoints < 2 or not self.outside:
-            raise InputError("MotionConfig: needs at least 2 waypoints and one place outside")
+        if self.timestep <= 0:
+            raise InputError(f"MotionConfig: timestep {self.timestep} must be positive")
+        if self.waypoints < 2:
+            raise InputError("MotionConfig: needs at least 2 waypoints")
 
     @property
     def grasp_step(self) -> int:
         """The time step, counted from 1, after which the fingers have closed, in a pick-and-place or a retrieval."""
-        return self.approach_steps + self.close_steps
+        return self.leave_steps + self.approach_steps + self.close_steps
 
     @property
     def release_step(self) -> int:
@@ -148,18 +147,10 @@ def _straight(start: Array, end: Array, waypoints: int) -> Array:
     return line.at[:, :3, 3].set((1 - share) * start[None, :3, 3] + share * end[None, :3, 3])
 
 
-def _entry(T: Array, outside: Array | float, config: MotionConfig) -> Array:
-    """Poses from outside the shelf, first along x, then straight along the gripper's z, to a pose."""
-    line = line_poses(T, jnp.float32(config.approach), config.waypoints)
-    away = jnp.minimum(outside - line[0, 0, 3], 0.0)
-    out = translate(line[0], away * jnp.array([1.0, 0.0, 0.0]))
-    return jnp.concatenate([_straight(out, line[0], config.waypoints), line[1:]])
-
-
 def push_reference(
     T_world_gripper: Float[Array, "4 4"], displacement: Float[Array, " 3"], q7: Float[Array, ""], config: MotionConfig
 ) -> tuple[Reference, Bool[Array, ""]]:
-    """A push with closed fingers: approach, translate, let go, retreat.
+    """A push with closed fingers: enter the shelf, approach, translate, let go, retreat, leave.
 
     Args:
       T_world_gripper: pose of the gripper where the push starts.
@@ -170,25 +161,26 @@ def push_reference(
     Returns:
       The reference, and whether the arm reaches all of it.
     """
-    n, approach = config.waypoints, jnp.float32(config.approach)
+    n, gripper = config.waypoints, config.gripper
     length = jnp.sqrt(jnp.sum(displacement**2))
     end = translate(T_world_gripper, displacement)
     apart = translate(end, -config.release * displacement / jnp.maximum(length, 1e-6))
     path = jnp.concatenate(
         [
-            line_poses(T_world_gripper, approach, n),
+            way_in(T_world_gripper, gripper.nearest_outside, gripper, n - 1, n),
             _straight(T_world_gripper, end, n)[1:],
             _straight(end, apart, n)[1:],
-            line_poses(apart, approach, n)[::-1][1:],
+            way_in(apart, gripper.nearest_outside, gripper, n - 1, n)[::-1][1:],
         ]
     )
     q, reachable = path_kinematics(path, q7)
     closed = (0.0, 0.0)
-    stretches = (
-        _Stretch(config.approach_steps, 0, n - 1, closed),
-        _Stretch(config.push_steps, n - 1, 2 * n - 2, closed),
-        _Stretch(config.release_steps, 2 * n - 2, 3 * n - 3, closed),
-        _Stretch(config.approach_steps, 3 * n - 3, 4 * n - 4, closed),
+    corners = np.arange(7) * (n - 1)
+    steps = (config.leave_steps, config.approach_steps, config.push_steps, config.release_steps)
+    steps = (*steps, config.approach_steps, config.leave_steps)
+    stretches = tuple(
+        _Stretch(count, int(first), int(last), closed)
+        for count, first, last in zip(steps, corners[:-1], corners[1:], strict=True)
     )
     return _schedule(q, stretches, config.timestep), reachable
 
@@ -196,7 +188,7 @@ def push_reference(
 def retrieve_reference(
     T_world_gripper: Float[Array, "4 4"], q7: Float[Array, ""], opening: Float[Array, ""], config: MotionConfig
 ) -> tuple[Reference, Bool[Array, ""]]:
-    """A retrieval: approach with open fingers, close them, retreat, leave the shelf; the hand stays closed.
+    """A retrieval: enter and approach with open fingers, close them, retreat, leave; the hand stays closed.
 
     Args:
       T_world_gripper: pose of the gripper where it closes.
@@ -207,7 +199,7 @@ def retrieve_reference(
     Returns:
       The reference, and whether the arm reaches all of it.
     """
-    q, reachable = _entries(T_world_gripper, q7, config)
+    q, reachable = _entry(T_world_gripper, q7, config)
     return _schedule(q[::-1], _pick_stretches(opening, config), config.timestep), reachable
 
 
@@ -218,7 +210,7 @@ def pick_and_place_reference(
     opening: Float[Array, ""],
     config: MotionConfig,
 ) -> tuple[Reference, Bool[Array, ""]]:
-    """A pick-and-place: retrieve, carry the object to in front of its new place, bring it in, open, retreat.
+    """A pick-and-place: retrieve, carry the object to in front of its new place, bring it in, open, retreat, leave.
 
     Args:
       T_world_gripper: pose of the gripper where it closes.
@@ -231,8 +223,8 @@ def pick_and_place_reference(
       The reference, and whether the arm reaches all of it.
     """
     raised = translate(T_world_place, jnp.array([0.0, 0.0, config.clearance]))
-    pick, pick_reachable = _entries(T_world_gripper, q7, config)
-    place, place_reachable = _entries(raised, q7, config)
+    pick, pick_reachable = _entry(T_world_gripper, q7, config)
+    place, place_reachable = _entry(raised, q7, config)
     q = jnp.concatenate([pick[::-1], place])
 
     opened, held = opening / 2, -config.squeeze
@@ -245,6 +237,7 @@ def pick_and_place_reference(
         _Stretch(config.carry_steps, front, last, (held, held)),
         _Stretch(config.open_steps, last, last, (held, opened)),
         _Stretch(config.approach_steps, last, front, (opened, opened)),
+        _Stretch(config.leave_steps, front, outside, (opened, opened)),
     )
     return _schedule(q, stretches, config.timestep), pick_reachable & place_reachable
 
@@ -253,6 +246,7 @@ def _pick_stretches(opening: Array, config: MotionConfig) -> tuple[_Stretch, ...
     """Along a path that begins where the fingers close, passes the start of the approach, and ends outside."""
     front, opened, held = config.waypoints - 1, opening / 2, -config.squeeze
     return (
+        _Stretch(config.leave_steps, 2 * front, front, (opened, opened)),
         _Stretch(config.approach_steps, front, 0, (opened, opened)),
         _Stretch(config.close_steps, 0, 0, (opened, held)),
         _Stretch(config.carry_steps, 0, front, (held, held)),
@@ -260,9 +254,7 @@ def _pick_stretches(opening: Array, config: MotionConfig) -> tuple[_Stretch, ...
     )
 
 
-def _entries(T: Array, q7: Array, config: MotionConfig) -> tuple[Array, Array]:
-    """Joint angles of `_entry` from the first place outside that is in reach."""
-    paths = jnp.stack([_entry(T, x, config) for x in config.outside])
-    q, reachable = path_kinematics(paths, jnp.broadcast_to(q7, len(config.outside)))
-    best = jnp.argmax(reachable)
-    return q[best], reachable[best]
+def _entry(T: Array, q7: Array, config: MotionConfig) -> tuple[Array, Array]:
+    """Joint angles on the way in from the first place outside that is in reach; its corner is row `waypoints - 1`."""
+    q, reachable, _ = ways_in(T, q7, config.gripper, config.waypoints - 1, config.waypoints)
+    return q, reachable
