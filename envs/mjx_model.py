@@ -158,7 +158,7 @@ class MjxModel:
         Each is counted as often as it lies in memory when one becomes the next.
         """
         plan = self._config.simulator.motion
-        stretches = 2 * (plan.approach_longest + plan.carry_longest + plan.leave_longest) + plan.transfer_longest
+        stretches = 2 * (plan.approach_longest + plan.carry_longest) + 4 * plan.leave_longest + plan.transfer_longest
         longest = stretches + plan.close_steps + plan.open_steps
         # One row of commands for each kind of motion, the chosen one, and the joint angles that they came from.
         commands = 8 * longest * ROBOT * np.dtype(np.float32).itemsize

@@ -113,7 +113,9 @@ def push_simulation() -> SimulatorConfig:
     Approximations: what the hand would drag along on the rest of the way out stays where it is, and what has not come
     to rest 0.4 s after the retreat is taken to rest where it is.
     """
-    motion = dataclasses.replace(MotionConfig(), approach=0.03, approach_longest=150)
+    # Everywhere counts as outside: there is no way along x.
+    gripper = Gripper(approach=0.03, outside=(math.inf,))
+    motion = MotionConfig(gripper=gripper, approach_longest=150, leave_longest=1)
     return SimulatorConfig(motion=motion, settle_steps=100)
 
 

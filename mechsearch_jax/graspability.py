@@ -5,6 +5,10 @@ Everything that a grasp sweeps (hand, fingers, links 7 and 6 on their straight w
 a constant point cloud in the target's frame. Which grasps the arm can make at a candidate pose, and which the shelf
 leaves room for, does not depend on the objects, so the pairs of a pose and a grasp that are feasible are listed once,
 and a scene only adds the table H[pair, object] of who is hit. Moving one object recomputes its column.
+
+An approximation: where the straight way in begins inside the shelf, the gripper first gets there along x. That the arm
+can is part of what is feasible, but H does not say what stands in the way there; for a target that has been found
+`planner.retrieval` does.
 """
 
 from __future__ import annotations
@@ -26,8 +30,8 @@ from mechsearch_jax.geometry.masked import block_size, for_each, masked_vmap, me
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make, transform, upright_pose
 from mechsearch_jax.options import option
-from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf, swept_cloud
-from mechsearch_jax.robot.kinematics import line_kinematics
+from mechsearch_jax.robot.entry import arm_enters
+from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 from mechsearch_jax.workspace.target import Target
@@ -50,6 +54,7 @@ class GraspConfig:
       height: how far above the target's centre it is grasped [m]: higher grasps keep the wrist clear of the board.
       points: points on the swept gripper.
       target_points: points on the swept target.
+      still_points: points on the gripper where it is, and on the target, for the crossing of a found one.
       waypoints: poses on an approach at which inverse kinematics must succeed.
       erosion: by how much the target is drawn in for the collision test of its way out [m].
     """
@@ -64,6 +69,7 @@ class GraspConfig:
     height: float = 0.03
     points: int = 2048
     target_points: int = 512
+    still_points: tuple[int, int] = (512, 128)
     waypoints: int = 4
     erosion: float = 0.001
 
@@ -89,6 +95,8 @@ class GraspTables(flax.struct.PyTreeNode):
       wrist: index of the wrist's swept gripper cloud, shape (G,).
       clouds: what each grasp sweeps, in the target's frame as rows of coordinates, shape (G, 3, P) [m].
       low, high: box around each cloud in the gripper's frame, shape (G, 3) [m].
+      still_gripper: what the open gripper takes up with each wrist, in its own frame as rows, shape (W, 3, S) [m].
+      still_target: surface of the target in its own frame as rows, shape (3, R) [m].
       T_world_target: candidate poses, shape (X, 4, 4).
       pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose.
       group_pose, group_pair: the pairs and, after them, the grasps of a target that has been found, in groups of at
@@ -103,6 +111,8 @@ class GraspTables(flax.struct.PyTreeNode):
     clouds: jax.Array
     low: jax.Array
     high: jax.Array
+    still_gripper: jax.Array
+    still_target: jax.Array
     T_world_target: jax.Array
     pair_pose: jax.Array
     pair_grasp: jax.Array
@@ -156,20 +166,17 @@ def feasible_grasps(
 ) -> Bool[Array, "n g"]:
     """Which grasps the arm can make at target poses and the shelf leaves room for, whatever the objects.
 
-    The approach has to be within `max_yaw` of +x, reachable along its whole length, and neither the arm nor anything
-    that is swept may touch the shelf. None is, and next to nothing is computed, where `active` is false.
+    The approach has to be within `max_yaw` of +x, the whole way in from outside the shelf reachable, and neither the
+    arm nor anything that is swept may touch the shelf. None is, and next to nothing is computed, where `active` is
+    false.
     """
     n, g = T_world_target.shape[0], tables.q7.shape[0]
     T = compose(T_world_target[:, None], tables.T_target_gripper[None])
     ahead = T[..., 0, 2] >= jnp.cos(config.max_yaw + 1e-4) * jnp.sqrt(T[..., 0, 2] ** 2 + T[..., 1, 2] ** 2)
     ahead &= active
 
-    def reach(_, row, i):
-        T, q7 = row[0][i], row[1][i % g]
-        q, reachable = line_kinematics(T, jnp.float32(gripper.approach), q7, config.waypoints)
-        return reachable & ~jnp.any(arm_hits_shelf(q, shelf))
-
-    reachable = masked_vmap(reach, ahead.reshape(-1), None, (T.reshape(-1, 4, 4), tables.q7), block=1024)
+    poses, q7 = T.reshape(-1, 4, 4), jnp.tile(tables.q7, n)
+    reachable = arm_enters(shelf, gripper, config.waypoints, poses, q7, ahead.reshape(-1), block=1024)
 
     def touches(tables, T_world_target, i):
         points = transform(T_world_target[i // g], tables.clouds[i % g].T)
@@ -194,6 +201,7 @@ def grasp_tables(
     T_target_gripper, _, wrist = _target_grasps(target, gripper, config)
     angles = [WRIST_ORIGIN + a for a in config.wrists]
     swept = [swept_cloud(gripper, gripper.max_opening, a, config.points) for a in angles]
+    still = [gripper_cloud(gripper, gripper.max_opening, a, config.still_points[0]) for a in angles]
     outward = -np.asarray(T_target_gripper)[:, :3, 2]
     # Every first part of a cloud covers the gripper and the target alike.
     progress = [np.arange(n) / n for n in (config.points, config.target_points)]
@@ -220,6 +228,10 @@ def grasp_tables(
         clouds=jnp.float32(np.stack(clouds)),
         low=jnp.float32(np.stack(low)),
         high=jnp.float32(np.stack(high)),
+        still_gripper=jnp.float32(np.stack([cloud.T for cloud in still])),
+        still_target=jnp.float32(
+            swept_target(target, np.array([1.0, 0.0, 0.0]), 0.0, config.still_points[1], config.erosion).T
+        ),
         T_world_target=poses,
         pair_pose=jnp.zeros(0, jnp.int32),
         pair_grasp=jnp.zeros(0, jnp.int32),

@@ -1,4 +1,4 @@
-"""What all kinds of action share: the straight approach of the gripper against the shelf, the objects, unseen space."""
+"""What all kinds of action share: the gripper's way in against the shelf, the objects and unseen space."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
 from mechsearch_jax.graspability import boxes_overlap
-from mechsearch_jax.robot.gripper import arm_hits_shelf
-from mechsearch_jax.robot.kinematics import line_kinematics
+from mechsearch_jax.robot.entry import arm_enters, crossing_length, crossing_poses
 from mechsearch_jax.workspace.shelf import hits_shelf
 
 # Number of poses on each stretch of a motion where it is followed closely.
 CLOSE_WAYPOINTS = 12
 # At how many places an action's gripper and object are tested against unseen space.
 PLACES = 5
+# At how many places of its crossing a gripper is tested. Crossings are at most 17 cm long, which leaves 3.4 cm from
+# place to place: less than the fingers measure along x, however they are turned, so that what is swept has no gaps.
+CROSSING_PLACES = 5
 
 
 def object_clouds(scene: Superquadrics, count: int) -> Float[Array, "n 3 p"]:
@@ -57,19 +59,29 @@ def gripper_hits(tables: ActionTables, opening, wrist, T, scene: Superquadrics, 
     return any_inside((mask & near).reshape(-1), pair, tables, (T, opening, wrist, scene)).reshape(c, n)
 
 
-def approach_clear(space: ActionSpace, tables: ActionTables, opening: np.ndarray, wrist: np.ndarray, T, mask):
-    """Whether the arm reaches along the approaches to poses (C, 4, 4) and nothing of it touches the shelf."""
+def crossing_hits(space: ActionSpace, tables: ActionTables, opening, wrist, T, scene: Superquadrics, mask):
+    """Which objects the gripper hits on its crossings to poses (C, 4, 4), where the mask (C, N) is true.
 
-    def clear(tables, row, i):
-        q7 = tables.q7[jnp.asarray(opening)[i], jnp.asarray(wrist)[i]]
-        q, reachable = line_kinematics(row[i], jnp.float32(space.gripper.approach), q7, space.waypoints)
-        return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf))
+    It is tested as far as the nearest place outside: what follows lies in front of the shelf.
+    """
+    (c, n), gripper = mask.shape, space.gripper
+    outside = gripper.nearest_outside
+    places = crossing_poses(T, outside, gripper, CROSSING_PLACES).reshape(-1, 4, 4)
+    crosses = mask & (crossing_length(T, outside, gripper) > 0.0)[:, None]
+    still = tables.replace(clouds=tables.still, low=jnp.min(tables.still, axis=-1), high=jnp.max(tables.still, axis=-1))
+    wrist = jnp.repeat(jnp.broadcast_to(wrist, c), CROSSING_PLACES)
+    hits = gripper_hits(still, opening, wrist, places, scene, jnp.repeat(crosses, CROSSING_PLACES, axis=0))
+    return jnp.any(hits.reshape(c, CROSSING_PLACES, n), axis=1)
+
+
+def approach_clear(space: ActionSpace, tables: ActionTables, opening: np.ndarray, wrist: np.ndarray, T, mask):
+    """Whether the arm follows the ways in to poses (C, 4, 4) and nothing of it touches the shelf."""
 
     def touches(tables, row, i):
         points = transform(row[i], tables.clouds[jnp.asarray(opening)[i], jnp.asarray(wrist)[i]].T)
         return jnp.any(hits_shelf(space.shelf, points))
 
-    reached = masked_vmap(clear, mask, tables, T, block=512)
+    reached = arm_enters(space.shelf, space.gripper, space.waypoints, T, tables.q7[opening, wrist], mask)
     return reached & ~masked_vmap(touches, reached, tables, T, block=512)
 
 

@@ -57,6 +57,7 @@ class ActionConfig:
       avoid_unseen: whether an object's actions that enter space where the target may be are sampled only if it has no
         others; the paper does not look at that.
       cloud_points: points on the swept gripper.
+      still_points: points on the gripper where it is.
       pusher_points: points on the hand and fingers.
       object_points: points on an object.
     """
@@ -89,6 +90,7 @@ class ActionConfig:
         True, "whether actions that enter space where the target may be come last; the paper's do not"
     )
     cloud_points: int = 1024
+    still_points: int = 512
     pusher_points: int = 384
     object_points: int = 128
 
@@ -120,6 +122,7 @@ class ActionTables(flax.struct.PyTreeNode):
       q7: angles of joint 7 with the hand open, then closed, shape (2, W) [rad].
       clouds: what the gripper sweeps on its way in, in its own frame, open and then closed: shape (2, W, 3, P) [m].
       low, high: boxes around them, shape (2, W, 3) [m].
+      still: what the gripper takes up where it is, shape (2, W, 3, S) [m].
       pusher: surface of the closed hand and fingers in the gripper's frame, shape (Q, 3) [m].
     """
 
@@ -127,6 +130,7 @@ class ActionTables(flax.struct.PyTreeNode):
     clouds: jax.Array
     low: jax.Array
     high: jax.Array
+    still: jax.Array
     pusher: jax.Array
 
 
@@ -165,11 +169,12 @@ def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: Act
             f"{len(grasp_wrists)} wrist angles for grasps but {len(config.push_wrists)} for pushes; give as many each"
         )
     q7 = WRIST_ORIGIN + np.array([grasp_wrists, config.push_wrists])
+    hands = list(zip((gripper.max_opening, 0.0), q7, strict=True))
     clouds = np.stack(
-        [
-            [swept_cloud(gripper, opening, float(angle), config.cloud_points) for angle in angles]
-            for opening, angles in zip((gripper.max_opening, 0.0), q7, strict=True)
-        ]
+        [[swept_cloud(gripper, opening, float(a), config.cloud_points) for a in angles] for opening, angles in hands]
+    )
+    still = np.stack(
+        [[gripper_cloud(gripper, opening, float(a), config.still_points) for a in angles] for opening, angles in hands]
     )
     # Only the hand and the fingers push; the links behind them would thin out the points that matter.
     surface = gripper_cloud(gripper, 0.0, float(q7[CLOSED][0]), 2048)
@@ -179,5 +184,6 @@ def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: Act
         clouds=jnp.float32(np.swapaxes(clouds, -1, -2)),
         low=jnp.float32(clouds.min(axis=-2)),
         high=jnp.float32(clouds.max(axis=-2)),
+        still=jnp.float32(np.swapaxes(still, -1, -2)),
         pusher=jnp.float32(pusher),
     )

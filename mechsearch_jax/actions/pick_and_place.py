@@ -7,12 +7,13 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.approach import (
     CLOSE_WAYPOINTS,
     PLACES,
     approach_enters,
+    crossing_hits,
     gripper_hits,
     object_clouds,
     swept_object,
@@ -28,14 +29,17 @@ from mechsearch_jax.geometry.collision import Pair, any_inside
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make, matmul, rotate, transform, yaw_rotation
+from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, arm_enters, crossing_length, ways_in
 from mechsearch_jax.robot.gripper import arm_hits_shelf
-from mechsearch_jax.robot.kinematics import line_kinematics, line_poses, path_kinematics
 from mechsearch_jax.robot.motion import MotionConfig, Reference, pick_and_place_reference
 from mechsearch_jax.workspace.shelf import hits_shelf
 
 CODE = 2
 # How far a joint may turn between where an object is taken out of the shelf and where it is brought in [rad].
 LARGEST_TRANSFER = 2.0
+# At how many places of its crossing an object in the hand is tested. Crossings are at most 25 cm long, which leaves
+# 2.5 cm from place to place: about as much as the thinnest object measures.
+OBJECT_PLACES = 10
 
 
 def _object_hits(T, owner, held, scene, clouds, distance, mask):
@@ -119,14 +123,11 @@ def _placement(key, space: ActionSpace, tables: ActionTables, scene, possible, i
     T_place = make(matmul(yaw_rotation(turn), T_grasp[:3, :3]), rotate(yaw_rotation(turn), arm) + position)
 
     def clear(tables, row, i):
-        T, wrist = row[0], row[1][...]
-        q, reachable = line_kinematics(
-            T[i], jnp.float32(space.gripper.approach), tables.q7[OPEN, wrist], space.waypoints
-        )
-        points = transform(T[i], tables.clouds[OPEN, wrist].T)
-        return reachable & ~jnp.any(arm_hits_shelf(q, shelf)) & ~jnp.any(hits_shelf(shelf, points))
+        return ~jnp.any(hits_shelf(shelf, transform(row[0][i], tables.clouds[OPEN, row[1][...]].T)))
 
-    clear_way = masked_vmap(clear, candidate, tables, (T_place, wrist))
+    q7 = jnp.broadcast_to(tables.q7[OPEN, wrist], tests)
+    clear_way = arm_enters(shelf, space.gripper, space.waypoints, T_place, q7, candidate)
+    clear_way = masked_vmap(clear, clear_way, tables, (T_place, wrist))
 
     mask = clear_way[:, None] & other.valid[None]
     hits = gripper_hits(tables, OPEN, jnp.full(tests, wrist), T_place, other, mask)
@@ -147,17 +148,77 @@ def _placement(key, space: ActionSpace, tables: ActionTables, scene, possible, i
     return jnp.any(free), T_place[first], make(rotation[first], position[first])
 
 
-def motion_feasible(space: ActionSpace, action: Action) -> Bool[Array, ""]:
-    """Whether the arm can follow both ways in and out closely, in one configuration and without a singularity.
+def motion_feasible(
+    space: ActionSpace, T_world_gripper: Float[Array, "2 4 4"], q7: Float[Array, ""]
+) -> tuple[Bool[Array, ""], Float[Array, "2"]]:
+    """Whether the arm can follow both ways in and out closely, in one configuration and without touching the shelf.
 
     Between them the arm is outside the shelf, where it may turn as it likes, but not into another of its
     configurations: it would fling away what it holds.
+
+    Args:
+      space: static.
+      T_world_gripper: where the object is grasped and where it is placed.
+      q7: angle of joint 7 [rad].
+
+    Returns:
+      Whether it can, and from which places outside [m].
     """
-    n, back = CLOSE_WAYPOINTS, jnp.float32(space.gripper.approach)
-    into = line_poses(action.T_world_gripper, back, n)
-    out = line_poses(action.T_world_place, back, n)[::-1]
-    q, reachable = path_kinematics(jnp.stack([into, out]), jnp.broadcast_to(action.q7, 2))
-    return jnp.all(reachable) & jnp.all(jnp.abs(q[1, -1] - q[0, 0]) < LARGEST_TRANSFER)
+    q, reachable, outside = jax.vmap(lambda T: ways_in(T, q7, space.gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS))(
+        T_world_gripper
+    )
+    able = jnp.all(reachable) & ~jnp.any(arm_hits_shelf(q, space.shelf))
+    return able & jnp.all(jnp.abs(q[1, 0] - q[0, 0]) < LARGEST_TRANSFER), outside
+
+
+def crossings_free(
+    space: ActionSpace,
+    tables: ActionTables,
+    scene: Superquadrics,
+    after: Superquadrics,
+    action: Action,
+    wrist: Int[Array, ""],
+    outside: Float[Array, "2"],
+    picks: Bool[Array, ""],
+) -> Bool[Array, ""]:
+    """Whether gripper and object hit nothing on their ways along x, and the object is outside the shelf between them.
+
+    Args:
+      space: static.
+      tables: constants of the problem.
+      scene, after: the objects before and after.
+      action: the pick-and-place.
+      wrist: index of its wrist angle.
+      outside: where the gripper is outside after the grasp, and before it places [m].
+      picks: whether it is one.
+    """
+    n, index, p = scene.capacity, action.object, OBJECT_PLACES
+    T = jnp.stack([action.T_world_gripper, action.T_world_place])
+    others = scene.valid & (jnp.arange(n) != index) & picks
+    hit = jnp.any(crossing_hits(space, tables, OPEN, wrist, T, scene, jnp.broadcast_to(others, (2, n))))
+
+    held = in_hand(scene, index, action.T_world_gripper)
+    rotation = jnp.stack([held, after.rotation[index]])
+    position = jnp.stack([scene.position[index], after.position[index]]) - space.gripper.approach * T[:, :3, 2]
+    length = crossing_length(T, outside, space.gripper)
+    share = (jnp.arange(p) + 1.0) / p
+    passed = jnp.broadcast_to(position[:, None], (2, p, 3)).at[..., 0].add(-length[:, None] * share[None])
+    ahead = jnp.sum(jnp.abs(rotation[:, 0]) * scene.size[index][None], axis=-1)
+    inside = passed[:, -1, 0] + ahead > space.shelf.front
+
+    def pair(_, row, i):
+        rotation, passed, cloud, scene = row
+        way, place, j = i // (p * n), i // n % p, i % n
+        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
+        T = compose(T_object_world, make(rotation[way], passed[way, place]))
+        return Pair(cloud[...].T, T, scene.size[j], scene.exponents[j])
+
+    reach = superquadric.bounding_radius(scene.size)
+    gap2 = jnp.sum((passed[:, :, None] - scene.position[None, None]) ** 2, axis=-1)
+    near = others[None, None] & (length > 0.0)[:, None, None] & (gap2 < ((reach + reach[index]) ** 2)[None, None])
+    cloud = superquadric.sample_surface(scene.size[index], scene.exponents[index], space.config.object_points)
+    hit |= jnp.any(any_inside(near.reshape(-1), pair, None, (rotation, passed, cloud, scene), block=32))
+    return ~hit & ~jnp.any(inside)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,9 +285,18 @@ class PickAndPlace:
         return Draft(placed, action, wrist, grippers, jnp.broadcast_to(T_object, (PLACES, 4, 4)))
 
     def predict(self, space, tables, push_model, scene, untouchable, action: Action, wrist) -> Prediction:
-        """The object, turned in the hand, moves with the gripper."""
+        """The object, turned in the hand, moves with the gripper; impossible where either cannot get in or out."""
+        picks = action.kind == CODE
         after = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
-        return Prediction(after, motion_feasible(space, action), jnp.float32(0.0))
+
+        def follows(_, row, i):
+            grasp, place, q7 = (a[...] for a in row)
+            return motion_feasible(space, jnp.stack([grasp, place]), q7)
+
+        row = (action.T_world_gripper, action.T_world_place, action.q7)
+        able, outside = (a[0] for a in masked_vmap(follows, picks[None], None, row))
+        free = crossings_free(space, tables, scene, after, action, wrist, outside, able)
+        return Prediction(after, able & free, jnp.float32(0.0))
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
         """See `motion.pick_and_place_reference`."""

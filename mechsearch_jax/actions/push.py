@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, PLACES, gripper_hits, object_clouds
+from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, PLACES, crossing_hits, gripper_hits, object_clouds
 from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace, ActionTables
 from mechsearch_jax.actions.push_starts import PushStarts, object_pushes, push_starts
 from mechsearch_jax.actions.sketch import Sketch
@@ -21,8 +22,14 @@ from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import back_off, make, transform, translate
-from mechsearch_jax.robot.gripper import arm_hits_shelf
-from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
+from mechsearch_jax.robot.entry import (
+    CLOSE_CROSSINGS,
+    FEW_CROSSINGS,
+    arm_follows,
+    crossing_length,
+    crossing_poses,
+    way_in,
+)
 from mechsearch_jax.robot.motion import MotionConfig, Reference, push_reference
 from mechsearch_jax.workspace.shelf import hits_shelf
 
@@ -42,15 +49,16 @@ def _displacements(config: ActionConfig, heading: Float[np.ndarray, "*batch 2"])
 
 
 def motion_feasible(space: ActionSpace, action: Action) -> Bool[Array, ""]:
-    """Whether the arm can follow a push closely, in one configuration and without passing a singularity.
+    """Whether the arm can follow a push from outside the shelf to outside, without touching the shelf.
 
-    Proposals are looked at in few poses, which is enough to rule out most; this is for the few that are drawn.
+    It stays in one configuration and passes no singularity. Proposals are looked at in few poses, which is enough to
+    rule out most; this is for the few that are drawn.
     """
-    n, back = CLOSE_WAYPOINTS, jnp.float32(space.gripper.approach)
+    n, gripper = CLOSE_WAYPOINTS, space.gripper
     start, end = action.T_world_gripper, action.T_world_place
     way = translate(jnp.broadcast_to(start, (n, 4, 4)), jnp.linspace(0.0, 1.0, n)[:, None] * (end - start)[None, :3, 3])
-    into, out = line_poses(start, back, n), line_poses(end, back, n)[::-1]
-    return path_kinematics(jnp.concatenate([into, way[1:], out[1:]]), action.q7)[1]
+    into, back = (way_in(T, gripper.nearest_outside, gripper, CLOSE_CROSSINGS, n) for T in (start, end))
+    return arm_follows(jnp.concatenate([into, way[1:], back[::-1][1:]]), action.q7, space.shelf)
 
 
 def push_hits_others(
@@ -78,6 +86,32 @@ def push_hits_others(
     T = translate(T, share[:, None] * action.displacement[None])
     mask = jnp.broadcast_to(still & scene.valid, (PUSH_PLACES, scene.capacity))
     return jnp.any(gripper_hits(tables, CLOSED, jnp.broadcast_to(wrist, PUSH_PLACES), T, scene, mask))
+
+
+def crossings_hit(
+    space: ActionSpace,
+    tables: ActionTables,
+    scene: Superquadrics,
+    after: Superquadrics,
+    action: Action,
+    wrist: Int[Array, ""],
+    pushes: Bool[Array, ""],
+) -> Bool[Array, ""]:
+    """Whether the gripper hits an object before a push on its way in along x, or after the push on its way out.
+
+    Args:
+      space: static.
+      tables: constants of the problem.
+      scene, after: the objects before and after the push.
+      action: the push.
+      wrist: index of its wrist angle.
+      pushes: whether it is one.
+    """
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene, after)
+    now = jnp.arange(2 * scene.capacity) < scene.capacity
+    mask = jnp.stack([now, ~now]) & both.valid[None] & pushes
+    T = jnp.stack([action.T_world_gripper, action.T_world_place])
+    return jnp.any(crossing_hits(space, tables, CLOSED, wrist, T, both, mask))
 
 
 def _in_words(displacement: Float[np.ndarray, " 3"]) -> str:
@@ -118,26 +152,36 @@ class Push:
         return _displacements(space.config, np.tile(self._starts(space).heading, (capacity, 1)))
 
     def travels(self, space: ActionSpace, tables: ActionTables, T, near) -> Bool[Array, "k d"]:
-        """Whether the arm follows the push and its retreat, and nothing of it touches the shelf where it ends."""
+        """Whether the arm follows the push from outside to outside and nothing of it touches the shelf at its end."""
         d = self.distances(space)
         wrist = self.wrists(space)
         capacity = T.shape[0] // len(wrist)
         wrist = np.tile(wrist, capacity)
         ends = translate(jnp.broadcast_to(T[:, None], (T.shape[0], d, 4, 4)), self._displacements(space, capacity))
 
-        def path(tables, row, i):
+        gripper, outside = space.gripper, space.gripper.nearest_outside
+
+        def follows(tables, row, i, crossing):
             starts, ends = row
             T, end = starts[i // d], ends[i // d, i % d]
-            w = jnp.asarray(wrist)[i // d]
-            back = jnp.float32(space.gripper.approach)
+            back = jnp.float32(gripper.approach)
             middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
-            q, reachable = path_kinematics(
-                jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)]), tables.q7[CLOSED, w]
-            )
-            points = transform(end, tables.clouds[CLOSED, w].T)
-            return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf)) & ~jnp.any(hits_shelf(space.shelf, points))
+            path = jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)])
+            if crossing:
+                into, out = (crossing_poses(pose, outside, gripper, FEW_CROSSINGS) for pose in (T, end))
+                path = jnp.concatenate([into, path, out[::-1]])
+            return arm_follows(path, tables.q7[CLOSED, jnp.asarray(wrist)[i // d]], space.shelf)
 
-        return masked_vmap(path, jnp.repeat(near, d), tables, (T, ends), block=512).reshape(-1, d)
+        def leaves(tables, row, i):
+            points = transform(row[1][i // d, i % d], tables.clouds[CLOSED, jnp.asarray(wrist)[i // d]].T)
+            return follows(tables, row, i, crossing=False) & ~jnp.any(hits_shelf(space.shelf, points))
+
+        crosses = functools.partial(follows, crossing=True)
+        reached = masked_vmap(leaves, jnp.repeat(near, d), tables, (T, ends), block=512)
+        longest = jnp.maximum(crossing_length(T, outside, gripper)[:, None], crossing_length(ends, outside, gripper))
+        crossing = reached & (longest > 0.0).reshape(-1)
+        reached = (reached & ~crossing) | masked_vmap(crosses, crossing, tables, (T, ends), block=128)
+        return reached.reshape(-1, d)
 
     def swept_hits(self, space, scene, T, mask):
         """The hand is empty."""
@@ -215,7 +259,13 @@ class Push:
         spoiled = ~holds | jnp.any(moved & untouchable)
         spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
         spoiled |= push_hits_others(space, tables, scene, action, wrist, still)
-        return Prediction(pushed.scene, ~spoiled & motion_feasible(space, action), jnp.sum(pushed.topples))
+        spoiled |= crossings_hit(space, tables, scene, pushed.scene, action, wrist, pushes & ~spoiled)
+
+        def follows(_, row, i):
+            return motion_feasible(space, jax.tree.map(lambda a: a[...], row))
+
+        follows = masked_vmap(follows, (pushes & ~spoiled)[None], None, action)[0]
+        return Prediction(pushed.scene, ~spoiled & follows, jnp.sum(pushed.topples))
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
         """See `motion.push_reference`."""

@@ -20,8 +20,9 @@ from mechsearch_jax.robot.motion import MotionConfig, Reference
 class JointTrajectory(flax.struct.PyTreeNode):
     """The motion of the arm and the fingers, one row for each time step.
 
-    It begins where the gripper starts its straight approach; the way there from the home configuration, in front of the
-    shelf, is the caller's. The fingers cannot come closer than the thing between them: a width of 0 then means grip.
+    It begins and ends outside the shelf, and holds all that happens inside; the ways between there and the home
+    configuration, in front of the shelf, are the caller's. The fingers cannot come closer than the thing between them:
+    a width of 0 then means grip.
 
     Attributes:
       time: since the motion began [s], shape (T,).
@@ -55,14 +56,14 @@ def joint_trajectory(problem, action: Action, config: MotionConfig | None = None
     single row, the home configuration.
 
     Args:
-      problem: what does not change; says how long an approach is.
+      problem: what does not change; says how the gripper is used.
       action: a single action.
-      config: lengths and durations; the problem's approach and the defaults if left out.
+      config: lengths and durations; the problem's gripper and the defaults if left out.
 
     Raises:
       InputError: the kind of action is unknown, or the arm does not reach all of the motion, or not in time.
     """
-    config = config or MotionConfig(approach=problem.gripper.approach)
+    config = config or MotionConfig(gripper=problem.gripper)
     kind = kind_of(int(action.kind))
     found = reference_motion(kind, action, config)
     if found is None:

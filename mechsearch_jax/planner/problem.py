@@ -12,6 +12,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceTables, existence_tables
 from mechsearch_jax.graspability import GraspTables, grasp_tables
 from mechsearch_jax.planner.config import ProblemConfig
+from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -64,13 +65,14 @@ def build_problem(
     Takes seconds; what is left out takes its default. Not to be called inside `jit`.
 
     Raises:
-      InputError: the target cannot be grasped by the gripper, a kind of action cannot be sampled, or `config` is of
-        something else.
+      InputError: the target cannot be grasped by the gripper, a kind of action cannot be sampled, the gripper's places
+        outside the shelf are not, or `config` is of something else.
     """
     target, camera, shelf = target or Target(), camera or Camera(), shelf or Shelf()
     gripper, config = gripper or Gripper(), ProblemConfig() if config is None else config
     if not isinstance(config, ProblemConfig):
         raise InputError(f"config: is a {type(config).__name__}; give a ProblemConfig, such as paper().problem")
+    check_outside(gripper, shelf)
     known = [kind.name for kind in SAMPLED_KINDS]
     for name in config.actions.actions:
         if name not in known:

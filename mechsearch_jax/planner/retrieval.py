@@ -7,34 +7,41 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS
+from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, CROSSING_PLACES
 from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.geometry.collision import Pair, any_inside
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics, gauge, to_object_frame
-from mechsearch_jax.geometry.transforms import compose, upright_pose
-from mechsearch_jax.graspability import find_grasps, grasp_hits
+from mechsearch_jax.geometry.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.graspability import GraspTables, boxes_overlap, find_grasps, grasp_hits
 from mechsearch_jax.planner.problem import Problem
-from mechsearch_jax.robot.gripper import arm_points
-from mechsearch_jax.robot.kinematics import line_kinematics, line_poses, path_kinematics
+from mechsearch_jax.robot.entry import (
+    CLOSE_CROSSINGS,
+    FEW_CROSSINGS,
+    arm_follows,
+    crossing_length,
+    crossing_poses,
+    way_in,
+)
+from mechsearch_jax.robot.gripper import Gripper, arm_points
+from mechsearch_jax.robot.kinematics import path_kinematics
 
 # By how much objects are grown to find the grasp that keeps furthest from them [m].
 CLEARANCES = (0.0, 0.004, 0.008, 0.012, 0.02)
-# On the approach to a found target: poses of the arm, and points on each of its capsules, that are tested.
+# On the way in to a found target: poses of the arm on the approach, and points on each of its capsules, that are
+# tested.
 ARM_WAYPOINTS, ARM_POINTS = 6, 7
-# How far in front of the shelf the gripper has to get with the target [m].
-OUTSIDE = 0.04
 
 
 class GraspChoice(flax.struct.PyTreeNode):
     """How to take out a found target.
 
     Attributes:
-      success: whether there is a grasp that hits nothing.
+      success: whether there is a grasp that hits nothing on its whole way from outside the shelf and out again.
       hits: number of objects that the best grasp hits; one more than there can be if no grasp is feasible.
-      action: takes it out with the best grasp: of those that hit fewest one with which the arm can leave the shelf, of
-        those one with which links 2 to 5 touch fewest objects, and of those the one that keeps furthest from the
-        objects.
+      action: takes it out with the best grasp: of those that hit fewest one with which links 2 to 5 touch fewest
+        objects, and of those the one that keeps furthest from the objects.
     """
 
     success: jax.Array
@@ -42,24 +49,61 @@ class GraspChoice(flax.struct.PyTreeNode):
     action: Action
 
 
-def _leaves_shelf(
+def _enters_shelf(
     problem: Problem, T_world_gripper: Float[Array, "g 4 4"], q7: Float[Array, " g"], feasible: Bool[Array, " g"]
 ) -> Bool[Array, " g"]:
-    """Whether the arm can go on from the end of a retreat, along -x, until what it holds is outside the shelf.
+    """Whether the arm can follow the way in closely from outside the shelf; out again it is the same.
 
     Looked at for feasible grasps only.
     """
-    n, gripper, shelf = CLOSE_WAYPOINTS, problem.gripper, problem.shelf
+    gripper = problem.gripper
 
-    def leaves(_, row, i):
-        T, q7 = row[0][i], row[1][i]
-        back = line_poses(T, jnp.float32(gripper.approach), n)
-        step = jnp.minimum(shelf.front - OUTSIDE - back[0, 0, 3], 0.0)
-        out = jnp.broadcast_to(back[:1], (n - 1, 4, 4))
-        out = out.at[:, 0, 3].add(step * jnp.linspace(1.0, 0.0, n)[:-1])
-        return path_kinematics(jnp.concatenate([out, back]), q7)[1]
+    def enters(_, row, i):
+        path = way_in(row[0][i], gripper.nearest_outside, gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS)
+        return arm_follows(path, row[1][i], problem.shelf)
 
-    return masked_vmap(leaves, feasible, None, (T_world_gripper, q7), block=64)
+    return masked_vmap(enters, feasible, None, (T_world_gripper, q7), block=64)
+
+
+def crossing_hits(
+    tables: GraspTables,
+    gripper: Gripper,
+    scene: Superquadrics,
+    T_world_target: Float[Array, "4 4"],
+    feasible: Bool[Array, " g"],
+) -> Bool[Array, "g n"]:
+    """Which objects gripper or target hit on the crossing of each grasp of a found target.
+
+    Args:
+      tables: the grasps.
+      gripper: static.
+      scene: the objects, without the target.
+      T_world_target: where the target is.
+      feasible: which grasps are looked at.
+    """
+    g, n, p = tables.q7.shape[0], scene.capacity, CROSSING_PLACES
+    T = compose(T_world_target[None], tables.T_target_gripper)
+    length = crossing_length(T, gripper.nearest_outside, gripper)
+    places = crossing_poses(T, gripper.nearest_outside, gripper, p)
+    # Boxes around gripper and target in the gripper's frame.
+    target = transform(inverse(tables.T_target_gripper)[:, None], tables.still_target.T[None])
+    low = jnp.minimum(jnp.min(tables.still_gripper, axis=-1)[tables.wrist], jnp.min(target, axis=1))
+    high = jnp.maximum(jnp.max(tables.still_gripper, axis=-1)[tables.wrist], jnp.max(target, axis=1))
+    T_objects = make(scene.rotation, scene.position)
+    T_gripper_object = compose(inverse(places)[:, :, None], T_objects[None, None])
+    mask = boxes_overlap(low[:, None, None], high[:, None, None], T_gripper_object, scene.size[None, None])
+    mask &= (feasible & (length > 0.0))[:, None, None] & scene.valid[None, None]
+
+    def pair(tables, row, i):
+        places, scene = row
+        k, place, j = i // (p * n), i // n % p, i % n
+        target = transform(inverse(tables.T_target_gripper[k]), tables.still_target.T)
+        cloud = jnp.concatenate([tables.still_gripper[tables.wrist[k]], target.T], axis=-1)
+        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
+        return Pair(cloud, compose(T_object_world, places[k, place]), scene.size[j], scene.exponents[j])
+
+    hits = any_inside(mask.reshape(-1), pair, tables, (places, scene), block=128)
+    return jnp.any(hits.reshape(g, p, n), axis=1)
 
 
 def _arm_touches(
@@ -69,12 +113,13 @@ def _arm_touches(
     q7: Float[Array, " g"],
     feasible: Bool[Array, " g"],
 ) -> Int[Array, " g"]:
-    """How many objects links 2 to 5 run into on the approach to each grasp; looked at for feasible grasps only."""
+    """How many objects links 2 to 5 run into on the way in to each grasp; looked at for feasible grasps only."""
     gripper = problem.gripper
 
     def touches(_, row, i):
         scene = jax.tree.map(lambda a: a[...], row[2])
-        q, _ = line_kinematics(row[0][i], jnp.float32(gripper.approach), row[1][i], ARM_WAYPOINTS)
+        path = way_in(row[0][i], gripper.nearest_outside, gripper, FEW_CROSSINGS, ARM_WAYPOINTS)
+        q, _ = path_kinematics(path, row[1][i])
         points, radius = arm_points(q, ARM_POINTS)
         # A superquadric that is larger by the radius on every side holds all that is nearer than that to the object.
         size = scene.size[None] + radius[:, None, None]
@@ -101,15 +146,17 @@ def graspable_at(
     found = find_grasps(tables, problem.shelf, problem.gripper, problem.config.retrieval, T_world_target, active)
     here = jnp.asarray(active)[None]
 
+    T = compose(T_world_target[None], tables.T_target_gripper)
+    found = found.replace(feasible=_enters_shelf(problem, T, tables.q7, found.feasible))
+    crossing = crossing_hits(tables, problem.gripper, scene, T_world_target, found.feasible)
+
     def count(clearance):
-        hits = grasp_hits(tables, found, scene.replace(size=scene.size + clearance), here)
+        hits = grasp_hits(tables, found, scene.replace(size=scene.size + clearance), here) | crossing
         return jnp.where(found.feasible, jnp.sum(hits, axis=1), scene.capacity + 1)
 
     counts = jax.lax.map(count, jnp.float32(CLEARANCES))
-    T = compose(T_world_target[None], tables.T_target_gripper)
-    leaves = _leaves_shelf(problem, T, tables.q7, found.feasible)
     touches = _arm_touches(problem, scene, T, tables.q7, found.feasible)
-    order = ((counts[0] * 2 + ~leaves) * 10 + touches) * 100 + jnp.sum(counts[1:], axis=0)
+    order = (counts[0] * 10 + touches) * 100 + jnp.sum(counts[1:], axis=0)
     best = jnp.argmin(order)
     return GraspChoice(
         success=counts[0, best] == 0,

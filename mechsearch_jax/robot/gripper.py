@@ -38,22 +38,32 @@ class Gripper:
       max_opening: largest distance between the fingers.
       usable_opening: largest width of an object that may be grasped.
       approach: length of the straight approach and retreat along the gripper's z.
+      outside: places outside the shelf, as x of the gripper in the world, ascending: an empty hand enters from the last
+        and leaves to it, what it holds is taken to the first that is in reach; see `entry`.
       front: the clouds are dense where z in the gripper frame is above this.
     """
 
     max_opening: float = 0.08
     usable_opening: float = 0.075
     approach: float = 0.3
+    outside: tuple[float, ...] = (0.3, 0.34, 0.374)
     front: float = -0.08
 
     def __post_init__(self):
         for field in ("max_opening", "usable_opening", "approach"):
             if not getattr(self, field) > 0:
                 raise InputError(f"Gripper: {field} ({getattr(self, field)}) must be positive, in metres")
+        if not self.outside or list(self.outside) != sorted(self.outside):
+            raise InputError(f"Gripper: outside {self.outside} must be one or more places in ascending order")
         if self.usable_opening > self.max_opening:
             raise InputError(
                 f"Gripper: usable_opening ({self.usable_opening}) must not exceed max_opening ({self.max_opening})"
             )
+
+    @property
+    def nearest_outside(self) -> float:
+        """The place outside that is nearest to the shelf [m]."""
+        return self.outside[-1]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -21,7 +21,9 @@ from scipy.interpolate import CubicSpline
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import translate
-from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
+from mechsearch_jax.robot.entry import way_in, ways_in
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.robot.kinematics import path_kinematics
 from mechsearch_jax.robot.time_scaling import angles_along, progress, smooth_curve, timing
 
 
@@ -31,9 +33,7 @@ class MotionConfig:
 
     Attributes:
       timestep: of the simulation and of the references [s].
-      approach: length of the straight approach and retreat along the gripper's z [m].
-      outside: the gripper leaves the shelf with an object until its x is at most one of these, the first that is in
-        reach [m].
+      gripper: says how long an approach is and which places are outside the shelf; the planner's.
       release: how far the gripper backs away from what it has pushed before it retreats, not to drag it along [m].
       clearance: how far above the commanded pose an object is released [m].
       squeeze: how far beyond closed the fingers are commanded when they hold something [m]; sets the grip's force, here
@@ -45,7 +45,7 @@ class MotionConfig:
       release_longest, release_least: the same of backing away after a push.
       close_steps: duration of closing the fingers.
       carry_longest: most that an approach or a retreat with an object in the hand may take.
-      leave_longest: the same of the way between the end of the retreat and the outside.
+      leave_longest: the same of the way along x between the outside and where the approach begins.
       transfer_longest: the same of the way, outside, to in front of where an object is placed.
       open_steps: duration of opening the fingers; opened at once, they turn a narrow box that they leave one after the
         other.
@@ -55,8 +55,7 @@ class MotionConfig:
     """
 
     timestep: float = 0.004
-    approach: float = 0.3
-    outside: tuple[float, ...] = (0.3, 0.34, 0.38, 0.42, 0.46)
+    gripper: Gripper = dataclasses.field(default_factory=Gripper)
     release: float = 0.01
     clearance: float = 0.002
     squeeze: float = 0.05
@@ -74,10 +73,10 @@ class MotionConfig:
     waypoints: int = 31
 
     def __post_init__(self):
-        if self.timestep <= 0 or self.approach <= 0:
-            raise InputError(f"MotionConfig: timestep {self.timestep} and approach {self.approach} must be positive")
-        if self.waypoints < 2 or not self.outside:
-            raise InputError("MotionConfig: needs at least 2 waypoints and one place outside")
+        if self.timestep <= 0:
+            raise InputError(f"MotionConfig: timestep {self.timestep} must be positive")
+        if self.waypoints < 2:
+            raise InputError("MotionConfig: needs at least 2 waypoints")
         if not 0 < self.carry_pace <= 1:
             raise InputError(f"MotionConfig: carry_pace {self.carry_pace} must be above 0 and at most 1")
 
@@ -184,18 +183,10 @@ def _straight(start: Array, end: Array, waypoints: int) -> Array:
     return line.at[:, :3, 3].set((1 - share) * start[None, :3, 3] + share * end[None, :3, 3])
 
 
-def _entry(T: Array, outside: Array | float, config: MotionConfig) -> Array:
-    """Poses from outside the shelf, first along x, then straight along the gripper's z, to a pose."""
-    line = line_poses(T, jnp.float32(config.approach), config.waypoints)
-    away = jnp.minimum(outside - line[0, 0, 3], 0.0)
-    out = translate(line[0], away * jnp.array([1.0, 0.0, 0.0]))
-    return jnp.concatenate([_straight(out, line[0], config.waypoints), line[1:]])
-
-
 def push_reference(
     T_world_gripper: Float[Array, "4 4"], displacement: Float[Array, " 3"], q7: Float[Array, ""], config: MotionConfig
 ) -> tuple[Reference, Bool[Array, ""]]:
-    """A push with closed fingers: approach, translate, let go, retreat.
+    """A push with closed fingers: enter the shelf, approach, translate, let go, retreat, leave.
 
     Args:
       T_world_gripper: pose of the gripper where the push starts.
@@ -206,25 +197,27 @@ def push_reference(
     Returns:
       The reference, and whether the arm reaches all of it, in time.
     """
-    n, approach = config.waypoints, jnp.float32(config.approach)
+    n, gripper = config.waypoints, config.gripper
     length = jnp.sqrt(jnp.sum(displacement**2))
     end = translate(T_world_gripper, displacement)
     apart = translate(end, -config.release * displacement / jnp.maximum(length, 1e-6))
     path = jnp.concatenate(
         [
-            line_poses(T_world_gripper, approach, n),
+            way_in(T_world_gripper, gripper.nearest_outside, gripper, n - 1, n),
             _straight(T_world_gripper, end, n)[1:],
             _straight(end, apart, n)[1:],
-            line_poses(apart, approach, n)[::-1][1:],
+            way_in(apart, gripper.nearest_outside, gripper, n - 1, n)[::-1][1:],
         ]
     )
     q, reachable = path_kinematics(path, q7)
     closed = (0.0, 0.0)
-    stretches = (
-        _Stretch(config.approach_longest, 0, n - 1, closed),
-        _Stretch(config.push_longest, n - 1, 2 * n - 2, closed, config.push_least),
-        _Stretch(config.release_longest, 2 * n - 2, 3 * n - 3, closed, config.release_least),
-        _Stretch(config.approach_longest, 3 * n - 3, 4 * n - 4, closed),
+    corners = [int(i) * (n - 1) for i in range(7)]
+    longest = (config.leave_longest, config.approach_longest, config.push_longest, config.release_longest)
+    longest = (*longest, config.approach_longest, config.leave_longest)
+    least = (1, 1, config.push_least, config.release_least, 1, 1)
+    stretches = tuple(
+        _Stretch(most, first, last, closed, fewest)
+        for most, first, last, fewest in zip(longest, corners[:-1], corners[1:], least, strict=True)
     )
     reference, in_time = _schedule(q, stretches, config.timestep)
     return reference, reachable & in_time
@@ -233,7 +226,7 @@ def push_reference(
 def retrieve_reference(
     T_world_gripper: Float[Array, "4 4"], q7: Float[Array, ""], opening: Float[Array, ""], config: MotionConfig
 ) -> tuple[Reference, Bool[Array, ""]]:
-    """A retrieval: approach with open fingers, close them, retreat, leave the shelf; the hand stays closed.
+    """A retrieval: enter and approach with open fingers, close them, retreat, leave; the hand stays closed.
 
     Args:
       T_world_gripper: pose of the gripper where it closes.
@@ -244,7 +237,7 @@ def retrieve_reference(
     Returns:
       The reference, and whether the arm reaches all of it, in time.
     """
-    q, reachable = _entries(T_world_gripper, q7, config)
+    q, reachable = _entry(T_world_gripper, q7, config)
     reference, in_time = _schedule(q[::-1], _pick_stretches(opening, config), config.timestep)
     return reference, reachable & in_time
 
@@ -256,7 +249,7 @@ def pick_and_place_reference(
     opening: Float[Array, ""],
     config: MotionConfig,
 ) -> tuple[Reference, Bool[Array, ""]]:
-    """A pick-and-place: retrieve, carry the object to in front of its new place, bring it in, open, retreat.
+    """A pick-and-place: retrieve, carry the object to in front of its new place, bring it in, open, retreat, leave.
 
     Args:
       T_world_gripper: pose of the gripper where it closes.
@@ -269,8 +262,8 @@ def pick_and_place_reference(
       The reference, and whether the arm reaches all of it, in time.
     """
     raised = translate(T_world_place, jnp.array([0.0, 0.0, config.clearance]))
-    pick, pick_reachable = _entries(T_world_gripper, q7, config)
-    place, place_reachable = _entries(raised, q7, config)
+    pick, pick_reachable = _entry(T_world_gripper, q7, config)
+    place, place_reachable = _entry(raised, q7, config)
     q = jnp.concatenate([pick[::-1], place])
 
     opened, held, pace = opening / 2, -config.squeeze, config.carry_pace
@@ -283,6 +276,7 @@ def pick_and_place_reference(
         _Stretch(config.carry_longest, front, last, (held, held), pace=pace),
         _Stretch(config.open_steps, last, last, (held, opened)),
         _Stretch(config.approach_longest, last, front, (opened, opened)),
+        _Stretch(config.leave_longest, front, outside, (opened, opened)),
     )
     reference, in_time = _schedule(q, stretches, config.timestep)
     return reference, pick_reachable & place_reachable & in_time
@@ -292,6 +286,7 @@ def _pick_stretches(opening: Array, config: MotionConfig) -> tuple[_Stretch, ...
     """Along a path that begins where the fingers close, passes the start of the approach, and ends outside."""
     front, opened, held, pace = config.waypoints - 1, opening / 2, -config.squeeze, config.carry_pace
     return (
+        _Stretch(config.leave_longest, 2 * front, front, (opened, opened)),
         _Stretch(config.approach_longest, front, 0, (opened, opened)),
         _Stretch(config.close_steps, 0, 0, (opened, held)),
         _Stretch(config.carry_longest, 0, front, (held, held), pace=pace),
@@ -299,9 +294,7 @@ def _pick_stretches(opening: Array, config: MotionConfig) -> tuple[_Stretch, ...
     )
 
 
-def _entries(T: Array, q7: Array, config: MotionConfig) -> tuple[Array, Array]:
-    """Joint angles of `_entry` from the first place outside that is in reach."""
-    paths = jnp.stack([_entry(T, x, config) for x in config.outside])
-    q, reachable = path_kinematics(paths, jnp.broadcast_to(q7, len(config.outside)))
-    best = jnp.argmax(reachable)
-    return q[best], reachable[best]
+def _entry(T: Array, q7: Array, config: MotionConfig) -> tuple[Array, Array]:
+    """Joint angles on the way in from the first place outside that is in reach; its corner is row `waypoints - 1`."""
+    q, reachable, _ = ways_in(T, q7, config.gripper, config.waypoints - 1, config.waypoints)
+    return q, reachable

@@ -1,0 +1,147 @@
+"""The one way in and out of the shelf: from outside along +x, then straight along the gripper's z; and back.
+
+Where a straight approach begins, the pre-grasp, may lie inside the shelf: it is `Gripper.approach` behind the pose.
+From outside the gripper gets there straight along x, without turning. This stretch is called the crossing; where the
+pre-grasp is outside already, its length is 0.
+
+Hand, fingers, links 6 and 7 cannot touch the shelf on a crossing unless they do at its end: they are rigid in the
+gripper's frame, and the free space of the shelf is a prism along x. Links 2 to 5 can.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.transforms import translate
+from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
+from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
+from mechsearch_jax.workspace.shelf import Shelf
+
+# How far in front of the shelf the gripper has to be to count as outside [m]: a target in the hand is outside then,
+# and so are the hand and its open fingers, of which one is up to 4 cm ahead where the hand is turned by 45 degrees.
+MARGIN = 0.04
+# Poses of a crossing at which the arm is tested for all proposals, and for the few actions that are drawn. The longest
+# are 17 cm to the nearest place outside, which leaves 6 and 3 cm between them.
+FEW_CROSSINGS, CLOSE_CROSSINGS = 3, 6
+
+
+def check_outside(gripper: Gripper, shelf: Shelf) -> None:
+    """Check that the places outside are outside of this shelf.
+
+    Raises:
+      InputError: one is not.
+    """
+    farthest = shelf.front - MARGIN
+    if gripper.nearest_outside > farthest + 1e-6:
+        raise InputError(
+            f"Gripper: outside {gripper.outside} must lie in front of the shelf, at {farthest:.3f} m or less"
+        )
+
+
+def crossing_length(
+    T_world_gripper: Float[Array, "*batch 4 4"], outside: float | Float[Array, "*#batch"], gripper: Gripper
+) -> Float[Array, "*batch"]:
+    """How far the gripper travels along x from a place outside to where the approach to a pose begins [m]."""
+    T = jnp.asarray(T_world_gripper)
+    return jnp.maximum(T[..., 0, 3] - gripper.approach * T[..., 0, 2] - outside, 0.0)
+
+
+def crossing_poses(
+    T_world_gripper: Float[Array, "*batch 4 4"],
+    outside: float | Float[Array, "*#batch"],
+    gripper: Gripper,
+    count: int,
+) -> Float[Array, "*batch {count} 4 4"]:
+    """Evenly spaced poses on the crossing to a pose's pre-grasp, which is left out; the first is outside."""
+    T = jnp.asarray(T_world_gripper)
+    share = (jnp.arange(count, 0, -1) / count).reshape((1,) * (T.ndim - 2) + (count,))
+    length = crossing_length(T, outside, gripper)[..., None] * share
+    back = -gripper.approach * T[..., None, :3, 2]
+    back = jnp.broadcast_to(back, (*length.shape, 3)).at[..., 0].add(-length)
+    return translate(jnp.broadcast_to(T[..., None, :, :], (*length.shape, 4, 4)), back)
+
+
+def way_in(
+    T_world_gripper: Float[Array, "4 4"],
+    outside: float | Float[Array, ""],
+    gripper: Gripper,
+    crossings: int,
+    waypoints: int,
+) -> Float[Array, "{crossings}+{waypoints} 4 4"]:
+    """Gripper poses from outside the shelf to a pose.
+
+    Args:
+      T_world_gripper: where the way ends.
+      outside: x of the gripper where it begins, unless the approach begins further out [m].
+      gripper: how long the approach is.
+      crossings: number of poses on the crossing, the pre-grasp not among them.
+      waypoints: number of poses on the approach, both ends included; the first is row `crossings`.
+    """
+    line = line_poses(T_world_gripper, jnp.float32(gripper.approach), waypoints)
+    return jnp.concatenate([crossing_poses(T_world_gripper, outside, gripper, crossings), line])
+
+
+def ways_in(
+    T_world_gripper: Float[Array, "4 4"], q7: Float[Array, ""], gripper: Gripper, crossings: int, waypoints: int
+) -> tuple[Float[Array, "{crossings}+{waypoints} 7"], Bool[Array, ""], Float[Array, ""]]:
+    """Joint angles on the way in from the first place outside that is in reach: the farthest, for a hand that is full.
+
+    Args:
+      T_world_gripper: where the way ends.
+      q7: angle of joint 7 [rad].
+      gripper: says which places there are.
+      crossings, waypoints: as in `way_in`.
+
+    Returns:
+      q: joint angles, in one configuration of the arm [rad].
+      reachable: whether the arm follows the way from any of the places.
+      outside: the place [m].
+    """
+    paths = jnp.stack([way_in(T_world_gripper, x, gripper, crossings, waypoints) for x in gripper.outside])
+    q, reachable = path_kinematics(paths, jnp.broadcast_to(q7, len(gripper.outside)))
+    best = jnp.argmax(reachable)
+    return q[best], reachable[best], jnp.float32(gripper.outside)[best]
+
+
+def arm_follows(path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf) -> Bool[Array, ""]:
+    """Whether the arm follows a path of gripper poses in one configuration, and links 2 to 5 do not touch the shelf."""
+    q, reachable = path_kinematics(path, q7)
+    return reachable & ~jnp.any(arm_hits_shelf(q, shelf))
+
+
+def arm_enters(
+    shelf: Shelf,
+    gripper: Gripper,
+    waypoints: int,
+    T_world_gripper: Float[Array, "c 4 4"],
+    q7: Float[Array, " c"],
+    mask: Bool[Array, " c"],
+    block: int = 512,
+) -> Bool[Array, " c"]:
+    """Whether the arm follows the way in to each pose and does not touch the shelf.
+
+    The nearest place outside will do: what reaches a farther one passes it. Most ways have no crossing, and those that
+    have one are looked at again only if the arm follows the approach.
+
+    Args:
+      shelf, gripper: static.
+      waypoints: poses on the approach; there are `FEW_CROSSINGS` on the crossing.
+      T_world_gripper: where the ways end.
+      q7: angles of joint 7 [rad].
+      mask: which are looked at; false for the others.
+      block: how many at once on a CPU.
+    """
+
+    def approaches(_, row, i):
+        return arm_follows(line_poses(row[0][i], jnp.float32(gripper.approach), waypoints), row[1][i], shelf)
+
+    def crosses(_, row, i):
+        path = way_in(row[0][i], gripper.nearest_outside, gripper, FEW_CROSSINGS, waypoints)
+        return arm_follows(path, row[1][i], shelf)
+
+    reached = masked_vmap(approaches, mask, None, (T_world_gripper, q7), block)
+    crossing = reached & (crossing_length(T_world_gripper, gripper.nearest_outside, gripper) > 0.0)
+    return (reached & ~crossing) | masked_vmap(crosses, crossing, None, (T_world_gripper, q7), min(block, 128))
