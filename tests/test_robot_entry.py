@@ -142,7 +142,9 @@ def test_a_push_from_outside_takes_the_old_way():
     before = back_off(T, jnp.float32(GRIPPER.approach))
     np.testing.assert_allclose(gripper_pose(reference.start[:7]), before, atol=1e-3)
     over = int(reference.length)
-    np.testing.assert_allclose(reference.q[over:], np.broadcast_to(reference.q[-1], reference.q[over:].shape), atol=1e-5)
+    np.testing.assert_allclose(
+        reference.q[over:], np.broadcast_to(reference.q[-1], reference.q[over:].shape), atol=1e-5
+    )
     turned = np.abs(np.diff(np.asarray(reference.q[:over]), axis=0)).max(axis=1)
     assert (turned > 0.0).mean() > 0.95
 

@@ -16,7 +16,14 @@ from mechsearch_jax.envs.mjx_model import MjxConfig, MjxModel
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot import motion
-from mechsearch_jax.robot.kinematics import ACCELERATION_LIMIT, HOME, JERK_LIMIT, VELOCITY_LIMIT
+from mechsearch_jax.robot.kinematics import (
+    ACCELERATION_LIMIT,
+    HOME,
+    JERK_LIMIT,
+    VELOCITY_LIMIT,
+    line_poses,
+    path_kinematics,
+)
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.robot.time_scaling import angles_along, progress, smooth_curve, timing
 from mechsearch_jax.workspace.camera import Camera
@@ -67,7 +74,7 @@ def sampled(reference, timestep=PLAN.timestep):
 def line(count=31):
     """Waypoints of a straight approach."""
     T = make(gripper_rotation(jnp.float32(0.2), jnp.float32(0.4)), jnp.float32([0.6, 0.1, 0.5]))
-    q, reachable = motion.path_kinematics(motion.line_poses(T, jnp.float32(0.3), count), jnp.float32(WRIST_ORIGIN))
+    q, reachable = path_kinematics(line_poses(T, jnp.float32(0.3), count), jnp.float32(WRIST_ORIGIN))
     assert reachable
     return q
 

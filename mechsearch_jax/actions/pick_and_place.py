@@ -29,6 +29,7 @@ from mechsearch_jax.geometry.collision import Pair, any_inside
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make, matmul, rotate, transform, yaw_rotation
+from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, arm_enters, crossing_length, ways_in
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.robot.motion import MotionConfig, Reference, pick_and_place_reference
@@ -148,16 +149,17 @@ def _placement(key, space: ActionSpace, tables: ActionTables, scene, possible, i
     return jnp.any(free), T_place[first], make(rotation[first], position[first])
 
 
-def motion_feasible(
-    space: ActionSpace, T_world_gripper: Float[Array, "2 4 4"], q7: Float[Array, ""]
+def motion_free(
+    space: ActionSpace, others: Superquadrics, T_world_gripper: Float[Array, "2 4 4"], q7: Float[Array, ""]
 ) -> tuple[Bool[Array, ""], Float[Array, "2"]]:
-    """Whether the arm can follow both ways in and out closely, in one configuration and without touching the shelf.
+    """Whether the arm can follow both ways in and out closely, in one configuration, and links 2 to 5 touch nothing.
 
     Between them the arm is outside the shelf, where it may turn as it likes, but not into another of its
     configurations: it would fling away what it holds.
 
     Args:
       space: static.
+      others: the objects without the one in the hand.
       T_world_gripper: where the object is grasped and where it is placed.
       q7: angle of joint 7 [rad].
 
@@ -167,7 +169,9 @@ def motion_feasible(
     q, reachable, outside = jax.vmap(lambda T: ways_in(T, q7, space.gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS))(
         T_world_gripper
     )
-    able = jnp.all(reachable) & ~jnp.any(arm_hits_shelf(q, space.shelf))
+    # Poses 5 cm apart at most.
+    hits = jnp.any(arm_hits(q[:, ::2].reshape(-1, q.shape[-1]), others))
+    able = jnp.all(reachable) & ~jnp.any(arm_hits_shelf(q, space.shelf)) & ~hits
     return able & jnp.all(jnp.abs(q[1, 0] - q[0, 0]) < LARGEST_TRANSFER), outside
 
 
@@ -290,10 +294,11 @@ class PickAndPlace:
         after = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
 
         def follows(_, row, i):
-            grasp, place, q7 = (a[...] for a in row)
-            return motion_feasible(space, jnp.stack([grasp, place]), q7)
+            others, grasp, place, q7 = jax.tree.map(lambda a: a[...], row)
+            return motion_free(space, others, jnp.stack([grasp, place]), q7)
 
-        row = (action.T_world_gripper, action.T_world_place, action.q7)
+        others = scene.replace(valid=scene.valid & (jnp.arange(scene.capacity) != action.object))
+        row = (others, action.T_world_gripper, action.T_world_place, action.q7)
         able, outside = (a[0] for a in masked_vmap(follows, picks[None], None, row))
         free = crossings_free(space, tables, scene, after, action, wrist, outside, able)
         return Prediction(after, able & free, jnp.float32(0.0))

@@ -22,6 +22,7 @@ from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import back_off, make, transform, translate
+from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import (
     CLOSE_CROSSINGS,
     FEW_CROSSINGS,
@@ -30,6 +31,8 @@ from mechsearch_jax.robot.entry import (
     crossing_poses,
     way_in,
 )
+from mechsearch_jax.robot.gripper import arm_hits_shelf
+from mechsearch_jax.robot.kinematics import path_kinematics
 from mechsearch_jax.robot.motion import MotionConfig, Reference, push_reference
 from mechsearch_jax.workspace.shelf import hits_shelf
 
@@ -38,6 +41,8 @@ CODE = 1
 PUSH_PLACES = 3
 # An object is not to be pushed to where its centre is nearer than this to the front edge [m].
 EDGE = 0.01
+# As the hand goes back, objects that the push moved are tested smaller by this on every side: many touch the hand [m].
+TOUCHING = 0.008
 # Length of the way in that a picture shows [m].
 SHOWN_WAY_IN = 0.12
 
@@ -48,17 +53,29 @@ def _displacements(config: ActionConfig, heading: Float[np.ndarray, "*batch 2"])
     return jnp.asarray(level[..., None, :] * np.asarray(config.push_distances, np.float32)[:, None])
 
 
-def motion_feasible(space: ActionSpace, action: Action) -> Bool[Array, ""]:
-    """Whether the arm can follow a push from outside the shelf to outside, without touching the shelf.
+def motion_free(
+    space: ActionSpace, scene: Superquadrics, after: Superquadrics, still: Bool[Array, " n"], action: Action
+) -> Bool[Array, ""]:
+    """Whether the arm can follow a push from outside the shelf to outside, and links 2 to 5 touch nothing.
 
     It stays in one configuration and passes no singularity. Proposals are looked at in few poses, which is enough to
     rule out most; this is for the few that are drawn.
+
+    Args:
+      space: static.
+      scene, after: the objects before and after the push.
+      still: which objects it leaves in place.
+      action: the push.
     """
     n, gripper = CLOSE_WAYPOINTS, space.gripper
     start, end = action.T_world_gripper, action.T_world_place
     way = translate(jnp.broadcast_to(start, (n, 4, 4)), jnp.linspace(0.0, 1.0, n)[:, None] * (end - start)[None, :3, 3])
     into, back = (way_in(T, gripper.nearest_outside, gripper, CLOSE_CROSSINGS, n) for T in (start, end))
-    return arm_follows(jnp.concatenate([into, way[1:], back[::-1][1:]]), action.q7, space.shelf)
+    q, reachable = path_kinematics(jnp.concatenate([into, way[1:], back[::-1][1:]]), action.q7)
+    begins, ends = len(into), len(into) + n - 1
+    # Poses 5 cm apart at most.
+    hits = arm_hits(q[:begins:2], scene) | arm_hits(q[ends::2], after) | (arm_hits(q[begins:ends:3], scene) & still)
+    return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf)) & ~jnp.any(hits)
 
 
 def push_hits_others(
@@ -86,6 +103,29 @@ def push_hits_others(
     T = translate(T, share[:, None] * action.displacement[None])
     mask = jnp.broadcast_to(still & scene.valid, (PUSH_PLACES, scene.capacity))
     return jnp.any(gripper_hits(tables, CLOSED, jnp.broadcast_to(wrist, PUSH_PLACES), T, scene, mask))
+
+
+def retreat_hits(
+    space: ActionSpace,
+    tables: ActionTables,
+    after: Superquadrics,
+    action: Action,
+    wrist: Int[Array, ""],
+    moved: Bool[Array, " n"],
+) -> Bool[Array, ""]:
+    """Whether the gripper, on its straight way back, hits an object that the push moved beside its own.
+
+    Args:
+      space: static.
+      tables: constants of the problem.
+      after: the objects after the push.
+      action: the push.
+      wrist: index of its wrist angle.
+      moved: which objects it moved.
+    """
+    others = moved & after.valid & (jnp.arange(after.capacity) != action.object)
+    slim = after.replace(size=jnp.maximum(after.size - TOUCHING, 0.5 * after.size))
+    return jnp.any(gripper_hits(tables, CLOSED, wrist[None], action.T_world_place[None], slim, others[None]))
 
 
 def crossings_hit(
@@ -259,12 +299,13 @@ class Push:
         spoiled = ~holds | jnp.any(moved & untouchable)
         spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
         spoiled |= push_hits_others(space, tables, scene, action, wrist, still)
+        spoiled |= retreat_hits(space, tables, pushed.scene, action, wrist, moved & pushes)
         spoiled |= crossings_hit(space, tables, scene, pushed.scene, action, wrist, pushes & ~spoiled)
 
         def follows(_, row, i):
-            return motion_feasible(space, jax.tree.map(lambda a: a[...], row))
+            return motion_free(space, *jax.tree.map(lambda a: a[...], row))
 
-        follows = masked_vmap(follows, (pushes & ~spoiled)[None], None, action)[0]
+        follows = masked_vmap(follows, (pushes & ~spoiled)[None], None, (scene, pushed.scene, still, action))[0]
         return Prediction(pushed.scene, ~spoiled & follows, jnp.sum(pushed.topples))
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
