@@ -36,7 +36,7 @@ from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation, split_found
+from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Config, Decision, Problem
 from mechsearch_jax.robot import motion
@@ -162,8 +162,7 @@ def f_of(problem: Problem, scene: Superquadrics) -> Bool[Array, " x"]:
 
 def g_of(problem: Problem, belief: Belief, scene: Superquadrics) -> Int[Array, " x"]:
     """g of a single state, where f = 1."""
-    hits = grasp_hits(problem.grasps, belief.grasps, scene, jnp.append(belief.exists, False))
-    return split_found(graspability(problem.grasps, belief.grasps, hits))[0]
+    return graspability(pairs(problem.grasps), grasp_hits(problem.grasps, None, scene, belief.exists))
 
 
 def bench_part(

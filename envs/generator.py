@@ -17,7 +17,7 @@ from mechsearch_jax.envs.simulated_camera import target_pixels
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.graspability import GraspConfig, GraspTables, find_grasps, grasp_tables
+from mechsearch_jax.graspability import GraspConfig, GraspTables, feasible_grasps, grasp_tables
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
@@ -121,7 +121,7 @@ def _any_grasp(
     tables: GraspTables, shelf: Shelf, gripper: Gripper, target: Target, pose: Float[Array, " 3"]
 ) -> Bool[Array, ""]:
     T_world_target = upright_pose(pose, target.height(shelf))
-    return jnp.any(find_grasps(tables, shelf, gripper, GraspConfig(), T_world_target).feasible)
+    return jnp.any(feasible_grasps(tables, shelf, gripper, GraspConfig(), T_world_target[None]))
 
 
 class ScenarioGenerator:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import NamedTuple
 
 import flax.struct
 import jax
@@ -99,9 +100,9 @@ class GraspTables(flax.struct.PyTreeNode):
       still_target: surface of the target in its own frame as rows, shape (3, R) [m].
       T_world_target: candidate poses, shape (X, 4, 4).
       pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose.
-      group_pose, group_pair: the pairs and, after them, the grasps of a target that has been found, in groups of at
-        most `GROUP` with the same pose: the pose of each, shape (C,), and its pairs, shape (C, GROUP), with -1 for
-        none.
+      found_grasp: the grasps of a target that has been found, shape (F,): all of them, or none in tables of candidates.
+      group_pose, group_pair: the pairs or the grasps of a found target in groups of at most `GROUP` with the same pose:
+        the pose of each, shape (C,), and its pairs, shape (C, GROUP), with -1 for none.
       gap: how far a point of a cloud may be from the nearest of its first `COARSE` [m].
     """
 
@@ -116,6 +117,7 @@ class GraspTables(flax.struct.PyTreeNode):
     T_world_target: jax.Array
     pair_pose: jax.Array
     pair_grasp: jax.Array
+    found_grasp: jax.Array
     group_pose: jax.Array
     group_pair: jax.Array
     gap: jax.Array
@@ -235,6 +237,7 @@ def grasp_tables(
         T_world_target=poses,
         pair_pose=jnp.zeros(0, jnp.int32),
         pair_grasp=jnp.zeros(0, jnp.int32),
+        found_grasp=jnp.zeros(0, jnp.int32),
         group_pose=jnp.zeros(0, jnp.int32),
         group_pair=jnp.zeros((0, GROUP), jnp.int32),
         gap=jnp.float32(max(_gap(cloud.T, COARSE) for cloud in clouds)),
@@ -242,16 +245,12 @@ def grasp_tables(
     if candidates:
         judge = jax.jit(lambda tables: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))
         pose, grasp = np.nonzero(np.asarray(judge(tables)))
+        tables = tables.replace(pair_pose=jnp.int32(pose), pair_grasp=jnp.int32(grasp))
     else:
-        pose = grasp = np.zeros(0, int)
-        tables = tables.replace(T_world_target=poses[:0])
-    group_pose, group_pair = _groups(np.append(pose, np.full(len(clouds), len(tables.T_world_target))))
-    return tables.replace(
-        pair_pose=jnp.int32(pose),
-        pair_grasp=jnp.int32(grasp),
-        group_pose=jnp.int32(group_pose),
-        group_pair=jnp.int32(group_pair),
-    )
+        pose = np.zeros(len(clouds), int)
+        tables = tables.replace(T_world_target=poses[:0], found_grasp=jnp.arange(len(clouds), dtype=jnp.int32))
+    group_pose, group_pair = _groups(pose)
+    return tables.replace(group_pose=jnp.int32(group_pose), group_pair=jnp.int32(group_pair))
 
 
 def _gap(points: np.ndarray, first: int) -> float:
@@ -286,44 +285,58 @@ class FoundGrasps(flax.struct.PyTreeNode):
 
     Attributes:
       T_world_target: pose of the target, shape (4, 4).
-      feasible: which grasps the arm and the shelf allow, shape (G,).
+      feasible: which grasps the arm and the shelf allow, shape (F,).
+      q: joint angles at a few poses on the way in to each, shape (F, W, 7) [rad].
     """
 
     T_world_target: jax.Array
     feasible: jax.Array
+    q: jax.Array
 
 
-def pairs(
-    tables: GraspTables, found: FoundGrasps
-) -> tuple[Int[Array, " k"], Int[Array, " k"], Bool[Array, " k"], Float[Array, "y 4 4"]]:
-    """Pose index, grasp index and feasibility of all pairs, and all poses: the candidates, then the found target."""
-    x, g = tables.T_world_target.shape[0], tables.q7.shape[0]
-    pose = jnp.concatenate([tables.pair_pose, jnp.full(g, x, jnp.int32)])
-    grasp = jnp.concatenate([tables.pair_grasp, jnp.arange(g, dtype=jnp.int32)])
-    allowed = jnp.concatenate([jnp.ones(tables.pair_pose.shape[0], bool), found.feasible])
-    return pose, grasp, allowed, jnp.concatenate([tables.T_world_target, found.T_world_target[None]])
+class Pairs(NamedTuple):
+    """What the rows of H stand for: those of the candidates, and after them those of a found target.
+
+    Attributes:
+      pose: index of the pose, the candidates first and then the found one, shape (K,), in ascending order.
+      allowed: whether arm and shelf allow the grasp, shape (K,).
+      poses: how many poses there are.
+    """
+
+    pose: Int[Array, " k"]
+    allowed: Bool[Array, " k"]
+    poses: int
 
 
-def no_hits(tables: GraspTables, capacity: int) -> Bool[Array, "k n"]:
+def pairs(candidates: GraspTables, found: FoundGrasps | None = None) -> Pairs:
+    """The rows of H; those of the candidates alone where nothing is said of a found target."""
+    poses, known = candidates.T_world_target.shape[0], candidates.pair_pose.shape[0]
+    if found is None:
+        return Pairs(candidates.pair_pose, jnp.ones(known, bool), poses)
+    pose = jnp.concatenate([candidates.pair_pose, jnp.full(found.feasible.shape, poses, jnp.int32)])
+    return Pairs(pose, jnp.concatenate([jnp.ones(known, bool), found.feasible]), poses + 1)
+
+
+def no_hits(rows: Pairs, capacity: int) -> Bool[Array, "k n"]:
     """H of so many objects that are yet to be tested."""
-    return jnp.zeros((tables.pair_pose.shape[0] + tables.q7.shape[0], capacity), bool)
+    return jnp.zeros((rows.pose.shape[0], capacity), bool)
 
 
 def grasp_hits(
     tables: GraspTables,
-    found: FoundGrasps,
+    found: FoundGrasps | None,
     scene: Superquadrics,
-    exists: Bool[Array, " y"],
+    exists: Bool[Array, " x"],
     previous: Bool[Array, "k n"] | None = None,
     moved: Bool[Array, " n"] | None = None,
 ) -> Bool[Array, "k n"]:
-    """H: which objects the grasp of each feasible pair would hit.
+    """H: which objects the grasp of each feasible pair, or each feasible grasp of a found target, would hit.
 
     Args:
-      tables: constants of the problem.
-      found: the found target, or anything if there is none.
+      tables: constants of the problem, of the candidates or of a found target.
+      found: the found target; None for tables of candidates.
       scene: the objects, fields (N, ...).
-      exists: at which of the poses of `pairs` H matters; it reads False elsewhere.
+      exists: at which of the poses of the tables H matters, of a found target at one; it reads False elsewhere.
       previous: H before some objects moved.
       moved: which objects moved since; only their columns are computed anew.
 
@@ -338,13 +351,12 @@ def grasp_hits(
     return jnp.where(moved[None], hit, previous)
 
 
-def _marked(mask: Bool[Array, "... e"], tables: GraspTables, rows: tuple[FoundGrasps, Superquadrics]) -> Array:
+def _marked(mask: Bool[Array, "... e"], tables: GraspTables, rows: tuple[FoundGrasps | None, Superquadrics]) -> Array:
     """H where a mask of all (group, object) is true; with the axes of a batch in front, see `masked.merged`."""
     batch, n = mask.shape[:-1], rows[1].size.shape[-2]
-    each, poses = mask.shape[-1], tables.T_world_target.shape[0]
-    known, grasps = tables.pair_pose.shape[0], tables.q7.shape[0]
-    total = known + grasps
-    grasp_of = jnp.concatenate([tables.pair_grasp, jnp.arange(grasps, dtype=jnp.int32)])
+    each, is_found = mask.shape[-1], tables.found_grasp.shape[0] > 0
+    grasp_of = tables.found_grasp if is_found else tables.pair_grasp
+    total = grasp_of.shape[0]
 
     def place(index):
         """Row of the batch, pair, object and pose index of entry `index`, of all entries times `GROUP`."""
@@ -353,14 +365,15 @@ def _marked(mask: Bool[Array, "... e"], tables: GraspTables, rows: tuple[FoundGr
         return entry // each, tables.group_pair[group, slot], thing, tables.group_pose[group]
 
     def target_pose(row, pose):
-        ours = tables.T_world_target[jnp.minimum(pose, poses - 1)] if poses else row[0].T_world_target[...]
-        return jnp.where(pose < poses, ours, row[0].T_world_target[...])
+        return row[0].T_world_target[...] if is_found else tables.T_world_target[pose]
 
     def near(index):
         b, k, thing, pose = place(index)
         row = rows_of(rows, b, batch)
         grasp = grasp_of[jnp.maximum(k, 0)]
-        allowed = (k >= 0) & ((k < known) | row[0].feasible[grasp])
+        allowed = k >= 0
+        if is_found:
+            allowed &= row[0].feasible[grasp]
         T_gripper_world = inverse(compose(target_pose(row, pose), tables.T_target_gripper[grasp]))
         scene = row[1]
         T = compose(T_gripper_world, make(scene.rotation[thing], scene.position[thing]))
@@ -391,22 +404,20 @@ def _marked(mask: Bool[Array, "... e"], tables: GraspTables, rows: tuple[FoundGr
     return hits.reshape(*batch, total, n)
 
 
-def graspability(tables: GraspTables, found: FoundGrasps, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:
-    """g at all poses of `pairs` from H: 1 minus the least number of objects that a feasible grasp hits (equation 17).
+def graspability(rows: Pairs, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:
+    """g at all poses from H: 1 minus the least number of objects that a feasible grasp hits (equation 17).
 
     A pose where no grasp is feasible counts as hitting one object more than there can be.
     """
-    pose, _, allowed, T_world_target = pairs(tables, found)
     worst = hits.shape[1] + 1
-    count = jnp.where(allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), worst)
-    least = jax.ops.segment_min(count, pose, num_segments=T_world_target.shape[0], indices_are_sorted=True)
+    count = jnp.where(rows.allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), worst)
+    least = jax.ops.segment_min(count, rows.pose, num_segments=rows.poses, indices_are_sorted=True)
     return 1 - jnp.minimum(least, worst)
 
 
-def crowding(tables: GraspTables, found: FoundGrasps, hits: Bool[Array, "k n"]) -> Float[Array, " y"]:
+def crowding(rows: Pairs, hits: Bool[Array, "k n"]) -> Float[Array, " y"]:
     """Mean number of objects that the feasible grasps of each pose hit; 0 where none is feasible."""
-    pose, _, allowed, T_world_target = pairs(tables, found)
-    y = T_world_target.shape[0]
+    pose, allowed, y = rows
     count = jnp.where(allowed, jnp.sum(hits, axis=1, dtype=jnp.float32), 0.0)
     total = jax.ops.segment_sum(count, pose, num_segments=y, indices_are_sorted=True)
     grasps = jax.ops.segment_sum(allowed.astype(jnp.float32), pose, num_segments=y, indices_are_sorted=True)
@@ -416,16 +427,3 @@ def crowding(tables: GraspTables, found: FoundGrasps, hits: Bool[Array, "k n"]) 
 def split_found(values: Shaped[Array, " y"]) -> tuple[Shaped[Array, " x"], Shaped[Array, ""]]:
     """What belongs to the candidate poses and what to the found target, in the order of `pairs`."""
     return values[:-1], values[-1]
-
-
-def find_grasps(
-    tables: GraspTables,
-    shelf: Shelf,
-    gripper: Gripper,
-    config: GraspConfig,
-    T_world_target: Float[Array, "4 4"],
-    active: Bool[Array, ""] | bool = True,
-) -> FoundGrasps:
-    """The feasible grasps of a target at any pose; none where `active` is false."""
-    feasible = feasible_grasps(tables, shelf, gripper, config, T_world_target[None], active)
-    return FoundGrasps(T_world_target, feasible[0])

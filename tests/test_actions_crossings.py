@@ -15,7 +15,7 @@ from mechsearch_jax.dynamics import rigid
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.transforms import make, transform, translate, upright_pose, yaw_rotation
 from mechsearch_jax.graspability import FoundGrasps, GraspConfig, grasp_hits, grasp_tables, gripper_rotation
-from mechsearch_jax.planner import retrieval
+from mechsearch_jax.planner import found_target
 from mechsearch_jax.robot.entry import crossing_length
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud
 from mechsearch_jax.shapes import shape_of
@@ -205,9 +205,10 @@ def test_a_retrieval_past_a_post_that_only_its_crossing_touches_hits_it(grasps):
     feasible = jnp.arange(len(grasps.q7)) == straight
     for top, found in ((0.0, True), (-0.045, True), (-0.12, False)):
         scene = in_the_way(grasp, top)
-        hits = retrieval.crossing_hits(grasps, GRIPPER, scene, T_world_target, feasible)
+        hits = found_target.crossing_hits(grasps, GRIPPER, scene, T_world_target, feasible)
         assert bool(hits[straight, 0]) == found
         assert not hits[~np.asarray(feasible)].any()
         assert not hits[:, 1].any()
-        z = grasp_hits(grasps, FoundGrasps(T_world_target, feasible), scene, jnp.ones(1, bool))
+        found = FoundGrasps(T_world_target, feasible, jnp.zeros((len(grasps.q7), 1, 7)))
+        z = grasp_hits(grasps, found, scene, jnp.ones(1, bool))
         assert not z.any()

@@ -11,8 +11,9 @@ from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
 from mechsearch_jax.existence import allowances, existence, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.graspability import FoundGrasps, find_grasps, grasp_hits, graspability, split_found
+from mechsearch_jax.graspability import FoundGrasps, grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner.found_target import found_grasps, no_grasps
 from mechsearch_jax.planner.problem import Problem
 
 
@@ -39,13 +40,12 @@ class Belief(flax.struct.PyTreeNode):
 
 def initial_belief(problem: Problem) -> Belief:
     """Nothing is known: the target can be at every candidate pose."""
-    g = problem.grasps.q7.shape[0]
     return Belief(
         exists=jnp.ones(problem.poses.shape[0], bool),
         found=jnp.array(False),
         found_pose=jnp.zeros(3),
         allowed=jnp.full(problem.existence.corner.shape[:2], problem.config.existence.allowed, jnp.int32),
-        grasps=FoundGrasps(jnp.eye(4), jnp.zeros(g, bool)),
+        grasps=no_grasps(problem),
         restarts=jnp.int32(0),
     )
 
@@ -74,13 +74,12 @@ def update_belief(problem: Problem, belief: Belief, observation: Observation) ->
     exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, belief.exists), both)
     pose = jnp.where(found, observation.target_pose, belief.found_pose)
     T_world_target = upright_pose(pose, problem.target.height(problem.shelf))
-    grasps = find_grasps(problem.grasps, problem.shelf, problem.gripper, problem.config.grasps, T_world_target)
     return Belief(
         exists=jnp.where(seen, belief.exists, exists),
         found=seen,
         found_pose=pose,
         allowed=allowed,
-        grasps=grasps.replace(feasible=grasps.feasible & seen),
+        grasps=found_grasps(problem, T_world_target, seen),
         restarts=belief.restarts + contradiction,
     )
 
@@ -122,6 +121,5 @@ def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tup
 @jax.jit
 def graspability_map(problem: Problem, belief: Belief, objects: Superquadrics) -> Int[Array, " x"]:
     """g at every candidate pose, whether the target can be there or not: 1, 0, -1, ... (section B.4), shape (X,)."""
-    everywhere = jnp.ones(problem.poses.shape[0] + 1, bool)
-    hits = grasp_hits(problem.grasps, belief.grasps, objects, everywhere)
-    return split_found(graspability(problem.grasps, belief.grasps, hits))[0]
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+    return graspability(pairs(problem.grasps), grasp_hits(problem.grasps, None, objects, everywhere))

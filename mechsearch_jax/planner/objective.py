@@ -8,7 +8,7 @@ from typing import Protocol
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.graspability import crowding, graspability, split_found
+from mechsearch_jax.graspability import crowding, graspability, pairs, split_found
 from mechsearch_jax.planner.belief import Belief, possible_poses
 from mechsearch_jax.planner.problem import Problem
 
@@ -37,7 +37,7 @@ class Objective(Protocol):
           problem: what does not change.
           belief: what was known at the start.
           exists: f of the state.
-          hits: H of the state; see `graspability.grasp_hits`.
+          hits: H of the state, with the rows of `graspability.pairs`.
           crowding_weight: see `PlannerConfig`.
         """
         ...
@@ -53,8 +53,9 @@ def _where_and_how_graspable(problem, belief, exists, hits, crowding_weight):
     g only sees the best grasp of a pose; while nothing changes that one, clearing the way for others is progress too.
     """
     f = possible_poses(belief, exists).astype(jnp.float32)
-    g = graspability(problem.grasps, belief.grasps, hits).astype(jnp.float32)
-    return f, g, crowding_weight * crowding(problem.grasps, belief.grasps, hits)
+    rows = pairs(problem.grasps, belief.grasps)
+    g = graspability(rows, hits).astype(jnp.float32)
+    return f, g, crowding_weight * crowding(rows, hits)
 
 
 @dataclasses.dataclass(frozen=True)

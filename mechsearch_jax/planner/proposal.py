@@ -57,8 +57,8 @@ def sampling_weights(
     problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
 ) -> Float[Array, " n"]:
     """Sampling weight of each object: in part even, in part by what it hides and which grasps it blocks."""
-    pose, _, allowed, _ = pairs(problem.grasps, belief.grasps)
-    blocks = blame(state.hits, allowed & objective.needs_graspability(belief, state.exists)[pose])
+    rows = pairs(problem.grasps, belief.grasps)
+    blocks = blame(state.hits, rows.allowed & objective.needs_graspability(belief, state.exists)[rows.pose])
     hides = blame(occluders(problem.existence, state.views), state.exists & ~belief.found)
     both = blocks + hides
     share = both / jnp.maximum(jnp.sum(both), 1e-12)

@@ -21,9 +21,10 @@ from mechsearch_jax.actions.types import Action, Prediction, Sample
 from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.existence import existence, no_views, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.graspability import grasp_hits, no_hits
+from mechsearch_jax.graspability import grasp_hits, no_hits, pairs, split_found
 from mechsearch_jax.planner.belief import Belief, possible_space, with_target
 from mechsearch_jax.planner.config import PlannerConfig
+from mechsearch_jax.planner.found_target import found_hits
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.prediction import Predict
 from mechsearch_jax.planner.problem import Problem
@@ -71,7 +72,7 @@ class Rollout:
             is_target=is_target,
             exists=self.belief.exists,
             views=no_views(scene.capacity, problem.config.existence, places),
-            hits=no_hits(problem.grasps, scene.capacity),
+            hits=no_hits(pairs(problem.grasps, self.belief.grasps), scene.capacity),
             options=no_candidates(problem.space, scene.capacity),
             moved=scene.valid,
             available=scene.valid & ~is_target,
@@ -87,9 +88,11 @@ class Rollout:
             problem.existence, problem.camera, objects, counts_collisions, settings, state.views, moved
         )
         exists = existence(problem.existence, problem.camera, views, state.exists, self.belief.allowed, settings)
-        counts = self.objective.needs_graspability(self.belief, exists)
-        hits = grasp_hits(problem.grasps, self.belief.grasps, objects, counts, state.hits, moved)
-        return state.replace(exists=exists, views=views, hits=hits)
+        counts, found = split_found(self.objective.needs_graspability(self.belief, exists))
+        grasps, known = self.belief.grasps, problem.grasps.pair_pose.shape[0]
+        hits = grasp_hits(problem.grasps, None, objects, counts, state.hits[:known], moved)
+        of_found = found_hits(problem, grasps, objects, found, state.hits[known:], moved)
+        return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, of_found]))
 
     def options(self, state: State, moved: Bool[Array, " n"]):
         """What can be done in a state after some objects moved."""

@@ -1,0 +1,130 @@
+"""A target that has been found: the grasps that it can be taken out with, and what is in the way of each.
+
+They are ten times as many as the candidates' grasps, and looked at more closely: the way along x in front of the
+straight approach counts too, and so do links 2 to 5.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, CROSSING_PLACES
+from mechsearch_jax.geometry.collision import Pair, any_inside
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
+from mechsearch_jax.graspability import FoundGrasps, GraspTables, boxes_overlap, feasible_grasps, grasp_hits
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.robot.arm_hits import arm_hits
+from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, crossing_length, crossing_poses, way_in
+from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
+from mechsearch_jax.robot.kinematics import JOINTS, path_kinematics
+
+# Of the poses where the arm's way in is followed, every so many is tested against objects: 5 cm apart at most.
+ARM_EVERY = 2
+
+
+def no_grasps(problem: Problem) -> FoundGrasps:
+    """Those of a target that has not been found."""
+    grasps = problem.retrieval.found_grasp.shape[0]
+    poses = len(range(0, CLOSE_CROSSINGS + CLOSE_WAYPOINTS, ARM_EVERY))
+    return FoundGrasps(jnp.eye(4), jnp.zeros(grasps, bool), jnp.zeros((grasps, poses, len(JOINTS))))
+
+
+def found_grasps(
+    problem: Problem, T_world_target: Float[Array, "4 4"], active: Bool[Array, ""] | bool = True
+) -> FoundGrasps:
+    """The grasps of a target at any pose that the arm and the shelf allow on the whole way in and out.
+
+    Args:
+      problem: what does not change.
+      T_world_target: pose of the target.
+      active: where false, none is feasible and little is computed: there is no target yet.
+    """
+    tables, gripper, shelf = problem.retrieval, problem.gripper, problem.shelf
+    config = problem.config.retrieval
+    feasible = feasible_grasps(tables, shelf, gripper, config, T_world_target[None], active)[0]
+
+    def enters(_, row, i):
+        path = way_in(row[0][i], gripper.nearest_outside, gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS)
+        q, reachable = path_kinematics(path, row[1][i])
+        return reachable & ~jnp.any(arm_hits_shelf(q, shelf)), q[::ARM_EVERY]
+
+    T = compose(T_world_target[None], tables.T_target_gripper)
+    able, q = masked_vmap(enters, feasible, None, (T, tables.q7), block=64)
+    return FoundGrasps(T_world_target, feasible & able, q)
+
+
+def found_hits(
+    problem: Problem,
+    found: FoundGrasps,
+    scene: Superquadrics,
+    active: Bool[Array, ""] | bool = True,
+    previous: Bool[Array, "f n"] | None = None,
+    moved: Bool[Array, " n"] | None = None,
+) -> Bool[Array, "f n"]:
+    """Which objects the whole way of each grasp of a found target would hit; those that are not feasible hit none.
+
+    Args:
+      problem: what does not change.
+      found: the target.
+      scene: the objects, without the target.
+      active: where false, nothing is hit and little is computed.
+      previous: the same before some objects moved.
+      moved: which objects moved since; only their columns are computed anew.
+    """
+    here = jnp.asarray(active)
+    fresh = scene.replace(valid=scene.valid if moved is None else scene.valid & moved)
+    hits = grasp_hits(problem.retrieval, found, fresh, here[None])
+    feasible = found.feasible & here
+    hits |= crossing_hits(problem.retrieval, problem.gripper, fresh, found.T_world_target, feasible)
+
+    def touches(_, row, i):
+        q, scene = row
+        return arm_hits(q[i], jax.tree.map(lambda a: a[...], scene))
+
+    hits |= masked_vmap(touches, feasible & jnp.any(fresh.valid), None, (found.q, fresh), block=16)
+    return hits if previous is None or moved is None else jnp.where(moved[None], hits, previous)
+
+
+def crossing_hits(
+    tables: GraspTables,
+    gripper: Gripper,
+    scene: Superquadrics,
+    T_world_target: Float[Array, "4 4"],
+    feasible: Bool[Array, " g"],
+) -> Bool[Array, "g n"]:
+    """Which objects gripper or target hit on the crossing of each grasp of a found target.
+
+    Args:
+      tables: the grasps.
+      gripper: static.
+      scene: the objects, without the target.
+      T_world_target: where the target is.
+      feasible: which grasps are looked at.
+    """
+    g, n, p = tables.q7.shape[0], scene.capacity, CROSSING_PLACES
+    T = compose(T_world_target[None], tables.T_target_gripper)
+    length = crossing_length(T, gripper.nearest_outside, gripper)
+    places = crossing_poses(T, gripper.nearest_outside, gripper, p)
+    # Boxes around gripper and target in the gripper's frame.
+    target = transform(inverse(tables.T_target_gripper)[:, None], tables.still_target.T[None])
+    low = jnp.minimum(jnp.min(tables.still_gripper, axis=-1)[tables.wrist], jnp.min(target, axis=1))
+    high = jnp.maximum(jnp.max(tables.still_gripper, axis=-1)[tables.wrist], jnp.max(target, axis=1))
+    T_objects = make(scene.rotation, scene.position)
+    T_gripper_object = compose(inverse(places)[:, :, None], T_objects[None, None])
+    mask = boxes_overlap(low[:, None, None], high[:, None, None], T_gripper_object, scene.size[None, None])
+    mask &= (feasible & (length > 0.0))[:, None, None] & scene.valid[None, None]
+
+    def pair(tables, row, i):
+        places, scene = row
+        k, place, j = i // (p * n), i // n % p, i % n
+        target = transform(inverse(tables.T_target_gripper[k]), tables.still_target.T)
+        cloud = jnp.concatenate([tables.still_gripper[tables.wrist[k]], target.T], axis=-1)
+        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
+        return Pair(cloud, compose(T_object_world, places[k, place]), scene.size[j], scene.exponents[j])
+
+    hits = any_inside(mask.reshape(-1), pair, tables, (places, scene), block=128)
+    return jnp.any(hits.reshape(g, p, n), axis=1)
