@@ -235,7 +235,7 @@ def test_a_held_object_stays_where_it_is_in_the_hand(sim):
     offset = trace.position[held, 0] - T[:, :3, 3]
     local = np.einsum("fji,fj->fi", T[:, :3, :3], offset)
     assert held.sum() > 30
-    assert np.ptp(local, axis=0).max() < 0.015
+    assert np.ptp(local, axis=0).max() < 0.02
 
 
 def test_a_hand_that_closes_on_nothing_reports_a_drop(sim):
@@ -422,7 +422,7 @@ def test_the_arm_follows_its_reference(sim):
     grasp, place = pose(0.6, 0.1, 0.2), pose(0.5, 0.25, 0.2)
     action = pick_and_place(grasp, place)
     plan = sim.config.motion
-    reference, reachable = motion.pick_and_place_reference(grasp, place, action.q7, jnp.float32(0.08), plan)
+    reference, reachable = reference_motion(kind_of(int(action.kind)), action, plan)
     outcome = sim.execute(action)
     assert outcome.reason() == "dropped"
     steps = np.rint(sim.trace.time / plan.timestep).astype(int)
@@ -445,8 +445,9 @@ def test_references_are_fixed_in_length_and_continuous():
     assert reachable.all()
     assert (batch.q.shape[1] > batch.length).all()
     assert (batch.length > batch.opens).all()
+    alone = jax.jit(motion.pick_and_place_reference, static_argnums=4)
     for i in range(3):
-        single, _ = motion.pick_and_place_reference(grasps[i], places[i], q7[i], opening[i], plan)
+        single, _ = alone(grasps[i], places[i], q7[i], opening[i], plan)
         np.testing.assert_allclose(batch.q[i], single.q, atol=1e-5)
         np.testing.assert_allclose(batch.fingers[i], single.fingers, atol=1e-6)
     assert float(jnp.abs(batch.velocity).max()) * plan.timestep < 0.03

@@ -26,6 +26,12 @@ from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import path_kinematics
 from mechsearch_jax.robot.time_scaling import angles_along, progress, smooth_curve, timing
 
+# Time steps that a stretch takes at least: where the hand hardly moves, rounding errors must not decide how long it is.
+SHORTEST = 25
+# Durations are multiples of so many time steps: rounding errors, which differ between compiled functions, then seldom
+# change them.
+GRAIN = 5
+
 
 @dataclasses.dataclass(frozen=True)
 class MotionConfig:
@@ -115,7 +121,7 @@ class _Stretch:
     first: int
     last: int
     fingers: tuple[Array | float, Array | float]
-    least: int = 1
+    least: int = SHORTEST
     pace: float = 1.0
 
 
@@ -155,10 +161,9 @@ def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float) -> tuple
     curves = jax.vmap(smooth_curve)(jnp.stack([_points(q, s, count) for s in stretches]))
     seconds, ramp = jax.vmap(timing)(curves, jnp.asarray(least * timestep, jnp.float32), pace)
 
-    # A little less than the duration, so that rounding adds no step.
-    needed = jnp.ceil(seconds / timestep - 1e-2)
+    needed = jnp.maximum(jnp.ceil(seconds / timestep / GRAIN - 1e-3) * GRAIN, least)
     in_time = needed <= longest
-    steps = jnp.where(in_time, jnp.maximum(needed, 1.0), longest).astype(jnp.int32)
+    steps = jnp.where(in_time, needed, longest).astype(jnp.int32)
     ends = jnp.cumsum(steps)
     row = jnp.arange(int(longest.sum()))
     now = jnp.minimum(jnp.sum(row[:, None] >= ends[None], axis=1), len(stretches) - 1)

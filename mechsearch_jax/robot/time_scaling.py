@@ -1,13 +1,12 @@
 """How fast the arm may travel: smooth curves through waypoints, timed within the joints' limits.
 
 A stretch of a motion begins and ends at rest. Its waypoints are joined by a natural cubic spline (of class C2, so that
-accelerations do not jump at the waypoints), whose parameter s from 0 to 1 grows by about the least time that the limits
-allow for each part: by joint turns over velocity limits, and by the root of the bends over acceleration limits. Places
-near singularities, where joints turn far or bend sharply for a short way of the hand, are so passed slowly. Along it
-goes a progress profile of unit duration, at rest and without acceleration at both ends: the speed rises as a cubic
-smoothstep, is constant, and falls likewise. The longer the time, the lower are all velocities, accelerations and jerks:
-by its first, second and third power. So the largest of the three ratios to the limits, over all joints and places,
-gives the duration.
+accelerations do not jump at the waypoints), whose parameter s from 0 to 1 grows by about the least time that the
+velocity limits allow for each part. Places near singularities, where joints turn far for a short way of the hand, are
+so passed slowly. Along it goes a progress profile of unit duration, at rest and without acceleration at both ends: the
+speed rises as a cubic smoothstep, is constant, and falls likewise. The longer the time, the lower are all velocities,
+accelerations and jerks: by its first, second and third power. So the largest of the three ratios to the limits, over
+all joints and places, gives the duration.
 
 Approximation: peaks are looked for at `PLACES` places of the curve. Differences of sampled references are averages of
 the derivatives, so that sampling raises no peak.
@@ -51,11 +50,8 @@ class Curve(flax.struct.PyTreeNode):
 
 def smooth_curve(q: Float[Array, "n 7"]) -> Curve:
     """The curve through joint angles [rad] at waypoints, evenly spaced along the hand's way; n is at least 2."""
-    turn = jnp.diff(q, axis=0) / VELOCITY_LIMIT[None]
-    bend = jnp.pad(jnp.diff(q, n=2, axis=0) / ACCELERATION_LIMIT[None], ((1, 1), (0, 0)))
-    bend = jnp.sum(bend**2, axis=1)
-    # A norm of high order instead of the largest over the joints, which would make kinks; q's bends are those of s^2.
-    fourth = jnp.sum(turn**4, axis=1) + (bend[1:] + bend[:-1]) / 2
+    # A norm of high order instead of the largest over the joints, which would make kinks.
+    fourth = jnp.sum((jnp.diff(q, axis=0) / VELOCITY_LIMIT[None]) ** 4, axis=1)
     least = LEAST_SHARE * jnp.mean((fourth + LEAST_TIME**4) ** 0.25) + LEAST_TIME
     taken = (fourth + least**4) ** 0.25
     for _ in range(SMOOTHINGS):
