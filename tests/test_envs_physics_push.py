@@ -109,7 +109,7 @@ def test_alone_it_is_as_in_a_batch(outcome):
     model = NativePhysics()
     for call in (model, jax.jit(model, static_argnums=0)):
         one = call(SHELF, SCENE, PUSHER, action.T_world_gripper, action.displacement, action.q7)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[1], atol=1e-3), one, outcome)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[1], atol=5e-3), one, outcome)
 
 
 def test_two_maps_are_one_call(outcome, monkeypatch):

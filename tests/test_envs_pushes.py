@@ -162,7 +162,8 @@ def test_objects_that_are_far_from_the_push_stay(pushes):
     assert 0.1 < truth.moved[truth.valid].mean() < 0.9
     middle = pushes.T_world_gripper[:, :3, 3] + 0.5 * pushes.displacement
     away = np.linalg.norm(pushes.before.position[..., :2] - middle[:, None, :2], axis=-1)
-    far = truth.valid & (away > 0.35)
+    # Links of the arm may still strike what is 0.35 m away.
+    far = truth.valid & (away > 0.4)
     assert far.sum() > 3
     assert not truth.moved[far].any()
 
