@@ -261,10 +261,10 @@ class Push:
         spoiled |= push_hits_others(space, tables, scene, action, wrist, still)
         spoiled |= crossings_hit(space, tables, scene, pushed.scene, action, wrist, pushes & ~spoiled)
 
-        def follows(_, row, i):
+        def feasible(_, row, i):
             return motion_feasible(space, jax.tree.map(lambda a: a[...], row))
 
-        follows = masked_vmap(follows, (pushes & ~spoiled)[None], None, action)[0]
+        follows = masked_vmap(feasible, (pushes & ~spoiled)[None], None, action)[0]
         return Prediction(pushed.scene, ~spoiled & follows, jnp.sum(pushed.topples))
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
