@@ -38,9 +38,9 @@ from mechsearch_jax.workspace.shelf import hits_shelf
 CODE = 2
 # How far a joint may turn between where an object is taken out of the shelf and where it is brought in [rad].
 LARGEST_TRANSFER = 2.0
-# At how many places of its crossing an object in the hand is tested. Crossings are at most 25 cm long, which leaves
-# 2.5 cm from place to place: about as much as the thinnest object measures.
-OBJECT_PLACES = 10
+# At how many places of its crossing an object in the hand is tested. Crossings are at most 28 cm long, which leaves
+# 2.3 cm from place to place: less than the thinnest object measures.
+OBJECT_PLACES = 12
 
 
 def _object_hits(T, owner, held, scene, clouds, distance, mask):

@@ -302,10 +302,10 @@ class Push:
         spoiled |= retreat_hits(space, tables, pushed.scene, action, wrist, moved & pushes)
         spoiled |= crossings_hit(space, tables, scene, pushed.scene, action, wrist, pushes & ~spoiled)
 
-        def follows(_, row, i):
+        def free(_, row, i):
             return motion_free(space, *jax.tree.map(lambda a: a[...], row))
 
-        follows = masked_vmap(follows, (pushes & ~spoiled)[None], None, (scene, pushed.scene, still, action))[0]
+        follows = masked_vmap(free, (pushes & ~spoiled)[None], None, (scene, pushed.scene, still, action))[0]
         return Prediction(pushed.scene, ~spoiled & follows, jnp.sum(pushed.topples))
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:

@@ -39,14 +39,15 @@ class Gripper:
       usable_opening: largest width of an object that may be grasped.
       approach: length of the straight approach and retreat along the gripper's z.
       outside: places outside the shelf, as x of the gripper in the world, ascending: an empty hand enters from the last
-        and leaves to it, what it holds is taken to the first that is in reach; see `entry`.
+        and leaves to it, what it holds is taken to the first that is in reach; see `entry`. At the first the longest
+        of the known objects is outside, too.
       front: the clouds are dense where z in the gripper frame is above this.
     """
 
     max_opening: float = 0.08
     usable_opening: float = 0.075
     approach: float = 0.3
-    outside: tuple[float, ...] = (0.3, 0.34, 0.374)
+    outside: tuple[float, ...] = (0.26, 0.3, 0.34, 0.374)
     front: float = -0.08
 
     def __post_init__(self):

@@ -71,8 +71,8 @@ class MotionConfig:
     release_longest: int = 150
     release_least: int = 50
     close_steps: int = 100
-    carry_longest: int = 500
-    leave_longest: int = 300
+    carry_longest: int = 700
+    leave_longest: int = 350
     transfer_longest: int = 1000
     open_steps: int = 120
     carry_pace: float = 0.7
