@@ -7,8 +7,8 @@ leaves room for, does not depend on the objects, so the pairs of a pose and a gr
 and a scene only adds the table H[pair, object] of who is hit. Moving one object recomputes its column.
 
 An approximation: where the straight way in begins inside the shelf, the gripper first gets there along x. That the arm
-can is part of what is feasible, but H does not say what stands in the way there; for a target that has been found
-`planner.retrieval` does.
+can is part of what is feasible, but H does not say what stands in the way there, nor what links 2 to 5 touch; for a
+target that has been found `planner.found_target` does.
 """
 
 from __future__ import annotations
