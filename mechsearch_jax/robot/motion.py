@@ -31,6 +31,8 @@ SHORTEST = 25
 # Durations are multiples of so many time steps: rounding errors, which differ between compiled functions, then seldom
 # change them.
 GRAIN = 5
+# A stretch in which no joint turns by more than this is left out [rad].
+STILL = 1e-4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +116,7 @@ class _Stretch:
     """Part of a schedule: from waypoint `first` to `last`, while the fingers go from one distance to another.
 
     It takes at least `least` and at most `longest` time steps; within them, as long as the joints' limits ask for,
-    divided by `pace`. Where `first` is `last`, the arm waits for `longest`.
+    divided by `pace`; none if nothing moves. Where `first` is `last`, the arm waits for `longest`.
     """
 
     longest: int
@@ -158,16 +160,22 @@ def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float) -> tuple
     pace = jnp.array([s.pace for s in stretches], jnp.float32)
     least = np.array([s.longest if s.first == s.last else s.least for s in stretches])
     longest = np.array([s.longest for s in stretches])
-    curves = jax.vmap(smooth_curve)(jnp.stack([_points(q, s, count) for s in stretches]))
+    points = jnp.stack([_points(q, s, count) for s in stretches])
+    curves = jax.vmap(smooth_curve)(points)
     seconds, ramp = jax.vmap(timing)(curves, jnp.asarray(least * timestep, jnp.float32), pace)
 
     needed = jnp.maximum(jnp.ceil(seconds / timestep / GRAIN - 1e-3) * GRAIN, least)
+    # A way of no length, such as that along x to an approach which begins outside, is left out.
+    travels = np.array([s.first != s.last for s in stretches])
+    still = jnp.max(jnp.abs(points - points[:, :1]), axis=(1, 2)) < STILL
+    needed = jnp.where(still & travels, 0.0, needed)
     in_time = needed <= longest
     steps = jnp.where(in_time, needed, longest).astype(jnp.int32)
     ends = jnp.cumsum(steps)
-    row = jnp.arange(int(longest.sum()))
-    now = jnp.minimum(jnp.sum(row[:, None] >= ends[None], axis=1), len(stretches) - 1)
-    u = jnp.minimum((row + 1 - (ends - steps)[now]) / steps[now], 1.0)
+    # When the motion is over, the last row is repeated.
+    row = jnp.minimum(jnp.arange(int(longest.sum())), ends[-1] - 1)
+    now = jnp.sum(row[:, None] >= ends[None], axis=1)
+    u = (row + 1 - (ends - steps)[now]) / jnp.maximum(steps[now], 1)
     travelled = angles_along(curves, now, progress(u, ramp[now]))
     first, last = (jnp.stack([jnp.asarray(s.fingers[i], jnp.float32) for s in stretches]) for i in (0, 1))
     fingers = first[now] + (last - first)[now] * _ease(u)
@@ -219,7 +227,7 @@ def push_reference(
     corners = [int(i) * (n - 1) for i in range(7)]
     longest = (config.leave_longest, config.approach_longest, config.push_longest, config.release_longest)
     longest = (*longest, config.approach_longest, config.leave_longest)
-    least = (1, 1, config.push_least, config.release_least, 1, 1)
+    least = (SHORTEST, SHORTEST, config.push_least, config.release_least, SHORTEST, SHORTEST)
     stretches = tuple(
         _Stretch(most, first, last, closed, fewest)
         for most, first, last, fewest in zip(longest, corners[:-1], corners[1:], least, strict=True)
