@@ -435,6 +435,7 @@ def test_the_arm_follows_its_reference(sim):
     assert error.max() < 1e-3
 
 
+@pytest.mark.slow
 def test_references_are_fixed_in_length_and_continuous():
     plan = MotionConfig()
     grasps = jnp.stack([pose(0.6, 0.1, 0.1), pose(0.65, 0.0, 0.08, 0.2), pose(0.5, 0.1, 0.12, -0.1)])

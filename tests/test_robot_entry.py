@@ -109,7 +109,7 @@ def x_of(q):
     return np.asarray(gripper_pose(q))[..., 0, 3]
 
 
-@pytest.mark.parametrize("position", [DEEP, NEAR])
+@pytest.mark.parametrize("position", [DEEP, pytest.param(NEAR, marks=pytest.mark.slow)])
 def test_every_motion_begins_and_ends_outside_and_passes_its_poses(position):
     T = pose(position)
     displacement, opening = jnp.float32([0.0, -0.06, 0.0]), jnp.float32(0.08)
