@@ -1,4 +1,4 @@
-"""A found target that may be pushed: where it counts as standing, what it costs there, and which actions move it."""
+"""A found target that may be pushed: where it counts as standing, what it costs there, and what moves it."""
 
 import dataclasses
 
@@ -9,6 +9,7 @@ import pytest
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind
+from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.graspability import crowding, grasp_hits, graspability, pairs
@@ -19,9 +20,9 @@ from mechsearch_jax.planner.rollout import Rollout
 from mechsearch_jax.workspace import scenario
 
 POLICY = planner.search_for_grasp()
-POSE = (0.66, 0.1, 0.0)
+POSE = (0.469, -0.058, 0.0)
 # How far the target is pushed, in predicted states [m].
-PUSH = np.float32([0.0, -0.15, 0.0])
+PUSH = np.float32([0.0, 0.05, 0.0])
 
 
 def boxes(*rows):
@@ -36,9 +37,12 @@ def seen(objects, found=True):
 
 @pytest.fixture(scope="module")
 def objects():
-    """A wide box right in front of the target, between two others that leave it no room."""
-    beside = (0.03, 0.05, 0.08)
-    return boxes((0.60, 0.1, (0.022, 0.078, 0.096)), (0.60, 0.24, beside), (0.60, -0.04, beside))
+    """A box beside the target, which every grasp of it hits, and two behind them."""
+    return boxes(
+        (0.455, -0.132, (0.028, 0.048, 0.08)),
+        (0.543, -0.088, (0.048, 0.028, 0.08)),
+        (0.543, -0.17, (0.054, 0.025, 0.054)),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -74,14 +78,12 @@ def states(problem, belief, objects):
 
 
 def test_a_pushed_target_stands_at_the_nearest_candidate(problem, belief, objects, states):
+    root, after, _ = states
     scene, is_target = with_target(problem, belief, objects)
-    poses = np.asarray(problem.poses)
-    for state, shift in zip(states[:2], (0.0, PUSH), strict=True):
-        place = np.asarray(POSE[:2]) + (shift if np.isscalar(shift) else shift[:2])
-        nearest = np.argmin(np.linalg.norm(poses[:, :2] - place, axis=1))
-        at = candidate_of(problem, scene.replace(position=scene.position + is_target[:, None] * shift), is_target)
-        assert np.flatnonzero(at).tolist() == [nearest]
-        assert np.flatnonzero(state.target_at).tolist() == ([] if np.isscalar(shift) else [nearest])
+    nearest = lambda place: np.argmin(np.linalg.norm(np.asarray(problem.poses)[:, :2] - place, axis=1))  # noqa: E731
+    assert np.flatnonzero(candidate_of(problem, scene, is_target)).tolist() == [nearest(POSE[:2])]
+    assert np.flatnonzero(after.target_at).tolist() == [nearest(POSE[:2] + PUSH[:2])]
+    assert not root.target_at.any()
 
 
 def test_only_the_place_of_a_found_target_counts(problem, belief):
@@ -105,39 +107,31 @@ def test_positions_far_from_the_candidates_are_known(problem):
 
 
 def test_the_cost_of_a_pushed_target_is_that_of_its_candidate(problem, objects, states):
-    root, after, (before, cost), _ = states
+    _, after, cost = states
     pose = int(np.argmax(after.target_at))
     rows = pairs(problem.grasps)
     hits = grasp_hits(problem.grasps, None, objects, jnp.asarray(after.target_at))
     of_pose = np.asarray(rows.pose) == pose
     np.testing.assert_array_equal(after.hits[: len(of_pose), :8][of_pose], np.asarray(hits)[of_pose])
     g, crowd = (float(of(rows, hits)[pose]) for of in (graspability, crowding))
+    assert crowd > 0
     assert not after.exists.any()
     assert float(cost) == pytest.approx(2.0 - g + POLICY.config.crowding_weight * crowd, rel=1e-6)
-    assert float(cost) < float(before) - 0.5
-    # What did not move costs what it cost.
-    assert not root.target_at.any()
 
 
 @pytest.mark.parametrize("objective", [planner.search_for_grasp().objective, planner.search_and_grasp().objective])
 def test_where_a_pushed_target_could_be_hidden_no_grasp_counts(problem, belief, states, objective):
-    after = states[1]
+    _, after, _ = states
     at, hits = jnp.asarray(after.target_at), jnp.zeros(after.hits.shape, bool)
     cost = lambda exists: float(objective.cost(problem, belief, exists, at, hits, 0.02))  # noqa: E731
     assert cost(jnp.zeros_like(at)) == objective.reached
     assert cost(at) == objective.reached + 1.0 + hits.shape[1]
 
 
-def test_the_target_is_pushed_but_never_picked(states):
-    root, after, _, actions = states
-    kind, index = np.asarray(actions.kind), np.asarray(actions.object)
-    assert np.mean((kind == ActionKind.PUSH) & (index == 8)) > 0.2
-    assert not ((kind == ActionKind.PICK_AND_PLACE) & (index == 8)).any()
-    names = [k.name for k in SAMPLED_KINDS]
-    able = {name: row for name, row in zip(names, np.asarray(root.able), strict=True)}
-    assert able["push"].tolist() == [True] * 3 + [False] * 5 + [True]
-    assert able["pick-and-place"].tolist() == [True] * 3 + [False] * 6
-    # It moves at most once.
+def test_the_target_may_be_pushed_once_but_not_picked(states):
+    root, after, _ = states
+    able = {kind.name: row.tolist() for kind, row in zip(SAMPLED_KINDS, np.asarray(root.able), strict=True)}
+    assert able == {"push": [True] * 3 + [False] * 5 + [True], "pick-and-place": [True] * 3 + [False] * 6}
     assert not after.available[8]
 
 
@@ -150,8 +144,11 @@ def test_without_the_option_the_target_stays(problem, belief, objects):
 def test_a_target_that_nothing_else_frees_is_pushed(problem, belief, objects):
     decision = POLICY(jax.random.key(0), problem, belief, seen(objects))
     assert (int(decision.action.kind), int(decision.action.object)) == (ActionKind.PUSH, 8)
-    assert float(decision.value) < -0.5
     assert float(decision.predicted_cost) < float(decision.cost) - 0.5
+    kind, index = (np.asarray(a) for a in (decision.sequences.actions.kind, decision.sequences.actions.object))
+    of_target = index == 8
+    assert np.mean(of_target[:, 0]) > 0.1
+    assert set(kind[of_target].tolist()) <= {ActionKind.PUSH, ActionKind.NONE}
 
 
 def test_a_target_that_is_not_found_is_not_there_to_be_pushed(problem, objects):
