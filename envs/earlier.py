@@ -22,6 +22,7 @@ EARLIER: Mapping[str, Any] = {
     "crowding_weight": 0.02,
     "draws": 1,
     "move_again": False,
+    "move_target": False,
     "predicted_collisions": False,
     "avoid_unseen": True,
     "cell_reach": [0.5],

@@ -46,7 +46,7 @@ class Narrator:
         if moment.decision is None:
             return
         kind = kind_of(int(moment.decision.action.kind))
-        self._line("does", kind.describe(moment.decision.action))
+        self._line("does", kind.describe(moment.decision.action, moment.observation.objects.capacity))
         if kind.takes_target:
             self._line("why", "a grasp that hits nothing is known")
         elif record.sequences and record.predicted_cost is not None:

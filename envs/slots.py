@@ -22,13 +22,13 @@ from mechsearch_jax.envs.episode_log import Choice, chosen
 from mechsearch_jax.envs.snapshot import (
     Recogniser,
     Snapshot,
-    nearest_candidate,
     objects_on_the_board,
     true_target_pose,
 )
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, graspable_at, initial_belief, update_belief
+from mechsearch_jax.planner.moved_target import nearest_candidate
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,7 +7,7 @@ import functools
 from typing import Protocol, runtime_checkable
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.envs.simulated_camera import Image, is_found, observe
 from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
@@ -64,16 +64,3 @@ def true_target_pose(world: World) -> Float[Array, " 3"]:
     """x, y [m] and yaw [rad] of the target."""
     R, t = world.rotation[TARGET], world.position[TARGET]
     return jnp.stack([t[0], t[1], jnp.arctan2(R[1, 0], R[0, 0])])
-
-
-def nearest_candidate(poses: Float[Array, "x 3"], pose: Float[Array, " 3"]) -> Int[Array, ""]:
-    """Index of the candidate pose that is nearest to a pose, both as x, y [m] and yaw [rad], which repeats after half a
-    turn.
-
-    Args:
-      poses: all positions with all yaws, so that the nearest of both is among them.
-      pose: of the target.
-    """
-    away = jnp.sum((poses[:, :2] - pose[None, :2]) ** 2, axis=1)
-    # Any weight that rounding does not swallow finds the same one, since positions and yaws make a grid.
-    return jnp.argmin(away + 1e-3 * jnp.sin(poses[:, 2] - pose[2]) ** 2)

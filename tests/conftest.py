@@ -36,7 +36,14 @@ MAPPINGS = 35_000
 # Files that trace the same functions stay in one process, so that they are traced once; every other file is a group of
 # its own. Those that take long come first, so that all processes end at the same time.
 GROUPS = {
-    "planning": ("test_planner", "test_envs_episode", "test_envs_batch_episode", "test_readme", "test_docs"),
+    "planning": (
+        "test_planner",
+        "test_planner_moved_target",
+        "test_envs_episode",
+        "test_envs_batch_episode",
+        "test_readme",
+        "test_docs",
+    ),
     "pushing": ("test_benchmarks_push", "test_envs_pushes"),
     "recognising": ("test_envs_recognisers", "test_perception_recogniser", "test_benchmarks_recognition"),
 }

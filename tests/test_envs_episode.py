@@ -18,11 +18,12 @@ from mechsearch_jax.envs.narration import Narrator, events, verdict
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.records import load_episode, save_episode
-from mechsearch_jax.envs.snapshot import Snapshot, nearest_candidate, oracle
+from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import search_for_grasp
+from mechsearch_jax.planner.moved_target import nearest_candidate
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target

@@ -63,7 +63,9 @@ def test_what_earlier_files_ran_with_by_default_is_the_default_but_for_what_is_n
         "criterion": "detector", "push_distances": [0.05, 0.10, 0.15], "caution": 1.0, "topple_charge": 0.0,
         "push_model": "learned", "focus": 0.7, "max_steps": 10, "recognition": "oracle",
     }  # fmt: skip
-    then = PRESETS["standard"](cell_reach=(0.5,), closer_look=0, push_directions=(math.pi / 2, -math.pi / 2))
+    then = PRESETS["standard"](
+        cell_reach=(0.5,), closer_look=0, push_directions=(math.pi / 2, -math.pi / 2), move_target=False
+    )
     assert present_options(earlier) == Method(config=then).options()
 
 

@@ -80,6 +80,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "crowding_weight": 0.02,
         "draws": 1,
         "move_again": False,
+        "move_target": True,
         "predicted_collisions": False,
         "actions": ["push", "pick-and-place"],
         "push_directions": pytest.approx(np.radians([90, -90, 0, 35, -35, 65, -65]).tolist()),
@@ -110,6 +111,7 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     assert (search.horizon, search.sequences, config.max_steps) == (3, 30, 10)
     assert (search.guided_fraction, search.unseen_contact_penalty, search.crowding_weight) == (0.0, 0.0, 0.0)
     assert (search.topple_charge, search.move_again, search.predicted_collisions) == (0.0, True, True)
+    assert not search.move_target
     assert search.draws > 1
     assert (config.problem.existence.criterion, actions.avoid_unseen) == ("depth-mse", False)
     assert (actions.push_distances, set(actions.actions)) == ((0.05, 0.10, 0.15), {"push", "pick-and-place"})

@@ -41,7 +41,7 @@ def candidates(
     possible: PossibleSpace,
     previous: Candidates | None = None,
     moved: Bool[Array, " n"] | None = None,
-    available: Bool[Array, " n"] | None = None,
+    available: Bool[Array, "*kinds n"] | None = None,
 ) -> Candidates:
     """All ways to move all objects, and what stands in their way.
 
@@ -55,7 +55,8 @@ def candidates(
       possible: where the target may be.
       previous: candidates before some objects moved.
       moved: which moved since; only what concerns them is computed anew.
-      available: which objects may be moved; all if left out. What the ways of the others enter is not looked at.
+      available: which objects may be moved, by all kinds alike or by each of `SAMPLED_KINDS`; all if left out. What the
+        ways of the others enter is not looked at.
     """
     n = scene.capacity
     previous = no_candidates(space, n) if previous is None else previous
@@ -89,14 +90,16 @@ def candidates(
     mask = jnp.concatenate(against)
     by_hand = gripper_hits(tables, opening, wrist, flat, scene, mask)
 
+    able = jnp.broadcast_to(True if available is None else available, (len(SAMPLED_KINDS), n))
     found = []
-    for kind, before, T, part, arrives in zip(SAMPLED_KINDS, previous, poses, parts, reached, strict=True):
+    for i, (kind, before, T, part, arrives) in enumerate(
+        zip(SAMPLED_KINDS, previous, poses, parts, reached, strict=True)
+    ):
         hits = by_hand[part]
         hits |= kind.swept_hits(space, scene, flat[part], mask[part] & ~hits)
         hits = jnp.where(concerns[:, None, :], hits.reshape(*T.shape[:2], n), before.hits)
         ways = Ways(T, arrives, hits, before.enters)
-        movable = arrives if available is None else arrives & available[:, None, None]
-        looked_at = ways.replace(reached=movable)
+        looked_at = ways.replace(reached=arrives & able[i][:, None, None])
         found.append(ways.replace(enters=kind.entering(space, tables, scene, possible, looked_at)))
     return tuple(found)
 

@@ -74,8 +74,13 @@ class Kind(Protocol):
         """What a picture shows of an action, from the objects before it and as they are predicted after it."""
         ...
 
-    def describe(self, action: Action) -> str:
-        """A single action in words, as the robot sees it."""
+    def describe(self, action: Action, target: int | None = None) -> str:
+        """A single action in words, as the robot sees it.
+
+        Args:
+          action: of this kind.
+          target: the index that stands for the target, if any does.
+        """
         ...
 
 
@@ -87,12 +92,15 @@ class SampledKind(Kind, Protocol):
     Attributes:
       opening: which of the gripper's swept clouds its approach is tested with, `config.OPEN` or `config.CLOSED`.
       surrounds_object: whether the fingers are around the object, which is then no obstacle.
+      moves_target: whether it may move a target that has been found like any other object.
     """
 
     @property
     def opening(self) -> int: ...
     @property
     def surrounds_object(self) -> bool: ...
+    @property
+    def moves_target(self) -> bool: ...
 
     def wrists(self, space: ActionSpace) -> Int[np.ndarray, " v"]:
         """Index of the wrist angle of each way."""

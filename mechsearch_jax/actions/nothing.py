@@ -48,5 +48,5 @@ class Nothing:
         """Nothing to show."""
         return Sketch()
 
-    def describe(self, action: Action) -> str:
+    def describe(self, action: Action, target: int | None = None) -> str:
         return "do nothing: no action is possible"

@@ -237,6 +237,8 @@ class PickAndPlace:
     returns_home: bool = True
     opening: int = OPEN
     surrounds_object: bool = True
+    # What could be picked could be taken out.
+    moves_target: bool = False
 
     def wrists(self, space: ActionSpace) -> Int[np.ndarray, " v"]:
         return grasp_variants(space.config.grasps, space.wrists)[1]
@@ -315,6 +317,6 @@ class PickAndPlace:
         arch = 4 * share * (1 - share) * np.array([-0.12, 0.0, 0.06])
         return Sketch(path=begin + share * (end - begin) + arch, ghost=i)
 
-    def describe(self, action: Action) -> str:
+    def describe(self, action: Action, target: int | None = None) -> str:
         shift = np.asarray(action.T_world_place - action.T_world_gripper)[:2, 3]
         return f"pick object {int(action.object)} and place it {100 * np.linalg.norm(shift):.0f} cm away"

@@ -174,6 +174,7 @@ class Push:
     returns_home: bool = True
     opening: int = CLOSED
     surrounds_object: bool = False
+    moves_target: bool = True
 
     def _starts(self, space: ActionSpace) -> PushStarts:
         return push_starts(space.config, space.wrists)
@@ -322,6 +323,7 @@ class Push:
             start=start,
         )
 
-    def describe(self, action: Action) -> str:
+    def describe(self, action: Action, target: int | None = None) -> str:
         d = np.asarray(action.displacement)
-        return f"push object {int(action.object)} by {100 * np.linalg.norm(d):.0f} cm {_in_words(d)}"
+        what = "the target" if int(action.object) == target else f"object {int(action.object)}"
+        return f"push {what} by {100 * np.linalg.norm(d):.0f} cm {_in_words(d)}"

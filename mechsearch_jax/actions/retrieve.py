@@ -64,5 +64,5 @@ class Retrieve:
         T = np.asarray(action.T_world_gripper, float)
         return Sketch(path=T[:3, 3] - np.linspace(0.0, SHOWN_WAY_OUT, 40)[:, None] * T[:3, 2])
 
-    def describe(self, action: Action) -> str:
+    def describe(self, action: Action, target: int | None = None) -> str:
         return "take the target out"

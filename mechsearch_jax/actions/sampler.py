@@ -44,7 +44,7 @@ def sample_action(
     scene: Superquadrics,
     possible: PossibleSpace,
     options: Candidates,
-    available: Bool[Array, " n"],
+    available: Bool[Array, "*kinds n"],
     weights: Float[Array, " n"] | None = None,
 ) -> Sample:
     """Draw an action: an object and a kind (the multi-set of B.5) by the object's weight, then one of its ways evenly.
@@ -56,12 +56,13 @@ def sample_action(
       scene: the objects.
       possible: where the target may be. An object's actions that enter it are drawn only if it has no others.
       options: of this scene, by kind.
-      available: which objects may be moved.
+      available: which objects may be moved, by all kinds alike or by each of `SAMPLED_KINDS`.
       weights: sampling weights of the objects, positive; the paper's, and those left out, are equal.
     """
     n = scene.capacity
     key_choice, key_place = jax.random.split(key)
-    ways = _stacked([free_ways(w) & available[:, None, None] for w in options])
+    able = jnp.broadcast_to(available, (len(SAMPLED_KINDS), n))
+    ways = _stacked([free_ways(w) & a[:, None, None] for w, a in zip(options, able, strict=True)])
     enters = _stacked([w.enters for w in options])
     weights = jnp.ones(n) if weights is None else weights
     weight = jnp.tile(weights, len(SAMPLED_KINDS))[:, None] * _shares(ways & ~enters, ways)

@@ -13,7 +13,8 @@ class Action(flax.struct.PyTreeNode):
 
     Attributes:
       kind: an `ActionKind`, int32.
-      object: index of the object that is pushed or picked, int32; 0 for kinds that move none.
+      object: index of the object that is pushed or picked, int32; N stands for a found target, beside N objects. 0 for
+        kinds that move none.
       T_world_gripper: gripper pose where a push starts, or where something is grasped, shape (..., 4, 4).
       displacement: translation of the gripper while it pushes, in the world [m], shape (..., 3); zero for other kinds.
       T_world_place: gripper pose where the object is released, shape (..., 4, 4); for a push, the pose where it ends.

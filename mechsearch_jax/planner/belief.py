@@ -55,6 +55,7 @@ def update_belief(problem: Problem, belief: Belief, observation: Observation) ->
     """Fold an observation into the belief: `f_t = f_{t-1} * f_hat(s_t)` (equation 4), or the target's pose once it is
     seen.
 
+    A target that is found and then hidden again stays found, at the pose where it was seen last, wherever it is now.
     A target that was pushed without having been seen may leave f empty, which is a contradiction; f then starts anew
     from what the objects allow now, and `restarts` counts it.
 
@@ -84,9 +85,20 @@ def update_belief(problem: Problem, belief: Belief, observation: Observation) ->
     )
 
 
-def possible_poses(belief: Belief, exists: Bool[Array, " x"]) -> Bool[Array, " y"]:
-    """f at the candidate poses and at the found pose (Y = X + 1): one or the other."""
-    return jnp.concatenate([exists & ~belief.found, belief.found[None]])
+def possible_poses(
+    belief: Belief, exists: Bool[Array, " x"], target_at: Bool[Array, " x"] | None = None
+) -> Bool[Array, " y"]:
+    """f at the candidate poses and at the found pose (Y = X + 1): one or the other.
+
+    Args:
+      belief: what was known at the start.
+      exists: f of the state.
+      target_at: the candidate that stands for where a found target was pushed to; nowhere if left out.
+    """
+    if target_at is None:
+        target_at = jnp.zeros_like(exists)
+    here = belief.found & ~jnp.any(target_at)
+    return jnp.concatenate([jnp.where(belief.found, target_at, exists), here[None]])
 
 
 def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) -> PossibleSpace:
@@ -104,7 +116,7 @@ def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) 
 def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tuple[Superquadrics, Bool[Array, " n"]]:
     """The objects and, in one more slot, the target, absent until it is found; and which of the slots is the target's.
 
-    It can be pushed along like any object, but neither hides itself nor is in the way of its own grasp.
+    It can be pushed like any object, but neither hides itself nor is in the way of its own grasp.
     """
     T = belief.grasps.T_world_target
     target = Superquadrics(

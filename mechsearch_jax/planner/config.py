@@ -25,7 +25,7 @@ from mechsearch_jax.options import option
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("gamma", "unseen_contact_penalty", "topple_charge", "guided_fraction", "crowding_weight"),
-    meta_fields=("horizon", "sequences", "draws", "move_again", "predicted_collisions"),
+    meta_fields=("horizon", "sequences", "draws", "move_again", "move_target", "predicted_collisions"),
 )
 @dataclasses.dataclass(frozen=True)
 class PlannerConfig:
@@ -46,6 +46,8 @@ class PlannerConfig:
         of a pose alone. Small enough that no number of hits outweighs one object of the cost proper.
       draws: how often an action is drawn, until one is possible; static. The paper draws until one is.
       move_again: whether an object may move more than once in a sequence, as in the paper; static.
+      move_target: whether a found target may be pushed, too; static. Where every grasp of it hits an object that can
+        neither be grasped nor pushed, nothing else helps.
       predicted_collisions: whether f also rules out, in predicted states, where the target would overlap objects
         (equation 14), as in the paper; static. Without, what an action covers is not ruled out: a target there would be
         pushed along, not found to be elsewhere.
@@ -68,6 +70,7 @@ class PlannerConfig:
     )
     draws: int = option(1, "how often an action is drawn until one is possible")
     move_again: bool = option(False, "whether an object may move more than once in a sequence, as in the paper")
+    move_target: bool = option(True, "whether a found target may be pushed, too; not in the paper")
     predicted_collisions: bool = option(
         False, "whether f rules out overlaps with objects in predicted states too, as in the paper"
     )

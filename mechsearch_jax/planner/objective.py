@@ -8,7 +8,7 @@ from typing import Protocol
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.graspability import crowding, graspability, pairs, split_found
+from mechsearch_jax.graspability import crowding, graspability, pairs
 from mechsearch_jax.planner.belief import Belief, possible_poses
 from mechsearch_jax.planner.problem import Problem
 
@@ -28,6 +28,7 @@ class Objective(Protocol):
         problem: Problem,
         belief: Belief,
         exists: Bool[Array, " x"],
+        target_at: Bool[Array, " x"],
         hits: Bool[Array, "k n"],
         crowding_weight: Array | float,
     ) -> Float[Array, ""]:
@@ -36,25 +37,31 @@ class Objective(Protocol):
         Args:
           problem: what does not change.
           belief: what was known at the start.
-          exists: f of the state.
+          exists: f of the state; see `State`, as of the next.
+          target_at: the candidate pose that stands for where a found target was pushed to.
           hits: H of the state, with the rows of `graspability.pairs`.
           crowding_weight: see `PlannerConfig`.
         """
         ...
 
-    def needs_graspability(self, belief: Belief, exists: Bool[Array, " x"]) -> Bool[Array, " y"]:
+    def needs_graspability(
+        self, belief: Belief, exists: Bool[Array, " x"], target_at: Bool[Array, " x"]
+    ) -> Bool[Array, " y"]:
         """At which poses, the candidates and then the found one, J depends on g."""
         ...
 
 
-def _where_and_how_graspable(problem, belief, exists, hits, crowding_weight):
+def _where_and_how_graspable(problem, belief, exists, target_at, hits, crowding_weight):
     """f, how far each pose is from graspable with g extended below zero (B.4), and how crowded its grasps are.
 
     g only sees the best grasp of a pose; while nothing changes that one, clearing the way for others is progress too.
+    A found target that is pushed to where it could be hidden counts as if no grasp were feasible: once it is not seen,
+    nothing tells where it really went.
     """
-    f = possible_poses(belief, exists).astype(jnp.float32)
+    f = possible_poses(belief, exists, target_at).astype(jnp.float32)
     rows = pairs(problem.grasps, belief.grasps)
-    g = graspability(rows, hits).astype(jnp.float32)
+    hidden = jnp.append(exists & belief.found, False)
+    g = jnp.minimum(graspability(rows, hits), jnp.where(hidden, -hits.shape[1], 1)).astype(jnp.float32)
     return f, g, crowding_weight * crowding(rows, hits)
 
 
@@ -64,12 +71,12 @@ class SearchForGrasp:
 
     reached: float = 1.0
 
-    def cost(self, problem, belief, exists, hits, crowding_weight) -> Float[Array, ""]:
-        f, g, crowded = _where_and_how_graspable(problem, belief, exists, hits, crowding_weight)
+    def cost(self, problem, belief, exists, target_at, hits, crowding_weight) -> Float[Array, ""]:
+        f, g, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits, crowding_weight)
         return jnp.sum(f * (1.0 + (1.0 - g) + crowded))
 
-    def needs_graspability(self, belief, exists) -> Bool[Array, " y"]:
-        return possible_poses(belief, exists)
+    def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:
+        return possible_poses(belief, exists, target_at)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,14 +85,12 @@ class SearchAndGrasp:
 
     reached: float = 0.0
 
-    def cost(self, problem, belief, exists, hits, crowding_weight) -> Float[Array, ""]:
-        f, g, crowded = _where_and_how_graspable(problem, belief, exists, hits, crowding_weight)
-        (_, g_found), (_, crowded_found) = split_found(g), split_found(crowded)
-        return jnp.where(belief.found, 1.0 - g_found + crowded_found, jnp.sum(f))
+    def cost(self, problem, belief, exists, target_at, hits, crowding_weight) -> Float[Array, ""]:
+        f, g, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits, crowding_weight)
+        return jnp.where(belief.found, jnp.sum(f * (1.0 - g + crowded)), jnp.sum(f))
 
-    def needs_graspability(self, belief, exists) -> Bool[Array, " y"]:
-        candidates, found = split_found(possible_poses(belief, exists))
-        return jnp.concatenate([jnp.zeros_like(candidates), found[None]])
+    def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:
+        return possible_poses(belief, exists, target_at) & belief.found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,8 +99,8 @@ class Indifferent:
 
     reached: float = 0.0
 
-    def cost(self, problem, belief, exists, hits, crowding_weight) -> Float[Array, ""]:
+    def cost(self, problem, belief, exists, target_at, hits, crowding_weight) -> Float[Array, ""]:
         return jnp.float32(0.0)
 
-    def needs_graspability(self, belief, exists) -> Bool[Array, " y"]:
-        return jnp.zeros_like(possible_poses(belief, exists))
+    def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:
+        return jnp.zeros_like(possible_poses(belief, exists, target_at))

@@ -102,7 +102,7 @@ class Search(flax.struct.PyTreeNode):
             self,
             key,
             problem,
-            belief.replace(exists=belief.exists & ~able),
+            belief.replace(exists=belief.exists & ~able, found=belief.found & ~able),
             observation.replace(objects=rest),
         )
         return jax.tree.map(lambda a, b: jnp.where(able, a, b), _take_out(self, observation, grasp), planned)
@@ -177,10 +177,16 @@ search_and_grasp = functools.partial(search, objective=SearchAndGrasp())
 def random_action(config: PlannerConfig | None = None, **options: Any) -> Search:
     """A baseline: a random possible action, by the sampler's even draw, until the target can be taken out.
 
-    It plans no further: of `config`, the horizon, the guided fraction and all charges are not used.
+    It plans no further, and leaves a found target where it is: of `config`, the horizon, `move_target`, the guided
+    fraction and all charges are not used.
     """
     even = dataclasses.replace(
-        _planner_config(config), horizon=1, guided_fraction=0.0, unseen_contact_penalty=0.0, topple_charge=0.0
+        _planner_config(config),
+        horizon=1,
+        move_target=False,
+        guided_fraction=0.0,
+        unseen_contact_penalty=0.0,
+        topple_charge=0.0,
     )
     return search(even, objective=Indifferent(), **options)
 

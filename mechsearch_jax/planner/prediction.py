@@ -13,6 +13,8 @@ from jaxtyping import Array, Bool
 from mechsearch_jax.actions.registry import KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.dynamics.push_model import PushModel
+from mechsearch_jax.dynamics.rigid import moved_objects
+from mechsearch_jax.planner.moved_target import beyond_candidates
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.state import State
 
@@ -48,6 +50,8 @@ def _either(first: Bool[Array, ""], model: PushModel, later: PushModel) -> PushM
 class PredictByKind:
     """The default `Predict`: every kind of action predicts itself, pushes with a push model.
 
+    A found target moves only where it is what the action moves, and stays among its candidate poses.
+
     Attributes:
       push_model: predicts pushes that are the first action of a sequence.
       later_push_model: predicts the others.
@@ -59,11 +63,13 @@ class PredictByKind:
     def __call__(self, problem: Problem, state: State, sample: Sample, first: Bool[Array, ""]) -> Prediction:
         push_model = _either(first, self.push_model, self.later_push_model)
         action, scene = sample.action, state.scene
+        # What is sampled may move the target only by pushing it itself.
+        untouchable = state.is_target & (jnp.arange(scene.capacity) != action.object)
         found = Prediction(scene, jnp.array(False), jnp.float32(0.0))
         for code, kind in KINDS.items():
-            told = kind.predict(
-                problem.space, problem.actions, push_model, scene, state.is_target, action, sample.wrist
-            )
+            told = kind.predict(problem.space, problem.actions, push_model, scene, untouchable, action, sample.wrist)
             found = jax.tree.map(lambda a, b, code=code: jnp.where(action.kind == code, a, b), told, found)
+        lost = state.is_target & moved_objects(scene, found.scene) & beyond_candidates(problem, found.scene.position)
+        found = found.replace(possible=found.possible & ~jnp.any(lost))
         after = jax.tree.map(lambda new, old: jnp.where(found.possible, new, old), found.scene, scene)
         return found.replace(scene=after)

@@ -49,6 +49,7 @@ def paper(**changes: Any) -> Config:
         "crowding_weight": 0.0,
         "draws": REDRAWS,
         "move_again": True,
+        "move_target": False,
         "horizon": 3,
         "sequences": 30,
     }

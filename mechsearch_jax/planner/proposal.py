@@ -56,9 +56,17 @@ def blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[Ar
 def sampling_weights(
     problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
 ) -> Float[Array, " n"]:
-    """Sampling weight of each object: in part even, in part by what it hides and which grasps it blocks."""
+    """Sampling weight of each object: in part even, in part by what it hides and which grasps it blocks.
+
+    A found target that may be pushed is one more object in the way of each of its grasps that is blocked; where none is
+    feasible, it alone is in the way.
+    """
     rows = pairs(problem.grasps, belief.grasps)
-    blocks = blame(state.hits, rows.allowed & objective.needs_graspability(belief, state.exists)[rows.pose])
+    counts = rows.allowed & objective.needs_graspability(belief, state.exists, state.target_at)[rows.pose]
+    target = state.available & state.is_target
+    blocked = jnp.any(state.hits, axis=1)
+    blocks = blame(state.hits | (blocked[:, None] & target[None]), counts)
+    blocks = jnp.where(jnp.any(counts), blocks, target)
     hides = blame(occluders(problem.existence, state.views), state.exists & ~belief.found)
     both = blocks + hides
     share = both / jnp.maximum(jnp.sum(both), 1e-12)
@@ -81,6 +89,6 @@ def guided_draw(
         state.scene,
         possible_space(problem, belief, state.exists),
         state.options,
-        state.available & state.alive,
+        state.able,
         sampling_weights(problem, belief, objective, guided_fraction, state),
     )

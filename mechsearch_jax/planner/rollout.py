@@ -25,11 +25,15 @@ from mechsearch_jax.graspability import grasp_hits, no_hits, pairs, split_found
 from mechsearch_jax.planner.belief import Belief, possible_space, with_target
 from mechsearch_jax.planner.config import PlannerConfig
 from mechsearch_jax.planner.found_target import found_hits
+from mechsearch_jax.planner.moved_target import candidate_of
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.prediction import Predict
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import Propose
 from mechsearch_jax.planner.state import Decision, Sequences, State
+
+# What an action changes in a state, and what is then computed for the next one.
+CHANGING = ("scene", "target_at", "moved", "available", "alive", "options")
 
 
 def prefix_values(
@@ -71,11 +75,12 @@ class Rollout:
             scene=scene,
             is_target=is_target,
             exists=self.belief.exists,
+            target_at=jnp.zeros_like(self.belief.exists),
             views=no_views(scene.capacity, problem.config.existence, places),
             hits=no_hits(pairs(problem.grasps, self.belief.grasps), scene.capacity),
             options=no_candidates(problem.space, scene.capacity),
             moved=scene.valid,
-            available=scene.valid & ~is_target,
+            available=scene.valid & (~is_target | self.config.move_target),
             alive=jnp.array(True),
         )
 
@@ -87,22 +92,26 @@ class Rollout:
         views = object_views(
             problem.existence, problem.camera, objects, counts_collisions, settings, state.views, moved
         )
-        exists = existence(problem.existence, problem.camera, views, state.exists, self.belief.allowed, settings)
-        counts, found = split_found(self.objective.needs_graspability(self.belief, exists))
+        here = jnp.where(self.belief.found, state.target_at, state.exists)
+        exists = existence(problem.existence, problem.camera, views, here, self.belief.allowed, settings)
+        counts, found = split_found(self.objective.needs_graspability(self.belief, exists, state.target_at))
         grasps, known = self.belief.grasps, problem.grasps.pair_pose.shape[0]
-        hits = grasp_hits(problem.grasps, None, objects, counts, state.hits[:known], moved)
+        # Where the target has moved, other rows of H count, of which nothing is known yet.
+        unknown = moved | jnp.any(moved & state.is_target)
+        hits = grasp_hits(problem.grasps, None, objects, counts, state.hits[:known], unknown)
         of_found = found_hits(problem, grasps, objects, found, state.hits[known:], moved)
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, of_found]))
 
     def options(self, state: State, moved: Bool[Array, " n"]):
         """What can be done in a state after some objects moved."""
         possible = possible_space(self.problem, self.belief, state.exists)
-        able = state.available & state.alive
-        return candidates(self.problem.space, self.problem.actions, state.scene, possible, state.options, moved, able)
+        space, tables = self.problem.space, self.problem.actions
+        return candidates(space, tables, state.scene, possible, state.options, moved, state.able)
 
     def cost(self, state: State) -> Float[Array, ""]:
         """J of a state that is up to date."""
-        return self.objective.cost(self.problem, self.belief, state.exists, state.hits, self.config.crowding_weight)
+        known = (state.exists, state.target_at, state.hits)
+        return self.objective.cost(self.problem, self.belief, *known, self.config.crowding_weight)
 
     def _attempt(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
         sample = self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, state)
@@ -136,9 +145,15 @@ class Rollout:
         acted = told.possible & state.alive
         action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
         spent = (jnp.arange(state.scene.capacity) == action.object) & (not self.config.move_again)
+        moved = moved_objects(state.scene, told.scene) & acted
+        target_at = state.target_at
+        if self.config.move_target:
+            at = candidate_of(self.problem, told.scene, state.is_target)
+            target_at = jnp.where(jnp.any(moved & state.is_target), at, target_at)
         changes = {
             "scene": told.scene,
-            "moved": moved_objects(state.scene, told.scene) & acted,
+            "target_at": target_at,
+            "moved": moved,
             "available": state.available & ~spent,
             "alive": acted,
         }
@@ -162,7 +177,7 @@ class Rollout:
             return changes | {"options": options}, actions, price
 
         def stay():
-            changes = {name: getattr(states, name) for name in ("scene", "moved", "available", "alive", "options")}
+            changes = {name: getattr(states, name) for name in CHANGING}
             return changes, repeated(no_action(), count), jnp.zeros(count)
 
         # After the last action only the cost counts. What the actions do not change does not pass through the branches.

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import flax.struct
 import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from mechsearch_jax.actions.candidates import Candidates
+from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.existence import ObjectViews
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -17,24 +20,33 @@ class State(flax.struct.PyTreeNode):
     Attributes:
       scene: the objects and the target, fields (N, ...).
       is_target: which slot is the target's, shape (N,).
-      exists: f, shape (X,).
+      exists: f, shape (X,). Once the target is found: the pose that it was pushed to, if it could be hidden there.
+      target_at: the candidate pose that stands for where a found target was pushed to, as a mask, shape (X,); nowhere
+        as long as it was not. See `planner.moved_target`.
       views: the objects as the camera sees them.
       hits: H, shape (K, N).
       options: the ways to move the objects.
       moved: which objects differ from the state before, shape (N,).
-      available: which objects may be moved, shape (N,).
+      available: which objects may be moved, shape (N,); the target only by some kinds, see `able`.
       alive: whether the sequence has found something to do so far.
     """
 
     scene: Superquadrics
     is_target: jax.Array
     exists: jax.Array
+    target_at: jax.Array
     views: ObjectViews
     hits: jax.Array
     options: Candidates
     moved: jax.Array
     available: jax.Array
     alive: jax.Array
+
+    @property
+    def able(self) -> Bool[Array, "kinds n"]:
+        """Which objects may be moved by each of `SAMPLED_KINDS`."""
+        kinds = jnp.array([kind.moves_target for kind in SAMPLED_KINDS])
+        return (self.available & self.alive)[None] & (kinds[:, None] | ~self.is_target[None])
 
 
 class Sequences(flax.struct.PyTreeNode):

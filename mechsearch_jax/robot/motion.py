@@ -74,7 +74,7 @@ class MotionConfig:
     release_least: int = 50
     close_steps: int = 100
     carry_longest: int = 700
-    leave_longest: int = 350
+    leave_longest: int = 400
     transfer_longest: int = 1000
     open_steps: int = 120
     carry_pace: float = 0.7
