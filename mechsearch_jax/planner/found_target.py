@@ -109,14 +109,21 @@ def crossing_hits(
     T = compose(T_world_target[None], tables.T_target_gripper)
     length = crossing_length(T, gripper.nearest_outside, gripper)
     places = crossing_poses(T, gripper.nearest_outside, gripper, p)
-    # Boxes around gripper and target in the gripper's frame.
-    target = transform(inverse(tables.T_target_gripper)[:, None], tables.still_target.T[None])
-    low = jnp.minimum(jnp.min(tables.still_gripper, axis=-1)[tables.wrist], jnp.min(target, axis=1))
-    high = jnp.maximum(jnp.max(tables.still_gripper, axis=-1)[tables.wrist], jnp.max(target, axis=1))
-    T_objects = make(scene.rotation, scene.position)
-    T_gripper_object = compose(inverse(places)[:, :, None], T_objects[None, None])
-    mask = boxes_overlap(low[:, None, None], high[:, None, None], T_gripper_object, scene.size[None, None])
-    mask &= (feasible & (length > 0.0))[:, None, None] & scene.valid[None, None]
+
+    def near(tables, row, i):
+        """Whether boxes around gripper and target, in the gripper's frame, overlap the objects'."""
+        places, scene = row[0][i], jax.tree.map(lambda a: a[...], row[1])
+        target = transform(inverse(tables.T_target_gripper[i]), tables.still_target.T)
+        still = tables.still_gripper[tables.wrist[i]]
+        low = jnp.minimum(jnp.min(still, axis=-1), jnp.min(target, axis=0))
+        high = jnp.maximum(jnp.max(still, axis=-1), jnp.max(target, axis=0))
+        T_gripper_object = compose(inverse(places)[:, None], make(scene.rotation, scene.position)[None])
+        size, low, high = scene.size[None], low[None, None], high[None, None]
+        return boxes_overlap(low, high, T_gripper_object, size) & scene.valid[None]
+
+    # Few grasps cross, and none before the target is found: nothing is computed for the others.
+    crosses = feasible & (length > 0.0) & jnp.any(scene.valid)
+    mask = masked_vmap(near, crosses, tables, (places, scene), block=16)
 
     def pair(tables, row, i):
         places, scene = row
