@@ -27,12 +27,11 @@ from mechsearch_jax.robot.entry import (
     CLOSE_CROSSINGS,
     FEW_CROSSINGS,
     arm_follows,
+    arm_path,
     crossing_length,
     crossing_poses,
     way_in,
 )
-from mechsearch_jax.robot.gripper import arm_hits_shelf
-from mechsearch_jax.robot.kinematics import path_kinematics
 from mechsearch_jax.robot.motion import MotionConfig, Reference, push_reference
 from mechsearch_jax.workspace.shelf import hits_shelf
 
@@ -71,11 +70,11 @@ def motion_free(
     start, end = action.T_world_gripper, action.T_world_place
     way = translate(jnp.broadcast_to(start, (n, 4, 4)), jnp.linspace(0.0, 1.0, n)[:, None] * (end - start)[None, :3, 3])
     into, back = (way_in(T, gripper.nearest_outside, gripper, CLOSE_CROSSINGS, n) for T in (start, end))
-    q, reachable = path_kinematics(jnp.concatenate([into, way[1:], back[::-1][1:]]), action.q7)
+    q, follows = arm_path(jnp.concatenate([into, way[1:], back[::-1][1:]]), action.q7, space.shelf)
     begins, ends = len(into), len(into) + n - 1
     # Poses 5 cm apart at most.
     hits = arm_hits(q[:begins:2], scene) | arm_hits(q[ends::2], after) | (arm_hits(q[begins:ends:3], scene) & still)
-    return reachable & ~jnp.any(arm_hits_shelf(q, space.shelf)) & ~jnp.any(hits)
+    return follows & ~jnp.any(hits)
 
 
 def push_hits_others(

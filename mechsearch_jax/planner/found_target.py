@@ -18,9 +18,9 @@ from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
 from mechsearch_jax.graspability import FoundGrasps, GraspTables, boxes_overlap, feasible_grasps, grasp_hits
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.robot.arm_hits import arm_hits
-from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, crossing_length, crossing_poses, way_in
-from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
-from mechsearch_jax.robot.kinematics import JOINTS, path_kinematics
+from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, arm_path, crossing_length, crossing_poses, way_in
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.robot.kinematics import JOINTS
 
 # Of the poses where the arm's way in is followed, every so many is tested against objects: 5 cm apart at most.
 ARM_EVERY = 2
@@ -49,8 +49,8 @@ def found_grasps(
 
     def enters(_, row, i):
         path = way_in(row[0][i], gripper.nearest_outside, gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS)
-        q, reachable = path_kinematics(path, row[1][i])
-        return reachable & ~jnp.any(arm_hits_shelf(q, shelf)), q[::ARM_EVERY]
+        q, follows = arm_path(path, row[1][i], shelf)
+        return follows, q[::ARM_EVERY]
 
     T = compose(T_world_target[None], tables.T_target_gripper)
     able, q = masked_vmap(enters, feasible, None, (T, tables.q7), block=64)

@@ -106,10 +106,20 @@ def ways_in(
     return q[best], reachable[best], jnp.float32(gripper.outside)[best]
 
 
-def arm_follows(path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf) -> Bool[Array, ""]:
-    """Whether the arm follows a path of gripper poses in one configuration, and links 2 to 5 do not touch the shelf."""
+def arm_path(
+    path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf
+) -> tuple[Float[Array, "w 7"], Bool[Array, ""]]:
+    """Joint angles along a path of gripper poses [rad], and whether the arm follows it.
+
+    It does if it stays in one configuration, and links 2 to 5 do not touch the shelf.
+    """
     q, reachable = path_kinematics(path, q7)
-    return reachable & ~jnp.any(arm_hits_shelf(q, shelf))
+    return q, reachable & ~jnp.any(arm_hits_shelf(q, shelf))
+
+
+def arm_follows(path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf) -> Bool[Array, ""]:
+    """Whether the arm follows a path of gripper poses; see `arm_path`."""
+    return arm_path(path, q7, shelf)[1]
 
 
 def arm_enters(
