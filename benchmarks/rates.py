@@ -31,6 +31,9 @@ class Rates:
       errors: how many of them could not be run to their end; they count as failures.
       found, graspable, retrieved: shares of them.
       found_interval, graspable_interval, retrieved_interval: what the true shares may be: see `wilson`.
+      paper_episodes: how many of the episodes say whether the target could be grasped with the paper's grasps alone.
+      paper_graspable, paper_graspable_interval: share of those in which it could, None where there are none, and what
+        the true share may be.
       steps: mean number of actions, attempts to take the target out among them.
       planning_seconds, simulation_seconds: mean wall time per action [s].
     """
@@ -45,6 +48,9 @@ class Rates:
     found_interval: tuple[float, float]
     graspable_interval: tuple[float, float]
     retrieved_interval: tuple[float, float]
+    paper_episodes: int
+    paper_graspable: float | None
+    paper_graspable_interval: tuple[float, float]
     steps: float
     planning_seconds: float
     simulation_seconds: float
@@ -98,6 +104,7 @@ def summarise(rows: Sequence[Row]) -> list[Rates]:
         found = sum(row.found_step is not None for row in group)
         graspable = sum(row.graspable_step is not None for row in group)
         retrieved = sum(row.retrieved for row in group)
+        said = [row.paper_graspable for row in group if row.paper_graspable is not None]
         summary.append(
             Rates(
                 method=method,
@@ -110,6 +117,9 @@ def summarise(rows: Sequence[Row]) -> list[Rates]:
                 found_interval=wilson(found, len(group)),
                 graspable_interval=wilson(graspable, len(group)),
                 retrieved_interval=wilson(retrieved, len(group)),
+                paper_episodes=len(said),
+                paper_graspable=sum(said) / len(said) if said else None,
+                paper_graspable_interval=wilson(sum(said), len(said)),
                 steps=sum(row.steps for row in group) / len(group),
                 planning_seconds=sum(row.planning_seconds for row in group) / actions,
                 simulation_seconds=sum(row.simulation_seconds for row in group) / actions,

@@ -27,6 +27,13 @@ FILES = ("report.md", "rates.csv", "rates.json", "failures.csv", "events.csv", "
 # Which action it was is no reason of its own.
 _WHICH_ACTION = re.compile(r" at action \d+$")
 GOALS = {"found": "found", "graspable": "found and graspable", "retrieved": "retrieved"}
+# The shares in `Rates` that a report lists, in its words.
+SHARES = {
+    "found": "found",
+    "graspable": "graspable",
+    "paper_graspable": "with the paper's grasps",
+    "retrieved": "retrieved",
+}
 # Told apart without colour vision too (Okabe and Ito).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 
@@ -113,8 +120,8 @@ def failures(rows: Sequence[Row]) -> list[Failures]:
     return result
 
 
-def _share(value: float, interval: tuple[float, float]) -> str:
-    return f"{value:.2f} ({interval[0]:.2f} to {interval[1]:.2f})"
+def _share(value: float | None, interval: tuple[float, float]) -> str:
+    return "-" if value is None else f"{value:.2f} ({interval[0]:.2f} to {interval[1]:.2f})"
 
 
 def _objects(rates: Rates | Events) -> str:
@@ -129,13 +136,14 @@ def _row(cells: Sequence[str]) -> str:
 def markdown(rows: Sequence[Row]) -> str:
     """The report as text."""
     summary, reasons = summarise(rows), failures(rows)
-    names = ("method", "objects", "episodes", "errors", *GOALS, "actions", "planning [s]", "simulation [s]")
+    names = ("method", "objects", "episodes", "errors", *SHARES.values(), "actions", "planning [s]", "simulation [s]")
     lines = [
         "# Results",
         "",
         f"{len(rows)} episodes. Shares with Wilson's 95% confidence interval; actions are the mean number per episode, "
         "attempts to take the target out among them; times are means per action. An episode that ended in an error of "
-        "the program counts as a failure.",
+        "the program counts as a failure. *With the paper's grasps*: graspable with those alone before the episode "
+        "ended, of the episodes that say so.",
         "",
         *([told_of_changes(rows), ""] if changed_scenarios(rows) else []),
         _row(names),
@@ -143,7 +151,7 @@ def markdown(rows: Sequence[Row]) -> str:
     ]
     for rates in summary:
         cells = [rates.method, _objects(rates), str(rates.episodes), str(rates.errors)]
-        cells += [_share(getattr(rates, goal), getattr(rates, f"{goal}_interval")) for goal in GOALS]
+        cells += [_share(getattr(rates, goal), getattr(rates, f"{goal}_interval")) for goal in SHARES]
         cells += [f"{v:.2f}" for v in (rates.steps, rates.planning_seconds, rates.simulation_seconds)]
         lines.append(_row(cells))
     lines += ["", "## Why episodes failed", ""]

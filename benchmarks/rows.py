@@ -56,9 +56,12 @@ class Row:
       fallen_step: number of actions after which the first of them was off it; None where none fell.
       held_up: number of actions in which the arm was held up.
       unsettled: number of actions after which something never came to rest.
+      paper_graspable: whether the target could be grasped with the paper's grasps alone at some step; None in files of
+        earlier versions, which do not say.
+      paper_graspable_step: as in `Episode`.
 
-    From `looks` on they are None where that is not known: in files of earlier versions, and of an episode that could
-    not be run to its end.
+    From `looks` to `unsettled` they are None where that is not known: in files of earlier versions, and of an episode
+    that could not be run to its end.
     """
 
     scenario: str
@@ -88,6 +91,8 @@ class Row:
     fallen_step: int | None = None
     held_up: int | None = None
     unsettled: int | None = None
+    paper_graspable: bool | None = None
+    paper_graspable_step: int | None = None
 
     @classmethod
     def of_episode(cls, episode: Episode) -> Row:
@@ -106,6 +111,8 @@ class Row:
             simulation_seconds=sum(timings["simulate"] for timings in spent),
             content_hash=episode.content_hash,
             **_event_columns(episode.steps),
+            paper_graspable=_paper_graspable(episode.steps),
+            paper_graspable_step=episode.paper_graspable_step,
         )
 
     @classmethod
@@ -123,6 +130,7 @@ class Row:
             planning_seconds=0.0,
             simulation_seconds=0.0,
             content_hash=scenario.content_hash,
+            paper_graspable=False,
         )
 
 
@@ -142,6 +150,12 @@ def _event_columns(steps: Sequence[Step]) -> dict[str, Any]:
         "held_up": sum(bool(step.held_up) for step in steps),
         "unsettled": sum(step.at_rest is False for step in steps),
     }
+
+
+def _paper_graspable(steps: Sequence[Step]) -> bool | None:
+    """Whether the paper's grasps would have done at some step; None where steps do not say, as in earlier versions."""
+    said = [step.paper_graspable for step in steps]
+    return None if None in said else any(said)
 
 
 def _option_columns(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -164,10 +178,11 @@ def _column(kind: Any) -> pyarrow.DataType:
 
 
 SCHEMA = pyarrow.schema([(name, _column(kind)) for name, kind in get_type_hints(Row).items()])
-# The last column before rows said what happened on the way, before that what their scenario holds, and before that
-# the configuration.
+# The last column before rows told of the paper's grasps, before that of what happened on the way, before that of what
+# their scenario holds, and before that of the configuration.
 _EARLIER_COLUMNS = tuple(
-    SCHEMA.names[: SCHEMA.names.index(last) + 1] for last in ("content_hash", "configuration", "simulation_seconds")
+    SCHEMA.names[: SCHEMA.names.index(last) + 1]
+    for last in ("unsettled", "content_hash", "configuration", "simulation_seconds")
 )
 
 

@@ -20,17 +20,21 @@ from mechsearch_jax.envs import scene_sets
 
 
 def rates_table(rows: Sequence[Row]) -> Table:
-    """Rates of success by method and number of objects, and mean times per action."""
+    """Rates of success by method and number of objects, and mean times per action.
+
+    "paper's" is the share that is graspable with the paper's grasps alone, of the episodes that say so.
+    """
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
     table.add_column("method", no_wrap=True)
-    for name in ("objects", "runs", "found", "graspable", "retrieved", "actions", "plan s", "act s"):
+    for name in ("objects", "runs", "found", "graspable", "paper's", "retrieved", "actions", "plan s", "act s"):
         table.add_column(name, justify="right", no_wrap=True)
     for rates in summarise(rows):
+        shares = rates.found, rates.graspable, rates.paper_graspable, rates.retrieved
         table.add_row(
             rates.method,
             "all" if rates.objects is None else str(rates.objects),
             str(rates.episodes),
-            *(f"{share:.2f}" for share in (rates.found, rates.graspable, rates.retrieved)),
+            *("-" if share is None else f"{share:.2f}" for share in shares),
             f"{rates.steps:.1f}",
             f"{rates.planning_seconds:.2f}",
             f"{rates.simulation_seconds:.2f}",

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from mechsearch_jax.actions import Action, ActionKind, kind_of
 from mechsearch_jax.envs.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.records import Episode, Step, record_action
+from mechsearch_jax.envs.verdicts import Verdict
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.planner import Decision
 from mechsearch_jax.versions import versions
@@ -126,7 +127,7 @@ def failure_of(choice: Choice, outcome: Outcome, i: int) -> str | None:
 def record(
     found: bool,
     belief_size: int,
-    graspable: bool,
+    verdict: Verdict,
     choice: Choice | None,
     truth_possible: bool | None = None,
     restarts: int | None = None,
@@ -136,7 +137,7 @@ def record(
     Args:
       found: whether the target has been found.
       belief_size: number of poses where it can be.
-      graspable: whether it truly is.
+      verdict: on the true state.
       choice: None where nothing is done.
       truth_possible, restarts: as in `Step`.
     """
@@ -151,7 +152,7 @@ def record(
     return Step(
         belief_size=belief_size,
         found=found,
-        graspable=graspable,
+        graspable=verdict.graspable,
         cost=cost,
         action=action,
         predicted_cost=predicted,
@@ -161,6 +162,7 @@ def record(
         timings={},
         truth_possible=truth_possible,
         restarts=restarts,
+        paper_graspable=verdict.paper_graspable,
     )
 
 
@@ -182,6 +184,7 @@ class EpisodeLog:
         self._index = 0
         self._found_step: int | None = None
         self._graspable_step: int | None = None
+        self._paper_graspable_step: int | None = None
         self._retrieved = False
         self._failure: str | None = None
 
@@ -208,6 +211,8 @@ class EpisodeLog:
             self._found_step = self._index
         if step.graspable and self._graspable_step is None:
             self._graspable_step = self._index
+        if step.paper_graspable and self._paper_graspable_step is None:
+            self._paper_graspable_step = self._index
         self.steps.append(step)
         return step
 
@@ -277,4 +282,5 @@ class EpisodeLog:
             retrieved=self._retrieved,
             failure=self._failure,
             content_hash=scenario.content_hash,
+            paper_graspable_step=self._paper_graspable_step,
         )

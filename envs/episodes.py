@@ -5,11 +5,11 @@ so that short episodes do not wait for long ones. The random numbers of an episo
 neither on its slot nor on its neighbours. An episode alone is a pool of one slot, which calls the functions of a single
 scene, and which can be watched.
 
-Two verdicts are passed on an episode, both on the true state: `graspable` (the target is in sight and a collision-free
-grasp exists) and `retrieved` (the hand took it out of the shelf, and no object fell, neither then nor before). An
-action that fails costs a step and leaves the world as it made it. Once an object has left the board nothing can be
-retrieved any more: the episode goes on until it is known whether the target is found and graspable, and takes nothing
-out.
+Three verdicts are passed on an episode, all on the true state: `graspable` (the target is in sight and a collision-free
+grasp exists), `paper_graspable` (the same of the paper's grasps alone) and `retrieved` (the hand took it out of the
+shelf, and no object fell, neither then nor before). An action that fails costs a step and leaves the world as it made
+it. Once an object has left the board nothing can be retrieved any more: the episode goes on until it is known whether
+the target is found and graspable, and takes nothing out. No episode goes on for the sake of `paper_graspable`.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from mechsearch_jax.envs.records import Episode, Step
 from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.envs.slots import ManySlots, OneSlot, Slots
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle
+from mechsearch_jax.envs.verdicts import Verdict
 from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
@@ -287,17 +288,18 @@ class _EpisodePool:
             choices = self._known.decide(planner_keys, asked)
         choices = {r: choice for r, choice in choices.items() if not logs[r].last or takes_target(choice)}
         with clock("judge", sought):
-            graspable = self._known.judge(world, sought)
+            verdicts = self._known.judge(world, sought)
 
         trouble |= {r: reason for r, choice in choices.items() if (reason := distrust(choice))}
         for r, log in logs.items():
             # Where an object has left the board, an episode goes on for what else is to be known of it, no further.
-            if log.spoilt and (graspable.get(r) or (r in choices and takes_target(choices[r]))):
+            verdict = verdicts.get(r, Verdict())
+            if log.spoilt and (verdict.graspable or (r in choices and takes_target(choices[r]))):
                 trouble.setdefault(r, log.spoilt)
             choice = None if r in trouble else choices.get(r)
             size = 1 if found[r] else int(known.size[r])
             truth = None if found[r] or r in lost else bool(known.truth[r])
-            log.decide(record(bool(found[r]), size, graspable.get(r, False), choice, truth, int(known.restarts[r])))
+            log.decide(record(bool(found[r]), size, verdict, choice, truth, int(known.restarts[r])))
         return self._act(clock, {r: choice for r, choice in choices.items() if r not in trouble}, trouble)
 
     def _target_troubles(self, world: World, rows: Sequence[int]) -> dict[int, str]:

@@ -119,9 +119,13 @@ def verdict(episode: Episode) -> str:
     if episode.found_step is None:
         parts.append(f"not found ({episode.failure})")
     else:
-        graspable = episode.graspable_step
+        graspable, by_paper = episode.graspable_step, episode.paper_graspable_step
         parts.append(f"found {after(episode.found_step)}")
         parts.append("never graspable" if graspable is None else f"graspable {after(graspable)}")
+        if graspable != by_paper:
+            when = "never" if by_paper is None else after(by_paper)
+            known = by_paper is not None or all(step.paper_graspable is not None for step in episode.steps)
+            parts[-1] += f" ({when} with the paper's grasps)" if known else ""
         parts.append("retrieved" if episode.retrieved else f"not retrieved ({episode.failure})")
     restless = [str(i + 1) for i, step in enumerate(episode.steps) if step.at_rest is False]
     if restless:

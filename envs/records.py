@@ -78,8 +78,10 @@ class Step:
       held_up: whether the arm was held up: see `SimulatorConfig.tracking_bound`.
       at_rest: whether everything came to rest after the action; False also where the simulation diverged.
       tracking_error: how far the joint that was farthest from its reference was from it [rad].
+      paper_graspable: whether `graspable` holds with the paper's grasps alone: see `verdicts.paper_grasps`.
 
-    From `fallen` on they are None where nothing was executed, from `truth_possible` on in files of earlier versions.
+    From `fallen` to `tracking_error` they are None where nothing was executed, from `truth_possible` on in files of
+    earlier versions.
     """
 
     belief_size: int
@@ -99,6 +101,7 @@ class Step:
     held_up: bool | None = None
     at_rest: bool | None = None
     tracking_error: float | None = None
+    paper_graspable: bool | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,6 +120,8 @@ class Episode:
       failure: why the episode ended without a retrieval; None after one. Where an object left the board, this is the
         reason, with the number of the action.
       content_hash: of the scenario, see `Scenario.content_hash`; None in files of earlier versions.
+      paper_graspable_step: number of actions before it could be grasped with the paper's grasps alone; None where it
+        could not before the episode ended, and in files of earlier versions, whose steps do not say.
     """
 
     scenario: str
@@ -129,6 +134,7 @@ class Episode:
     retrieved: bool
     failure: str | None
     content_hash: str | None = None
+    paper_graspable_step: int | None = None
 
 
 def save_episode(episode: Episode, path: PathLike) -> None:

@@ -19,15 +19,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.envs.episode_log import Choice, chosen
-from mechsearch_jax.envs.snapshot import (
-    Recogniser,
-    Snapshot,
-    objects_on_the_board,
-    true_target_pose,
-)
+from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
+from mechsearch_jax.envs.verdicts import Verdict, judge, judge_many
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Belief, Decision, Policy, Problem, graspable_at, initial_belief, update_belief
+from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.moved_target import nearest_candidate
 
 
@@ -69,8 +65,8 @@ class Slots(Protocol):
         """What the policy decides in some slots; `keys` are the planner's, one for each slot."""
         ...
 
-    def judge(self, world: World, rows: Sequence[int]) -> dict[int, bool]:
-        """In which of some slots a collision-free grasp of the target exists, whatever anybody believes."""
+    def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
+        """Whether in some slots a collision-free grasp of the target exists, whatever anybody believes."""
         ...
 
 
@@ -112,20 +108,13 @@ class OneSlot:
         self.decision = self._policy(keys[0], self._problem, self.belief, self.observation)
         return {0: jax.device_get(chosen(self.decision))}
 
-    def judge(self, world: World, rows: Sequence[int]) -> dict[int, bool]:
+    def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
         """See `Slots`."""
-        here = self._snapshot(world)
-        objects, pose = objects_on_the_board(here), true_target_pose(here.world)
-        # Called as the policies call it, so that nothing is compiled twice.
-        return {r: bool(graspable_at(self._problem, objects, pose).success) for r in rows}
+        return {r: judge(self._problem, self._snapshot(world)) for r in rows}
 
     def _snapshot(self, world: World) -> Snapshot:
         here = jax.tree.map(lambda a: a[0], world)
         return Snapshot(self._problem.camera, self._problem.shelf, here)
-
-
-def _graspable(problem: Problem, objects: Any, world: World, active: Bool[Array, ""]) -> Array:
-    return graspable_at(problem, objects, true_target_pose(world), active).success
 
 
 class PlannerState(flax.struct.PyTreeNode):
@@ -180,12 +169,12 @@ class ManySlots:
             found |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(some)}
         return found
 
-    def judge(self, world: World, rows: Sequence[int]) -> dict[int, bool]:
+    def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
         """See `Slots`."""
-        found: dict[int, bool] = {}
+        found: dict[int, Verdict] = {}
         for some, padded in self._chunks(rows):
-            graspable = np.asarray(_judge(self._problem, world, padded))
-            found |= {r: bool(graspable[i]) for i, r in enumerate(some)}
+            verdicts = judge_many(self._problem, _some_worlds(world, padded), padded < self._count)
+            found |= dict(zip(some, verdicts, strict=False))
         return found
 
     def _chunks(self, rows: Sequence[int]) -> Iterator[tuple[Sequence[int], Array]]:
@@ -202,6 +191,7 @@ def _some(tree: Any, rows: Int[Array, " n"]) -> Any:
     return jax.tree.map(lambda a: a[jnp.minimum(rows, a.shape[0] - 1)], tree)
 
 
+@jax.jit
 def _some_worlds(world: World, rows: Int[Array, " n"]) -> World:
     """The worlds in the slots `rows`, empty ones for rows beyond the end."""
     here = _some(world, rows)
@@ -259,14 +249,3 @@ def _decide(policy: Policy, problem: Problem, state: PlannerState, keys: Array, 
     objects = mine.observation.objects
     objects = objects.replace(valid=objects.valid & active[:, None])
     return jax.vmap(one)(_some(keys, rows), PlannerState(belief, mine.observation.replace(objects=objects)))
-
-
-@jax.jit
-def _judge(problem: Problem, world: World, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
-    """Whether the target can truly be taken out in the slots `rows`."""
-
-    def one(here, active):
-        objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, here))
-        return _graspable(problem, objects, here, active)
-
-    return jax.vmap(one)(_some_worlds(world, rows), rows < len(world.kind))

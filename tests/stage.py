@@ -21,6 +21,8 @@ CYLINDER = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), UPRIGHT)
 HIDDEN = Scenario("hidden", (BOX,), CYLINDER)
 OPEN = Scenario("open", (dataclasses.replace(BOX, position=(0.6, -0.2, 0.4845)),), CYLINDER)
 TWO = Scenario("two", (BOX, dataclasses.replace(BOX, position=(0.6, -0.15, 0.4845))), CYLINDER)
+# Low and wide before the target: grasps have to be tilted by more than 20 degrees to reach over it.
+SILL = Scenario("sill", (Body("box", (0.01, 0.2, 0.026), (0.52, 0.07, 0.4305), UPRIGHT),), CYLINDER)
 
 
 def reveal(world):

@@ -15,6 +15,7 @@ from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.outcome import Failure, Overflow
 from mechsearch_jax.envs.simulator import Simulator
+from mechsearch_jax.envs.verdicts import Verdict
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import search_for_grasp
@@ -121,7 +122,7 @@ def test_what_falls_belongs_to_its_own_row(problem):
 
 def test_a_success_that_cannot_be_trusted_is_none():
     log = EpisodeLog(2)
-    log.decide(record(True, 1, True, None))
+    log.decide(record(True, 1, Verdict(True, False), None))
     assert log.act(WON, "error: no", {})
     episode = log.episode(OPEN, {})
     assert (episode.retrieved, episode.failure) == (False, "error: no")
@@ -130,10 +131,10 @@ def test_a_success_that_cannot_be_trusted_is_none():
 def test_a_retrieval_does_not_count_once_an_object_has_left_the_board():
     log = EpisodeLog(2)
     fell = dataclasses.replace(WON, takes_target=False, retrieved=False, final=False, off_board=frozenset({1, TARGET}))
-    log.decide(record(False, 9, False, None))
+    log.decide(record(False, 9, Verdict(), None))
     assert not log.act(fell, None, {})
     assert log.spoilt == "an object fell off the board at action 1"
-    log.decide(record(True, 1, False, None))
+    log.decide(record(True, 1, Verdict(), None))
     assert log.act(dataclasses.replace(WON, off_board=frozenset({1, 2})), None, {})
     episode = log.episode(OPEN, {})
     assert (episode.retrieved, episode.failure) == (False, "an object fell off the board at action 1")
@@ -142,7 +143,7 @@ def test_a_retrieval_does_not_count_once_an_object_has_left_the_board():
 
 def test_an_error_is_told_before_what_fell():
     log = EpisodeLog(2)
-    log.decide(record(False, 9, False, None))
+    log.decide(record(False, 9, Verdict(), None))
     assert log.act(dataclasses.replace(WON, off_board=frozenset({0})), "error: no", {})
     assert log.episode(OPEN, {}).failure == "error: no"
 
@@ -159,7 +160,7 @@ def test_decisions_that_cannot_be_trusted_are_named():
 def test_a_policy_need_not_say_what_it_expects():
     silent = Choice(no_action(), jnp.float32(3.0), jnp.float32(jnp.nan), jnp.int32(1), jnp.array(False))
     assert distrust(silent) is None
-    step = record(False, 5, False, silent)
+    step = record(False, 5, Verdict(), silent)
     assert (step.cost, step.predicted_cost, step.sequences) == (3.0, None, 1)
 
 

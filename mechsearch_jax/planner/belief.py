@@ -45,7 +45,7 @@ def initial_belief(problem: Problem) -> Belief:
         found=jnp.array(False),
         found_pose=jnp.zeros(3),
         allowed=jnp.full(problem.existence.corner.shape[:2], problem.config.existence.allowed, jnp.int32),
-        grasps=no_grasps(problem),
+        grasps=no_grasps(problem.target_grasps),
         restarts=jnp.int32(0),
     )
 
@@ -80,7 +80,7 @@ def update_belief(problem: Problem, belief: Belief, observation: Observation) ->
         found=seen,
         found_pose=pose,
         allowed=allowed,
-        grasps=found_grasps(problem, T_world_target, seen),
+        grasps=found_grasps(problem.target_grasps, T_world_target, seen),
         restarts=belief.restarts + contradiction,
     )
 

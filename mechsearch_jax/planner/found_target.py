@@ -16,7 +16,7 @@ from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
 from mechsearch_jax.graspability import FoundGrasps, GraspTables, boxes_overlap, feasible_grasps, grasp_hits
-from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.problem import TargetGrasps
 from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, arm_path, crossing_length, crossing_poses, way_in
 from mechsearch_jax.robot.gripper import Gripper
@@ -26,26 +26,25 @@ from mechsearch_jax.robot.kinematics import JOINTS
 ARM_EVERY = 2
 
 
-def no_grasps(problem: Problem) -> FoundGrasps:
+def no_grasps(grasps: TargetGrasps) -> FoundGrasps:
     """Those of a target that has not been found."""
-    grasps = problem.retrieval.found_grasp.shape[0]
+    count = grasps.tables.found_grasp.shape[0]
     poses = len(range(0, CLOSE_CROSSINGS + CLOSE_WAYPOINTS, ARM_EVERY))
-    return FoundGrasps(jnp.eye(4), jnp.zeros(grasps, bool), jnp.zeros((grasps, poses, len(JOINTS))))
+    return FoundGrasps(jnp.eye(4), jnp.zeros(count, bool), jnp.zeros((count, poses, len(JOINTS))))
 
 
 def found_grasps(
-    problem: Problem, T_world_target: Float[Array, "4 4"], active: Bool[Array, ""] | bool = True
+    grasps: TargetGrasps, T_world_target: Float[Array, "4 4"], active: Bool[Array, ""] | bool = True
 ) -> FoundGrasps:
     """The grasps of a target at any pose that the arm and the shelf allow on the whole way in and out.
 
     Args:
-      problem: what does not change.
+      grasps: those to choose from.
       T_world_target: pose of the target.
       active: where false, none is feasible and little is computed: there is no target yet.
     """
-    tables, gripper, shelf = problem.retrieval, problem.gripper, problem.shelf
-    config = problem.config.retrieval
-    feasible = feasible_grasps(tables, shelf, gripper, config, T_world_target[None], active)[0]
+    tables, gripper, shelf = grasps.tables, grasps.gripper, grasps.shelf
+    feasible = feasible_grasps(tables, shelf, gripper, grasps.config, T_world_target[None], active)[0]
 
     def enters(_, row, i):
         path = way_in(row[0][i], gripper.nearest_outside, gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS)
@@ -58,7 +57,7 @@ def found_grasps(
 
 
 def found_hits(
-    problem: Problem,
+    grasps: TargetGrasps,
     found: FoundGrasps,
     scene: Superquadrics,
     active: Bool[Array, ""] | bool = True,
@@ -68,7 +67,7 @@ def found_hits(
     """Which objects the whole way of each grasp of a found target would hit; those that are not feasible hit none.
 
     Args:
-      problem: what does not change.
+      grasps: as `found_grasps` was told.
       found: the target.
       scene: the objects, without the target.
       active: where false, nothing is hit and little is computed.
@@ -77,9 +76,9 @@ def found_hits(
     """
     here = jnp.asarray(active)
     fresh = scene.replace(valid=scene.valid if moved is None else scene.valid & moved)
-    hits = grasp_hits(problem.retrieval, found, fresh, here[None])
+    hits = grasp_hits(grasps.tables, found, fresh, here[None])
     feasible = found.feasible & here
-    hits |= crossing_hits(problem.retrieval, problem.gripper, fresh, found.T_world_target, feasible)
+    hits |= crossing_hits(grasps.tables, grasps.gripper, fresh, found.T_world_target, feasible)
 
     def touches(_, row, i):
         q, scene = row

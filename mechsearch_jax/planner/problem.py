@@ -10,13 +10,38 @@ from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tabl
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceTables, existence_tables
-from mechsearch_jax.graspability import GraspTables, grasp_tables
+from mechsearch_jax.graspability import GraspConfig, GraspTables, grasp_tables
 from mechsearch_jax.planner.config import ProblemConfig
 from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
+
+
+class TargetGrasps(flax.struct.PyTreeNode):
+    """The grasps that a found target may be taken out with, and what else decides which of them are feasible.
+
+    Attributes:
+      tables: their constants; they have no candidate poses.
+      shelf, gripper, target, config: static.
+    """
+
+    tables: GraspTables
+    shelf: Shelf = flax.struct.field(pytree_node=False)
+    gripper: Gripper = flax.struct.field(pytree_node=False)
+    target: Target = flax.struct.field(pytree_node=False)
+    config: GraspConfig = flax.struct.field(pytree_node=False)
+
+
+def target_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: GraspConfig) -> TargetGrasps:
+    """The grasps of a configuration for a target that has been found. Not to be called inside `jit`.
+
+    Raises:
+      InputError: the target is too wide for the gripper.
+    """
+    tables = grasp_tables(shelf, gripper, target, config, candidates=False)
+    return TargetGrasps(tables, shelf, gripper, target, config)
 
 
 class Problem(flax.struct.PyTreeNode):
@@ -52,6 +77,11 @@ class Problem(flax.struct.PyTreeNode):
             wrists=self.actions.q7.shape[1],
         )
 
+    @property
+    def target_grasps(self) -> TargetGrasps:
+        """The grasps that the target is taken out with."""
+        return TargetGrasps(self.retrieval, self.shelf, self.gripper, self.target, self.config.retrieval)
+
 
 def build_problem(
     target: Target | None = None,
@@ -82,7 +112,7 @@ def build_problem(
         existence=existence_tables(camera, shelf, target, config.existence),
         grasps=grasps,
         actions=action_tables(gripper, config.grasps.wrists, config.actions),
-        retrieval=grasp_tables(shelf, gripper, target, config.retrieval, candidates=False),
+        retrieval=target_grasps(shelf, gripper, target, config.retrieval).tables,
         poses=jnp.asarray(target.candidate_poses(shelf)),
         camera=camera,
         shelf=shelf,

@@ -13,7 +13,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, upright_pose
 from mechsearch_jax.graspability import grasp_hits
 from mechsearch_jax.planner.found_target import found_grasps, found_hits
-from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.problem import Problem, TargetGrasps
 
 # By how much objects are grown to find the grasp that keeps furthest from them [m].
 CLEARANCES = (0.004, 0.008, 0.012, 0.02)
@@ -39,29 +39,43 @@ class GraspChoice(flax.struct.PyTreeNode):
 def graspable_at(
     problem: Problem, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool = True
 ) -> GraspChoice:
-    """Whether and how a target at a pose can be grasped without hitting anything.
+    """Whether and how a target at a pose can be grasped without hitting anything, with the problem's own grasps.
 
     Args:
       problem: what does not change.
+      scene, pose, active: as in `best_grasp`.
+    """
+    return best_grasp(problem.target_grasps, scene, pose, active)
+
+
+def best_grasp(
+    grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool = True
+) -> GraspChoice:
+    """Whether and how a target at a pose can be grasped with some grasps without hitting anything.
+
+    Args:
+      grasps: those to choose from.
       scene: the objects, without the target.
       pose: of the target as x, y [m], yaw [rad]; need not be a candidate.
       active: where false, no grasp is feasible and little is computed: there is no target yet.
     """
-    T_world_target = upright_pose(pose, problem.target.height(problem.shelf))
-    tables = problem.retrieval
-    found = found_grasps(problem, T_world_target, active)
+    T_world_target = upright_pose(pose, grasps.target.height(grasps.shelf))
+    tables = grasps.tables
+    found = found_grasps(grasps, T_world_target, active)
     here = jnp.asarray(active)[None]
     worst = scene.capacity + 1
 
     def count(clearance):
         return jnp.sum(grasp_hits(tables, found, scene.replace(size=scene.size + clearance), here), axis=1)
 
-    hits = jnp.where(found.feasible, jnp.sum(found_hits(problem, found, scene, active), axis=1), worst)
+    hits = jnp.where(found.feasible, jnp.sum(found_hits(grasps, found, scene, active), axis=1), worst)
     crowd = jnp.sum(jax.lax.map(count, jnp.float32(CLEARANCES)), axis=0)
     best = jnp.argmin(hits * 100 + crowd)
     T = compose(T_world_target[None], tables.T_target_gripper)
+    # Not of the best: who asks for these alone need not know how near others are.
+    fewest = jnp.min(hits)
     return GraspChoice(
-        success=hits[best] == 0,
-        hits=hits[best].astype(jnp.int32),
-        action=retrieve_action(T[best], tables.q7[best], jnp.float32(problem.gripper.max_opening)),
+        success=fewest == 0,
+        hits=fewest.astype(jnp.int32),
+        action=retrieve_action(T[best], tables.q7[best], jnp.float32(grasps.gripper.max_opening)),
     )

@@ -99,7 +99,7 @@ class Rollout:
         # Where the target has moved, other rows of H count, of which nothing is known yet.
         unknown = moved | jnp.any(moved & state.is_target)
         hits = grasp_hits(problem.grasps, None, objects, counts, state.hits[:known], unknown)
-        of_found = found_hits(problem, grasps, objects, found, state.hits[known:], moved)
+        of_found = found_hits(problem.target_grasps, grasps, objects, found, state.hits[known:], moved)
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, of_found]))
 
     def options(self, state: State, moved: Bool[Array, " n"]):

@@ -1,0 +1,70 @@
+"""Verdicts on the true state: with the grasps that the robot uses, and with the paper's alone."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from stage import HIDDEN, OPEN, SILL, Stage, grab, reveal
+
+from mechsearch_jax.envs import verdicts
+from mechsearch_jax.envs.episodes import Start, run_episode, run_episodes
+from mechsearch_jax.envs.narration import verdict
+from mechsearch_jax.envs.snapshot import Snapshot
+from mechsearch_jax.envs.verdicts import Verdict, judge, paper_grasps
+from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.graspability import GraspConfig
+from mechsearch_jax.planner.problem import target_grasps
+from mechsearch_jax.workspace.target import Target
+
+
+@pytest.mark.parametrize(("shape", "count"), [("cylinder", 21), ("box", 12)])
+def test_the_papers_grasps_are_10_to_30_tilted_by_20_degrees(problem, shape, count):
+    grasps = paper_grasps(problem.shelf, problem.gripper, Target.of(shape))
+    assert grasps.tables.found_grasp.shape == (count,)
+    approach = np.asarray(grasps.tables.T_target_gripper)[:, :3, 2]
+    np.testing.assert_allclose(approach[:, 2], -math.sin(math.radians(20)), atol=1e-6)
+    assert paper_grasps(problem.shelf, problem.gripper, Target.of(shape)) is grasps
+
+
+REVEALING = {"hidden": reveal}
+
+
+def test_steeper_grasps_reach_over_what_the_papers_do_not(problem):
+    """Alone and in a batch: what stands low and wide before the target leaves only grasps tilted by more than that."""
+    scenarios = [OPEN, SILL, HIDDEN]
+    alone = [run_episode(0, s, problem, grab, Stage(REVEALING), max_steps=2) for s in scenarios]
+    found = {}
+    starts = [Start(s, 0) for s in scenarios]
+    run_episodes(starts, problem, grab, Stage(REVEALING), 2, lambda e: found.update(e), max_steps=2, at_once=2)
+    for episodes in (alone, [found[i] for i in range(3)]):
+        steps = [(e.graspable_step, e.paper_graspable_step) for e in episodes]
+        assert steps == [(0, 0), (0, None), (1, 1)]
+        assert [[s.paper_graspable for s in e.steps] for e in episodes] == [[True], [False], [False, True]]
+    assert verdict(alone[0]) == "open: found after 0 actions, graspable after 0 actions, retrieved"
+    assert "graspable after 0 actions (never with the paper's grasps), retrieved" in verdict(alone[1])
+    unknown = [dataclasses.replace(step, paper_graspable=None) for step in alone[1].steps]
+    assert "paper" not in verdict(dataclasses.replace(alone[1], steps=tuple(unknown)))
+
+
+def test_the_papers_grasps_do_not_depend_on_the_methods(problem, monkeypatch):
+    steep = GraspConfig(tilts=(math.radians(30),))
+    grasps = target_grasps(problem.shelf, problem.gripper, problem.target, steep)
+    config = dataclasses.replace(problem.config, grasps=steep, retrieval=steep)
+    other = problem.replace(retrieval=grasps.tables, config=config)
+    # Nothing is to be compiled for its grasps.
+    choice = type("Choice", (), {"success": jnp.array(True)})
+    monkeypatch.setattr(verdicts, "graspable_at", lambda problem, objects, pose: choice)
+    traced = verdicts._graspable._cache_size()
+    for scenario, expected in ((OPEN, True), (SILL, False)):
+        here = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))
+        assert judge(other, here) == Verdict(True, expected)
+    assert verdicts._graspable._cache_size() <= max(traced, 1)
+
+
+def test_nothing_is_judged_where_nothing_stands(problem):
+    """The slots that fill up a batch."""
+    world = jax.tree.map(lambda a: jnp.stack([a, a]), from_scenario(OPEN))
+    assert verdicts.judge_many(problem, world, jnp.array([True, False])) == [Verdict(True, True), Verdict()]
