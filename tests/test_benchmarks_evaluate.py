@@ -146,7 +146,12 @@ def test_every_option_tells_rows_apart(tmp_path, files, command, other):
     assert [rates.episodes for rates in summarise(both)] == [1] * 4
 
 
-@pytest.mark.parametrize("columns", [["content_hash", *EVENTS], ["configuration", "content_hash", *EVENTS]], ids=len)
+BY_PAPER = ["paper_graspable", "paper_graspable_step"]
+
+
+@pytest.mark.parametrize(
+    "columns", [["content_hash", *EVENTS, *BY_PAPER], ["configuration", "content_hash", *EVENTS, *BY_PAPER]], ids=len
+)
 def test_rows_that_do_not_say_all_are_kept_but_not_believed(tmp_path, files, command, columns):
     out = tmp_path / "rows.parquet"
     jobs = make_jobs(files[:1], [Method()], (0,))
@@ -262,7 +267,7 @@ def test_progress_and_rates_are_shown(tmp_path, files, command):
     text = screen.getvalue()
     assert "3/3 raise: error: ValueError: no" in text
     everything = next(line for line in text.splitlines() if " all " in line)
-    assert everything.split()[:6] == ["search-for-grasp", "all", "3", "0.67", "0.67", "0.67"]
+    assert everything.split()[:6] == ["search-for-grasp", "all", "3", "0.67", "0.67", "0.00"]
 
 
 @pytest.mark.slow

@@ -2,15 +2,17 @@
 
 import csv
 import dataclasses
+import io
 import json
 
 import pytest
 from matplotlib import image
+from rich.console import Console
 
 from mechsearch_jax.benchmarks import report
 from mechsearch_jax.benchmarks.rates import summarise, wilson
 from mechsearch_jax.benchmarks.rows import EVENTS, Row, write_rows
-from mechsearch_jax.benchmarks.tables import events_table
+from mechsearch_jax.benchmarks.tables import events_table, rates_table
 from mechsearch_jax.errors import InputError
 
 WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)
@@ -60,6 +62,21 @@ def test_a_report_holds_what_the_rows_say(tmp_path):
     assert "| search-for-grasp | error: a \\| b c | 1 | 0.33 |" in text
     assert "](success.png)" in text
     assert image.imread(tmp_path / "new" / "success.png").std() > 0.01
+
+
+def test_a_report_tells_the_papers_grasps_of_the_episodes_that_say_so(tmp_path):
+    said = [dataclasses.replace(WON, paper_graspable=True, paper_graspable_step=2), LOST]
+    report.write_report([*said, dataclasses.replace(LOST, seed=1, paper_graspable=False), OTHER], tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    low, high = wilson(1, 2)
+    assert f"| 0.33 (0.06 to 0.79) | 0.50 ({low:.2f} to {high:.2f}) | 0.33 (0.06 to 0.79) |" in text
+    assert "| 1.00 (0.21 to 1.00) | - | 1.00 (0.21 to 1.00) |" in text
+    with open(tmp_path / "rates.csv", newline="") as file:
+        lines = [(line["paper_episodes"], line["paper_graspable"]) for line in csv.DictReader(file)]
+    assert lines == [("0", "")] * 2 + [("2", "0.5")] * 2
+    screen = Console(file=io.StringIO(), width=100)
+    screen.print(rates_table([*said, OTHER]))
+    assert [line.split()[4:7] for line in screen.file.getvalue().splitlines()[-1:]] == [["0.50", "1.00", "0.50"]]
 
 
 def test_a_report_of_one_success_has_no_failures(tmp_path):

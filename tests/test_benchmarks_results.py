@@ -95,11 +95,27 @@ def test_what_happened_on_the_way_is_read_back_and_counted(tmp_path):
     assert [getattr(unknown, name) for name in EVENTS] == [None] * len(EVENTS)
 
 
+def test_a_row_says_whether_the_papers_grasps_would_have_done_if_the_steps_do():
+    config = {**OLD, "policy": "search-and-grasp", "actions": ["push"], "target": "box", "seed": 3}
+
+    def row(*said, step=None):
+        steps = tuple(dataclasses.replace(STEPS[0], paper_graspable=each) for each in said)
+        episode = dataclasses.replace(EPISODE, config=config, steps=steps, paper_graspable_step=step)
+        found = Row.of_episode(episode)
+        return found.paper_graspable, found.paper_graspable_step
+
+    assert row(False, True, step=1) == (True, 1)
+    assert row(False, False) == (False, None)
+    assert row(None, None) == (None, None)
+
+
 def test_an_episode_of_an_earlier_version_does_not_say_what_happened_on_the_way(tmp_path):
     save_episode(EPISODE, tmp_path / "episode.json")
     value = json.loads((tmp_path / "episode.json").read_text())
+    assert value.pop("paper_graspable_step") is None
+    names = ("truth_possible", "restarts", "fallen", "target_fallen", "held_up", "at_rest", "tracking_error")
     for step in value["steps"]:
-        for name in ("truth_possible", "restarts", "fallen", "target_fallen", "held_up", "at_rest", "tracking_error"):
+        for name in (*names, "paper_graspable"):
             assert step.pop(name) is None
     (tmp_path / "episode.json").write_text(json.dumps(value))
     assert load_episode(tmp_path / "episode.json") == EPISODE
@@ -195,7 +211,13 @@ def test_rows_are_read_back(tmp_path):
     assert pyarrow.parquet.read_schema(tmp_path / "new" / "rows.parquet").equals(SCHEMA)
 
 
-EARLIER_LACKED = [[*EVENTS], ["content_hash", *EVENTS], ["configuration", "content_hash", *EVENTS]]
+BY_PAPER = ["paper_graspable", "paper_graspable_step"]
+EARLIER_LACKED = [
+    BY_PAPER,
+    [*EVENTS, *BY_PAPER],
+    ["content_hash", *EVENTS, *BY_PAPER],
+    ["configuration", "content_hash", *EVENTS, *BY_PAPER],
+]
 
 
 @pytest.mark.parametrize("columns", EARLIER_LACKED, ids=len)
@@ -205,6 +227,8 @@ def test_rows_of_earlier_versions_are_read(tmp_path, columns):
         content_hash="0123456789ab",
         configuration=configuration({**EARLIER, "gamma": 0.9}),
         **dict.fromkeys(EVENTS, 3),
+        paper_graspable=True,
+        paper_graspable_step=2,
     )
     write_rows([row], tmp_path / "rows.parquet")
     table = pyarrow.parquet.read_table(tmp_path / "rows.parquet")
@@ -368,7 +392,8 @@ def test_confidence_intervals_are_those_of_the_formula():
 
 
 def test_the_columns_are_those_of_earlier_tables_but_for_names():
-    assert SCHEMA.types == [*OLD_SCHEMA.types, pyarrow.string(), *[pyarrow.int64()] * len(EVENTS)]
+    since = [pyarrow.string(), *[pyarrow.int64()] * len(EVENTS), pyarrow.bool_(), pyarrow.int64()]
+    assert SCHEMA.types == [*OLD_SCHEMA.types, *since]
     assert SCHEMA.names == [*(RENAMED.get(name, name) for name in OLD_SCHEMA.names), "content_hash", *EVENTS]
     assert SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
 
@@ -385,8 +410,8 @@ def test_what_is_no_table_of_episodes_is_one_line(tmp_path):
 def test_rows_are_summarised_by_method_and_number_of_objects():
     rows = [
         ROW,
-        dataclasses.replace(ROW, seed=1, graspable_step=2, retrieved=True, steps=4),
-        dataclasses.replace(ROW, objects=8, found_step=None, steps=10),
+        dataclasses.replace(ROW, seed=1, graspable_step=2, retrieved=True, steps=4, paper_graspable=True),
+        dataclasses.replace(ROW, objects=8, found_step=None, steps=10, paper_graspable=False),
         dataclasses.replace(ROW, policy="search-and-grasp"),
     ]
     summary = summarise(rows)
@@ -400,3 +425,4 @@ def test_rows_are_summarised_by_method_and_number_of_objects():
     two = summary[2]
     assert (two.found, two.graspable, two.retrieved, two.steps) == (1.0, 0.5, 0.5, 3.0)
     assert two.planning_seconds == pytest.approx(0.5)
+    assert [(r.paper_episodes, r.paper_graspable) for r in summary[1:]] == [(0, None), (1, 1.0), (1, 0.0), (2, 0.5)]
