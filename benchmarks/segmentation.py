@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 
 from mechsearch_jax.benchmarks.images import NOISES, Look, Scene, image_of, named, save_rows
 from mechsearch_jax.envs.recognisers import Labeller, Segmenter
+from mechsearch_jax.envs.simulated_camera import is_found
 from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
@@ -26,6 +27,7 @@ from mechsearch_jax.networks.weights import shipped_weights
 from mechsearch_jax.train.scenes import PIXELS
 from mechsearch_jax.versions import versions
 from mechsearch_jax.viz import drawing
+from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Colours of up to eight objects, told apart with red-green blindness too.
@@ -170,17 +172,17 @@ class Bench:
     def _compiled(self) -> Callable[..., Any]:
         labeller = self.labeller or Segmenter(shipped_weights("segmentation"))
 
-        def label(key, image):
+        def label(key, image, target_seen):
             labels = image.shown.labels
-            return labeller(key, self.shelf, image.shown.points, labels == TARGET, labels)
+            return labeller(key, self.shelf, image.shown.points, (labels == TARGET) & target_seen, labels)
 
         return jax.jit(label)
 
     def _label(self, label: Callable[..., Any], index: int, noise: str) -> tuple[Look, np.ndarray, float]:
         key, image = image_of(self.scenes, index, noise, self.seed, self.shelf)
-        jax.block_until_ready(image)
+        seen = jax.block_until_ready((image, is_found(Camera(), self.scenes[index].world)))[1]
         start = time.perf_counter()
-        found = jax.block_until_ready(label(key, image))
+        found = jax.block_until_ready(label(key, image, seen))
         return image, np.asarray(found), time.perf_counter() - start
 
 

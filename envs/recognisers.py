@@ -1,9 +1,10 @@
 """Recognisers: what the planner sees the simulated world through, from its truth to nothing but a depth image.
 
 `oracle` knows the true shapes and poses. The others are shown the depth image of a camera with the noise of a sensor,
-and make superquadrics of it as `perception.recogniser.Recogniser` does: `masks` is told which pixels are whose, `full`
-has to segment them too. Whether the target is seen is the detector's word, for all of them; where it is, only the
-oracle is told.
+and make superquadrics of it as `perception.recogniser.Recogniser` does: `masks` is told which pixels are whose, and
+which show nothing at all, `full` has to segment them too. Whether the target is seen is the detector's word, for all of
+them; where it is, only the oracle is told. Which pixels are the target's, `full` is told if the detector sees it; as
+long as it does not, they are to it those of one more object.
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.perception.cloud import MARGIN, View, above_board, shelf_view
-from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
-from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, measured_depth
+from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
+from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter
+from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -64,7 +65,7 @@ class Labeller(Protocol):
           key: PRNG key.
           shelf: static.
           points: in the world [m]; NaN where nothing was measured.
-          of_target: where the detector sees the target.
+          of_target: where the detector sees the target; nowhere as long as it does not.
           masks: the true labels; a labeller that should not know them takes no more from them than the numbers that
             objects go by, so that what is done to an object can be judged.
         """
@@ -91,19 +92,31 @@ class Segmenter:
 
 
 def numbered(found: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "h w"]:
-    """Segments renamed after the true objects that they overlap most, one each; what is left over becomes OTHER.
+    """Segments, numbered 0 to 7, renamed after the true objects that they overlap most, one each; none is lost.
 
     A planner does not care for the names; but the simulator's notes on whether the picked object slipped do.
     """
-    segments = jnp.arange(INSTANCES)
-    own = (found.reshape(-1)[:, None] == segments[None]).astype(jnp.float32)
-    truth = (masks.reshape(-1)[:, None] == segments[None]).astype(jnp.float32)
-    shared = jnp.matmul(own.T, truth)
-    # With nothing shared, a segment still gets one of the slots of objects that nobody sees. One finds none.
-    slots = jnp.where(segments[None] < TARGET, shared, 0.0)
-    slot = assign(-slots)
-    name = jnp.where(slot < TARGET, slot, OTHER)
+    slots = jnp.arange(TARGET)
+    own = (found.reshape(-1)[:, None] == slots[None]).astype(jnp.float32)
+    truth = (masks.reshape(-1)[:, None] == slots[None]).astype(jnp.float32)
+    # With nothing shared, a segment still gets one of the slots of objects that nobody sees.
+    name = assign(-jnp.matmul(own.T, truth))
     return jnp.where(found >= 0, name[jnp.maximum(found, 0)], found).astype(jnp.int8)
+
+
+class Depth(Protocol):
+    """Says how deep a measured image is."""
+
+    def __call__(
+        self, camera: Camera, depth: Float[Array, "h w"], points: Float[Array, "h w 3"]
+    ) -> Float[Array, "h w"]:
+        """The depth of measured points [m], NaN where nothing was measured; see `noise.measured_depth`."""
+        ...
+
+
+def only_measured(camera: Camera, depth: Array, points: Array) -> Array:
+    """The `Depth` that takes nothing from the truth: where nothing was measured, nothing is known."""
+    return depth_of(camera, points)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -116,6 +129,7 @@ class ImageRecogniser:
       weights: of the recognition network.
       noise: of the depth sensor.
       refinement: how recognised shapes are refined.
+      depth: of the image; by default it is known, as with true masks, where there is nothing at all.
     """
 
     target: Target
@@ -123,26 +137,41 @@ class ImageRecogniser:
     weights: Weights
     noise: NoiseModel = dataclasses.field(default_factory=RandomDirection)
     refinement: RefinementConfig = dataclasses.field(default_factory=RefinementConfig)
+    depth: Depth = measured_depth
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
-        view = shelf_view(snapshot.camera, snapshot.shelf)
-        objects, pose = _recognise(key, self, view, snapshot.shelf, snapshot.world)
+        view, shelf = shelf_view(snapshot.camera, snapshot.shelf), snapshot.shelf
+        keys = jax.random.split(key, 4)
+        image = labelled(keys[:2], self, view, shelf, snapshot.world, snapshot.target_seen)
+        shapes = ShapeNetwork.of(self.weights)
+        # Compiled on its own, whatever the labels come from.
+        objects, pose = recognise_image(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
         return Observation(objects, snapshot.target_seen, pose)
 
 
 @functools.partial(jax.jit, static_argnames=("recogniser", "view", "shelf"))
-def _recognise(
-    key: Array, recogniser: ImageRecogniser, view: View, shelf: Shelf, world: World
-) -> tuple[Superquadrics, Float[Array, " 3"]]:
-    """The objects, and where the target would be if it was seen."""
-    keys = jax.random.split(key, 4)
+def labelled(
+    keys: Key[Array, "2"],
+    recogniser: ImageRecogniser,
+    view: View,
+    shelf: Shelf,
+    world: World,
+    target_seen: Bool[Array, ""],
+) -> LabelledImage:
+    """What a recogniser makes shapes of: the part of the image that shows the shelf, as measured, with labels.
+
+    Args:
+      keys: of the noise, and of the labeller.
+      recogniser, view, shelf: static.
+      world: the true state.
+      target_seen: whether the detector sees the target; where it does not, nothing is said of its pixels.
+    """
     image = observe(view.camera, world, shelf)
     points = recogniser.noise(keys[0], view.camera, image.depth)
     masks = true_labels(points, image.segmentation, shelf)
-    labels = recogniser.labeller(keys[1], shelf, points, image.segmentation == TARGET, masks)
-    seen = LabelledImage(points, measured_depth(view.camera, image.depth, points), labels, masks == TARGET)
-    shapes = ShapeNetwork.of(recogniser.weights)
-    return recognise_image(keys[2:], seen, shapes, view.camera, shelf, recogniser.target, recogniser.refinement)
+    labels = recogniser.labeller(keys[1], shelf, points, (image.segmentation == TARGET) & target_seen, masks)
+    depth = recogniser.depth(view.camera, image.depth, points)
+    return LabelledImage(points, depth, labels, (masks == TARGET) & target_seen)
 
 
 @functools.cache
@@ -160,5 +189,7 @@ def recogniser(name: str, target: Target) -> Recogniser:
         raise InputError(f'recognition "{name}" is unknown; use {", ".join(get_args(RecognitionName))}')
     if name == "oracle":
         return oracle
-    labellers = {"masks": lambda: true_masks, "full": lambda: Segmenter(shipped_weights("segmentation"))}
-    return ImageRecogniser(target, labellers[name](), shipped_weights("recognition"))
+    shapes = shipped_weights("recognition")
+    if name == "masks":
+        return ImageRecogniser(target, true_masks, shapes)
+    return ImageRecogniser(target, Segmenter(shipped_weights("segmentation")), shapes, depth=only_measured)

@@ -394,7 +394,8 @@ def test_confidence_intervals_are_those_of_the_formula():
 def test_the_columns_are_those_of_earlier_tables_but_for_names():
     since = [pyarrow.string(), *[pyarrow.int64()] * len(EVENTS), pyarrow.bool_(), pyarrow.int64()]
     assert SCHEMA.types == [*OLD_SCHEMA.types, *since]
-    assert SCHEMA.names == [*(RENAMED.get(name, name) for name in OLD_SCHEMA.names), "content_hash", *EVENTS]
+    known = [RENAMED.get(name, name) for name in OLD_SCHEMA.names]
+    assert SCHEMA.names == [*known, "content_hash", *EVENTS, *BY_PAPER]
     assert SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.envs.episodes import target_of
-from mechsearch_jax.envs.recognisers import numbered, recogniser, true_labels
+from mechsearch_jax.envs.recognisers import labelled, numbered, recogniser, true_labels
 from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
@@ -92,7 +92,7 @@ def test_segments_are_named_after_the_objects_that_they_overlap_most():
     truth = np.full((4, 6), FREE, np.int8)
     truth[:, 0:2], truth[:, 2:4], truth[:, 4:5] = 5, 1, 3
     found = np.full((4, 6), FREE, np.int8)
-    found[:, 0:2], found[:, 2:3], found[:, 3:4], found[:, 4:5], found[0, 5] = 8, 0, 2, 7, OTHER
+    found[:, 0:2], found[:, 2:3], found[:, 3:4], found[:, 4:5], found[0, 5] = 4, 0, 2, 7, OTHER
     found[0, 2] = 2
     named = np.asarray(numbered(jnp.asarray(found), jnp.asarray(truth)))
     assert (named[:, 0:2] == 5).all()
@@ -101,6 +101,58 @@ def test_segments_are_named_after_the_objects_that_they_overlap_most():
     assert (named[1:, 2] != 1).all()
     assert named[0, 5] == OTHER
     assert (named[1:, 5] == FREE).all()
+
+
+def test_no_segment_is_lost_because_the_truth_knows_no_object_there():
+    """Eight segments: that of number 3 shows a target that the detector does not see."""
+    truth = np.repeat(np.int8([[0, 1, 2, TARGET, 4, 5, 6, 7]]), 3, axis=0)
+    found = np.repeat(np.int8([[7, 6, 5, 3, 4, 2, 1, 0]]), 3, axis=0)
+    named = np.asarray(numbered(jnp.asarray(found), jnp.asarray(truth)))
+    np.testing.assert_array_equal(named, np.where(truth == TARGET, 3, truth))
+
+
+@dataclasses.dataclass
+class Curious:
+    """A labeller that takes the target's pixels for the ninth instance, and all else for the shelf."""
+
+    def __call__(self, key, shelf, points, of_target, masks):
+        return jnp.where(of_target, 8, FREE).astype(jnp.int8)
+
+    __hash__ = object.__hash__
+
+
+@pytest.fixture(scope="module")
+def shown():
+    """What `full` sees of a world, but for its segments."""
+    curious = dataclasses.replace(recogniser("full", target_of(SCENE)), labeller=Curious())
+
+    def see(world):
+        view, snapshot = shelf_view(CAMERA, SHELF), Snapshot(CAMERA, SHELF, world)
+        keys = jax.random.split(jax.random.key(0))
+        image = labelled(keys, curious, view, SHELF, world, snapshot.target_seen)
+        owner = np.asarray(observe(view.camera, world, SHELF).segmentation)
+        return jax.tree.map(np.asarray, image), owner, bool(snapshot.target_seen)
+
+    return see
+
+
+@pytest.mark.parametrize(("y", "seen"), [(-0.0335, False), (-0.0403, True)])
+def test_full_is_told_the_targets_pixels_only_where_the_detector_sees_it(world, shown, y, seen):
+    x, _, z = SCENE.target.position
+    image, owner, found = shown(moved(world, TARGET, [x, y, z]))
+    assert found == seen
+    assert (owner == TARGET).sum() > 5
+    np.testing.assert_array_equal(image.labels == 8, (owner == TARGET) & seen)
+    assert image.of_target.any() == seen
+
+
+def test_full_does_not_know_that_there_is_nothing_where_nothing_was_measured(world, shown, masks):
+    image, owner, _ = shown(world)
+    nothing = owner == -1
+    assert nothing.sum() > 1000
+    assert np.isnan(image.depth[nothing]).all()
+    assert np.isfinite(image.depth[~nothing]).all()
+    assert masks.depth is measured_depth
 
 
 def test_depth_is_infinite_where_nothing_is_and_nan_where_nothing_was_measured():

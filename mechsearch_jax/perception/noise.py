@@ -32,17 +32,28 @@ def no_noise(key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) ->
     return back_project(camera, depth)
 
 
+def depth_of(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
+    """The depth of measured points [m]; NaN where nothing was measured.
+
+    Args:
+      camera: static.
+      points: what a `NoiseModel` made.
+    """
+    finite: Bool[Array, "h w"] = jnp.isfinite(points).all(axis=-1)
+    _, measured = project(camera, jnp.where(finite[..., None], points, 0.0))
+    return jnp.where(finite, measured, jnp.nan)
+
+
 def measured_depth(camera: Camera, depth: Float[Array, "h w"], points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
-    """The depth of measured points [m]: infinite where nothing is, NaN where nothing was measured.
+    """The depth of measured points [m]; where nothing was measured infinite if nothing is there, else NaN.
 
     Args:
       camera: static.
       depth: the true one [m]; infinite where nothing is.
       points: what a `NoiseModel` made of it.
     """
-    finite: Bool[Array, "h w"] = jnp.isfinite(points).all(axis=-1)
-    _, measured = project(camera, jnp.where(finite[..., None], points, 0.0))
-    return jnp.where(finite, measured, jnp.where(jnp.isfinite(depth), jnp.nan, jnp.inf))
+    measured = depth_of(camera, points)
+    return jnp.where(jnp.isnan(measured) & ~jnp.isfinite(depth), jnp.inf, measured)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,7 +35,8 @@ class Segmenter(Protocol):
           of_target: where the detector sees the target.
 
         Returns:
-          Labels as `perception.labels` has them; the target's pixels are OTHER.
+          Labels as `perception.labels` has them, with no more than eight segments, 0 to 7; the target's pixels are
+          OTHER.
         """
         ...
 
@@ -144,6 +145,18 @@ def spread_labels(
     return jnp.where(~measured, MISSING, jnp.where(candidates, found, FREE)).astype(jnp.int8)
 
 
+def leave_out_smallest(labels: Int[Array, "h w"]) -> Int[Array, "h w"]:
+    """Labels with the numbers 0 to `INSTANCES - 2`: of as many segments as `INSTANCES` the smallest becomes OTHER.
+
+    The last segment takes the number of the one that is smallest, or absent.
+    """
+    last = INSTANCES - 1
+    pixels = jnp.sum(labels[..., None] == jnp.arange(INSTANCES).reshape(1, 1, -1), axis=(0, 1))
+    smallest = jnp.argmin(pixels)
+    rest = jnp.where(labels == last, smallest, labels)
+    return jnp.where(labels == smallest, OTHER, rest).astype(jnp.int8)
+
+
 class NetworkSegmenter(flax.struct.PyTreeNode):
     """The `Segmenter` that segments a cloud of the image's points with the segmentation network.
 
@@ -167,4 +180,4 @@ class NetworkSegmenter(flax.struct.PyTreeNode):
         output = apply_network(self.network, self.parameters, cloud.points[None])
         labels = clean_up(cloud.points, labels_of(output.logits[-1, 0]), cloud.valid)
         found = spread_labels(points, objects, cloud.points, labels)
-        return jnp.where(of_target & (found != MISSING), OTHER, found).astype(jnp.int8)
+        return leave_out_smallest(jnp.where(of_target & (found != MISSING), OTHER, found))
