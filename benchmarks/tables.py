@@ -233,7 +233,8 @@ def push_scores_tables(measured: push.Measured) -> Group:
         "failed: how many pushes a simulation could not carry out; they count as predicted to move nothing. "
         "pushed: mean errors of the pushed object's place and, if it is a box, of its turn. other: of the place of "
         "others that moved. still: share of what stays that is predicted to stay within 1 mm. topple AP: average "
-        "precision of what falls over, which counts for nothing else. distance: within 2.5 cm. "
+        "precision of what falls over or off the board. All else leaves that out: toppled says how many objects, and "
+        "how many of them were pushed themselves. distance: within 2.5 cm. "
         f"{measured.versions['device']}."
     )
     return Group(*tables, Text(explanation, style="dim"))
@@ -247,12 +248,13 @@ def _is_plain(group: str, ending: str) -> bool:
 def _push_scores_table(title: str, first: str, lines: Mapping[str, Mapping[str, Any]]) -> Table:
     table = _plain_table(title)
     table.add_column(first, no_wrap=True, min_width=12)
-    for name in ("pushes", "failed", "pushed mm", "pushed deg", "other mm", "still", "topple AP"):
+    for name in ("pushes", "failed", "toppled", "pushed mm", "pushed deg", "other mm", "still", "topple AP"):
         table.add_column(name, justify="right", no_wrap=True)
     digits = {"pushed_mm": 2, "pushed_deg": 2, "other_mm": 2, "still": 3, "topple_ap": 3}
     for name, line in lines.items():
         cells = ("-" if line[key] is None else f"{line[key]:.{n}f}" for key, n in digits.items())
-        table.add_row(name, str(line["pushes"]), str(line["failed"]), *cells)
+        toppled = f"{line['toppled']} ({line['pushed_toppled']})"
+        table.add_row(name, str(line["pushes"]), str(line["failed"]), toppled, *cells)
     return table
 
 

@@ -203,6 +203,8 @@ def test_scores_are_written_with_how_they_came_about(measured, weights, tmp_path
 LINE = {
     "pushes": 4,
     "failed": 0,
+    "toppled": 3,
+    "pushed_toppled": 2,
     "pushed_mm": 12.345,
     "pushed_deg": None,
     "other_mm": 6.0,
@@ -234,15 +236,17 @@ def test_the_tables_show_every_model_and_the_groups_of_the_best():
     models, distances, objects, _ = group.renderables
     numbers = ["-", "6.00", "0.500", "0.250"]
     assert rows_of(models) == [
-        ["no motion", "4", "0", "-", *numbers],
-        ["quasi-static", "4", "0", "12.35", *numbers],
-        ["nudged", "4", "0", "1.00", *numbers],
+        ["no motion", "4", "0", "3 (2)", "-", *numbers],
+        ["quasi-static", "4", "0", "3 (2)", "12.35", *numbers],
+        ["nudged", "4", "0", "3 (2)", "1.00", *numbers],
     ]
     assert [row[:2] for row in rows_of(distances)] == [["10 cm", "3"]]
     assert [row[:2] for row in rows_of(objects)] == [["1", "1"], ["8", "2"]]
     console = Console(file=io.StringIO(), width=100)
     console.print(group)
-    assert "quasi-static, by distance" in console.file.getvalue()
+    printed = " ".join(console.file.getvalue().split())
+    assert "quasi-static, by distance" in printed
+    assert "of what falls over or off the board. All else leaves that out" in printed
 
 
 def test_the_learned_model_is_looked_at_closely_if_there_is_one():

@@ -10,6 +10,7 @@ import pytest
 import mechsearch_jax
 from mechsearch_jax.envs.earlier import EARLIER, RENAMED
 from mechsearch_jax.envs.scene_sets import SETS, digest, recorded
+from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS
 from mechsearch_jax.planner import OPTIONS, PRESETS
 
 ROOT = Path(__file__).parents[1]
@@ -172,6 +173,9 @@ def test_the_table_of_scenes_is_the_stored_result():
         assert target_share == f"{line['target_share_mean']:.3f}"
         assert visible == f"{line['visible_mean']:.2f}"
         assert objects_share.startswith(f"{line['objects_share_mean']:.2f} ± ")
+    scenes = [dict(zip(stored["columns"], row, strict=True)) for row in stored["rows"]]
+    in_sight = {(row["scenario"], str(row["target_pixels"])) for row in scenes if row["target_pixels"] > FOUND_PIXELS}
+    assert set(re.findall(r"`(published-\d-\d\d)` \((\d+)\)", read("docs/results.md"))) == in_sight
 
 
 def test_stored_scenes_are_those_on_record():

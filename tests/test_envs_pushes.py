@@ -467,6 +467,8 @@ def test_a_model_that_knows_the_outcome_scores_best(pushes):
     truth = push_truth(jax.tree.map(jnp.asarray, pushes))
     rows = np.arange(len(pushes.object))
     upright = ~truth.toppled[rows, pushes.object]
+    assert best["pushed_toppled"] == (~upright).sum()
+    assert best["toppled"] == (np.asarray(truth.toppled) & truth.valid).sum()
     moved = np.linalg.norm(np.asarray(truth.shift)[rows, pushes.object], axis=1)[upright]
     assert idle["pushed_mm"] == pytest.approx(1e3 * moved.mean(), abs=2e-3)
 

@@ -437,7 +437,9 @@ def outcome_scores(told: PushOutcome, pushes: Pushes) -> dict[str, Any]:
       For each group the number of `pushes` and of those that the model `failed` at (an infinite residual; what it says
       of them counts all the same), mean errors of the pushed object (`pushed_mm`, `pushed_deg`, the latter of boxes)
       and of others that moved (`other_mm`), the share of still objects that are predicted to move by less than `STILL`
-      (`still`), and the average precision of toppling (`topple_ap`). Objects that toppled count for the last alone.
+      (`still`), and the average precision of toppling (`topple_ap`). Objects that toppled, over or off the board, count
+      for the last alone; so many were left out of the others (`toppled`), and so many of them were pushed themselves
+      (`pushed_toppled`).
 
     Raises:
       InputError: what was predicted is no number.
@@ -482,6 +484,8 @@ def _summary(
     return {
         "pushes": int(chosen.sum()),
         "failed": int(failed[chosen].sum()),
+        "toppled": int((here & truth.toppled).sum()),
+        "pushed_toppled": int((here & truth.toppled & pushed).sum()),
         "pushed_mm": mean(compared.shift_error, upright & pushed, 1e3),
         "pushed_deg": mean(compared.turn_error, upright & pushed & turns, 180 / np.pi),
         "other_mm": mean(compared.shift_error, upright & ~pushed & truth.moved, 1e3),
