@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+from typing import NamedTuple
+
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
@@ -47,6 +50,36 @@ def graspable_at(
       pose: of the target as x, y [m], yaw [rad]; need not be a candidate.
       active: where false, no grasp is feasible and little is computed: there is no target yet.
     """
+    ranked = _ranked(problem, scene, pose, active)
+    return _choice(problem, ranked, jnp.argmin(ranked.order))
+
+
+@functools.partial(jax.jit, static_argnames=("count",))
+def best_grasps(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"], count: int) -> GraspChoice:
+    """The `count` best grasps of a target at a pose, as `graspable_at` ranks them: fields have a leading axis, best
+    first.
+
+    Args:
+      problem: what does not change.
+      scene: the objects, without the target.
+      pose: of the target as x, y [m], yaw [rad]; need not be a candidate.
+      count: how many; not more than the dense set has.
+    """
+    ranked = _ranked(problem, scene, pose, True)
+    best = jnp.argsort(ranked.order, stable=True)[:count]
+    return jax.vmap(lambda i: _choice(problem, ranked, i))(best)
+
+
+class _Ranked(NamedTuple):
+    """All grasps of the dense set: where the gripper closes, how many objects each hits, and by what they are ranked,
+    least first."""
+
+    T_world_gripper: Float[Array, "f 4 4"]
+    hits: Int[Array, " f"]
+    order: Int[Array, " f"]
+
+
+def _ranked(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool) -> _Ranked:
     T_world_target = upright_pose(pose, problem.target.height(problem.shelf))
     tables = problem.retrieval
     found = found_grasps(problem, T_world_target, active)
@@ -58,10 +91,14 @@ def graspable_at(
 
     hits = jnp.where(found.feasible, jnp.sum(found_hits(problem, found, scene, active), axis=1), worst)
     crowd = jnp.sum(jax.lax.map(count, jnp.float32(CLEARANCES)), axis=0)
-    best = jnp.argmin(hits * 100 + crowd)
-    T = compose(T_world_target[None], tables.T_target_gripper)
+    return _Ranked(compose(T_world_target[None], tables.T_target_gripper), hits, hits * 100 + crowd)
+
+
+def _choice(problem: Problem, ranked: _Ranked, i: Int[Array, ""]) -> GraspChoice:
     return GraspChoice(
-        success=hits[best] == 0,
-        hits=hits[best].astype(jnp.int32),
-        action=retrieve_action(T[best], tables.q7[best], jnp.float32(problem.gripper.max_opening)),
+        success=ranked.hits[i] == 0,
+        hits=ranked.hits[i].astype(jnp.int32),
+        action=retrieve_action(
+            ranked.T_world_gripper[i], problem.retrieval.q7[i], jnp.float32(problem.gripper.max_opening)
+        ),
     )
