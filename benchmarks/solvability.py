@@ -20,7 +20,8 @@ from mechsearch_jax.benchmarks.images import save_rows
 from mechsearch_jax.benchmarks.rates import wilson
 from mechsearch_jax.benchmarks.rows import read_rows
 from mechsearch_jax.envs.episodes import target_of
-from mechsearch_jax.envs.known_search import Found, InFullView, KnownSearchConfig, Node, known_search
+from mechsearch_jax.envs.known_search import Found, KnownSearchConfig, Node, known_search
+from mechsearch_jax.envs.known_target import InFullView
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.errors import InputError
@@ -45,6 +46,7 @@ class Row:
       actions: that the search needed, taking the target out among them; None where it did not, or was not needed.
       rounds, simulated: of the search, and the number of actions that it executed; None where it was not needed.
       seconds: wall time that it took [s].
+      path: those actions, each with the fields of an `ActionRecord`.
       reason: why the scene is not known to be solvable; None where it is.
     """
 
@@ -58,6 +60,7 @@ class Row:
     rounds: int | None = None
     simulated: int | None = None
     seconds: float | None = None
+    path: list[dict[str, Any]] | None = None
     reason: str | None = None
 
 
@@ -137,7 +140,7 @@ class Ceiling:
         sequences: sampled from each world of a round.
         """
         self._folder, self._config = Path(folder), config
-        self._planner: Config = PRESETS["best"](sequences=sequences)
+        self._planner: Config = PRESETS["best"](sequences=sequences, max_steps=config.max_steps)
         self._simulator = NativeSimulator()
         self._problem = functools.cache(cached_problem)
         first, later = push_models(self._planner.push_model)
@@ -168,9 +171,7 @@ class Ceiling:
             if found.actions is None:
                 figure = unsolved.picture(found, problem, scenario.name, known["reason"])
                 save_figure(figure, self._folder / f"{scenario.name}.png")
-            path = () if found.actions is None else found.actions
-            each = {"path": [dataclasses.asdict(action) for action in path]}
-            save_json({**same, "versions": versions(), "found": known, **each}, file)
+            save_json({**same, "versions": versions(), "found": known}, file)
         return dataclasses.replace(row, **known, solvable=known["actions"] is not None)
 
 
@@ -180,6 +181,7 @@ def told_of(found: Found) -> dict[str, Any]:
         "actions": None if found.actions is None else len(found.actions),
         "rounds": found.rounds,
         "simulated": found.simulated,
+        "path": None if found.actions is None else [dataclasses.asdict(action) for action in found.actions],
         "reason": None if found.actions is not None else unsolved.reason(found),
     }
 

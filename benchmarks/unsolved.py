@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
-from mechsearch_jax.envs.known_search import Found, Judgement, Node
+from mechsearch_jax.envs.known_search import Found, Node
+from mechsearch_jax.envs.known_target import Judgement
 from mechsearch_jax.envs.pictures import colour_image
 from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.planner import Problem
@@ -42,9 +43,9 @@ def reason(found: Found) -> str:
     """
     judgement, tries = found.best.judgement, f"{found.simulated} actions simulated in {found.rounds} rounds"
     if found.retrievals:
-        told = ", ".join(f"{why} {count} times" for why, count in found.retrievals.most_common())
+        told = ", ".join(f"{why} ({_times(count, 'time')})" for why, count in found.retrievals.most_common())
         return (
-            f"A grasp that hits nothing was reached, but no attempt to take the target out succeeded: {told}; {tries}."
+            f"A grasp that hits nothing was reached, but every attempt to take the target out failed: {told}; {tries}."
         )
     if judgement.least is None and found.start.judgement.least is None:
         return f"Arm and shelf allow no grasp of the target, nor of one that was pushed; {tries}."

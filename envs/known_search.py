@@ -1,21 +1,19 @@
 """A search with everything known: whatever can be tried is tried in copies of the simulated world.
 
 It tells whether a scene can be solved at all by the actions that there are. Nothing is hidden from it: it plans with
-the true poses of all objects and of the target from the start, and it may take back what went wrong. A beam of worlds
-is kept. From each, sequences are sampled as the planner does; the best of them are executed in copies of their worlds,
-and of the worlds that come of it those are kept in which the target is nearest to being graspable. A world in which an
-object has left the board, or the target has fallen, is given up.
+the true poses of all objects and of the target from the start, and it may take back what went wrong. All worlds that
+were reached are kept. In a round sequences are sampled, as the planner does, from the few in which the target is
+nearest to being graspable, and the best sequences are executed in copies of their worlds. A world that was tried in
+vain makes way for others by and by. One in which an object has left the board, or the target has fallen, is given up.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,24 +21,19 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, kind_of, no_action
 from mechsearch_jax.envs.episode_log import target_trouble
+from mechsearch_jax.envs.known_target import Judgement, judge, retrievals_of, sample
 from mechsearch_jax.envs.outcome import Outcome
 from mechsearch_jax.envs.records import ActionRecord, record_action
 from mechsearch_jax.envs.simulator import Simulator
-from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.graspability import no_hits, pairs
-from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import Belief, Problem, Search, Sequences, initial_belief
-from mechsearch_jax.planner.found_target import found_grasps, found_hits
-from mechsearch_jax.planner.objective import SearchForGrasp
-from mechsearch_jax.planner.retrieval import GraspChoice, best_grasps
-from mechsearch_jax.planner.rollout import Rollout, plan
+from mechsearch_jax.planner import Problem, Search
 from mechsearch_jax.workspace.scenario import Scenario
 
-# Worlds in which no body is farther than this from where it is in another are the same to a beam [m].
-ALIKE = 0.005
+# Worlds in which no body is farther than this from where it is in another are taken for the same [m].
+ALIKE = 0.01
+# What a world is set back by for every round in which it was tried, in units of J: an object in the way counts 1.
+TRIED = 0.25
 # First actions that agree to this are the same, in metres and entries of a rotation.
 STEP = 0.002
 
@@ -51,7 +44,8 @@ class KnownSearchConfig:
 
     Attributes:
       simulated: how many sequences are executed in a round.
-      beam: how many worlds are kept from one round to the next.
+      worlds: from how many sequences are sampled in a round.
+      rounds: how many there are at most.
       grasps: with how many grasps it is tried to take the target out of a world where one hits nothing.
       retrievals: from how many worlds of a round that is tried, at most.
       max_steps: number of actions, taking the target out among them.
@@ -59,44 +53,17 @@ class KnownSearchConfig:
     """
 
     simulated: int = 32
-    beam: int = 4
+    worlds: int = 4
+    rounds: int = 40
     grasps: int = 8
     retrievals: int = 4
     max_steps: int = 30
     seed: int = 0
 
     def __post_init__(self):
-        for name in ("simulated", "beam", "grasps", "retrievals", "max_steps"):
+        for name in ("simulated", "worlds", "rounds", "grasps", "retrievals", "max_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"KnownSearchConfig: {name} {getattr(self, name)} must be at least 1")
-
-
-@dataclasses.dataclass(frozen=True)
-class InFullView(SearchForGrasp):
-    """How far the target is from graspable where it is known to be: it may stand hidden."""
-
-    def cost(self, problem, belief, exists, target_at, hits, crowding_weight) -> Float[Array, ""]:
-        nowhere_hidden = jnp.zeros_like(exists)
-        return super().cost(problem, belief, nowhere_hidden, target_at, hits, crowding_weight)
-
-
-class Judgement(flax.struct.PyTreeNode):
-    """How far the target of a world is from graspable, by the dense grasps of a found target.
-
-    Attributes:
-      cost: J of the planner, of this target alone.
-      feasible: which grasps arm and shelf allow, shape (F,).
-      hits: which objects each of these hits on its whole way, shape (F, N).
-    """
-
-    cost: Float[Array, "*batch"]
-    feasible: Bool[Array, "*batch f"]
-    hits: Bool[Array, "*batch f n"]
-
-    @property
-    def least(self) -> int | None:
-        """How many objects the best grasp hits; None where none is feasible. Of a single world."""
-        return int(self.hits.sum(axis=1)[self.feasible].min()) if self.feasible.any() else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +79,11 @@ class Node:
     world: World
     actions: tuple[ActionRecord, ...]
     judgement: Judgement
+
+    @property
+    def cost(self) -> float:
+        """J of it."""
+        return float(self.judgement.cost)
 
     @property
     def graspable(self) -> bool:
@@ -171,34 +143,6 @@ def known_search(
     return running.found()
 
 
-@functools.partial(jax.jit, static_argnames=("objective",))
-def _judge(problem: Problem, objective: Any, weight: Array | float, world: World, active: Bool[Array, ""]) -> Judgement:
-    """See `Judgement`; little is computed where `active` is false."""
-    here = Snapshot(problem.camera, problem.shelf, world)
-    belief = _known(problem, world, active)
-    hits = found_hits(problem, belief.grasps, objects_on_the_board(here), active)
-    nowhere = jnp.zeros_like(belief.exists)
-    rows = jnp.concatenate([no_hits(pairs(problem.grasps), hits.shape[1]), hits])
-    cost = objective.cost(problem, belief, nowhere, nowhere, rows, weight)
-    return Judgement(cost, belief.grasps.feasible, hits & belief.grasps.feasible[:, None])
-
-
-def _known(problem: Problem, world: World, active: Bool[Array, ""] | bool = True) -> Belief:
-    """The belief of who knows where the target is."""
-    pose = true_target_pose(world)
-    grasps = found_grasps(problem, upright_pose(pose, problem.target.height(problem.shelf)), active)
-    return initial_belief(problem).replace(found=jnp.array(True), found_pose=pose, grasps=grasps)
-
-
-@jax.jit
-def _sample(search: Search, key: Array, problem: Problem, world: World) -> Sequences:
-    """Sequences of actions from a world, best first, as the planner samples them."""
-    here = Snapshot(problem.camera, problem.shelf, world)
-    seen = Observation(objects_on_the_board(here), jnp.array(True), true_target_pose(world))
-    rollout = Rollout(problem, _known(problem, world), search.config, search.propose, search.predict, search.objective)
-    return plan(rollout, key, seen.objects).sequences
-
-
 class _Proposal(NamedTuple):
     """A sequence that may be executed: from where, with what expected cost, and its actions with their axis M."""
 
@@ -211,6 +155,37 @@ class _Proposal(NamedTuple):
     def group(self) -> tuple[int, int, int]:
         """Proposals that begin alike: the world, and kind and object of the first action."""
         return id(self.node), int(self.actions.kind[0]), int(self.actions.object[0])
+
+
+class Frontier:
+    """Worlds to go on from.
+
+    Attributes:
+      nodes: all of them.
+    """
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._tried: list[int] = []
+        self._places: list[Float[np.ndarray, "9 3"]] = []
+
+    def add(self, node: Node) -> None:
+        """Keep a world, unless one that is alike is kept."""
+        place = np.where(node.world.valid[:, None], node.world.position, 0.0)
+        if not self._places or np.abs(np.stack(self._places) - place).max(axis=(1, 2)).min() > ALIKE:
+            self.nodes.append(node)
+            self._tried.append(0)
+            self._places.append(place)
+
+    def next(self, count: int) -> list[Node]:
+        """The worlds to be tried now: those of least cost, what `TRIED` adds included, and then of fewest actions."""
+        promise = [
+            (node.cost + TRIED * tried, len(node.actions)) for node, tried in zip(self.nodes, self._tried, strict=True)
+        ]
+        chosen = sorted(range(len(promise)), key=promise.__getitem__)[:count]
+        for i in chosen:
+            self._tried[i] += 1
+        return [self.nodes[i] for i in chosen]
 
 
 class _Running:
@@ -230,13 +205,14 @@ class _Running:
         self._solution: tuple[ActionRecord, ...] | None = None
         (judgement,) = self._judged([world])
         self._start = self.best = Node(world, (), judgement)
-        self._beam: list[Node] = [self._start]
-        self._take_out(self._beam)
+        self._open = Frontier()
+        self._keep([self._start])
+        self._take_out([self._start])
 
     @property
     def goes_on(self) -> bool:
         """Whether there is anything left to be tried."""
-        return self._solution is None and bool(self._beam)
+        return self._solution is None and self.rounds < self._config.rounds and bool(self._open.nodes)
 
     def found(self) -> Found:
         """What it came to so far."""
@@ -253,23 +229,27 @@ class _Running:
         )
 
     def round(self) -> None:
-        """Sample from all worlds of the beam, execute the best, and keep the best worlds that come of it."""
-        key = jax.random.fold_in(jax.random.key(self._config.seed), self.rounds)
-        keys = jax.random.split(key, len(self._beam))
-        proposals = [one for node, k in zip(self._beam, keys, strict=True) for one in self._proposals(node, k)]
+        """Sample from the most promising worlds, execute the best sequences, and keep the worlds that come of it."""
+        nodes = self._open.next(self._config.worlds)
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(self._config.seed), self.rounds), len(nodes))
+        proposals = [one for node, k in zip(nodes, keys, strict=True) for one in self._proposals(node, k)]
         self.rounds += 1
         nodes = self._execute(in_turn(proposals, self._config.simulated))
-        nodes.sort(key=lambda node: (float(node.judgement.cost), len(node.actions)))
-        if nodes and nodes[0].judgement.cost < self.best.judgement.cost:
+        nodes.sort(key=lambda node: (node.cost, len(node.actions)))
+        if nodes and nodes[0].cost < self.best.cost:
             self.best = nodes[0]
-        self._take_out([node for node in nodes if node.graspable])
-        # One more action has to be left: to take the target out.
-        last = self._config.max_steps - 1
-        self._beam = different([node for node in nodes if len(node.actions) < last], self._config.beam)
+        self._take_out(nodes)
+        self._keep(nodes)
+
+    def _keep(self, nodes: Sequence[Node]) -> None:
+        """Keep worlds to go on from, if there is room for two more actions: one, and taking the target out."""
+        for node in nodes:
+            if len(node.actions) < self._config.max_steps - 1:
+                self._open.add(node)
 
     def _judge_one(self, world: World, active: Bool[Array, ""]) -> Judgement:
         search = self._search
-        return _judge(self._problem, search.objective, search.config.crowding_weight, world, active)
+        return judge(self._problem, search.objective, search.config.crowding_weight, world, active)
 
     def _judged(self, worlds: Sequence[World]) -> list[Judgement]:
         """Judge worlds, so many at once as are simulated at once."""
@@ -284,13 +264,12 @@ class _Running:
 
     def _proposals(self, node: Node, key: Array) -> list[_Proposal]:
         """The sampled sequences whose first actions differ, best first."""
-        sequences = jax.device_get(_sample(self._search, key, self._problem, node.world))
-        # One more action has to be left.
+        sequences = jax.device_get(sample(self._search, key, self._problem, node.world))
         room = self._config.max_steps - 1 - len(node.actions)
         found: dict[tuple[str | int, ...], _Proposal] = {}
         for i in np.flatnonzero(np.isfinite(sequences.value)):
             actions = jax.tree.map(lambda a, i=i: a[i], sequences.actions)
-            expected = float(node.judgement.cost + sequences.value[i])
+            expected = node.cost + float(sequences.value[i])
             proposal = _Proposal(node, expected, actions, min(int(sequences.length[i]), room))
             self._sampled[_named(actions, 0)] += 1
             found.setdefault(_first_step(actions), proposal)
@@ -340,22 +319,18 @@ class _Running:
 
     def _take_out(self, nodes: Sequence[Node]) -> None:
         """Try to take the target out of worlds in which a grasp hits nothing, until it is out."""
-        for node in different(nodes, self._config.retrievals):
-            if node.graspable and self._solution is None:
-                grasps = retrievals_of(self._problem, node.world, self._config.grasps)
-                actions = [jax.tree.map(lambda a, i=i: a[i], grasps.action) for i in np.flatnonzero(grasps.success)]
-                self._simulator.load(_stacked([node.world] * len(actions)))
-                outcome = self._acted(actions, range(len(actions)))
-                self._retrievals.update(outcome.reason(i) or "" for i in range(len(actions)))
-                if outcome.retrieved.any():
-                    best = actions[int(np.argmax(outcome.retrieved))]
-                    self._solution, self.best = (*node.actions, record_action(best)), node
-
-
-def retrievals_of(problem: Problem, world: World, count: int) -> GraspChoice:
-    """The best grasps of the target of a world, as `best_grasps` ranks them, as NumPy arrays."""
-    objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-    return jax.device_get(best_grasps(problem, objects, true_target_pose(jax.tree.map(jnp.asarray, world)), count))
+        for node in different([node for node in nodes if node.graspable], self._config.retrievals):
+            grasps = retrievals_of(self._problem, node.world, self._config.grasps)
+            actions = [jax.tree.map(lambda a, i=i: a[i], grasps.action) for i in np.flatnonzero(grasps.success)]
+            if not actions:
+                continue
+            self._simulator.load(_stacked([node.world] * len(actions)))
+            outcome = self._acted(actions, range(len(actions)))
+            self._retrievals.update(outcome.reason(i) or "" for i in range(len(actions)))
+            if outcome.retrieved.any():
+                best = actions[int(np.argmax(outcome.retrieved))]
+                self._solution, self.best = (*node.actions, record_action(best)), node
+                return
 
 
 def in_turn(proposals: Sequence[_Proposal], count: int) -> list[_Proposal]:

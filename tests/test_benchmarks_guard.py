@@ -140,14 +140,10 @@ def test_the_command_fails_after_a_loss_and_passes_noise(run, capsys):
     assert "0.004" in told
 
 
-def test_what_is_no_reference_is_refused_before_episodes_run(run, monkeypatch):
-    for text, complaint in (
-        ("{", "is not JSON"),
-        ("[]", "is no reference"),
-        ('{"columns": ["a"], "rows": [[1]]}', "is no"),
-    ):
+def test_what_is_no_reference_is_refused(run):
+    for text in ("{", "[]", '{"columns": ["a"], "rows": [[1]]}'):
         run.reference.write_text(text)
-        with pytest.raises(InputError, match=complaint):
+        with pytest.raises(InputError, match=r"guard.json: is no"):
             run(BEFORE)
 
 

@@ -29,7 +29,8 @@ def bench_ceiling(
     results: Results = (),
     sequences: int = 64,
     simulated: int = 32,
-    beam: int = 4,
+    worlds: int = 4,
+    rounds: int = 40,
     grasps: int = 8,
     max_steps: int = 30,
     seed: int = 0,
@@ -43,7 +44,8 @@ def bench_ceiling(
       results: tables of `evaluate` (.parquet) and stored results (.json); what was retrieved in any is solvable.
       sequences: sampled from each world of a round.
       simulated: so many of them, the best, are executed in a round.
-      beam: worlds that are kept from one round to the next.
+      worlds: from which sequences are sampled in a round: those nearest to being solved.
+      rounds: of each search, at most.
       grasps: that are tried out to take the target out of a world.
       max_steps: actions, the retrieval among them.
       seed: of the search.
@@ -57,7 +59,7 @@ def bench_ceiling(
     from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import load_scenario
 
-    at_least_one("bench ceiling", sequences=sequences, simulated=simulated, beam=beam)
+    at_least_one("bench ceiling", sequences=sequences, simulated=simulated, worlds=worlds, rounds=rounds)
     at_least_one("bench ceiling", grasps=grasps, max_steps=max_steps)
     scenes = [load_scenario(file) for file in find_scenarios(scenarios)]
     names = [scene.name for scene in scenes]
@@ -67,7 +69,9 @@ def bench_ceiling(
     outcomes = solvability.read_outcomes(results)
     check_writable(out)
     keep_compilations()
-    config = KnownSearchConfig(simulated=simulated, beam=beam, grasps=grasps, max_steps=max_steps, seed=seed)
+    config = KnownSearchConfig(
+        simulated=simulated, worlds=worlds, rounds=rounds, grasps=grasps, max_steps=max_steps, seed=seed
+    )
     ceiling = solvability.Ceiling(out, config, sequences)
     console = Console(highlight=False)
     rows: list[solvability.Row] = []
