@@ -3,12 +3,16 @@
 import dataclasses
 import json
 from collections import Counter
+from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from published import published_scenarios
 from stage import HIDDEN, OPEN, TWO
 
+from mechsearch_jax.actions import KINDS, Action
 from mechsearch_jax.benchmarks import solvability, unsolved
 from mechsearch_jax.benchmarks.episode_tables import ceiling_table
 from mechsearch_jax.benchmarks.rates import wilson
@@ -18,9 +22,11 @@ from mechsearch_jax.benchmarks.solvability import Ceiling, Outcomes, Row, read_o
 from mechsearch_jax.benchmarks.unsolved import blockers, in_the_way, reason
 from mechsearch_jax.envs.known_search import Found, KnownSearchConfig, Node
 from mechsearch_jax.envs.known_target import Judgement
+from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.records import ActionRecord
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.workspace.scenario import load_scenario
 
 EPISODE = EpisodeRow(
     "two", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.5
@@ -149,6 +155,38 @@ def test_shares_are_those_of_the_rows(tmp_path):
     table, why = ceiling_table(rows).renderables
     assert table.row_count == 3
     assert str(why) == "c: too tight"
+
+
+RESULT = Path(__file__).parents[1] / "benchmarks" / "results" / "ceiling-cpu.json"
+
+
+def test_the_table_of_the_ceiling_is_the_stored_result():
+    stored = json.loads(RESULT.read_text())
+    rows = [Row(**dict(zip(stored["columns"], each, strict=True))) for each in stored["rows"]]
+    lines = summary(rows)
+    assert json.loads(json.dumps(lines)) == stored["summary"]
+    guide = (RESULT.parents[2] / "docs" / "results.md").read_text()
+    for line in lines:
+        low, high = line["solvable_interval"]
+        solved = f"{line['solved_in_an_episode']} | {line['solved_by_the_search']} | {line['solvable']:.2f}"
+        name = line["objects"] or "all"
+        assert f"| {name} | {line['scenes']} | {solved} | {low:.2f} to {high:.2f} |" in guide
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not published_scenarios(), reason="the published scenes are not next to this checkout")
+def test_stored_actions_take_the_target_out():
+    stored = json.loads(RESULT.read_text())
+    rows = [Row(**dict(zip(stored["columns"], each, strict=True))) for each in stored["rows"]]
+    scenes = {scene.content_hash: scene for scene in map(load_scenario, published_scenarios())}
+    codes, world = {kind.name: code for code, kind in KINDS.items()}, NativeWorld()
+    for row in (row for row in rows if row.path):
+        world.reset(scenes[row.content_hash])
+        for action in row.path:
+            known = {**action, "kind": codes[action["kind"]], "object": action["object"] or 0}
+            outcome = world.execute(Action(**{name: jnp.array(value) for name, value in known.items()}))
+            assert not outcome.fallen.any()
+        assert outcome.retrieved, row.scenario
 
 
 def test_what_is_in_the_way_are_the_least_sets_that_feasible_grasps_hit():

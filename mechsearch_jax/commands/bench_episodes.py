@@ -95,7 +95,7 @@ def bench_ceiling(
 def bench_guard(
     *,
     out: Path,
-    scenes: Literal[40, 80, 160] = 80,
+    scenes: Literal[40, 80, 160] = 160,
     reference: JsonFile = None,
     write: bool = False,
     workers: int | None = None,
