@@ -138,9 +138,19 @@ def compare(before: Sequence[Outcome], now: Sequence[Outcome]) -> list[Compariso
     for measure in MEASURES:
         pairs = [(getattr(known[one.episode], measure), getattr(one, measure)) for one in now]
         gains, losses = (sum(pair == change for pair in pairs) for change in ((False, True), (True, False)))
-        held = [sum(column) for column in zip(*pairs, strict=True)]
-        alpha = ALPHA / len(MEASURES)
-        changes.append(Comparison(measure, len(pairs), *held, gains, losses, sign_test(gains, losses), alpha))
+        before_held, now_held = (sum(column) for column in zip(*pairs, strict=True))
+        changes.append(
+            Comparison(
+                measure=measure,
+                pairs=len(pairs),
+                before=before_held,
+                now=now_held,
+                gains=gains,
+                losses=losses,
+                p_value=sign_test(gains, losses),
+                alpha=ALPHA / len(MEASURES),
+            )
+        )
     return changes
 
 

@@ -149,6 +149,8 @@ def test_there_are_no_more_actions_than_allowed(search):
         found = search(sequences((-0.5, LEFT, LEFT, LEFT)), Toy(), max_steps=steps)
         assert (found.actions is not None) is solved
         assert len(found.best.actions) <= steps - 1
+    # Where there is no room for any action, no round is spent on it.
+    assert found.rounds == 0
 
 
 def test_a_world_that_is_lost_is_given_up(search):

@@ -5,13 +5,18 @@ from __future__ import annotations
 import os
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from mechsearch_jax.commands.options import JsonFile, SomeScenarios, at_least_one, check_files, files_of, find_scenarios
 from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.envs.known_search import Node
+    from mechsearch_jax.workspace.scenario import Scenario
 
 Results = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...")]
 
@@ -19,6 +24,28 @@ Results = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...")]
 def _command() -> str:
     """What was typed."""
     return shlex.join(["mechsearch", *sys.argv[1:]])
+
+
+def _scenes(names: Sequence[str]) -> list[Scenario]:
+    """The scenes that files, folders and names stand for.
+
+    Raises:
+      InputError: there is nothing for one of them, or two have the same name.
+    """
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    scenes: dict[str, Scenario] = {}
+    for scene in map(load_scenario, find_scenarios(names)):
+        if scene.name in scenes:
+            raise InputError(f"bench ceiling: two scenes are called {scene.name}; rename one")
+        scenes[scene.name] = scene
+    return list(scenes.values())
+
+
+def _nearest(best: Node) -> str:
+    """How near to being solved the best world of a search is."""
+    hit = "no grasp" if best.judgement.least is None else f"{best.judgement.least} in the way"
+    return f"{hit} after {len(best.actions)} actions"
 
 
 def bench_ceiling(
@@ -57,15 +84,10 @@ def bench_ceiling(
     from mechsearch_jax.envs.known_search import KnownSearchConfig
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
-    from mechsearch_jax.workspace.scenario import load_scenario
 
     at_least_one("bench ceiling", sequences=sequences, simulated=simulated, worlds=worlds, rounds=rounds)
     at_least_one("bench ceiling", grasps=grasps, max_steps=max_steps)
-    scenes = [load_scenario(file) for file in find_scenarios(scenarios)]
-    names = [scene.name for scene in scenes]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(f"bench ceiling: two scenes are called {twice}; rename one")
+    scenes = _scenes(scenarios)
     outcomes = solvability.read_outcomes(results)
     check_writable(out)
     keep_compilations()
@@ -78,11 +100,8 @@ def bench_ceiling(
     with console.status("searching") as status:
         for scene in scenes:
 
-            def told(number: int, best: solvability.Node, scene=scene) -> None:
-                hit = "no grasp" if best.judgement.least is None else f"{best.judgement.least} in the way"
-                line = (
-                    f"{len(rows)}/{len(scenes)} {scene.name}: round {number}, {hit} after {len(best.actions)} actions"
-                )
+            def told(number: int, best: Node, scene=scene) -> None:
+                line = f"{len(rows)}/{len(scenes)} {scene.name}: round {number}, {_nearest(best)}"
                 status.update(line)
                 if not console.is_terminal:
                     console.print(line, soft_wrap=True)
