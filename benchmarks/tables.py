@@ -160,12 +160,12 @@ def recognition_tables(measured: Measured) -> Group:
     return Group(*tables.values(), Text(explanation, style="dim"))
 
 
-def _plain_table(title: str) -> Table:
+def plain_table(title: str) -> Table:
     return Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left")
 
 
 def _recognition_table(title: str) -> Table:
-    table = _plain_table(title)
+    table = plain_table(title)
     table.add_column("method", no_wrap=True, min_width=15)
     for name in ("objects", "IoU", "<30%", "30-60%", "≥60%", "mm", "wrong", "lost", "gain"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -196,7 +196,7 @@ def segmentation_tables(measured: segmentation.Measured) -> Group:
     for line in measured.summary():
         key = line["source"], line["noise"]
         if key not in tables:
-            tables[key] = _plain_table(f"{key[0]} scenes, {key[1]}")
+            tables[key] = plain_table(f"{key[0]} scenes, {key[1]}")
             for name in ("objects", "scenes", "counted", "IoU", "missed", "visible", "IoU of all visible"):
                 tables[key].add_column(name, justify="right", no_wrap=True)
         mean = line["iou_mean"]
@@ -246,7 +246,7 @@ def _is_plain(group: str, ending: str) -> bool:
 
 
 def _push_scores_table(title: str, first: str, lines: Mapping[str, Mapping[str, Any]]) -> Table:
-    table = _plain_table(title)
+    table = plain_table(title)
     table.add_column(first, no_wrap=True, min_width=12)
     for name in ("pushes", "failed", "toppled", "pushed mm", "pushed deg", "other mm", "still", "topple AP"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -260,7 +260,7 @@ def _push_scores_table(title: str, first: str, lines: Mapping[str, Mapping[str, 
 
 def scenes_table(rows: Sequence[scenes.Row]) -> Group:
     """What scenes are like: a row for each source and number of objects."""
-    table = _plain_table("scenes at their start")
+    table = plain_table("scenes at their start")
     table.add_column("source", no_wrap=True)
     for name in ("objects", "scenes", "f", "lost", "hidden", "≤100", ">100", "seen", "visible", "of each"):
         table.add_column(name, justify="right", no_wrap=True)

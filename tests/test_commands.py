@@ -130,6 +130,20 @@ WRONG = {
     "no scene of a set": (["inspect", "c2-4-180", "--out", "out"], "c2-4-180: there is no such file"),
     "no scenes to look at": (["bench", "scenes", "none.json"], "none.json: there is no such file"),
     "the same source twice": (["bench", "scenes", "empty", "out/../empty"], "two sources are called empty"),
+    "no results": (
+        ["bench", "ceiling", "good.json", "--results", "none.json", "--out", "new"],
+        "none.json: cannot be read",
+    ),
+    "no search": (["bench", "ceiling", "good.json", "--rounds", "0", "--out", "new"], "--rounds 0 must be at least 1"),
+    "one scene twice": (
+        ["bench", "ceiling", "good.json", "good.json", "--out", "new"],
+        "two scenes are called one-box",
+    ),
+    "no such suite": (["bench", "guard", "--scenes", "41", "--out", "new.parquet"], "--scenes"),
+    "no reference": (
+        ["bench", "guard", "--reference", "none.json", "--out", "new.parquet"],
+        "none.json: cannot be read",
+    ),
     "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
     "no repeats": (["bench", "plan", "--repeats", "0"], "--repeats 0"),
     "no worlds": (["bench", "simulate", "--worlds", "0"], "worlds 0 must be at least 1"),

@@ -18,7 +18,7 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 
-from mechsearch_jax.commands import bench, bench_quality, scenarios, train
+from mechsearch_jax.commands import bench, bench_episodes, bench_quality, scenarios, train
 from mechsearch_jax.commands.evaluate import evaluate
 from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
 from mechsearch_jax.commands.options import with_planner_options
@@ -52,7 +52,7 @@ COMMANDS: Commands = {
 GROUPS: Mapping[str, Commands] = {
     "scenarios": scenarios.COMMANDS,
     "train": train.COMMANDS,
-    "bench": {**bench.COMMANDS, **bench_quality.COMMANDS},
+    "bench": {**bench.COMMANDS, **bench_quality.COMMANDS, **bench_episodes.COMMANDS},
 }
 
 

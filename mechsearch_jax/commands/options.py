@@ -238,7 +238,7 @@ def find_scenario(name: str) -> Path:
             f"{name}: there is no such file, nor a shipped scenario of that name ({', '.join(shipped)}), nor a scene "
             "set (mechsearch scenarios list)"
         )
-    return _files_of([scene])[0]
+    return files_of([scene])[0]
 
 
 def find_scenarios(names: Sequence[str]) -> list[Path]:
@@ -258,7 +258,7 @@ def find_scenarios(names: Sequence[str]) -> list[Path]:
             _tell_what_is_taken(name)
             files += _files_in(Path(name))
         elif name in SETS and not Path(name).exists():
-            files += _files_of(set_scenes(SETS[name]))
+            files += files_of(set_scenes(SETS[name]))
         else:
             files.append(find_scenario(name))
     if not files:
@@ -293,7 +293,7 @@ def _files_in(folder: Path) -> list[Path]:
     raise InputError(f"{folder}: there are no scenario files (*.json) in this folder or those in it")
 
 
-def _files_of(scenes: Sequence[tuple[Block, int]]) -> list[Path]:
+def files_of(scenes: Sequence[tuple[Block, int]]) -> list[Path]:
     """Files of scenes of sets; making them shows its progress on standard error."""
     from mechsearch_jax.envs.scene_sets import scene_files
     from mechsearch_jax.planner.cache import keep_compilations

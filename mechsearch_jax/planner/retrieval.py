@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+from typing import NamedTuple
+
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
@@ -59,6 +62,37 @@ def best_grasp(
       pose: of the target as x, y [m], yaw [rad]; need not be a candidate.
       active: where false, no grasp is feasible and little is computed: there is no target yet.
     """
+    ranked = _ranked(grasps, scene, pose, active)
+    # Not of the best: who asks for these alone need not know how near others are.
+    fewest = jnp.min(ranked.hits)
+    choice = _choice(grasps, ranked, jnp.argmin(ranked.order))
+    return choice.replace(success=fewest == 0, hits=fewest.astype(jnp.int32))
+
+
+@functools.partial(jax.jit, static_argnames=("count",))
+def best_grasps(grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"], count: int) -> GraspChoice:
+    """The `count` best grasps of a target at a pose, ranked as for `best_grasp`: fields have a leading axis, best first.
+
+    Args:
+      grasps, scene, pose: as in `best_grasp`.
+      count: how many; not more than there are.
+    """
+    ranked = _ranked(grasps, scene, pose, True)
+    best = jnp.argsort(ranked.order, stable=True)[:count]
+    return jax.vmap(lambda i: _choice(grasps, ranked, i))(best)
+
+
+class _Ranked(NamedTuple):
+    """All grasps: where the gripper closes, how many objects each hits, and by what they are ranked, least first."""
+
+    T_world_gripper: Float[Array, "f 4 4"]
+    hits: Int[Array, " f"]
+    order: Int[Array, " f"]
+
+
+def _ranked(
+    grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool
+) -> _Ranked:
     T_world_target = upright_pose(pose, grasps.target.height(grasps.shelf))
     tables = grasps.tables
     found = found_grasps(grasps, T_world_target, active)
@@ -70,12 +104,13 @@ def best_grasp(
 
     hits = jnp.where(found.feasible, jnp.sum(found_hits(grasps, found, scene, active), axis=1), worst)
     crowd = jnp.sum(jax.lax.map(count, jnp.float32(CLEARANCES)), axis=0)
-    best = jnp.argmin(hits * 100 + crowd)
-    T = compose(T_world_target[None], tables.T_target_gripper)
-    # Not of the best: who asks for these alone need not know how near others are.
-    fewest = jnp.min(hits)
+    return _Ranked(compose(T_world_target[None], tables.T_target_gripper), hits, hits * 100 + crowd)
+
+
+def _choice(grasps: TargetGrasps, ranked: _Ranked, i: Int[Array, ""]) -> GraspChoice:
+    T, q7 = ranked.T_world_gripper[i], grasps.tables.q7[i]
     return GraspChoice(
-        success=fewest == 0,
-        hits=fewest.astype(jnp.int32),
-        action=retrieve_action(T[best], tables.q7[best], jnp.float32(grasps.gripper.max_opening)),
+        success=ranked.hits[i] == 0,
+        hits=ranked.hits[i].astype(jnp.int32),
+        action=retrieve_action(T, q7, jnp.float32(grasps.gripper.max_opening)),
     )

@@ -1,0 +1,92 @@
+"""A target whose pose is known, seen or not: how far it is from graspable, what can be done, how it is taken out."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
+from mechsearch_jax.envs.world import World
+from mechsearch_jax.geometry.transforms import upright_pose
+from mechsearch_jax.graspability import no_hits, pairs
+from mechsearch_jax.planner import Belief, Problem, Search, Sequences, initial_belief
+from mechsearch_jax.planner.found_target import found_grasps, found_hits
+from mechsearch_jax.planner.objective import Objective, SearchForGrasp
+from mechsearch_jax.planner.retrieval import GraspChoice, best_grasps
+from mechsearch_jax.planner.rollout import Rollout, plan
+
+
+@dataclasses.dataclass(frozen=True)
+class InFullView(SearchForGrasp):
+    """How far the target is from graspable where it is known to be: it may stand hidden."""
+
+    def cost(self, problem, belief, exists, target_at, hits, crowding_weight) -> Float[Array, ""]:
+        nowhere_hidden = jnp.zeros_like(exists)
+        return super().cost(problem, belief, nowhere_hidden, target_at, hits, crowding_weight)
+
+
+class Judgement(flax.struct.PyTreeNode):
+    """How far the target of a world is from graspable, by the dense grasps of a found target.
+
+    Attributes:
+      cost: J of the planner, of this target alone.
+      feasible: which grasps arm and shelf allow, shape (F,).
+      hits: which objects each of these hits on its whole way, shape (F, N).
+    """
+
+    cost: Float[Array, "*batch"]
+    feasible: Bool[Array, "*batch f"]
+    hits: Bool[Array, "*batch f n"]
+
+    @property
+    def least(self) -> int | None:
+        """How many objects the best grasp hits; None where none is feasible. Of a single world."""
+        return int(self.hits.sum(axis=1)[self.feasible].min()) if self.feasible.any() else None
+
+
+@functools.partial(jax.jit, static_argnames=("objective",))
+def judge(
+    problem: Problem, objective: Objective, weight: Array | float, world: World, active: Bool[Array, ""]
+) -> Judgement:
+    """How far the target of a world is from graspable.
+
+    Args:
+      problem: built for the target.
+      objective: whose cost it is; static.
+      weight: of crowding, see `PlannerConfig`.
+      world: the true state, fields without leading axes.
+      active: where false, little is computed, and what is told means nothing.
+    """
+    here = Snapshot(problem.camera, problem.shelf, world)
+    belief = _known(problem, world, active)
+    hits = found_hits(problem, belief.grasps, objects_on_the_board(here), active)
+    nowhere = jnp.zeros_like(belief.exists)
+    rows = jnp.concatenate([no_hits(pairs(problem.grasps), hits.shape[1]), hits])
+    cost = objective.cost(problem, belief, nowhere, nowhere, rows, weight)
+    return Judgement(cost, belief.grasps.feasible, hits & belief.grasps.feasible[:, None])
+
+
+def _known(problem: Problem, world: World, active: Bool[Array, ""] | bool = True) -> Belief:
+    """The belief of who knows where the target is."""
+    pose = true_target_pose(world)
+    grasps = found_grasps(problem, upright_pose(pose, problem.target.height(problem.shelf)), active)
+    return initial_belief(problem).replace(found=jnp.array(True), found_pose=pose, grasps=grasps)
+
+
+@jax.jit
+def sample(search: Search, key: Array, problem: Problem, world: World) -> Sequences:
+    """Sequences of actions from a world, best first, as the planner samples them."""
+    objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
+    rollout = Rollout(problem, _known(problem, world), search.config, search.propose, search.predict, search.objective)
+    return plan(rollout, key, objects).sequences
+
+
+def retrievals_of(problem: Problem, world: World, count: int) -> GraspChoice:
+    """The best grasps of the target of a world, as `best_grasps` ranks them, as NumPy arrays."""
+    objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
+    return jax.device_get(best_grasps(problem.target_grasps, objects, true_target_pose(jax.tree.map(jnp.asarray, world)), count))

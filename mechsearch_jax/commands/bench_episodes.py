@@ -1,0 +1,160 @@
+"""`mechsearch bench`: what whole episodes can come to, and whether they come to less than before."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from mechsearch_jax.commands.options import JsonFile, SomeScenarios, at_least_one, check_files, files_of, find_scenarios
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.envs.known_search import Node
+    from mechsearch_jax.workspace.scenario import Scenario
+
+Results = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...")]
+
+
+def _command() -> str:
+    """What was typed."""
+    return shlex.join(["mechsearch", *sys.argv[1:]])
+
+
+def _scenes(names: Sequence[str]) -> list[Scenario]:
+    """The scenes that files, folders and names stand for.
+
+    Raises:
+      InputError: there is nothing for one of them, or two have the same name.
+    """
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    scenes: dict[str, Scenario] = {}
+    for scene in map(load_scenario, find_scenarios(names)):
+        if scene.name in scenes:
+            raise InputError(f"bench ceiling: two scenes are called {scene.name}; rename one")
+        scenes[scene.name] = scene
+    return list(scenes.values())
+
+
+def _nearest(best: Node) -> str:
+    """How near to being solved the best world of a search is."""
+    hit = "no grasp" if best.judgement.least is None else f"{best.judgement.least} in the way"
+    return f"{hit} after {len(best.actions)} actions"
+
+
+def bench_ceiling(
+    scenarios: SomeScenarios,
+    /,
+    *,
+    out: Path,
+    results: Results = (),
+    sequences: int = 64,
+    simulated: int = 32,
+    worlds: int = 4,
+    rounds: int = 40,
+    grasps: int = 8,
+    max_steps: int = 30,
+    seed: int = 0,
+) -> None:
+    """Tell what share of scenes can be solved at all; those that no episode solved are searched with everything known.
+
+    Args:
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
+      out: folder for a file for every scene that is searched, a picture of each that stays unsolved, and ceiling.json.
+        Scenes that have a file of the same code and options are not searched again.
+      results: tables of `evaluate` (.parquet) and stored results (.json); what was retrieved in any is solvable.
+      sequences: sampled from each world of a round.
+      simulated: so many of them, the best, are executed in a round.
+      worlds: from which sequences are sampled in a round: those nearest to being solved.
+      rounds: of each search, at most.
+      grasps: that are tried out to take the target out of a world.
+      max_steps: actions, the retrieval among them.
+      seed: of the search.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import solvability
+    from mechsearch_jax.benchmarks.episode_tables import ceiling_table
+    from mechsearch_jax.envs.known_search import KnownSearchConfig
+    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.planner.cache import keep_compilations
+
+    at_least_one("bench ceiling", sequences=sequences, simulated=simulated, worlds=worlds, rounds=rounds)
+    at_least_one("bench ceiling", grasps=grasps, max_steps=max_steps)
+    scenes = _scenes(scenarios)
+    outcomes = solvability.read_outcomes(results)
+    check_writable(out)
+    keep_compilations()
+    config = KnownSearchConfig(
+        simulated=simulated, worlds=worlds, rounds=rounds, grasps=grasps, max_steps=max_steps, seed=seed
+    )
+    ceiling = solvability.Ceiling(out, config, sequences)
+    console = Console(highlight=False)
+    rows: list[solvability.Row] = []
+    with console.status("searching") as status:
+        for scene in scenes:
+
+            def told(number: int, best: Node, scene=scene) -> None:
+                line = f"{len(rows)}/{len(scenes)} {scene.name}: round {number}, {_nearest(best)}"
+                status.update(line)
+                if not console.is_terminal:
+                    console.print(line, soft_wrap=True)
+
+            rows.append(ceiling.row(scene, outcomes, told))
+    solvability.save_ceiling(rows, ceiling.settings, _command(), out / "ceiling.json")
+    console.print(ceiling_table(rows))
+
+
+def bench_guard(
+    *,
+    out: Path,
+    scenes: Literal[40, 80, 160] = 160,
+    reference: JsonFile = None,
+    write: bool = False,
+    workers: int | None = None,
+) -> None:
+    """Run a fixed suite of episodes and compare them with stored ones; status 1 after a significant loss.
+
+    Args:
+      out: Parquet file for the rows; one that is there is gone on with, if the same code wrote it.
+      scenes: size of the suite: the first scenes of each number of objects in the scene set `development`.
+      reference: what it is compared with; benchmarks/results/guard-cpu.json of the checkout if not given.
+      write: store what it came to in that place, instead of comparing.
+      workers: number of processes; one for each core if not given.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import guard
+    from mechsearch_jax.benchmarks.episode_tables import guard_table
+    from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
+    from mechsearch_jax.benchmarks.processes import Processes
+    from mechsearch_jax.benchmarks.tables import EpisodeProgress
+    from mechsearch_jax.envs.method import Method
+
+    at_least_one("bench guard", workers=workers)
+    stored = reference or guard.REFERENCE
+    before = None if write else guard.read_reference(stored)
+    if write:
+        check_files(stored)
+    jobs = make_jobs(files_of(guard.suite(scenes)), [Method()], (guard.SEED,))
+    console = Console(highlight=False)
+    with EpisodeProgress(console, len(jobs)) as progress:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        rows = evaluate(jobs, out, Processes(workers or cores), progress.ended)
+    if before is None:
+        guard.save_reference(rows, _command(), stored)
+        console.print(str(stored), soft_wrap=True)
+        return
+    comparisons = guard.compare(before.outcomes, [guard.Outcome.of_row(row) for row in rows])
+    console.print(guard_table(comparisons, before.code))
+    if any(one.lost for one in comparisons):
+        raise SystemExit(1)
+
+
+COMMANDS = {"ceiling": bench_ceiling, "guard": bench_guard}

@@ -1,0 +1,101 @@
+"""What stands in the way of a target: moments of a scene with the objects marked that its best grasps hit."""
+
+from __future__ import annotations
+
+import dataclasses
+import textwrap
+from collections.abc import Collection, Sequence
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from matplotlib import patches
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.viz import drawing
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+MARK = drawing.BLOCKED[2]
+_WIDTH, _GAP, _TITLE, _LINE = 4.6, 0.16, 0.34, 0.2
+# Letters in a line of the text beneath, for each inch of the figure's width.
+_LETTERS = 13
+
+
+@dataclasses.dataclass(frozen=True)
+class Moment:
+    """A scene as it is at one moment.
+
+    Attributes:
+      title: what moment it is.
+      image: the camera's view.
+      owner: index of the object that each pixel shows; anything else where there is none.
+      scene: the true objects.
+      target_pose: x, y [m] and yaw [rad] of the target.
+      blockers: indices of the objects in the way.
+    """
+
+    title: str
+    image: UInt8[np.ndarray, "h w 3"]
+    owner: Int[np.ndarray, "h w"]
+    scene: Superquadrics
+    target_pose: Float[np.ndarray, " 3"]
+    blockers: Collection[int]
+
+
+def blockers_figure(
+    moments: Sequence[Moment], camera: Camera, shelf: Shelf, target: Target, heading: str, text: str
+) -> Figure:
+    """Draw moments side by side, each as the camera sees it and from above, objects in the way in orange.
+
+    Args:
+      moments: at least one.
+      camera, shelf, target: of the problem.
+      heading: one line above everything.
+      text: why the target cannot be taken out; it is broken into lines below everything.
+    """
+    left, right, top, bottom = drawing.view_window(camera, shelf)
+    view_height = _WIDTH * (bottom - top) / (right - left)
+    map_height = _WIDTH * (shelf.back - shelf.front + 0.087) / (shelf.left - shelf.right + 0.024)
+    width = len(moments) * (_WIDTH + _GAP) + _GAP
+    lines = textwrap.wrap(text, int(_LETTERS * width))
+    low = _GAP + _LINE * len(lines) + 0.1
+    height = low + map_height + 0.08 + view_height + _TITLE + 0.5
+    figure = Figure(figsize=(width, height), facecolor=drawing.PAPER)
+    figure.text(_GAP / width, 1 - 0.28 / height, heading, fontsize=13, color=drawing.INK, weight="bold", va="center")
+    for i, moment in enumerate(moments):
+        x = _GAP + i * (_WIDTH + _GAP)
+        upper = low + map_height + 0.08
+        middle = (upper + view_height + _TITLE / 2) / height
+        figure.text(x / width, middle, moment.title, fontsize=10, color=drawing.INK, va="center")
+        view = figure.add_axes((x / width, upper / height, _WIDTH / width, view_height / height))
+        above = figure.add_axes((x / width, low / height, _WIDTH / width, map_height / height))
+        _draw(view, above, moment, camera, shelf, target)
+    for i, line in enumerate(lines):
+        y = (low - 0.1 - _LINE * (i + 0.5)) / height
+        figure.text(_GAP / width, y, line, fontsize=9, color=drawing.INK, va="center")
+    return figure
+
+
+def _draw(view: Axes, above: Axes, moment: Moment, camera: Camera, shelf: Shelf, target: Target) -> None:
+    drawing.draw_view(view, moment.image, camera, shelf)
+    drawing.draw_numbers_in_view(view, moment.owner, moment.scene.capacity)
+    drawing.draw_shelf(above, shelf)
+    drawing.draw_objects(above, moment.scene)
+    drawing.draw_target(above, moment.target_pose, target, certain=True)
+    seen, from_above = drawing.outlines_in_view(moment.scene, camera), drawing.outlines(moment.scene)
+    for index in moment.blockers:
+        for axes, outline in ((view, seen[index]), (above, _turned(from_above[index]))):
+            if outline is not None:
+                axes.add_patch(
+                    patches.Polygon(
+                        outline, closed=True, facecolor=(*drawing.rgb(MARK), 0.3), edgecolor=MARK, lw=2.2, zorder=4
+                    )
+                )
+
+
+def _turned(outline: np.ndarray | None) -> np.ndarray | None:
+    """An outline in x and y as the picture from above has it: y across, x upwards."""
+    return None if outline is None else outline[:, ::-1]

@@ -1,0 +1,222 @@
+"""What share of scenes can be solved: which episodes count, what is searched, what is kept, and why a search failed."""
+
+import dataclasses
+import json
+from collections import Counter
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from published import published_scenarios
+from stage import HIDDEN, OPEN, TWO
+
+from mechsearch_jax.actions import KINDS, Action
+from mechsearch_jax.benchmarks import solvability, unsolved
+from mechsearch_jax.benchmarks.episode_tables import ceiling_table
+from mechsearch_jax.benchmarks.rates import wilson
+from mechsearch_jax.benchmarks.rows import Row as EpisodeRow
+from mechsearch_jax.benchmarks.rows import write_rows
+from mechsearch_jax.benchmarks.solvability import Ceiling, Outcomes, Row, read_outcomes, summary
+from mechsearch_jax.benchmarks.unsolved import blockers, in_the_way, reason
+from mechsearch_jax.envs.known_search import Found, KnownSearchConfig, Node
+from mechsearch_jax.envs.known_target import Judgement
+from mechsearch_jax.envs.native import NativeWorld
+from mechsearch_jax.envs.records import ActionRecord
+from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.workspace.scenario import load_scenario
+
+EPISODE = EpisodeRow(
+    "two", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.5
+)
+PUSH = ActionRecord("push", 0, np.eye(4).tolist(), [0.0, 0.1, 0.0], np.eye(4).tolist(), 0.7, 0.0)
+
+
+def judgement(*hits, feasible=None):
+    """Of grasps that hit these objects."""
+    rows = np.zeros((len(hits), 8), bool)
+    for row, objects in zip(rows, hits, strict=True):
+        row[list(objects)] = True
+    return Judgement(np.float32(1.0), np.ones(len(hits), bool) if feasible is None else np.array(feasible), rows)
+
+
+def found(start, best=None, actions=None, **changes):
+    """What a search came to, by the judgements of its worlds."""
+    world = jax.device_get(from_scenario(TWO))
+    begin = Node(world, (), start)
+    counts = {name: Counter() for name in ("sampled", "executed", "failed", "retrievals")}
+    reached = begin if best is None else Node(world, (PUSH,), best)
+    told = {"actions": actions, "best": reached, "start": begin, "rounds": 3, "simulated": 70}
+    return Found(**{**told, **counts, **changes})
+
+
+def test_episodes_count_by_content_and_by_name_only_where_they_do_not_say(tmp_path):
+    table = tmp_path / "rows.parquet"
+    known = dataclasses.replace(EPISODE, configuration="{}", content_hash=TWO.content_hash, retrieved=False)
+    write_rows([known, dataclasses.replace(known, scenario="another name", seed=1, retrieved=True)], table)
+    stored = tmp_path / "stored.json"
+    episodes = [{"scenario": "hidden", "retrieved": True}, {"scenario": "two", "retrieved": True}]
+    stored.write_text(json.dumps({"runs": [{"episodes": episodes}]}))
+    listed = tmp_path / "listed.json"
+    columns = ["scenario", "seed", "retrieved", "content_hash"]
+    runs = [{"episodes": [["two", 0, True, "other"], ["hidden", 0, False, HIDDEN.content_hash]]}]
+    listed.write_text(json.dumps({"columns": columns, "runs": runs}))
+
+    assert read_outcomes([table]).of(TWO) == (2, 1)
+    assert read_outcomes([stored]).of(TWO) == (1, 1)
+    # The scene of that name held something else.
+    assert read_outcomes([listed]).of(TWO) == (0, 0)
+    everything = read_outcomes([table, stored, listed])
+    assert [everything.of(scene) for scene in (TWO, HIDDEN, OPEN)] == [(3, 2), (2, 1), (0, 0)]
+    assert read_outcomes([]).of(TWO) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("{", "is not JSON"),
+        ("[]", "there are no episodes"),
+        ('{"runs": []}', "there are no episodes"),
+        ('{"runs": [{"episodes": [["a"]]}]}', "is no stored result"),
+        ('{"runs": [3]}', "is no stored result"),
+        ('{"runs": [{"episodes": [{"scenario": "a"}]}]}', "is no stored result"),
+    ],
+)
+def test_what_holds_no_episodes_is_refused(tmp_path, text, complaint):
+    (tmp_path / "stored.json").write_text(text)
+    with pytest.raises(InputError, match=rf"stored.json: .*{complaint}"):
+        read_outcomes([tmp_path / "stored.json"])
+
+
+@pytest.fixture
+def ceiling(tmp_path, monkeypatch):
+    """Searches that come to what `answers` says of a scene; `ceiling.asked` tells which were searched."""
+    ceiling = Ceiling(tmp_path, KnownSearchConfig(rounds=3), 5)
+    ceiling.asked, ceiling.answers = [], {}
+
+    def known_search(scenario, *rest):
+        ceiling.asked.append(scenario.name)
+        return ceiling.answers[scenario.name]
+
+    monkeypatch.setattr(solvability, "known_search", known_search)
+    monkeypatch.setattr(solvability, "cached_problem", lambda *_: None)
+    monkeypatch.setattr(ceiling, "_problem", lambda *_: None)
+    monkeypatch.setattr(unsolved, "picture", lambda *_: "figure")
+    monkeypatch.setattr(solvability, "save_figure", lambda figure, path: path.write_text(figure))
+    return ceiling
+
+
+def test_only_what_no_episode_solved_is_searched_and_kept(tmp_path, ceiling, monkeypatch):
+    ceiling.answers = {
+        "two": found(judgement([0]), judgement([]), (PUSH, PUSH)),
+        "hidden": found(judgement([0])),
+    }
+    outcomes = Outcomes({}, {"open": (4, 1), "hidden": (4, 0)})
+    first = [ceiling.row(scene, outcomes) for scene in (OPEN, TWO, HIDDEN)]
+    assert ceiling.asked == ["two", "hidden"]
+    assert [(row.solvable, row.episodes, row.retrieved, row.actions) for row in first] == [
+        (True, 4, 1, None), (True, 0, 0, 2), (False, 4, 0, None),
+    ]  # fmt: skip
+    assert [row.reason is None for row in first] == [True, True, False]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hidden.json", "hidden.png", "two.json"]
+    assert first[1].path == [dataclasses.asdict(PUSH)] * 2
+
+    assert [ceiling.row(scene, outcomes) for scene in (OPEN, TWO, HIDDEN)] == first
+    assert ceiling.asked == ["two", "hidden"]
+    ceiling.row(dataclasses.replace(OPEN, name="two"), Outcomes({}, {"two": (1, 1)}))
+    (tmp_path / "hidden.json").write_text("{")
+    ceiling.row(HIDDEN, outcomes)
+    monkeypatch.setattr(solvability, "present_code", lambda: "other code")
+    ceiling.row(TWO, outcomes)
+    other = Ceiling(tmp_path, KnownSearchConfig(rounds=4), 5)
+    assert other.settings != ceiling.settings
+    assert ceiling.asked == ["two", "hidden", "hidden", "two"]
+
+
+def test_shares_are_those_of_the_rows(tmp_path):
+    row = Row("a", "00", 2, 4, 1, True)
+    rows = [
+        row,
+        dataclasses.replace(row, scenario="b", retrieved=0, actions=3, rounds=1, simulated=9, seconds=1.0),
+        dataclasses.replace(row, scenario="c", retrieved=0, solvable=False, reason="too tight"),
+        dataclasses.replace(row, scenario="d", objects=8),
+    ]
+    two, eight, everything = summary(rows)
+    assert (two["objects"], eight["objects"], everything["objects"]) == (2, 8, None)
+    assert (two["scenes"], two["solved_in_an_episode"], two["solved_by_the_search"]) == (3, 1, 1)
+    assert two["solvable"] == pytest.approx(2 / 3)
+    assert everything["solvable_interval"] == wilson(3, 4)
+    solvability.save_ceiling(rows, {"rounds": 3}, "mechsearch bench ceiling", tmp_path / "ceiling.json")
+    value = json.loads((tmp_path / "ceiling.json").read_text())
+    assert [Row(**dict(zip(value["columns"], each, strict=True))) for each in value["rows"]] == rows
+    assert (value["command"], value["settings"]) == ("mechsearch bench ceiling", {"rounds": 3})
+    table, why = ceiling_table(rows).renderables
+    assert table.row_count == 3
+    assert str(why) == "c: too tight"
+
+
+RESULT = Path(__file__).parents[1] / "benchmarks" / "results" / "ceiling-cpu.json"
+
+
+def test_the_table_of_the_ceiling_is_the_stored_result():
+    stored = json.loads(RESULT.read_text())
+    rows = [Row(**dict(zip(stored["columns"], each, strict=True))) for each in stored["rows"]]
+    lines = summary(rows)
+    assert json.loads(json.dumps(lines)) == stored["summary"]
+    guide = (RESULT.parents[2] / "docs" / "results.md").read_text()
+    for line in lines:
+        low, high = line["solvable_interval"]
+        solved = f"{line['solved_in_an_episode']} | {line['solved_by_the_search']} | {line['solvable']:.2f}"
+        name = line["objects"] or "all"
+        assert f"| {name} | {line['scenes']} | {solved} | {low:.2f} to {high:.2f} |" in guide
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not published_scenarios(), reason="the published scenes are not next to this checkout")
+def test_stored_actions_take_the_target_out():
+    stored = json.loads(RESULT.read_text())
+    rows = [Row(**dict(zip(stored["columns"], each, strict=True))) for each in stored["rows"]]
+    scenes = {scene.content_hash: scene for scene in map(load_scenario, published_scenarios())}
+    codes, world = {kind.name: code for code, kind in KINDS.items()}, NativeWorld()
+    for row in (row for row in rows if row.path):
+        world.reset(scenes[row.content_hash])
+        for action in row.path:
+            known = {**action, "kind": codes[action["kind"]], "object": action["object"] or 0}
+            outcome = world.execute(Action(**{name: jnp.array(value) for name, value in known.items()}))
+            assert not outcome.fallen.any()
+        assert outcome.retrieved, row.scenario
+
+
+def test_what_is_in_the_way_are_the_least_sets_that_feasible_grasps_hit():
+    judged = judgement([0, 1], [1], [2, 3], [1, 4], [5], feasible=[True, True, True, True, False])
+    assert in_the_way(judged) == [(1,), (2, 3)]
+    assert blockers(judged) == (1,)
+    assert blockers(judgement([0, 1], [2, 3], [0, 1, 2])) == (0, 1, 2, 3)
+    assert in_the_way(judgement([0], feasible=[False])) == []
+    assert blockers(judgement([0], feasible=[False])) == ()
+
+
+def test_reasons_say_what_is_in_the_way_and_what_could_be_done_to_it():
+    nowhere = judgement([0], feasible=[False])
+    assert reason(found(nowhere)).startswith("Arm and shelf allow no grasp of the target, nor of one that was pushed")
+    stuck = reason(found(judgement([1], [0, 1])))
+    assert "each of the 2 grasps that arm and shelf allow hits object 1." in stuck
+    assert "No action brought it nearer" in stuck
+    assert "Object 1 could be neither picked nor pushed." in stuck
+    better = reason(
+        found(
+            judgement([0, 1]),
+            judgement([1], [2]),
+            sampled=Counter({("push", 1): 9, ("push", 2): 3, ("pick-and-place", 2): 4}),
+            executed=Counter({("push", 1): 5}),
+            failed=Counter({("push", 1, "dropped"): 1, ("push", 1, "unreachable"): 2, ("push", 0, "dropped"): 7}),
+        )
+    )
+    assert "hits objects 0 and 1. At best, after 1 action, each of the 2 grasps" in better
+    assert "hits object 1, or object 2 (70 actions simulated in 3 rounds)" in better
+    assert "Object 1: push 5 times (3 more failed); never pick-and-place." in better
+    assert "Object 2: pick-and-place 0 times (0 more failed), push 0 times (0 more failed)." in better
+    failed = reason(found(judgement([1]), judgement([]), retrievals=Counter({"the arm was held up": 3, "missed": 1})))
+    assert "every attempt to take the target out failed: the arm was held up (3 times), missed (1 time)" in failed

@@ -1,0 +1,266 @@
+"""The search with everything known: what it tries, what it keeps, when it gives up, and what it says of it."""
+
+import dataclasses
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from stage import BOX, HIDDEN, TWO
+
+from mechsearch_jax import planner
+from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
+from mechsearch_jax.envs import known_search
+from mechsearch_jax.envs.known_search import Frontier, KnownSearchConfig, Node, in_turn
+from mechsearch_jax.envs.known_target import InFullView, Judgement, judge
+from mechsearch_jax.envs.native import NativeSimulator
+from mechsearch_jax.envs.outcome import Failure, Outcome
+from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
+from mechsearch_jax.envs.world import BODIES, TARGET, World, from_scenario
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.graspability import no_hits, pairs
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import GraspChoice, Sequences, graspable_at
+from mechsearch_jax.planner.retrieval import best_grasps
+from mechsearch_jax.workspace.shelf import Shelf
+
+START = jax.device_get(from_scenario(TWO))
+SEARCH = planner.search(objective=InFullView())
+
+
+@dataclasses.dataclass
+class Toy:
+    """A simulator in which a push moves its object by its displacement, and a retrieval comes to what a test says.
+
+    Attributes:
+      retrieval: what comes of taking the target out.
+      tilts: whether a push of the target tips it over.
+    """
+
+    retrieval: Failure = Failure.NONE
+    tilts: bool = False
+    pushes: int = 0
+    engine: str = "Toy"
+    world: World | None = None
+
+    def replace(self, scenarios):
+        raise AssertionError("a search begins with one scenario")
+
+    def settle(self, active=None):
+        raise AssertionError("a search acts; it never just lets time pass")
+
+    def reset(self, scenarios):
+        return self.load(jax.tree.map(lambda a: a[None], from_scenario(scenarios[0])))
+
+    def load(self, world, only=None):
+        self.world = world
+        return world
+
+    def execute(self, actions, active=None):
+        position, rotation, count = np.array(self.world.position), np.array(self.world.rotation), len(active)
+        failure, retrieved = np.zeros(count, np.int32), np.zeros(count, bool)
+        for i in np.flatnonzero(active):
+            if actions.kind[i] == ActionKind.RETRIEVE:
+                failure[i], retrieved[i] = self.retrieval, self.retrieval is Failure.NONE
+                continue
+            self.pushes += 1
+            body = int(actions.object[i])
+            position[i, body] += actions.displacement[i]
+            if body == TARGET and self.tilts:
+                rotation[i, body] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        self.world = self.world.replace(position=jnp.asarray(position), rotation=jnp.asarray(rotation))
+        fallen = np.array(self.world.valid & (self.world.position[..., 0] < Shelf().front))
+        flags = {name: np.zeros(count, bool) for name in ("held", "outside")}
+        return Outcome(
+            failure=failure, steps=np.ones(count, np.int32), settled=np.ones(count, bool), fallen=fallen,
+            retrieved=retrieved, overflow=np.zeros(count, np.int32), tracking_error=np.zeros(count), **flags,
+        )  # fmt: skip
+
+
+def push(body, **displacement):
+    moved = np.array([displacement.get(axis, 0.0) for axis in "xyz"], np.float32)
+    return jax.device_get(
+        no_action().replace(kind=jnp.int32(ActionKind.PUSH), object=jnp.int32(body), displacement=jnp.asarray(moved))
+    )
+
+
+def sequences(*rows):
+    """Each row: value, and the actions, which are all executed."""
+    longest = max(len(actions) for _, *actions in rows)
+    padded = [[*actions, *[jax.device_get(no_action())] * (longest - len(actions))] for _, *actions in rows]
+    stacked = [jax.tree.map(lambda *a: np.stack(a), *actions) for actions in padded]
+    return Sequences(
+        actions=jax.tree.map(lambda *a: np.stack(a), *stacked),
+        cost=np.zeros((len(rows), longest)),
+        value=np.array([value for value, *_ in rows]),
+        length=np.array([len(actions) for _, *actions in rows]),
+    )
+
+
+@pytest.fixture
+def search(problem, monkeypatch):
+    """Runs a search in which the first object is in the way of the only grasp unless its y is above 0.3 [m]."""
+    config = KnownSearchConfig(simulated=8, worlds=2, rounds=6, grasps=2, max_steps=4)
+
+    def judged(self, worlds):
+        free = [world.position[0, 1] > 0.3 for world in worlds]
+        return [
+            Judgement(np.float32(2.0 - clear), np.array([True, False]), np.eye(2, 8, dtype=bool) & ~clear)
+            for clear in free
+        ]
+
+    grasp = retrieve_action(jnp.eye(4)[None].repeat(2, 0), jnp.zeros(2), jnp.zeros(2))
+    choice = jax.device_get(GraspChoice(jnp.array([True, False]), jnp.array([0, 1]), grasp))
+    monkeypatch.setattr(known_search._Running, "_judged", judged)
+    monkeypatch.setattr(known_search, "retrievals_of", lambda problem, world, count: choice)
+
+    def run(sampled, simulator, **changes):
+        monkeypatch.setattr(known_search, "sample", lambda search, key, problem, world: sampled)
+        told = lambda *of: run.told.append(of)  # noqa: E731
+        return known_search.known_search(TWO, problem, SEARCH, simulator, dataclasses.replace(config, **changes), told)
+
+    run.told = []
+    return run
+
+
+LEFT = push(0, y=0.1)
+
+
+def test_actions_are_joined_until_the_target_is_out(search):
+    simulator = Toy()
+    found = search(sequences((-0.5, LEFT), (-0.1, push(1, y=0.05))), simulator)
+    assert [(action.kind, action.object) for action in found.actions] == [("push", 0), ("push", 0), ("retrieve", None)]
+    assert found.rounds == 2
+    assert [number for number, _ in search.told] == [1, 2]
+    assert found.retrievals == Counter({"": 1})
+    assert found.simulated == simulator.pushes + 1
+    assert found.best.world.position[0, 1] == pytest.approx(0.335)
+    assert (found.start.judgement.least, found.best.judgement.least) == (1, 0)
+
+
+def test_a_whole_sequence_is_executed_and_each_world_of_it_looked_at(search):
+    found = search(sequences((-0.5, LEFT, LEFT, push(1, y=0.05))), Toy())
+    assert (found.rounds, len(found.actions), found.simulated) == (1, 3, 4)
+
+
+def test_there_are_no_more_actions_than_allowed(search):
+    for steps, solved in ((3, True), (2, False), (1, False)):
+        found = search(sequences((-0.5, LEFT, LEFT, LEFT)), Toy(), max_steps=steps)
+        assert (found.actions is not None) is solved
+        assert len(found.best.actions) <= steps - 1
+    # Where there is no room for any action, no round is spent on it.
+    assert found.rounds == 0
+
+
+def test_a_world_that_is_lost_is_given_up(search):
+    for sampled, simulator in (
+        (sequences((-0.5, push(1, x=-0.3), LEFT, LEFT)), Toy()),
+        (sequences((-0.5, push(TARGET, y=0.1), LEFT, LEFT)), Toy(tilts=True)),
+    ):
+        found = search(sampled, simulator)
+        assert found.actions is None
+        # Six rounds of one push each: nothing follows one after which something has fallen.
+        assert (found.simulated, found.rounds, len(found.best.actions)) == (6, 6, 0)
+
+
+def test_retrievals_that_fail_are_counted_and_solve_nothing(search):
+    found = search(sequences((-0.5, LEFT, LEFT)), Toy(retrieval=Failure.HELD_UP))
+    assert found.actions is None
+    assert set(found.retrievals) == {"the arm was held up"}
+    assert found.best.graspable
+
+
+def test_what_cannot_be_acted_upon_ends_when_the_rounds_do(search):
+    found = search(sequences((np.inf, LEFT)), Toy())
+    assert (found.actions, found.rounds, found.simulated, found.sampled) == (None, 6, 0, Counter())
+
+
+def test_what_was_done_is_counted_by_kind_and_object(search):
+    rows = ((-0.5, push(1, y=0.02)), (-0.4, push(1, y=0.02)), (-0.2, push(1, y=0.04)))
+    found = search(sequences(*rows), Toy(), rounds=1)
+    assert found.sampled == Counter({("push", 1): 3})
+    # The same first action is executed once.
+    assert found.executed == Counter({("push", 1): 2})
+    assert not found.failed
+
+
+def node(y, cost, actions=0):
+    position = np.array(START.position)
+    position[0, 1] = y
+    judgement = Judgement(np.float32(cost), np.zeros(1, bool), np.zeros((1, 8), bool))
+    return Node(START.replace(position=position), (None,) * actions, judgement)
+
+
+def test_a_frontier_gives_the_most_promising_worlds_and_lets_others_have_their_turn():
+    frontier = Frontier()
+    start, good, alike = node(0.0, 2.0), node(0.1, 1.5, 1), node(0.105, 1.0, 1)
+    for one in (start, good, alike):
+        frontier.add(one)
+    assert frontier.nodes == [start, good]
+    assert [frontier.next(1)[0] is good for _ in range(5)] == [True, True, False, True, False]
+    shorter, longer = Frontier(), node(0.2, 2.0, 2)
+    for one in (longer, start):
+        shorter.add(one)
+    assert shorter.next(2) == [start, longer]
+
+
+def test_proposals_of_every_kind_have_their_turn():
+    here, there = node(0.0, 2.0), node(0.1, 2.0)
+
+    def proposal(where, body, expected):
+        action = jax.tree.map(lambda a: a[None], push(body, y=0.1))
+        return known_search._Proposal(where, expected, action, 1)
+
+    easy = [proposal(here, 0, 0.1 * i) for i in range(5)]
+    others = [proposal(here, 1, 3.0), proposal(there, 0, 2.0)]
+    assert in_turn([*easy[::-1], *others], 4) == [easy[0], others[1], others[0], easy[1]]
+    assert in_turn([], 4) == []
+
+
+def test_settings_that_try_nothing_are_refused():
+    for name in ("simulated", "worlds", "rounds", "grasps", "retrievals", "max_steps"):
+        with pytest.raises(InputError, match=f"{name} 0 must be at least 1"):
+            KnownSearchConfig(**{name: 0})
+
+
+def test_a_target_that_may_stand_hidden_costs_no_more_for_it(problem):
+    belief = planner.initial_belief(problem).replace(found=jnp.array(True))
+    at = jnp.arange(problem.poses.shape[0]) == 400
+    hits = no_hits(pairs(problem.grasps, belief.grasps), 8)
+    seen, hidden = (InFullView().cost(problem, belief, e, at, hits, 0.0) for e in (jnp.zeros_like(at), at))
+    assert seen == hidden == 1.0
+    assert planner.search_for_grasp().objective.cost(problem, belief, at, at, hits, 0.0) > 1.0
+
+
+@pytest.mark.slow
+def test_a_judgement_is_the_planners_own(problem):
+    policy = planner.search_for_grasp(sequences=2, horizon=1)
+    beside = dataclasses.replace(BOX, position=(0.62, 0.0, 0.4845))
+    for scene in (HIDDEN, TWO, dataclasses.replace(TWO, objects=(BOX, beside))):
+        world = from_scenario(scene)
+        objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
+        pose = true_target_pose(world)
+        judgement = jax.device_get(judge(problem, InFullView(), 0.02, world, jnp.array(True)))
+        grasp = graspable_at(problem, objects, pose)
+        assert judgement.least == int(grasp.hits)
+        seen = Observation(objects, jnp.array(True), pose)
+        belief = planner.update_belief(problem, planner.initial_belief(problem), seen)
+        if not grasp.success:
+            decision = policy(jax.random.key(0), problem, belief, seen)
+            assert float(decision.cost) == pytest.approx(float(judgement.cost))
+        best = best_grasps(problem.target_grasps, objects, pose, 5)
+        np.testing.assert_array_equal(best.action.T_world_gripper[0], grasp.action.T_world_gripper)
+        assert (np.diff(np.asarray(best.hits)) >= 0).all()
+        assert best.hits[0] == grasp.hits
+
+
+@pytest.mark.slow
+def test_a_hidden_target_is_taken_out(problem):
+    search = planner.search(planner.PlannerConfig(sequences=4, horizon=2), objective=InFullView())
+    config = KnownSearchConfig(simulated=4, worlds=1, rounds=4, grasps=2)
+    found = known_search.known_search(HIDDEN, problem, search, NativeSimulator(), config)
+    assert found.actions is not None
+    assert found.actions[-1].kind == "retrieve"
+    assert found.best.graspable
+    assert found.best.world.position.shape == (BODIES, 3)
