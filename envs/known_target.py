@@ -64,7 +64,7 @@ def judge(
     """
     here = Snapshot(problem.camera, problem.shelf, world)
     belief = _known(problem, world, active)
-    hits = found_hits(problem, belief.grasps, objects_on_the_board(here), active)
+    hits = found_hits(problem.target_grasps, belief.grasps, objects_on_the_board(here), active)
     nowhere = jnp.zeros_like(belief.exists)
     rows = jnp.concatenate([no_hits(pairs(problem.grasps), hits.shape[1]), hits])
     cost = objective.cost(problem, belief, nowhere, nowhere, rows, weight)
@@ -74,7 +74,7 @@ def judge(
 def _known(problem: Problem, world: World, active: Bool[Array, ""] | bool = True) -> Belief:
     """The belief of who knows where the target is."""
     pose = true_target_pose(world)
-    grasps = found_grasps(problem, upright_pose(pose, problem.target.height(problem.shelf)), active)
+    grasps = found_grasps(problem.target_grasps, upright_pose(pose, problem.target.height(problem.shelf)), active)
     return initial_belief(problem).replace(found=jnp.array(True), found_pose=pose, grasps=grasps)
 
 
@@ -89,4 +89,5 @@ def sample(search: Search, key: Array, problem: Problem, world: World) -> Sequen
 def retrievals_of(problem: Problem, world: World, count: int) -> GraspChoice:
     """The best grasps of the target of a world, as `best_grasps` ranks them, as NumPy arrays."""
     objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-    return jax.device_get(best_grasps(problem.target_grasps, objects, true_target_pose(jax.tree.map(jnp.asarray, world)), count))
+    pose = true_target_pose(jax.tree.map(jnp.asarray, world))
+    return jax.device_get(best_grasps(problem.target_grasps, objects, pose, count))

@@ -71,7 +71,7 @@ def best_grasp(
 
 @functools.partial(jax.jit, static_argnames=("count",))
 def best_grasps(grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"], count: int) -> GraspChoice:
-    """The `count` best grasps of a target at a pose, ranked as for `best_grasp`: fields have a leading axis, best first.
+    """The `count` best grasps of a target at a pose, ranked as for `best_grasp`; leading axis, best first.
 
     Args:
       grasps, scene, pose: as in `best_grasp`.
