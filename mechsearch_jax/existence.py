@@ -142,16 +142,12 @@ class ObjectViews(flax.struct.PyTreeNode):
     """Per object, what f needs of it; only what moved has to be computed anew.
 
     Attributes:
-      depth: the object's depth in its window, shape (N, h, w) [m].
-      corner: first row and column of the window, shape (N, 2).
+      windows: the objects' images, with a leading axis N.
       collides: whether the target at a place would run into the object, shape (X, S, N); None if that does not count.
-      overflow: whether the object's image did not fit the window, shape (N,): f may then be too small.
     """
 
-    depth: jax.Array
-    corner: jax.Array
+    windows: render.Window
     collides: jax.Array | None
-    overflow: jax.Array
 
 
 def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: ExistenceConfig) -> ExistenceTables:
@@ -181,7 +177,8 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
         )
         return render.object_window(coarse, one, window)
 
-    depth, corner = jax.jit(jax.vmap(jax.vmap(view)))(T)
+    views = jax.jit(jax.vmap(jax.vmap(view)))(T)
+    depth, corner = views.depth, views.corner
     eroded = jnp.asarray(half - config.erosion)
     sample = jax.jit(superquadric.sample_surface, static_argnames="count")
     cloud = sample(eroded, jnp.array(target.exponents), count=config.points)
@@ -198,10 +195,12 @@ def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | N
       places: number of candidate poses, and of places at each, if collisions count; None if they do not.
     """
     return ObjectViews(
-        depth=jnp.zeros((capacity, *config.window)),
-        corner=jnp.zeros((capacity, 2), jnp.int32),
+        windows=render.Window(
+            depth=jnp.zeros((capacity, *config.window)),
+            corner=jnp.zeros((capacity, 2), jnp.int32),
+            stride=jnp.ones(capacity, jnp.int32),
+        ),
         collides=None if places is None else jnp.zeros((*places, capacity), bool),
-        overflow=jnp.zeros(capacity, bool),
     )
 
 
@@ -233,23 +232,26 @@ def object_views(
     fresh = scene.valid if moved is None else moved & scene.valid
 
     def view(_, scene, i):
-        one = jax.tree.map(lambda a: a[i], scene)
-        depth, corner = render.object_window(coarse, one, config.window)
-        return depth, corner, jnp.any(render.window_corner(coarse, one, config.window)[1] > 0)
+        return render.object_window(coarse, jax.tree.map(lambda a: a[i], scene), config.window)
 
-    depth, corner, overflow = masked_vmap(view, fresh, None, scene, block=8)
-    depth = jnp.where(fresh[:, None, None], depth, jnp.inf)
+    windows = _seen(masked_vmap(view, fresh, None, scene, block=8), fresh)
     collides = None if exists is None else _collisions(tables, scene, exists, fresh)
-    views = ObjectViews(depth, corner, collides, overflow)
     if previous is None or moved is None:
-        return views
+        return ObjectViews(windows, collides)
     if collides is not None and previous.collides is not None:
         collides = jnp.where(moved[None, None], collides, previous.collides)
     return ObjectViews(
-        depth=jnp.where(moved[:, None, None], views.depth, previous.depth),
-        corner=jnp.where(moved[:, None], views.corner, previous.corner),
+        windows=jax.tree.map(
+            lambda a, b: jnp.where(moved.reshape(-1, *[1] * (a.ndim - 1)), a, b), windows, previous.windows
+        ),
         collides=collides,
-        overflow=jnp.where(moved, views.overflow, previous.overflow),
+    )
+
+
+def _seen(windows: render.Window, mask: Bool[Array, " n"]) -> render.Window:
+    """Windows of which those outside of the mask, that stand for nothing, show nothing."""
+    return windows.replace(
+        depth=jnp.where(mask[:, None, None], windows.depth, jnp.inf), stride=jnp.maximum(windows.stride, 1)
     )
 
 
@@ -367,7 +369,7 @@ def allowances(
         return bound
     everywhere = jnp.ones(tables.corner.shape[0], bool)
     coarse = camera.scaled(config.downscale)
-    image = render.merge_windows(coarse, views.depth, views.corner)
+    image = render.merge_windows(coarse, views.windows)
     shown = _shown(tables, coarse, image, everywhere, config)
     free = jnp.ones(shown.shape, bool) if views.collides is None else ~jnp.any(views.collides, axis=-1)
     settled = jnp.any(free & (shown <= config.allowed), axis=1)
@@ -399,8 +401,8 @@ def _counted(
     def view(_, scene, i):
         return render.object_window(closer, jax.tree.map(lambda a: a[i], scene), of_objects)
 
-    depth, corner = masked_vmap(view, scene.valid, None, scene, block=1)
-    image = render.merge_windows(closer, jnp.where(scene.valid[:, None, None], depth, jnp.inf), corner)
+    windows = _seen(masked_vmap(view, scene.valid, None, scene, block=1), scene.valid)
+    image = render.merge_windows(closer, windows)
 
     def counted(tables, image, i):
         T = tables.T_world_target.reshape(-1, 4, 4)[i]
@@ -411,9 +413,9 @@ def _counted(
             rotation=T[:3, :3],
             valid=jnp.array(True),
         )
-        depth, corner = render.object_window(closer, one, of_target)
-        behind, inside = _in_window(closer, image, corner, of_target)
-        return jnp.sum(inside & (depth + config.depth_margin < behind)) * float(scale**2)
+        mine = render.object_window(closer, one, of_target)
+        behind, inside = _in_window(closer, image, mine.corner, of_target)
+        return jnp.sum(inside & (mine.depth + config.depth_margin < behind)) * float(scale**2)
 
     return masked_vmap(counted, doubtful.reshape(-1), tables, image, block=64).reshape(doubtful.shape)
 
@@ -440,7 +442,7 @@ def existence(
       Where the target can be.
     """
     coarse = camera.scaled(config.downscale)
-    image = render.merge_windows(coarse, views.depth, views.corner)
+    image = render.merge_windows(coarse, views.windows)
     if config.criterion == "detector":
         possible = _shown(tables, coarse, image, exists, config) <= allowed
     else:
@@ -456,9 +458,10 @@ def occluders(tables: ExistenceTables, views: ObjectViews) -> Bool[Array, "x n"]
     An approximation, for telling which objects matter; what is visible, `existence` says.
     """
     middle = tables.corner[:, 0] + jnp.array(tables.depth.shape[-2:])[None] // 2
-    pixel = middle[:, None] - views.corner[None]
-    size = jnp.array(views.depth.shape[-2:])
+    windows = views.windows
+    pixel = (middle[:, None] - windows.corner[None]) // windows.stride[None, :, None]
+    size = jnp.array(windows.depth.shape[-2:])
     inside = jnp.all((pixel >= 0) & (pixel < size[None, None]), axis=-1)
     row, column = jnp.moveaxis(jnp.clip(pixel, 0, size[None, None] - 1), -1, 0)
-    depth = views.depth[jnp.arange(views.depth.shape[0])[None], row, column]
+    depth = windows.depth[jnp.arange(windows.depth.shape[0])[None], row, column]
     return inside & (depth < tables.nearest[:, None])

@@ -221,7 +221,7 @@ def test_looking_again_at_moved_objects_alone_gives_the_same_views(problem):
     update = existence.object_views(tables, problem.camera, moved, everywhere, config, before, which)
     whole = existence.object_views(tables, problem.camera, moved, everywhere, config)
     np.testing.assert_array_equal(update.collides, whole.collides)
-    np.testing.assert_allclose(update.depth, whole.depth, rtol=1e-5)
+    np.testing.assert_allclose(update.windows.depth, whole.windows.depth, rtol=1e-5)
 
 
 def test_occluders_are_those_of_a_reference(problem):
