@@ -65,9 +65,12 @@ class ExistenceConfig:
       depth_threshold: threshold of "depth-mse" [m^2] and "depth-norm" [m].
       downscale: how much coarser than the camera f is rendered.
       cell_reach: a target is tried at the middle of its grid cell and this far on the way to each of the cell's corners
-        in x and y; at the corners themselves (1) it is also turned by half a step in yaw, to either side in turn.
+        in x and y; at the corners themselves (1) it is also turned by half a step in yaw, to either side in turn, and
+        those of the outermost cells lie at the walls.
       closer_look: how much coarser than the camera doubtful places are looked at again; 0 for not at all.
-      erosion: by how much the target is drawn in for the collision test [m].
+      erosion: by how much the target is drawn in for the collision test [m]. One that was pushed touches what pushed
+        it, often on several sides, and hardly any of its cell's places fits in between.
+      reopen: whether f is opened again around what an action may have moved unseen; see `planner.unseen_motion`.
       depth_margin: by how much nearer than an object the target must be to count as visible [m].
       window: rows and columns of the window an object is rendered in, at the coarse resolution.
       points: points on the target's surface for the collision test.
@@ -87,7 +90,12 @@ class ExistenceConfig:
     closer_look: int = option(
         3, "where few of the target's pixels show, they are counted again in an image this much coarser; 0 for never"
     )
-    erosion: float = 0.0
+    erosion: float = option(
+        0.001, "how deep a target that may be somewhere may reach into an object, on all sides [m]; the paper's is 0"
+    )
+    reopen: bool = option(
+        True, "whether f is opened again around what an action may have moved unseen; not in the paper"
+    )
     depth_margin: float = 0.0
     window: tuple[int, int] = (48, 48)
     points: int = 512
@@ -97,6 +105,8 @@ class ExistenceConfig:
             raise InputError(f'criterion "{self.criterion}" is unknown; use "detector", "depth-mse" or "depth-norm"')
         if not all(0.0 < share <= 1.0 for share in self.cell_reach):
             raise InputError(f"cell_reach {self.cell_reach} must be shares above 0 and at most 1")
+        if not 0.0 <= self.erosion < math.inf:
+            raise InputError(f"erosion {self.erosion} m must be a number that is not negative")
         if self.downscale < 1:
             raise InputError(f"ExistenceConfig: downscale {self.downscale} must be at least 1")
         if not 0 <= self.closer_look < max(self.downscale, 2):
@@ -152,9 +162,7 @@ class ObjectViews(flax.struct.PyTreeNode):
 
 def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: ExistenceConfig) -> ExistenceTables:
     """Precompute, for every candidate pose, the target's own depth image and collision cloud."""
-    poses = target.candidate_poses(shelf)
-    offsets = config.places * np.array(target.cell(shelf), np.float32) / 2
-    places = poses[:, None] + offsets[None]
+    places = target.places(shelf, config.places)
     T = jax.jit(upright_pose)(jnp.asarray(places), target.height(shelf))
     coarse = camera.scaled(config.downscale)
     half = np.array(target.half_size, np.float32)
