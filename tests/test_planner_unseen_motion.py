@@ -11,6 +11,7 @@ from mechsearch_jax import planner
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.envs import slots
+from mechsearch_jax.envs.episode_log import Choice
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
@@ -70,7 +71,7 @@ def test_a_push_opens_f_beside_what_it_swept(problem, opened):
     # The hand is 20 cm wide and ends at 5 cm.
     assert not where[poses[:, 1] > 0.05 + 0.1 + 0.04].any()
     assert not where[distances(problem, 0.6, 0.08) > 0.1 + 0.04].any()
-    assert where.sum() < 0.15 * where.size
+    assert where.sum() < 0.2 * where.size
 
 
 def test_what_no_possible_pose_is_beside_stays_ruled_out(problem, opened):
@@ -158,7 +159,8 @@ def test_an_episode_tells_the_belief_what_it_did(problem, monkeypatch):
 
     monkeypatch.setattr(slots, "update_belief", update)
     monkeypatch.setattr(slots.OneSlot, "_snapshot", lambda self, world: None)
-    monkeypatch.setattr(slots, "chosen", lambda decision: 0)
+    choice = Choice(push(), jnp.float32(3.0), jnp.float32(2.0), jnp.int32(1))
+    monkeypatch.setattr(slots, "chosen", lambda decision: choice)
 
     @dataclasses.dataclass
     class Decided:
