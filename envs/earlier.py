@@ -27,6 +27,8 @@ EARLIER: Mapping[str, Any] = {
     "avoid_unseen": True,
     "cell_reach": [0.5],
     "closer_look": 0,
+    "erosion": 0.0,
+    "reopen": False,
     "push_directions": [math.radians(angle) for angle in (90, -90)],
     "grasp_tilts": [math.radians(angle) for angle in (20, 25, 30)],
     "retrieval_tilts": [math.radians(angle) for angle in (20, 22.5, 25, 27.5, 30)],

@@ -30,7 +30,7 @@ class Choice(flax.struct.PyTreeNode):
     """What a policy decided, without the sequences that it did not choose.
 
     Attributes:
-      action, cost, predicted_cost, overflow: of the `Decision`.
+      action, cost, predicted_cost: of the `Decision`.
       sequences: how many sequences it was chosen from.
     """
 
@@ -38,13 +38,12 @@ class Choice(flax.struct.PyTreeNode):
     cost: jax.Array
     predicted_cost: jax.Array
     sequences: jax.Array
-    overflow: jax.Array
 
 
 def chosen(decision: Decision) -> Choice:
     """What a decision comes down to."""
     count = jnp.sum(jnp.isfinite(decision.sequences.value))
-    return Choice(decision.action, decision.cost, decision.predicted_cost, count, decision.overflow)
+    return Choice(decision.action, decision.cost, decision.predicted_cost, count)
 
 
 def takes_target(choice: Choice) -> bool:
@@ -54,8 +53,6 @@ def takes_target(choice: Choice) -> bool:
 
 def distrust(choice: Choice) -> str | None:
     """Why a choice must not be acted upon; None if it may."""
-    if choice.overflow:
-        return "error: an object's image outgrew its window, so that f may be too small"
     numbers = [choice.cost, *jax.tree.leaves(choice.action)]
     return None if all(np.all(np.isfinite(n)) for n in numbers) else "error: the decision is not finite"
 

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.envs.episode_log import Choice, chosen
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
 from mechsearch_jax.envs.verdicts import Verdict, judge, judge_many
@@ -78,6 +79,7 @@ class OneSlot:
       observation: what was recognised.
       belief: what is known of the target.
       decision: of the policy; None since the last look.
+      action: what was decided at the last look, to be executed before the next; of kind NONE before the first.
     """
 
     def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser) -> None:
@@ -85,18 +87,23 @@ class OneSlot:
         self.observation: Observation | None = None
         self.belief = initial_belief(problem)
         self.decision: Decision | None = None
+        self.action: Action = no_action()
         self._problem, self._policy, self._recogniser = problem, policy, recogniser
 
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
         """See `Slots`."""
         if fresh[0]:
             self.belief = initial_belief(self._problem)
+            self.action, self.observation = no_action(), None
 
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
         """See `Slots`."""
         snapshot = self._snapshot(world)
         observation = self._recogniser(keys[0], snapshot)
-        self.belief = update_belief(self._problem, self.belief, observation)
+        # Called the same at the first look, when nothing was done yet, so that nothing is compiled twice.
+        before = observation if self.observation is None else self.observation
+        self.belief = update_belief(self._problem, self.belief, observation, before, self.action)
+        self.action = no_action()
         self.snapshot, self.observation, self.decision = snapshot, observation, None
         return _known(self._problem, jax.tree.map(lambda a: a[None], self.belief), world)
 
@@ -106,6 +113,7 @@ class OneSlot:
             return {}
         assert self.observation is not None
         self.decision = self._policy(keys[0], self._problem, self.belief, self.observation)
+        self.action = self.decision.action
         return {0: jax.device_get(chosen(self.decision))}
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
@@ -122,6 +130,7 @@ class PlannerState(flax.struct.PyTreeNode):
 
     belief: Belief
     observation: Observation
+    action: Action
 
 
 class ManySlots:
@@ -148,7 +157,7 @@ class ManySlots:
         seen = jax.eval_shape(
             lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), one
         )
-        empty = PlannerState(initial_belief(problem), seen)
+        empty = PlannerState(initial_belief(problem), seen, no_action())
         self._state: PlannerState = jax.tree.map(lambda a: jnp.zeros((self._count, *a.shape), a.dtype), empty)
 
     def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
@@ -165,7 +174,9 @@ class ManySlots:
         """See `Slots`."""
         found: dict[int, Choice] = {}
         for some, padded in self._chunks(rows):
-            choice = jax.device_get(_decide(self._policy, self._problem, self._state, keys, padded))
+            decided = _decide(self._policy, self._problem, self._state, keys, padded)
+            self._state = _note(self._state, decided.action, padded)
+            choice = jax.device_get(decided)
             found |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(some)}
         return found
 
@@ -214,12 +225,18 @@ def _told(poses: Array, exists: Bool[Array, "slots x"], world: World) -> tuple[A
 @jax.jit
 def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"]) -> PlannerState:
     """Let the fresh slots know nothing."""
-    belief = jax.tree.map(
+    belief, action = jax.tree.map(
         lambda new, old: jnp.where(fresh.reshape(-1, *[1] * new.ndim), new[None], old),
-        initial_belief(problem),
-        state.belief,
+        (initial_belief(problem), no_action()),
+        (state.belief, state.action),
     )
-    return state.replace(belief=belief)
+    return state.replace(belief=belief, action=action)
+
+
+@jax.jit
+def _note(state: PlannerState, action: Action, rows: Int[Array, " n"]) -> PlannerState:
+    """Keep what was decided in the slots `rows` until the next look."""
+    return state.replace(action=jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state.action, action))
 
 
 @functools.partial(jax.jit, static_argnames=("recogniser",))
@@ -228,11 +245,12 @@ def _look(
 ) -> PlannerState:
     """Recognise and update the belief in the slots `rows`."""
 
-    def one(belief, here, key):
+    def one(mine, here, key):
         observation = recogniser(key, Snapshot(problem.camera, problem.shelf, here))
-        return PlannerState(update_belief(problem, belief, observation), observation)
+        belief = update_belief(problem, mine.belief, observation, mine.observation, mine.action)
+        return PlannerState(belief, observation, no_action())
 
-    new = jax.vmap(one)(_some(state.belief, rows), _some_worlds(world, rows), _some(keys, rows))
+    new = jax.vmap(one)(_some(state, rows), _some_worlds(world, rows), _some(keys, rows))
     return jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state, new)
 
 
@@ -248,4 +266,5 @@ def _decide(policy: Policy, problem: Problem, state: PlannerState, keys: Array, 
     belief = mine.belief.replace(exists=mine.belief.exists & active[:, None], found=mine.belief.found & active)
     objects = mine.observation.objects
     objects = objects.replace(valid=objects.valid & active[:, None])
-    return jax.vmap(one)(_some(keys, rows), PlannerState(belief, mine.observation.replace(objects=objects)))
+    seen = mine.observation.replace(objects=objects)
+    return jax.vmap(one)(_some(keys, rows), mine.replace(belief=belief, observation=seen))

@@ -65,9 +65,12 @@ class ExistenceConfig:
       depth_threshold: threshold of "depth-mse" [m^2] and "depth-norm" [m].
       downscale: how much coarser than the camera f is rendered.
       cell_reach: a target is tried at the middle of its grid cell and this far on the way to each of the cell's corners
-        in x and y; at the corners themselves (1) it is also turned by half a step in yaw, to either side in turn.
+        in x and y; at the corners themselves (1) it is also turned by half a step in yaw, to either side in turn, and
+        those of the outermost cells lie at the walls.
       closer_look: how much coarser than the camera doubtful places are looked at again; 0 for not at all.
-      erosion: by how much the target is drawn in for the collision test [m].
+      erosion: by how much the target is drawn in for the collision test [m]. One that was pushed touches what pushed
+        it, often on several sides, and hardly any of its cell's places fits in between.
+      reopen: whether f is opened again around what an action may have moved unseen; see `planner.unseen_motion`.
       depth_margin: by how much nearer than an object the target must be to count as visible [m].
       window: rows and columns of the window an object is rendered in, at the coarse resolution.
       points: points on the target's surface for the collision test.
@@ -87,7 +90,12 @@ class ExistenceConfig:
     closer_look: int = option(
         3, "where few of the target's pixels show, they are counted again in an image this much coarser; 0 for never"
     )
-    erosion: float = 0.0
+    erosion: float = option(
+        0.001, "how deep a target that may be somewhere may reach into an object, on all sides [m]; the paper's is 0"
+    )
+    reopen: bool = option(
+        True, "whether f is opened again around what an action may have moved unseen; not in the paper"
+    )
     depth_margin: float = 0.0
     window: tuple[int, int] = (48, 48)
     points: int = 512
@@ -97,6 +105,8 @@ class ExistenceConfig:
             raise InputError(f'criterion "{self.criterion}" is unknown; use "detector", "depth-mse" or "depth-norm"')
         if not all(0.0 < share <= 1.0 for share in self.cell_reach):
             raise InputError(f"cell_reach {self.cell_reach} must be shares above 0 and at most 1")
+        if not 0.0 <= self.erosion < math.inf:
+            raise InputError(f"erosion {self.erosion} m must be a number that is not negative")
         if self.downscale < 1:
             raise InputError(f"ExistenceConfig: downscale {self.downscale} must be at least 1")
         if not 0 <= self.closer_look < max(self.downscale, 2):
@@ -142,23 +152,17 @@ class ObjectViews(flax.struct.PyTreeNode):
     """Per object, what f needs of it; only what moved has to be computed anew.
 
     Attributes:
-      depth: the object's depth in its window, shape (N, h, w) [m].
-      corner: first row and column of the window, shape (N, 2).
+      windows: the objects' images, with a leading axis N.
       collides: whether the target at a place would run into the object, shape (X, S, N); None if that does not count.
-      overflow: whether the object's image did not fit the window, shape (N,): f may then be too small.
     """
 
-    depth: jax.Array
-    corner: jax.Array
+    windows: render.Window
     collides: jax.Array | None
-    overflow: jax.Array
 
 
 def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: ExistenceConfig) -> ExistenceTables:
     """Precompute, for every candidate pose, the target's own depth image and collision cloud."""
-    poses = target.candidate_poses(shelf)
-    offsets = config.places * np.array(target.cell(shelf), np.float32) / 2
-    places = poses[:, None] + offsets[None]
+    places = target.places(shelf, config.places)
     T = jax.jit(upright_pose)(jnp.asarray(places), target.height(shelf))
     coarse = camera.scaled(config.downscale)
     half = np.array(target.half_size, np.float32)
@@ -181,7 +185,8 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
         )
         return render.object_window(coarse, one, window)
 
-    depth, corner = jax.jit(jax.vmap(jax.vmap(view)))(T)
+    views = jax.jit(jax.vmap(jax.vmap(view)))(T)
+    depth, corner = views.depth, views.corner
     eroded = jnp.asarray(half - config.erosion)
     sample = jax.jit(superquadric.sample_surface, static_argnames="count")
     cloud = sample(eroded, jnp.array(target.exponents), count=config.points)
@@ -198,10 +203,12 @@ def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | N
       places: number of candidate poses, and of places at each, if collisions count; None if they do not.
     """
     return ObjectViews(
-        depth=jnp.zeros((capacity, *config.window)),
-        corner=jnp.zeros((capacity, 2), jnp.int32),
+        windows=render.Window(
+            depth=jnp.zeros((capacity, *config.window)),
+            corner=jnp.zeros((capacity, 2), jnp.int32),
+            stride=jnp.ones(capacity, jnp.int32),
+        ),
         collides=None if places is None else jnp.zeros((*places, capacity), bool),
-        overflow=jnp.zeros(capacity, bool),
     )
 
 
@@ -233,23 +240,26 @@ def object_views(
     fresh = scene.valid if moved is None else moved & scene.valid
 
     def view(_, scene, i):
-        one = jax.tree.map(lambda a: a[i], scene)
-        depth, corner = render.object_window(coarse, one, config.window)
-        return depth, corner, jnp.any(render.window_corner(coarse, one, config.window)[1] > 0)
+        return render.object_window(coarse, jax.tree.map(lambda a: a[i], scene), config.window)
 
-    depth, corner, overflow = masked_vmap(view, fresh, None, scene, block=8)
-    depth = jnp.where(fresh[:, None, None], depth, jnp.inf)
+    windows = _seen(masked_vmap(view, fresh, None, scene, block=8), fresh)
     collides = None if exists is None else _collisions(tables, scene, exists, fresh)
-    views = ObjectViews(depth, corner, collides, overflow)
     if previous is None or moved is None:
-        return views
+        return ObjectViews(windows, collides)
     if collides is not None and previous.collides is not None:
         collides = jnp.where(moved[None, None], collides, previous.collides)
     return ObjectViews(
-        depth=jnp.where(moved[:, None, None], views.depth, previous.depth),
-        corner=jnp.where(moved[:, None], views.corner, previous.corner),
+        windows=jax.tree.map(
+            lambda a, b: jnp.where(moved.reshape(-1, *[1] * (a.ndim - 1)), a, b), windows, previous.windows
+        ),
         collides=collides,
-        overflow=jnp.where(moved, views.overflow, previous.overflow),
+    )
+
+
+def _seen(windows: render.Window, mask: Bool[Array, " n"]) -> render.Window:
+    """Windows of which those outside of the mask, that stand for nothing, show nothing."""
+    return windows.replace(
+        depth=jnp.where(mask[:, None, None], windows.depth, jnp.inf), stride=jnp.maximum(windows.stride, 1)
     )
 
 
@@ -367,7 +377,7 @@ def allowances(
         return bound
     everywhere = jnp.ones(tables.corner.shape[0], bool)
     coarse = camera.scaled(config.downscale)
-    image = render.merge_windows(coarse, views.depth, views.corner)
+    image = render.merge_windows(coarse, views.windows)
     shown = _shown(tables, coarse, image, everywhere, config)
     free = jnp.ones(shown.shape, bool) if views.collides is None else ~jnp.any(views.collides, axis=-1)
     settled = jnp.any(free & (shown <= config.allowed), axis=1)
@@ -399,8 +409,8 @@ def _counted(
     def view(_, scene, i):
         return render.object_window(closer, jax.tree.map(lambda a: a[i], scene), of_objects)
 
-    depth, corner = masked_vmap(view, scene.valid, None, scene, block=1)
-    image = render.merge_windows(closer, jnp.where(scene.valid[:, None, None], depth, jnp.inf), corner)
+    windows = _seen(masked_vmap(view, scene.valid, None, scene, block=1), scene.valid)
+    image = render.merge_windows(closer, windows)
 
     def counted(tables, image, i):
         T = tables.T_world_target.reshape(-1, 4, 4)[i]
@@ -411,9 +421,9 @@ def _counted(
             rotation=T[:3, :3],
             valid=jnp.array(True),
         )
-        depth, corner = render.object_window(closer, one, of_target)
-        behind, inside = _in_window(closer, image, corner, of_target)
-        return jnp.sum(inside & (depth + config.depth_margin < behind)) * float(scale**2)
+        mine = render.object_window(closer, one, of_target)
+        behind, inside = _in_window(closer, image, mine.corner, of_target)
+        return jnp.sum(inside & (mine.depth + config.depth_margin < behind)) * float(scale**2)
 
     return masked_vmap(counted, doubtful.reshape(-1), tables, image, block=64).reshape(doubtful.shape)
 
@@ -440,7 +450,7 @@ def existence(
       Where the target can be.
     """
     coarse = camera.scaled(config.downscale)
-    image = render.merge_windows(coarse, views.depth, views.corner)
+    image = render.merge_windows(coarse, views.windows)
     if config.criterion == "detector":
         possible = _shown(tables, coarse, image, exists, config) <= allowed
     else:
@@ -456,9 +466,10 @@ def occluders(tables: ExistenceTables, views: ObjectViews) -> Bool[Array, "x n"]
     An approximation, for telling which objects matter; what is visible, `existence` says.
     """
     middle = tables.corner[:, 0] + jnp.array(tables.depth.shape[-2:])[None] // 2
-    pixel = middle[:, None] - views.corner[None]
-    size = jnp.array(views.depth.shape[-2:])
+    windows = views.windows
+    pixel = (middle[:, None] - windows.corner[None]) // windows.stride[None, :, None]
+    size = jnp.array(windows.depth.shape[-2:])
     inside = jnp.all((pixel >= 0) & (pixel < size[None, None]), axis=-1)
     row, column = jnp.moveaxis(jnp.clip(pixel, 0, size[None, None] - 1), -1, 0)
-    depth = views.depth[jnp.arange(views.depth.shape[0])[None], row, column]
+    depth = windows.depth[jnp.arange(windows.depth.shape[0])[None], row, column]
     return inside & (depth < tables.nearest[:, None])

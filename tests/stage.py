@@ -158,7 +158,6 @@ class Grab(flax.struct.PyTreeNode):
                 value=tried,
                 length=jnp.ones(1, jnp.int32),
             ),
-            overflow=jnp.array(False),
         )
 
 

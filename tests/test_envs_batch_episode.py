@@ -149,16 +149,15 @@ def test_an_error_is_told_before_what_fell():
 
 
 def test_decisions_that_cannot_be_trusted_are_named():
-    good = Choice(no_action(), jnp.float32(3.0), jnp.float32(2.0), jnp.int32(1), jnp.array(False))
+    good = Choice(no_action(), jnp.float32(3.0), jnp.float32(2.0), jnp.int32(1))
     assert distrust(good) is None
-    assert "outgrew" in distrust(good.replace(overflow=jnp.array(True)))
     lost = dataclasses.replace(no_action(), q7=jnp.float32(jnp.nan))
     assert distrust(good.replace(action=lost)) == "error: the decision is not finite"
     assert distrust(good.replace(cost=jnp.float32(jnp.inf))) == "error: the decision is not finite"
 
 
 def test_a_policy_need_not_say_what_it_expects():
-    silent = Choice(no_action(), jnp.float32(3.0), jnp.float32(jnp.nan), jnp.int32(1), jnp.array(False))
+    silent = Choice(no_action(), jnp.float32(3.0), jnp.float32(jnp.nan), jnp.int32(1))
     assert distrust(silent) is None
     step = record(False, 5, Verdict(), silent)
     assert (step.cost, step.predicted_cost, step.sequences) == (3.0, None, 1)

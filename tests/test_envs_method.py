@@ -64,7 +64,12 @@ def test_what_earlier_files_ran_with_by_default_is_the_default_but_for_what_is_n
         "push_model": "learned", "focus": 0.7, "max_steps": 10, "recognition": "oracle",
     }  # fmt: skip
     then = PRESETS["standard"](
-        cell_reach=(0.5,), closer_look=0, push_directions=(math.pi / 2, -math.pi / 2), move_target=False
+        cell_reach=(0.5,),
+        closer_look=0,
+        erosion=0.0,
+        reopen=False,
+        push_directions=(math.pi / 2, -math.pi / 2),
+        move_target=False,
     )
     assert present_options(earlier) == Method(config=then).options()
 

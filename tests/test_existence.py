@@ -40,21 +40,20 @@ def every_scenario():
     return [s for s in loaded if s.target.shape == "cylinder"]
 
 
-def reference_existence(problem, objects, poses, config):
+def reference_existence(problem, objects, places, config):
     """Try the target at every place of every cell: count the pixels it shows, and look for points inside objects."""
     cam, target, shelf = problem.camera.scaled(config.downscale), problem.target, problem.shelf
     scene_depth = reference_superquadric_depth(cam, objects)
-    cell = target.cell(shelf)
     half = np.array(target.half_size)
     cloud = np.asarray(
         superquadric.sample_surface(jnp.float32(half - config.erosion), jnp.float32(target.exponents), config.points),
         np.float64,
     )
     result = []
-    for pose in poses:
+    for of_cell in places:
         possible = False
-        for a, b, _ in config.places:
-            position = np.array([pose[0] + a * cell[0] / 2, pose[1] + b * cell[1] / 2, target.height(shelf)])
+        for x, y, _ in of_cell:
+            position = np.array([x, y, target.height(shelf)])
             one = superquadric.Superquadrics(
                 size=jnp.float32(half)[None],
                 exponents=jnp.float32(target.exponents)[None],
@@ -90,7 +89,8 @@ def test_f_is_that_of_a_brute_force_reference(problem):
     chosen = np.concatenate(
         [rng.choice(np.flatnonzero(exists), 12, False), rng.choice(np.flatnonzero(~exists), 12, False)]
     )
-    expected = reference_existence(problem, objects, np.asarray(problem.poses)[chosen], problem.config.existence)
+    places = problem.target.places(problem.shelf, config.places)
+    expected = reference_existence(problem, objects, places[chosen], config)
     # A ray that grazes a silhouette may count in one and not in the other.
     assert np.mean(exists[chosen] == expected) >= 0.95
 
@@ -157,6 +157,19 @@ def test_places_are_the_middle_and_the_corners():
     assert ExistenceConfig(cell_reach=()).places.shape == (1, 3)
 
 
+def test_the_cells_cover_the_board_up_to_its_walls(problem):
+    target, shelf = problem.target, problem.shelf
+    places, poses = target.places(shelf, ExistenceConfig().places), target.candidate_poses(shelf)
+    low, high = places.min(axis=(0, 1)), places.max(axis=(0, 1))
+    cell = target.cell(shelf)
+    walls = (shelf.back - 0.02, shelf.left - 0.02), (poses[:, 0].min() - cell[0] / 2, shelf.right + 0.02)
+    np.testing.assert_allclose([high[:2], low[:2]], walls, atol=1e-6)
+    inner = (np.abs(poses[:, :2] - poses[:, :2].mean(axis=0)) < np.ptp(poses[:, :2], axis=0) / 2 - 1e-3).all(axis=1)
+    assert np.all(np.abs(places - poses[:, None])[inner] <= np.array(cell) / 2 + 1e-6)
+    half_way = target.places(shelf, ExistenceConfig(cell_reach=(0.5,)).places)
+    assert np.all(np.abs(half_way - poses[:, None]) <= np.array(cell) / 4 + 1e-6)
+
+
 @pytest.mark.slow
 def test_f_is_little_larger_than_what_must_stay_possible(problem):
     """Against nine places a cell, without margins, at a third of the camera's resolution instead of a seventh."""
@@ -221,7 +234,7 @@ def test_looking_again_at_moved_objects_alone_gives_the_same_views(problem):
     update = existence.object_views(tables, problem.camera, moved, everywhere, config, before, which)
     whole = existence.object_views(tables, problem.camera, moved, everywhere, config)
     np.testing.assert_array_equal(update.collides, whole.collides)
-    np.testing.assert_allclose(update.depth, whole.depth, rtol=1e-5)
+    np.testing.assert_allclose(update.windows.depth, whole.windows.depth, rtol=1e-5)
 
 
 def test_occluders_are_those_of_a_reference(problem):

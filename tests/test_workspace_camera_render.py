@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
@@ -139,16 +141,38 @@ def test_volumetric_depth_is_the_root_and_ten_millimetres():
 
 def test_windows_merge_to_the_whole_image():
     scene = scene_of(BOX, CYLINDER)
-    windows, corners = jax.vmap(lambda one: render.object_window(COARSE, one, (48, 48)))(scene)
-    np.testing.assert_allclose(
-        render.merge_windows(COARSE, windows, corners), render.render_depth(COARSE, scene), rtol=1e-5
+    windows = jax.vmap(lambda one: render.object_window(COARSE, one, (48, 48)))(scene)
+    assert np.all(np.asarray(windows.stride) == 1)
+    np.testing.assert_allclose(render.merge_windows(COARSE, windows), render.render_depth(COARSE, scene), rtol=1e-5)
+
+
+LARGEST = {"tall cylinder": (0.034, 0.034, 0.107), "long box": (0.078, 0.022, 0.096), "fits nowhere": (0.3, 0.3, 0.3)}
+
+
+@pytest.mark.parametrize("half", LARGEST.values(), ids=LARGEST)
+@pytest.mark.parametrize(("yaw", "lean"), [(0.0, 0.0), (0.6, 0.0), (-1.0, np.pi / 2), (0.4, 0.7)])
+def test_no_image_outgrows_its_window(half, yaw, lean):
+    along = transforms.yaw_rotation(jnp.float32(yaw))
+    rotation = np.asarray(along @ Rotation.from_rotvec([0.0, lean, 0.0]).as_matrix())
+    # As near to the camera as the board allows: its left front corner.
+    position = (0.42, 0.47, 0.4045 + np.abs(rotation[2]) @ np.array(half))
+    scene = scene_of((half, shape_of("box").exponents, position, 0.0)).replace(rotation=jnp.float32(rotation)[None])
+    window = jax.vmap(lambda one: render.object_window(COARSE, one, (48, 48)))(scene)
+    stride = int(window.stride[0])
+    merged, whole = (
+        np.isfinite(image) for image in (render.merge_windows(COARSE, window), render.render_depth(COARSE, scene))
     )
+    assert whole.sum() > 400
+    if stride == 1:
+        np.testing.assert_array_equal(merged, whole)
+    blurred = np.ones((2 * stride + 1,) * 2)
+    assert np.all(merged[ndimage.binary_erosion(whole, blurred, border_value=1)])
+    assert np.all(ndimage.binary_dilation(whole, blurred)[merged])
 
 
-def test_a_window_that_is_too_small_says_so():
+def test_a_window_is_no_coarser_than_it_must_be():
     one = jax.tree.map(lambda a: a[0], scene_of(BOX))
-    assert float(jnp.max(render.window_corner(COARSE, one, (48, 48))[1])) == 0
-    assert float(jnp.max(render.window_corner(COARSE, one, (8, 8))[1])) > 0
+    assert [int(render.object_window(COARSE, one, (n, n)).stride) for n in (48, 8)] == [1, 3]
 
 
 def test_absent_objects_are_not_seen():

@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from mechsearch_jax.actions.types import Action
 from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
+from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import allowances, existence, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
@@ -15,13 +17,14 @@ from mechsearch_jax.graspability import FoundGrasps, grasp_hits, graspability, p
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.found_target import found_grasps, no_grasps
 from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.unseen_motion import reopened
 
 
 class Belief(flax.struct.PyTreeNode):
     """What is known of the target.
 
     Attributes:
-      exists: f_t, shape (X,). It only ever shrinks, unless it contradicts every pose: see `update_belief`.
+      exists: f_t, shape (X,). It grows only where an action may have moved the target: see `update_belief`.
       found: c_t, whether the target has been seen.
       found_pose: where, as x, y [m], yaw [rad].
       allowed: how many coarse pixels the target may show at each place of its candidate poses while it is hidden, shape
@@ -51,25 +54,42 @@ def initial_belief(problem: Problem) -> Belief:
 
 
 @jax.jit
-def update_belief(problem: Problem, belief: Belief, observation: Observation) -> Belief:
+def update_belief(
+    problem: Problem,
+    belief: Belief,
+    observation: Observation,
+    before: Observation | None = None,
+    action: Action | None = None,
+) -> Belief:
     """Fold an observation into the belief: `f_t = f_{t-1} * f_hat(s_t)` (equation 4), or the target's pose once it is
     seen.
 
     A target that is found and then hidden again stays found, at the pose where it was seen last, wherever it is now.
-    A target that was pushed without having been seen may leave f empty, which is a contradiction; f then starts anew
-    from what the objects allow now, and `restarts` counts it.
+    Where the action since then may have moved a target that nobody sees, f is opened again before the observation is
+    folded in; see `unseen_motion.reopened`. Where f becomes empty nevertheless, which is a contradiction, it starts
+    anew from what the objects allow now, and `restarts` counts it.
 
     Args:
       problem: what does not change.
       belief: before the observation.
       observation: what is seen now.
+      before: what was seen before the action; None, as `action`, if nothing was done since `belief`.
+      action: what the robot did or tried to do.
+
+    Raises:
+      InputError: one of the last two is given without the other.
     """
+    if (before is None) != (action is None):
+        raise InputError("update_belief: give what was seen before the action and the action, or neither")
     everywhere = jnp.ones_like(belief.exists)
     settings, found = problem.config.existence, jnp.asarray(observation.target_visible)
     views = object_views(problem.existence, problem.camera, observation.objects, everywhere, settings)
     allowed = allowances(problem.existence, problem.camera, problem.target, observation.objects, views, settings)
     now = existence(problem.existence, problem.camera, views, everywhere, allowed, settings)
-    both = belief.exists & now
+    exists = belief.exists
+    if before is not None and action is not None and settings.reopen:
+        exists |= reopened(problem, exists, before.objects, observation.objects, action)
+    both = exists & now
     seen = belief.found | found
     contradiction = ~jnp.any(both) & ~seen
     exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, belief.exists), both)

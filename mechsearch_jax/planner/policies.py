@@ -123,7 +123,6 @@ def _take_out(search: Search, observation: Observation, grasp: GraspChoice) -> D
         predicted_cost=jnp.float32(jnp.nan),
         predicted=observation.objects,
         sequences=no_sequences(search.config),
-        overflow=jnp.array(False),
     )
 
 

@@ -24,8 +24,9 @@ def standard(**changes: Any) -> Config:
 def paper(**changes: Any) -> Config:
     """The paper's settings, and where it gives none, as for gamma, those of `standard` (appendices B.2 to B.5).
 
-    f by the difference of depth images, with the collision condition in predicted states too; grasps tilted by 20
-    degrees; even draws, repeated until one is possible, of any object at any step; nothing in the cost but J.
+    f by the difference of depth images, never opened again, with the collision condition in predicted states too;
+    grasps tilted by 20 degrees; even draws, repeated until one is possible, of any object at any step; nothing in the
+    cost but J.
 
     Args:
       **changes: options by name, see `Config.with_options`.
@@ -35,6 +36,8 @@ def paper(**changes: Any) -> Config:
         "criterion": "depth-mse",
         "cell_reach": (0.5,),
         "closer_look": 0,
+        "erosion": 0.0,
+        "reopen": False,
         "predicted_collisions": True,
         "grasp_tilts": tilt,
         "retrieval_tilts": tilt,

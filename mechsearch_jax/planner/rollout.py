@@ -182,7 +182,7 @@ class Rollout:
 
         # After the last action only the cost counts. What the actions do not change does not pass through the branches.
         changes, actions, price = jax.lax.cond(time < self.config.horizon, go_on, stay)
-        kept = (actions, jax.vmap(self.cost)(states), price, jnp.any(states.views.overflow), changes["scene"])
+        kept = (actions, jax.vmap(self.cost)(states), price, changes["scene"])
         return states.replace(**changes), kept
 
 
@@ -206,7 +206,7 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     count, horizon = config.sequences, config.horizon
     states = repeated(rollout.root(objects), count)
     keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
-    _, (actions, cost, price, overflow, scenes) = jax.lax.scan(
+    _, (actions, cost, price, scenes) = jax.lax.scan(
         lambda states, now: rollout.step(states, *now), states, (keys, jnp.arange(horizon + 1))
     )
     actions, price = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, price))
@@ -227,7 +227,6 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
         # Without the target's slot, which comes after those of the objects.
         predicted=jax.tree.map(lambda a: a[0, best, :slots], scenes),
         sequences=sequences,
-        overflow=overflow[0],
     )
 
 

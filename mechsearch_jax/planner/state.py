@@ -75,7 +75,6 @@ class Decision(flax.struct.PyTreeNode):
       predicted_cost: J that is expected after the action; NaN after a retrieval.
       predicted: the objects as they are expected to be after the action, without the target, fields (N, ...).
       sequences: all sampled sequences, best first; none has a first action where none was sampled.
-      overflow: whether an object's image outgrew its window (see `existence.ObjectViews`): f may be too small.
     """
 
     action: Action
@@ -84,4 +83,3 @@ class Decision(flax.struct.PyTreeNode):
     predicted_cost: jax.Array
     predicted: Superquadrics
     sequences: Sequences
-    overflow: jax.Array

@@ -5,9 +5,10 @@ from __future__ import annotations
 import functools
 from typing import Literal
 
+import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -122,45 +123,65 @@ def render_depth(
     return jnp.min(each, axis=0)
 
 
-def window_corner(
-    camera: Camera, scene_object: Superquadrics, window: tuple[int, int]
-) -> tuple[Int[Array, "2"], Float[Array, "2"]]:
-    """First row and column of a window of fixed size that is centred on an object's image.
+class Window(flax.struct.PyTreeNode):
+    """One object's image: the depth at every `stride`-th pixel of a part of the camera's image.
 
-    Returns:
-      The corner, and by how many pixels the image of the object's bounding box exceeds the window in rows and columns
-      (0 where it fits).
+    Attributes:
+      depth: infinite where the object is not, shape (h, w) [m].
+      corner: row and column of the first pixel, int32, shape (2,).
+      stride: how many rows and columns of pixels each row and column stands for, int32.
+    """
+
+    depth: jax.Array
+    corner: jax.Array
+    stride: jax.Array
+
+
+def window_place(
+    camera: Camera, scene_object: Superquadrics, window: tuple[int, int]
+) -> tuple[Int[Array, "2"], Int[Array, ""]]:
+    """First row and column, and stride, of a window that holds what the camera sees of an object.
+
+    The stride is 1 where the window is large enough for the image of the object's bounding box, as far as that lies in
+    the camera's image, and as small as possible elsewhere.
     """
     corners = jnp.stack(jnp.meshgrid(*[jnp.array([-1.0, 1.0])] * 3, indexing="ij"), axis=-1).reshape(8, 3)
     T_world_object = make(scene_object.rotation, scene_object.position)
     pixels, _ = project(camera, transform(T_world_object, corners * scene_object.size[None]))
-    low, high = jnp.min(pixels, axis=0), jnp.max(pixels, axis=0)
+    # One pixel beyond the image, so that what is outside of it stays outside.
+    limit = jnp.array([camera.height, camera.width], jnp.float32)
+    low, high = (jnp.clip(bound, -1.0, limit) for bound in (jnp.min(pixels, axis=0), jnp.max(pixels, axis=0)))
     extent = jnp.array(window, jnp.float32)
-    corner = jnp.round((low + high) / 2.0 - (extent - 1.0) / 2.0)
-    corner = jnp.clip(corner, -extent, jnp.array([camera.height, camera.width], jnp.float32))
-    return corner.astype(jnp.int32), jnp.maximum(jnp.ceil(high - low) + 1.0 - extent, 0.0)
+    stride = jnp.maximum(jnp.max(jnp.ceil((jnp.ceil(high - low) + 1.0) / extent)), 1.0)
+    corner = jnp.round((low + high) / 2.0 - (stride * extent - 1.0) / 2.0)
+    return corner.astype(jnp.int32), stride.astype(jnp.int32)
 
 
 @functools.partial(jax.jit, static_argnames=("camera", "window"))
-def object_window(
-    camera: Camera, scene_object: Superquadrics, window: tuple[int, int]
-) -> tuple[Float[Array, "h w"], Int[Array, "2"]]:
-    """Depth of one object in a window around its image, and the window's first row and column."""
-    corner, _ = window_corner(camera, scene_object, window)
+def object_window(camera: Camera, scene_object: Superquadrics, window: tuple[int, int]) -> Window:
+    """Depth of one object in a window of fixed size around its image; more coarsely where it is larger than that."""
+    corner, stride = window_place(camera, scene_object, window)
     rows, columns = jnp.meshgrid(jnp.arange(window[0]), jnp.arange(window[1]), indexing="ij")
-    directions = pixel_rays(camera, (rows + corner[0]) * 1.0, (columns + corner[1]) * 1.0)
-    return object_depth(scene_object, jnp.array(camera.position), directions), corner
+    middle = (stride - 1) / 2.0
+    row, column = rows * stride + corner[0] + middle, columns * stride + corner[1] + middle
+    depth = object_depth(scene_object, jnp.array(camera.position), pixel_rays(camera, row, column))
+    return Window(depth, corner, stride)
 
 
-def merge_windows(
-    camera: Camera, windows: Float[Array, "n h w"], corners: Int[Array, "n 2"]
-) -> Float[Array, "height width"]:
-    """The depth image of a scene from its objects' windows."""
-    _, h, w = windows.shape
-    rows = corners[:, 0, None, None] + jnp.arange(h)[None, :, None]
-    columns = corners[:, 1, None, None] + jnp.arange(w)[None, None, :]
-    # Negative indices would wrap around to the far side of the image instead of being dropped.
-    rows = jnp.where(rows < 0, camera.height, rows)
-    columns = jnp.where(columns < 0, camera.width, columns)
-    image = jnp.full((camera.height, camera.width), jnp.inf)
-    return image.at[rows, columns].min(windows, mode="drop")
+def _window_pixels(
+    corner: Int[Array, " n"], stride: Int[Array, " n"], size: int, count: int
+) -> tuple[Int[Array, "n {count}"], Bool[Array, "n {count}"]]:
+    """Along one axis, the pixel of each window that shows each pixel of an image, and whether any does."""
+    index = (jnp.arange(count)[None] - corner[:, None]) // stride[:, None]
+    return jnp.clip(index, 0, size - 1), (index >= 0) & (index < size)
+
+
+def merge_windows(camera: Camera, windows: Window) -> Float[Array, "height width"]:
+    """The depth image of a scene from its objects' windows, which have a leading axis."""
+    n, h, w = windows.depth.shape
+    row, among_rows = _window_pixels(windows.corner[:, 0], windows.stride, h, camera.height)
+    column, among_columns = _window_pixels(windows.corner[:, 1], windows.stride, w, camera.width)
+    depth = windows.depth[jnp.arange(n)[:, None, None], row[:, :, None], column[:, None, :]]
+    return jnp.min(
+        jnp.where(among_rows[:, :, None] & among_columns[:, None, :], depth, jnp.inf), axis=0, initial=jnp.inf
+    )

@@ -82,6 +82,24 @@ class Target:
         yaw = np.arange(self.yaws) * np.pi / self.yaws
         return np.stack(np.meshgrid(x, y, yaw, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
 
+    def places(self, shelf: Shelf, shares: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "x s 3"]:
+        """Places in the grid cell of each candidate pose: x, y [m] and yaw [rad].
+
+        The corners of the outermost cells lie where a target touches the back or a side wall: pushes take it there, and
+        no other pose would stand for it. At the front nothing holds it, and little hides it.
+
+        Args:
+          shelf: as in `candidate_poses`.
+          shares: where in a cell, as shares of half of it; those of 1 are its corners.
+        """
+        poses = self.candidate_poses(shelf)
+        offsets = np.tile(shares * np.array(self.cell(shelf), np.float32) / 2, (len(poses), 1, 1))
+        outward = max(self.inset - min(self.half_size[:2]), 0.0)
+        for axis, side in ((0, 1.0), (1, 1.0), (1, -1.0)):
+            outermost = poses[:, axis] * side == np.max(poses[:, axis] * side)
+            offsets[np.ix_(outermost, shares[:, axis] == side, [axis])] = side * outward
+        return poses[:, None] + offsets
+
     def cell(self, shelf: Shelf) -> tuple[float, float, float]:
         """Spacing of the candidate poses in x, y [m] and yaw [rad]."""
         return (

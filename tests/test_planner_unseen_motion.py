@@ -1,0 +1,179 @@
+"""f is opened again where an action may have moved the target unseen, and nowhere else."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mechsearch_jax import planner
+from mechsearch_jax.actions import no_action
+from mechsearch_jax.actions.registry import ActionKind
+from mechsearch_jax.envs import slots
+from mechsearch_jax.envs.episode_log import Choice
+from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.transforms import make, translate
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner.moved_target import nearest_candidate
+from mechsearch_jax.planner.unseen_motion import reopened
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+
+LEFT = jnp.float32([0.0, 0.1, 0.0])
+# The gripper's z points into the shelf, tilted down by 30 degrees.
+FORWARD = jnp.float32([[0.5, 0.0, 0.8660254], [0.0, -1.0, 0.0], [0.8660254, 0.0, -0.5]])
+
+
+def boxes(*centres):
+    many = superquadric.Superquadrics(
+        size=jnp.tile(jnp.float32([0.025, 0.025, 0.06]), (len(centres), 1)),
+        exponents=jnp.full((len(centres), 2), 0.2),
+        position=jnp.float32([(x, y, 0.4645) for x, y in centres]),
+        rotation=jnp.tile(jnp.eye(3), (len(centres), 1, 1)),
+        valid=jnp.ones(len(centres), bool),
+    )
+    return superquadric.pad(many, 8)
+
+
+BEFORE, AFTER = boxes((0.6, 0.0), (0.6, 0.3)), boxes((0.6, 0.09), (0.6, 0.3))
+
+
+def push(way=LEFT):
+    start = make(FORWARD, jnp.float32([0.6, -0.05, 0.46]))
+    return no_action().replace(
+        kind=jnp.int32(ActionKind.PUSH), T_world_gripper=start, displacement=way, T_world_place=translate(start, way)
+    )
+
+
+def at(problem, *places):
+    rows = [int(nearest_candidate(problem.poses, jnp.float32([x, y, 0.0]))) for x, y in places]
+    return jnp.zeros(problem.poses.shape[0], bool).at[jnp.array(rows)].set(True)
+
+
+@pytest.fixture(scope="module")
+def opened(problem):
+    function = jax.jit(reopened)
+    return lambda *arguments: np.asarray(function(problem, *arguments))
+
+
+def distances(problem, x, y):
+    return np.linalg.norm(np.asarray(problem.poses)[:, :2] - (x, y), axis=1)
+
+
+def test_a_push_opens_f_beside_what_it_swept(problem, opened):
+    """The target stood at the box's left side and is 6 cm farther to the left now."""
+    where = opened(at(problem, (0.6, 0.08)), BEFORE, AFTER, push())
+    assert where[np.asarray(at(problem, (0.6, 0.14)))].all()
+    # Not where nothing passed, and not farther away than the hand went.
+    poses = np.asarray(problem.poses)
+    # The hand is 20 cm wide and ends at 5 cm.
+    assert not where[poses[:, 1] > 0.05 + 0.1 + 0.04].any()
+    assert not where[distances(problem, 0.6, 0.08) > 0.1 + 0.04].any()
+    assert where.sum() < 0.2 * where.size
+
+
+def test_what_no_possible_pose_is_beside_stays_ruled_out(problem, opened):
+    assert not opened(at(problem, (0.6, 0.35), (0.7, 0.12)), BEFORE, AFTER, push()).any()
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+    assert not opened(everywhere, BEFORE, AFTER, no_action()).any()
+
+
+def test_a_push_that_moved_nothing_opens_f_beside_the_hand_alone(problem, opened):
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+    where, whole = (opened(everywhere, BEFORE, after, push()) for after in (BEFORE, AFTER))
+    assert where.any()
+    assert where.sum() < whole.sum()
+    assert not (where & ~whole).any()
+
+
+def test_objects_may_be_seen_in_another_order(problem, opened):
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+    swapped = boxes((0.6, 0.3), (0.6, 0.09))
+    np.testing.assert_array_equal(*(opened(everywhere, BEFORE, after, push()) for after in (AFTER, swapped)))
+
+
+def test_a_picked_object_may_have_touched_the_target_at_both_ends(problem, opened):
+    grasp = make(FORWARD, jnp.float32([0.6, 0.0, 0.46]))
+    pick = no_action().replace(
+        kind=jnp.int32(ActionKind.PICK_AND_PLACE),
+        opening=jnp.float32(0.08),
+        T_world_gripper=grasp,
+        T_world_place=translate(grasp, jnp.float32([0.05, -0.15, 0.0])),
+    )
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+    # Dropped where it stood, it may all the same have been carried to its place.
+    for after in (boxes((0.65, -0.15), (0.6, 0.3)), BEFORE):
+        where = opened(everywhere, BEFORE, after, pick)
+        for place in ((0.6, 0.04), (0.65, -0.19)):
+            assert where[np.asarray(at(problem, place))].all()
+        assert not where[np.asarray(at(problem, (0.6, 0.25)))].any()
+
+
+def test_it_works_in_a_batch(problem, opened):
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+    ways = jnp.stack([LEFT, 0.5 * LEFT])
+    many = jax.vmap(lambda way: reopened(problem, everywhere, BEFORE, AFTER, push(way)))(ways)
+    for way, where in zip(ways, many, strict=True):
+        assert np.mean(opened(everywhere, BEFORE, AFTER, push(way)) == np.asarray(where)) > 0.999
+
+
+def seen(objects):
+    return Observation(objects, jnp.array(False), jnp.zeros(3))
+
+
+def test_a_belief_is_opened_before_it_looks(problem):
+    """Behind the tall box, where the target was pushed to, f was ruled out before."""
+    wall = (0.5, 0.1)
+    before, after = boxes((0.6, 0.0), wall), boxes((0.6, 0.05), wall)
+    belief = planner.initial_belief(problem)
+    belief = belief.replace(exists=at(problem, (0.6, 0.06)))
+    kept = planner.update_belief(problem, belief, seen(after))
+    open_again = planner.update_belief(problem, belief, seen(after), seen(before), push())
+    fresh = planner.update_belief(problem, planner.initial_belief(problem), seen(after))
+    assert not (open_again.exists & ~fresh.exists).any()
+    assert (open_again.exists & ~belief.exists).any()
+    assert not open_again.restarts
+    config = dataclasses.replace(problem.config, existence=dataclasses.replace(problem.config.existence, reopen=False))
+    as_before = planner.update_belief(problem.replace(config=config), belief, seen(after), seen(before), push())
+    np.testing.assert_array_equal(as_before.exists, kept.exists)
+
+
+def test_an_action_without_what_was_seen_before_it_is_refused(problem):
+    with pytest.raises(InputError, match="or neither"):
+        planner.update_belief(problem, planner.initial_belief(problem), seen(AFTER), action=push())
+
+
+def world_of_none():
+    one = load_scenario(example_scenarios()["first-light"])
+    return jax.tree.map(lambda a: a[None], from_scenario(one))
+
+
+def test_an_episode_tells_the_belief_what_it_did(problem, monkeypatch):
+    told = []
+
+    def update(problem, belief, observation, before, action):
+        told.append((int(action.kind), before))
+        return belief
+
+    monkeypatch.setattr(slots, "update_belief", update)
+    monkeypatch.setattr(slots.OneSlot, "_snapshot", lambda self, world: None)
+    choice = Choice(push(), jnp.float32(3.0), jnp.float32(2.0), jnp.int32(1))
+    monkeypatch.setattr(slots, "chosen", lambda decision: choice)
+
+    @dataclasses.dataclass
+    class Decided:
+        action: object = dataclasses.field(default_factory=push)
+
+    views = [seen(BEFORE), seen(AFTER), seen(AFTER)]
+    waiting = iter(views)
+    slot = slots.OneSlot(problem, lambda *_: Decided(), lambda *_: next(waiting))
+    world, keys = world_of_none(), jax.random.split(jax.random.key(0), 1)
+    slot.look(world, keys, [0])
+    slot.decide(keys, [0])
+    slot.look(world, keys, [0])
+    slot.forget(np.array([True]))
+    slot.look(world, keys, [0])
+    assert [kind for kind, _ in told] == [0, ActionKind.PUSH, 0]
+    assert [before for _, before in told] == [views[0], views[0], views[2]]
