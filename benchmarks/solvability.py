@@ -169,7 +169,7 @@ class Ceiling:
             found = known_search(scenario, problem, self._search, self._simulator, self._config, told)
             known = told_of(found) | {"seconds": round(time.perf_counter() - begin, 1)}
             if found.actions is None:
-                figure = unsolved.picture(found, problem, scenario.name, known["reason"])
+                figure = unsolved.picture(found, problem, scenario.name, str(known["reason"]))
                 save_figure(figure, self._folder / f"{scenario.name}.png")
             save_json({**same, "versions": versions(), "found": known}, file)
         return dataclasses.replace(row, **known, solvable=known["actions"] is not None)

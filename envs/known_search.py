@@ -314,7 +314,8 @@ class _Running:
 
     def _is_whole(self, outcome: Outcome, worlds: World, i: int) -> bool:
         """Whether world `i` is one to go on with after an action."""
-        trouble = target_trouble(self._problem.shelf, worlds.position[i, TARGET], worlds.rotation[i, TARGET])
+        position, rotation = np.asarray(worlds.position[i, TARGET]), np.asarray(worlds.rotation[i, TARGET])
+        trouble = target_trouble(self._problem.shelf, position, rotation)
         return trouble is None and not outcome.fallen[i].any() and bool(outcome.took_place[i])
 
     def _take_out(self, nodes: Sequence[Node]) -> None:
