@@ -1,19 +1,28 @@
-"""Files that are written beside their place and then moved there, so that each is either whole or not there at all."""
+"""Files as they come and go: written beside their place and then moved there, so that each is either whole or not there
+at all; read with bounds on their size, and whatever they hold, an `InputError` is the worst that can happen."""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import tempfile
 import uuid
+import warnings
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
+import numpy as np
+
 from mechsearch_jax.errors import InputError
 
 PathLike = str | os.PathLike[str]
+# What is larger is none of ours [bytes]: the largest scenario has 10 kB, the largest archive 20 MB.
+TEXT_LIMIT = 4 * 2**20
+ARRAYS_LIMIT = 512 * 2**20
 
 
 @contextlib.contextmanager
@@ -60,3 +69,74 @@ def check_writable(folder: PathLike) -> None:
             pass
     except OSError as error:
         raise InputError(f"{folder}: cannot be written to ({error.strerror or error})") from error
+
+
+def read_bytes(path: PathLike, limit: int) -> bytes:
+    """What a file holds.
+
+    Args:
+      path: of the file.
+      limit: a file with more bytes is refused.
+
+    Raises:
+      InputError: the file cannot be read, or is too large.
+    """
+    try:
+        with open(path, "rb") as file:
+            data = file.read(limit + 1)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    if len(data) > limit:
+        raise InputError(f"{path}: is too large; at most {limit} bytes are read")
+    return data
+
+
+def read_text(path: PathLike, limit: int = TEXT_LIMIT) -> str:
+    """What a text file holds.
+
+    Raises:
+      InputError: the file cannot be read, is too large, or is not UTF-8.
+    """
+    try:
+        return read_bytes(path, limit).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: is not a text file in UTF-8") from error
+
+
+def read_json(path: PathLike, limit: int = TEXT_LIMIT) -> Any:
+    """What a JSON file holds, as `json.loads` returns it.
+
+    Raises:
+      InputError: as `read_text`, or it is not JSON.
+    """
+    text = read_text(path, limit)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
+
+
+def read_arrays(data: bytes, where: PathLike, limit: int = ARRAYS_LIMIT) -> dict[str, np.ndarray]:
+    """The arrays in a NumPy archive, by name; no code can run from it.
+
+    Args:
+      data: what the archive's file holds.
+      where: how to name it in messages.
+      limit: an archive that unpacks to more bytes is refused.
+
+    Raises:
+      InputError: it is damaged or none, or unpacks to too much.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > limit:
+            raise InputError(f"{where}: unpacks to {size} bytes; at most {limit} are read")
+        with warnings.catch_warnings(), np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            warnings.simplefilter("ignore")
+            return {name: archive[name] for name in archive.files}
+    except InputError:
+        raise
+    # To damage the parsers beneath answer with a dozen kinds of exception, and document none.
+    except Exception as error:
+        raise InputError(f"{where}: is no whole archive of arrays, .npz ({type(error).__name__})") from error

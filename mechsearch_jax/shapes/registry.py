@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.errors import InputError, shown
 from mechsearch_jax.shapes.box import Box
 from mechsearch_jax.shapes.cylinder import Cylinder
 from mechsearch_jax.shapes.shape import Shape
@@ -28,7 +27,7 @@ def shape_of(name: Any, where: str = "shape") -> Shape:
         if shape.name == name:
             return shape
     *others, last = (f'"{known}"' for known in SHAPES)
-    raise InputError(f"{where}: {json.dumps(name)} is unknown; use {', '.join(others)} or {last}")
+    raise InputError(f"{where}: {shown(name)} is unknown; use {', '.join(others)} or {last}")
 
 
 def in_order() -> tuple[Shape, ...]:

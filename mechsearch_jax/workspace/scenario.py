@@ -8,6 +8,7 @@ import importlib.resources
 import json
 import math
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import replacing
+from mechsearch_jax.errors import InputError, shown
+from mechsearch_jax.files import read_json, replacing
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.shapes import shape_of
@@ -29,6 +30,10 @@ VERSION = 1
 MAX_OBJECTS = 8
 # Enough for thousands of scenes: 48 bits.
 HASH_DIGITS = 12
+# Names are used as names of files.
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
+# Half-extents below this are none that can be computed with, let alone seen [m].
+LEAST_HALF_SIZE = 5e-4
 
 _BODY_KEYS = {"shape": str, "half_size": 3, "position": 3, "quaternion": 4}
 
@@ -84,21 +89,38 @@ def rotation_matrix(quaternion: Sequence[float] | Float[np.ndarray, "*batch 4"])
     return Rotation.from_quat(np.roll(np.asarray(quaternion, float), -1, axis=-1)).as_matrix()
 
 
+def check_name(value: Any, where: str) -> None:
+    """Refuse what cannot be a scenario's name, which is a name of files.
+
+    Raises:
+      InputError: it cannot.
+    """
+    if not isinstance(value, str) or not NAME.fullmatch(value):
+        raise InputError(
+            f'{where}: must be a text of 1 to 100 letters, digits, ".", "_" and "-", the first no "." or "-",'
+            f" not {shown(value)}"
+        )
+
+
 def _numbers(value: Any, count: int, where: str) -> tuple[float, ...]:
     number = isinstance(value, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
     if not number or len(value) != count:
         raise InputError(f"{where}: must be a list of {count} numbers")
-    if not all(math.isfinite(v) for v in value):
+    try:
+        numbers = tuple(float(v) for v in value)
+    except OverflowError:
+        raise InputError(f"{where}: holds a number that is too large; every number must be finite") from None
+    if not all(math.isfinite(v) for v in numbers):
         raise InputError(f"{where}: holds NaN or an infinite number; every number must be finite")
-    return tuple(float(v) for v in value)
+    return numbers
 
 
 def _check_keys(value: Any, keys: Sequence[str], where: str, key: str | None) -> None:
     place = where if key is None else f"{where}: {key}"
     if not isinstance(value, dict):
         raise InputError(f"{place}: must be a JSON object with the keys {', '.join(keys)}")
-    for unknown in value.keys() - set(keys):
-        raise InputError(f'{place}: unknown key "{unknown}"; known are {", ".join(keys)}')
+    for unknown in [k for k in value if k not in keys]:
+        raise InputError(f"{place}: unknown key {shown(unknown)}; known are {', '.join(keys)}")
     for missing in [k for k in keys if k not in value]:
         raise InputError(f'{place}: key "{missing}" is missing')
 
@@ -114,9 +136,15 @@ def _body(value: Any, where: str, key: str, shelf: Shelf) -> Body:
         raise InputError(f"{where}.half_size: {list(half_size)} must be positive lengths in metres")
     if fault := shape.fault(half_size):
         raise InputError(f"{where}.half_size: {fault}")
+    ranges = ((shelf.front, shelf.back), (shelf.right, shelf.left), (shelf.board, shelf.ceiling))
+    widest = max(high - low for low, high in ranges)
+    if not all(LEAST_HALF_SIZE <= half <= widest for half in half_size):
+        raise InputError(
+            f"{where}.half_size: {list(half_size)} must be from {LEAST_HALF_SIZE} to {widest:g}, in metres, which no"
+            " object on this shelf exceeds"
+        )
     if abs(math.hypot(*quaternion) - 1.0) > 1e-3:
         raise InputError(f"{where}.quaternion: its norm is {math.hypot(*quaternion):.4g}; it must be 1 (w, x, y, z)")
-    ranges = ((shelf.front, shelf.back), (shelf.right, shelf.left), (shelf.board, shelf.ceiling))
     for axis, p, (low, high) in zip("xyz", position, ranges, strict=True):
         if not low <= p <= high:
             raise InputError(
@@ -134,19 +162,16 @@ def parse_scenario(value: Any, where: str, shelf: Shelf | None = None) -> Scenar
       shelf: the shelf that the bodies must stand on; the default shelf if None.
 
     Raises:
-      InputError: the format or version is another one; a key is unknown or missing; a number is not finite; a size is
-        not positive; a quaternion is not of unit length; a body is off the board.
+      InputError: the format or version is another one; a key is unknown or missing; the name cannot be one of a file; a
+        number is not finite; a size is that of nothing on the shelf; a quaternion is not of unit length; a body is off the board.
     """
     shelf = shelf or Shelf()
     _check_keys(value, ("format", "version", "name", "objects", "target"), where, None)
     if value["format"] != FORMAT:
-        raise InputError(f'{where}: format: {json.dumps(value["format"])} is not "{FORMAT}"')
+        raise InputError(f'{where}: format: {shown(value["format"])} is not "{FORMAT}"')
     if value["version"] != VERSION or isinstance(value["version"], bool):
-        raise InputError(
-            f"{where}: version: {json.dumps(value['version'])} is not supported; this program reads {VERSION}"
-        )
-    if not isinstance(value["name"], str) or not value["name"]:
-        raise InputError(f"{where}: name: must be a text that is not empty")
+        raise InputError(f"{where}: version: {shown(value['version'])} is not supported; this program reads {VERSION}")
+    check_name(value["name"], f"{where}: name")
     if not isinstance(value["objects"], list):
         raise InputError(f"{where}: objects: must be a list")
     if len(value["objects"]) > MAX_OBJECTS:
@@ -161,17 +186,7 @@ def load_scenario(path: str | os.PathLike[str], shelf: Shelf | None = None) -> S
     Raises:
       InputError: the file cannot be read, is not JSON, or fails a check of `parse_scenario`.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not a text file in UTF-8") from error
-    try:
-        value = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
-    return parse_scenario(value, str(path), shelf)
+    return parse_scenario(read_json(path), str(path), shelf)
 
 
 def is_another_format(path: str | os.PathLike[str]) -> bool:
@@ -180,8 +195,8 @@ def is_another_format(path: str | os.PathLike[str]) -> bool:
     What cannot be read or parsed may be a broken scenario, and is left to `load_scenario` to complain about.
     """
     try:
-        value = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        value = read_json(path)
+    except InputError:
         return False
     return isinstance(value, dict) and not {"format", "target"} & set(value)
 
