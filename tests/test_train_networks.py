@@ -493,7 +493,7 @@ def damaged(tmp_path, name):
         ("no card", "card"),
         ("no file", "cannot be read"),
         ("another shape", "shape"),
-        ("another configuration", "archive"),
+        ("another configuration", "config: .* must hold width"),
         ("no number", "NaN"),
         ("no JSON", "card"),
     ],

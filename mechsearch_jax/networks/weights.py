@@ -7,11 +7,11 @@ An archive `NAME.npz` holds one array for each parameter, named by its path in t
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import importlib.resources
 import io
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.errors import InputError, shown
+from mechsearch_jax.files import ARRAYS_LIMIT, PathLike, read_arrays, read_bytes, read_json, replacing
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.networks.push import PushConfig, PushNetwork
 from mechsearch_jax.networks.push_geometry import push_start
@@ -135,16 +135,42 @@ def read_card(archive: PathLike, name: str) -> dict[str, Any]:
     """
     path = Path(archive).with_suffix(".json")
     try:
-        card = json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); weights need their card") from None
-    except ValueError:
-        raise InputError(f"{path}: is not a card of weights; train or install them anew") from None
+        card = read_json(path)
+    except InputError as error:
+        raise InputError(f"{error}; weights need their card") from None
     if not isinstance(card, dict) or card.get("format") != FORMAT or card.get("version") != VERSION:
         raise InputError(f'{path}: is not a card of format "{FORMAT}", version {VERSION}; train or install them anew')
     if card.get("network") != name:
-        raise InputError(f"{path}: is of a {json.dumps(card.get('network'))} network; give the one for {name}")
+        raise InputError(f"{path}: is of a {shown(card.get('network'))} network; give the one for {name}")
     return card
+
+
+@functools.cache
+def _shapes(name: str, config: Any) -> dict[str, tuple[int, ...]]:
+    """The shapes of a network's parameters, by their paths."""
+    shapes: dict[str, Any] = flatten_dict(ARCHITECTURES[name].shapes(config), sep="/")
+    return {key: value.shape for key, value in shapes.items()}
+
+
+def _config(name: str, value: Any, arrays: dict[str, np.ndarray], where: Path) -> Any:
+    """The configuration that a card tells of.
+
+    Raises:
+      InputError: it is none of this network, or of one that is larger than anything in its archive.
+    """
+    kinds = {field.name: type(field.default) for field in dataclasses.fields(ARCHITECTURES[name].config)}
+    if not isinstance(value, dict) or {key: type(part) for key, part in value.items()} != kinds:
+        told = ", ".join(f"{key} ({kind.__name__})" for key, kind in kinds.items())
+        raise InputError(f"{where}: config: {shown(value)} must hold {told}; train or install anew")
+    # A network of millions of layers would be laid out before anybody could find that it is not this one.
+    largest = max([len(arrays), *(size for array in arrays.values() for size in array.shape)])
+    for key, part in value.items():
+        if isinstance(part, int) and part > largest:
+            raise InputError(f"{where}: config: {key} {shown(part)} is of a larger network than the archive holds")
+    try:
+        return ARCHITECTURES[name].config(**value)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def load_weights(path: PathLike, name: str) -> Weights:
@@ -159,33 +185,35 @@ def load_weights(path: PathLike, name: str) -> Weights:
     """
     path = Path(path)
     card = read_card(path, name)
-    architecture = ARCHITECTURES[name]
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); train or install weights") from None
+        data = read_bytes(path, ARRAYS_LIMIT)
+    except InputError as error:
+        raise InputError(f"{error}; train or install weights") from None
     if hashlib.sha256(data).hexdigest() != card.get("sha256"):
         raise InputError(f"{path}: is not the file that its card describes (SHA-256 differs); copy both again")
+    arrays = read_arrays(data, path)
+    config = _config(name, card.get("config"), arrays, path.with_suffix(".json"))
     try:
-        config = architecture.config(**card["config"])
-        shapes: dict[str, Any] = flatten_dict(architecture.shapes(config), sep="/")
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
-    except InputError as error:
-        raise InputError(f"{path.with_suffix('.json')}: {error}") from None
-    except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile):
-        raise InputError(f"{path}: is no archive of a {name} network; train or install weights anew") from None
-    for key in shapes.keys() | arrays.keys():
-        expected = shapes[key].shape if key in shapes else None
+        shapes = _shapes(name, config)
+    except (TypeError, ValueError):
+        raise InputError(f"{path.with_suffix('.json')}: config makes no {name} network; train or install anew") from None
+    for key in sorted(shapes.keys() | arrays.keys()):
+        expected = shapes.get(key)
         found = arrays[key].shape if key in arrays else None
         if expected != found:
-            raise InputError(f"{path}: {key} has the shape {found} where the network needs {expected}; train anew")
+            raise InputError(
+                f"{path}: {shown(key)} has the shape {found} where the network needs {expected}; train anew"
+            )
+        if arrays[key].dtype.kind != "f":
+            raise InputError(f"{path}: {shown(key)} holds {arrays[key].dtype} instead of numbers; train anew")
+        with np.errstate(over="ignore"):
+            arrays[key] = arrays[key].astype(np.float32)
         if not np.isfinite(arrays[key]).all():
-            raise InputError(f"{path}: {key} holds NaN or infinite numbers; train anew")
+            raise InputError(f"{path}: {shown(key)} holds NaN or infinite numbers; train anew")
     # Numbers, also where the caller is traced.
     with jax.ensure_compile_time_eval():
-        parameters = {key: jnp.asarray(np.asarray(a, np.float32)) for key, a in arrays.items()}
-    return Weights(architecture.network(config), unflatten_dict(parameters, sep="/"), card)
+        parameters = {key: jnp.asarray(a) for key, a in arrays.items()}
+    return Weights(ARCHITECTURES[name].network(config), unflatten_dict(parameters, sep="/"), card)
 
 
 def shipped_weights(name: str) -> Weights:
