@@ -16,7 +16,7 @@ from mechsearch_jax.envs.recognisers import recogniser
 from mechsearch_jax.envs.records import Episode
 from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner.cache import cached_problem
+from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.workspace.target import Target
 
 # More worlds at once are no faster per world, but every round takes longer.
@@ -29,8 +29,8 @@ SHARE_OF_WORLDS = 0.4
 AT_ONCE, AT_ONCE_ON_CPU = 64, 4
 
 
-def new_simulator(engine: EngineName) -> Simulator:
-    """A simulator of an engine; MJX takes long to import and is not always installed.
+def new_simulator(engine: EngineName, workcell: Workcell) -> Simulator:
+    """A simulator of a workcell by an engine; MJX takes long to import and is not always installed.
 
     Raises:
       InputError: it is unknown, or cannot be imported.
@@ -40,10 +40,10 @@ def new_simulator(engine: EngineName) -> Simulator:
     if engine == "NativeSimulator":
         from mechsearch_jax.envs.native import NativeSimulator
 
-        return NativeSimulator()
+        return NativeSimulator(shelf=workcell.shelf, camera=workcell.camera)
     from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 
-    return MjxSimulator()
+    return MjxSimulator(workcell.shelf, workcell.camera)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Batches:
             does not suffice for a single world.
         """
         for (target, method), group in _groups(jobs):
-            simulator = new_simulator(method.engine)
+            simulator = new_simulator(method.engine, method.workcell)
             worlds = self.worlds or fitting_worlds(simulator)
             # Those that take longest come first, so that none of them begins when all others are over.
             todo = sorted(group, key=lambda job: -len(job.scenario.objects))
@@ -85,18 +85,18 @@ class Batches:
                         raise
                     else:
                         worlds = used // 2
-                    simulator = new_simulator(method.engine)
+                    simulator = new_simulator(method.engine, method.workcell)
                 except InputError:
                     raise
                 except Exception as error:
                     attempt.fail(error)
-                    simulator = new_simulator(method.engine)
+                    simulator = new_simulator(method.engine, method.workcell)
                 todo = attempt.left
 
     def _run(self, attempt: _Attempt, target: Target, method: Method, simulator: Simulator, worlds: int) -> None:
         run_episodes(
             attempt.starts(),
-            cached_problem(target, method.config.problem),
+            method.workcell.problem(target, method.config.problem),
             method.policy(),
             simulator,
             worlds,
@@ -152,7 +152,7 @@ def _groups(jobs: Sequence[Job]) -> list[tuple[tuple[Target, Method], list[Job]]
     """The jobs by what is compiled for them."""
     groups: dict[tuple[Target, Method], list[Job]] = {}
     for job in jobs:
-        groups.setdefault((target_of(job.scenario), job.method), []).append(job)
+        groups.setdefault((target_of(job.scenario, job.method.workcell.target), job.method), []).append(job)
     return list(groups.items())
 
 

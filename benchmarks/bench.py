@@ -39,11 +39,14 @@ from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Config, Decision, Problem
+from mechsearch_jax.planner.settings import Settings
+from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.robot import motion
 from mechsearch_jax.train.push import push_scenes
 from mechsearch_jax.train.scenes import random_world
 from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -168,7 +171,7 @@ def g_of(problem: Problem, belief: Belief, scene: Superquadrics) -> Int[Array, "
 def bench_part(
     subject: Literal["existence", "graspability"],
     objects: int,
-    config: Config,
+    settings: Settings,
     batch: int = 1,
     scenes: int = 5,
     repeats: int = 20,
@@ -178,7 +181,7 @@ def bench_part(
     Args:
       subject: what is timed.
       objects: number of objects in a scene.
-      config: how the problem is built.
+      settings: of the workcell, of the objects in it, and how the problem is built.
       batch: number of scenes in one call; 1 times the function itself, without a batch axis.
       scenes: number of different scenes, taken in turn.
       repeats: number of timed calls.
@@ -186,7 +189,7 @@ def bench_part(
     Raises:
       InputError: the number of objects does not fit.
     """
-    problem, states, shapes = _states(objects, config, batch, scenes)
+    problem, states, shapes = _states(objects, settings.config, settings.workcell, settings.objects, batch, scenes)
     functions: dict[str, Callable[..., Any]] = {
         "existence": lambda problem, key, belief, seen: f_of(problem, seen.objects),
         "graspability": lambda problem, key, belief, seen: g_of(problem, belief, seen.objects),
@@ -200,19 +203,27 @@ def bench_part(
     return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions())
 
 
-def bench_plan(objects: int, method: Method, batch: int = 1, scenes: int = 5, repeats: int = 20) -> Timing:
+def bench_plan(
+    objects: int,
+    method: Method,
+    batch: int = 1,
+    scenes: int = 5,
+    repeats: int = 20,
+    sizes: ObjectSizes | None = None,
+) -> Timing:
     """Time a decision on generated scenes, whose targets are not found yet.
 
     Args:
       objects: number of objects in a scene.
       method: what decides, and with which settings.
       batch, scenes, repeats: as in `bench_part`.
+      sizes: of the objects; the paper's if None.
 
     Raises:
       InputError: the number of objects does not fit, or the method cannot be used.
     """
     policy = method.policy()
-    problem, states, shapes = _states(objects, method.config, batch, scenes)
+    problem, states, shapes = _states(objects, method.config, method.workcell, sizes, batch, scenes)
     shapes |= {"sequences": method.config.planner.sequences, "horizon": method.config.planner.horizon}
 
     def decide(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
@@ -229,11 +240,12 @@ def bench_plan(objects: int, method: Method, batch: int = 1, scenes: int = 5, re
 
 
 def _states(
-    objects: int, config: Config, batch: int, scenes: int
+    objects: int, config: Config, workcell: Workcell, sizes: ObjectSizes | None, batch: int, scenes: int
 ) -> tuple[Problem, list[tuple[Array, Belief, Observation]], dict[str, int]]:
     """The problem, what is known and seen at the start of generated scenes with a key each, and the sizes."""
-    generator = ScenarioGenerator()
-    problem = planner.build_problem(target=generator.target, config=config.problem)
+    around = {"shelf": workcell.shelf, "camera": workcell.camera, "gripper": workcell.gripper}
+    generator = ScenarioGenerator(workcell.target, **around, sizes=sizes)
+    problem = planner.build_problem(target=generator.target, **around, config=config.problem)
     states = []
     for seed in range(scenes):
         world = from_scenario(generator.generate(seed, objects))

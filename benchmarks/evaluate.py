@@ -63,9 +63,11 @@ def make_jobs(
         method.check()
     jobs: list[Job] = []
     names: dict[str, str] = {}
+    # All methods of a run are of the same shelf.
+    shelf = methods[0].workcell.shelf if methods else None
     for file in files:
         path = str(Path(file).resolve())
-        scenario = load_scenario(file)
+        scenario = load_scenario(file, shelf)
         if scenario.name in names:
             raise InputError(
                 f"{file}: has the name {scenario.name!r} as {names[scenario.name]} has; rename one of them"

@@ -17,7 +17,8 @@ from mechsearch_jax.envs.episodes import run_episode, target_of
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.recognisers import recogniser
-from mechsearch_jax.planner.cache import cached_problem, keep_compilations
+from mechsearch_jax.planner.cache import keep_compilations
+from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.workspace.scenario import load_scenario
 
 
@@ -25,8 +26,8 @@ class Worker:
     """Runs episodes, and keeps what does not change between them."""
 
     def __init__(self) -> None:
-        self._simulator = NativeSimulator()
-        self._problem = functools.cache(cached_problem)
+        self._simulator = functools.cache(_simulator)
+        self._problem = functools.cache(Workcell.problem)
         self._policy = functools.cache(Method.policy)
 
     def run(self, path: str, method: Method, seed: int) -> Row:
@@ -35,19 +36,24 @@ class Worker:
         Raises:
           InputError: the file is no scenario, or the method cannot be used.
         """
-        scenario = load_scenario(path)
-        target = target_of(scenario)
+        workcell = method.workcell
+        scenario = load_scenario(path, workcell.shelf)
+        target = target_of(scenario, workcell.target)
         episode = run_episode(
             seed,
             scenario,
-            self._problem(target, method.config.problem),
+            self._problem(workcell, target, method.config.problem),
             self._policy(method),
-            self._simulator,
+            self._simulator(workcell),
             recogniser(method.recognition, target),
             method.config.max_steps,
             method.options(),
         )
         return Row.of_episode(episode)
+
+
+def _simulator(workcell: Workcell) -> NativeSimulator:
+    return NativeSimulator(shelf=workcell.shelf, camera=workcell.camera)
 
 
 def serve(jobs: TextIO, answers: TextIO) -> None:

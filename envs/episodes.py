@@ -50,10 +50,14 @@ from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.target import Target
 
 
-def target_of(scenario: Scenario) -> Target:
-    """The target of a scenario as the planner knows it: its shape, and how finely its yaw is searched."""
-    body = scenario.target
-    return Target.of(body.shape, body.half_size)
+def target_of(scenario: Scenario, usual: Target | None = None) -> Target:
+    """The target of a scenario as the planner knows it: its shape, and how finely it is searched.
+
+    Args:
+      scenario: says what the target is.
+      usual: searched as finely as the scenario's is to be; the default target if None.
+    """
+    return (usual or Target()).resized(scenario.target.shape, scenario.target.half_size)
 
 
 @dataclasses.dataclass(frozen=True)

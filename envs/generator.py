@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,29 +20,17 @@ from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import GraspConfig, GraspTables, feasible_grasps, grasp_tables
+from mechsearch_jax.planner.settings import Settings
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotation_matrix
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Full sizes [m].
-BOXES = (
-    (0.104, 0.058, 0.076),
-    (0.084, 0.036, 0.07),
-    (0.06, 0.024, 0.12),
-    (0.108, 0.05, 0.108),
-    (0.096, 0.056, 0.16),
-    (0.156, 0.044, 0.192),
-)
-# Radius and height [m].
-CYLINDERS = ((0.034, 0.214), (0.032, 0.134), (0.032, 0.122), (0.024, 0.134), (0.028, 0.06))
 # The shapes and half-extents of the paper's eleven objects; the x and y of those that are not round may be swapped.
-CATALOGUE = (
-    *(("box", (x / 2, y / 2, z / 2)) for x, y, z in BOXES),
-    *(("cylinder", (radius, radius, height / 2)) for radius, height in CYLINDERS),
-)
+CATALOGUE = ObjectSizes().catalogue
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,6 +140,8 @@ class ScenarioGenerator:
         camera: Camera | None = None,
         config: GeneratorConfig | None = None,
         graspable: Callable[[Float[np.ndarray, " 3"]], bool] | None = None,
+        gripper: Gripper | None = None,
+        sizes: ObjectSizes | None = None,
     ):
         """Args:
         target: what is hidden; the usual one by default.
@@ -158,19 +149,49 @@ class ScenarioGenerator:
         config: how scenarios are made.
         graspable: tells from a pose (x, y [m], yaw [rad]) whether the shelf alone leaves the target graspable there;
           by default `graspable_alone`, or `graspable_at` where the target may stand anywhere.
+        gripper: that is to grasp it; the default gripper if None.
+        sizes: of the objects; the paper's if None.
+
+        Raises:
+          InputError: objects would be dropped beside the board.
         """
         self.target = target or Target()
         self.config = config or GeneratorConfig()
         self._shelf = shelf or Shelf()
         self._camera = camera or Camera()
+        self._catalogue = (sizes or ObjectSizes()).catalogue
+        for name, low, high in (("x", self._shelf.front, self._shelf.back), ("y", self._shelf.right, self._shelf.left)):
+            spawn = getattr(self._shelf, f"spawn_{name}")
+            if not (spawn[0] < high and spawn[1] > low):
+                raise InputError(f"Shelf: spawn_{name} {spawn} is beside the board, which reaches from {low} to {high}")
         self._simulator = NativeWorld(self._shelf, self._camera)
         self._poses = self.target.candidate_poses(self._shelf).astype(float)
         if self.config.anywhere:
-            self._graspable = graspable or graspable_at(self._shelf, self.target)
+            self._graspable = graspable or graspable_at(self._shelf, self.target, gripper)
         else:
-            allowed = graspable_alone(self._shelf, self.target) if graspable is None else map(graspable, self._poses)
+            if graspable is None:
+                allowed = graspable_alone(self._shelf, self.target, gripper)
+            else:
+                allowed = map(graspable, self._poses)
             self._poses = self._poses[np.array([*allowed], bool)]
             self._graspable = lambda pose: True
+
+    @classmethod
+    def of(cls, settings: Settings, shape: str | None = None) -> ScenarioGenerator:
+        """The generator that a configuration file describes.
+
+        Args:
+          settings: of the workcell and the objects in it.
+          shape: of a target of the usual size, instead of the settings' own.
+
+        Raises:
+          InputError: there is no such shape, or as the constructor.
+        """
+        cell = settings.workcell
+        target = cell.target
+        if shape is not None and shape != target.shape:
+            target = target.resized(shape, Target.of(shape).half_size)
+        return cls(target, cell.shelf, cell.camera, gripper=cell.gripper, sizes=settings.objects)
 
     def generate(self, seed: int, objects: int, name: str | None = None) -> Scenario:
         """A scenario whose bodies rest on the board, with a target that the detector does not see.
@@ -201,7 +222,7 @@ class ScenarioGenerator:
         dropped: list[Body] = []
         outlines: list[np.ndarray] = []
         for _ in range(objects):
-            shape, half = _draw_shape(rng)
+            shape, half = _draw_shape(rng, self._catalogue)
             for _ in range(self.config.placements):
                 body = self._draw_body(rng, shape, half)
                 polygon = outline(body)
@@ -263,9 +284,9 @@ class ScenarioGenerator:
         return bool(outcome.settled) and still and self.is_hidden(self._simulator.scenario(scene.name))
 
 
-def _draw_shape(rng: np.random.Generator) -> tuple[str, tuple[float, float, float]]:
-    """One of the paper's eleven objects and its half-extents."""
-    name, (x, y, z) = CATALOGUE[int(rng.integers(len(CATALOGUE)))]
+def _draw_shape(rng: np.random.Generator, catalogue: Sequence[Any]) -> tuple[str, tuple[float, float, float]]:
+    """One of the objects of a catalogue and its half-extents."""
+    name, (x, y, z) = catalogue[int(rng.integers(len(catalogue)))]
     swapped = not shape_of(name).round and rng.random() < 0.5
     return name, (y, x, z) if swapped else (x, y, z)
 

@@ -7,12 +7,11 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
-from mechsearch_jax.actions import SAMPLED_KINDS
+from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, policy_factory
-from mechsearch_jax.workspace.target import Target
+from mechsearch_jax.planner.workcell import Workcell
 
 EngineName = Literal["NativeSimulator", "MjxSimulator"]
 
@@ -27,12 +26,14 @@ class Method:
       config: every setting of the problem and of the policy, one preset's worth.
       recognition: name of the recogniser.
       engine: name of the simulator.
+      workcell: what stands around the objects, and how finely a target is searched.
     """
 
     name: str = "search-for-grasp"
     config: Config = dataclasses.field(default_factory=PRESETS["standard"])
     recognition: RecognitionName = "oracle"
     engine: EngineName = "NativeSimulator"
+    workcell: Workcell = dataclasses.field(default_factory=Workcell)
 
     def policy(self) -> Policy:
         """The policy, with the push models that the configuration names.
@@ -50,18 +51,21 @@ class Method:
           InputError: as `policy`, or there is no such kind of action, or the weights that the recogniser needs are
             missing or damaged.
         """
-        kinds = [kind.name for kind in SAMPLED_KINDS]
-        unknown = [name for name in self.config.problem.actions.actions if name not in kinds]
-        if unknown:
-            raise InputError(f'actions: "{unknown[0]}" is unknown; use one or more of {", ".join(kinds)}')
+        check_kinds(self.config.problem.actions.actions)
         self.policy()
-        recogniser(self.recognition, Target())
+        recogniser(self.recognition, self.workcell.target)
 
     def options(self) -> dict[str, Any]:
         """What tells this method from others, flat and as JSON values: the policy, the recognition, every option of the
-        configuration by its name, and other settings that are not the preset `standard`'s by their path."""
-        usual, named = dict(_settings(PRESETS["standard"]())), {".".join(option.path) for option in OPTIONS}
-        unusual = {path: value for path, value in _settings(self.config) if value != usual[path] and path not in named}
+        configuration by its name, and other settings that are not the preset `standard`'s, or not the usual workcell's,
+        by their path."""
+        named = {".".join(option.path) for option in OPTIONS}
+        pairs = ((self.config, PRESETS["standard"](), ""), (self.workcell, Workcell(), "workcell."))
+        unusual: dict[str, Any] = {}
+        for config, standard, prefix in pairs:
+            usual = dict(_settings(standard, prefix))
+            settings = _settings(config, prefix)
+            unusual |= {path: value for path, value in settings if value != usual[path] and path not in named}
         return {"policy": self.name, "recognition": self.recognition, **self.config.options(), **unusual}
 
     def to_json(self) -> dict[str, Any]:
@@ -78,8 +82,8 @@ class Method:
         return _restored(cls(), value)
 
 
-def _settings(config: Config) -> Iterator[tuple[str, Any]]:
-    """Every setting, as JSON has it, by its path: "problem.grasps.wrists"."""
+def _settings(config: Config | Workcell, prefix: str) -> Iterator[tuple[str, Any]]:
+    """Every setting, as JSON has it, by its path: "problem.grasps.wrists", after a prefix."""
 
     def inside(value: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
         for name, part in value.items():
@@ -88,7 +92,7 @@ def _settings(config: Config) -> Iterator[tuple[str, Any]]:
             else:
                 yield f"{path}{name}", part
 
-    return inside(json.loads(json.dumps(dataclasses.asdict(config))), "")
+    return inside(json.loads(json.dumps(dataclasses.asdict(config))), prefix)
 
 
 def _restored(like: Any, value: Any) -> Any:

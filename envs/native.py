@@ -314,13 +314,19 @@ class NativeSimulator:
 
     engine = "NativeSimulator"
 
-    def __init__(self, threads: int | None = None, config: SimulatorConfig | None = None):
+    def __init__(
+        self,
+        threads: int | None = None,
+        config: SimulatorConfig | None = None,
+        shelf: Shelf | None = None,
+        camera: Camera | None = None,
+    ):
         """Args:
         threads: how many worlds are simulated at the same time; one for each core if left out.
-        config: of every world.
+        config, shelf, camera: of every world.
         """
         self.world: World | None = None
-        self._config = config
+        self._config, self._shelf, self._camera = config, shelf, camera
         self._threads = threads or os.cpu_count() or 1
         self._worlds: list[NativeWorld] = []
 
@@ -393,7 +399,7 @@ class NativeSimulator:
 
     def _make(self, count: int) -> None:
         """Have so many worlds."""
-        missing = [NativeWorld(config=self._config) for _ in range(count - len(self._worlds))]
+        missing = [NativeWorld(self._shelf, self._camera, self._config) for _ in range(count - len(self._worlds))]
         self._worlds = (self._worlds + missing)[:count]
 
     def _each(self, active: Bool[Array, " worlds"] | None, run: Callable[[int], Outcome]) -> Outcome:

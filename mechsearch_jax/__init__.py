@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.planner.policies import Policy, random_action, search_and_grasp, search_for_grasp
     from mechsearch_jax.planner.presets import best, paper, standard
     from mechsearch_jax.planner.problem import Problem, build_problem
+    from mechsearch_jax.planner.settings import Settings, load_settings
     from mechsearch_jax.planner.state import Decision
     from mechsearch_jax.robot.gripper import Gripper
     from mechsearch_jax.workspace.camera import Camera
@@ -54,6 +55,7 @@ _ROOMS = {
     "Policy": "planner.policies",
     "Problem": "planner.problem",
     "Recogniser": "perception.recogniser",
+    "Settings": "planner.settings",
     "Shelf": "workspace.shelf",
     "Superquadrics": "geometry.superquadric",
     "Target": "workspace.target",
@@ -64,6 +66,7 @@ _ROOMS = {
     "initial_belief": "planner.belief",
     "joint_trajectory": "actions.trajectory",
     "load_scenario": "workspace.scenario",
+    "load_settings": "planner.settings",
     "paper": "planner.presets",
     "random_action": "planner.policies",
     "render_depth": "workspace.render",
@@ -87,6 +90,7 @@ __all__ = [
     "Policy",
     "Problem",
     "Recogniser",
+    "Settings",
     "Shelf",
     "Superquadrics",
     "Target",
@@ -97,6 +101,7 @@ __all__ = [
     "initial_belief",
     "joint_trajectory",
     "load_scenario",
+    "load_settings",
     "paper",
     "random_action",
     "render_depth",

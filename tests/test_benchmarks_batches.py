@@ -39,7 +39,7 @@ class Stand:
         self.slots = []
         self._fail = fail
         monkeypatch.setattr(batches, "run_episodes", self)
-        monkeypatch.setattr(batches, "cached_problem", lambda target, config: problem)
+        monkeypatch.setattr(batches.Workcell, "problem", lambda workcell, target, config: problem)
 
     def __call__(self, starts, problem, policy, simulator, slots, ended, *, max_steps, options, **rest):
         assert max_steps == METHOD.config.max_steps

@@ -251,7 +251,7 @@ def test_grasped_objects_fit_between_the_fingers(sampled, problem):
 def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(InputError, match="a tuple of one or more kinds"):
         ActionConfig(actions="push")
-    with pytest.raises(InputError, match='"throw" is unknown; use pick-and-place or push'):
+    with pytest.raises(InputError, match='"throw" is unknown; use one or more of pick-and-place, push'):
         planner.build_problem(config=planner.standard(actions=("throw",)).problem)
     with pytest.raises(InputError, match="push_distances"):
         ActionConfig(push_distances=())

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from mechsearch_jax.actions import nothing, pick_and_place, push, retrieve
 from mechsearch_jax.actions.kind import Kind, SampledKind
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.errors import InputError, shown
 
 
 class ActionKind(enum.IntEnum):
@@ -38,3 +38,15 @@ def kind_of(code: int) -> Kind:
             return kind
     known = ", ".join(f"{kind.code} ({kind.name})" for kind in KINDS.values())
     raise InputError(f"action kind {int(code)} is unknown; there are {known}")
+
+
+def check_kinds(names: Sequence[str]) -> None:
+    """Refuse names that none of `SAMPLED_KINDS` has.
+
+    Raises:
+      InputError: there is one.
+    """
+    known = [kind.name for kind in SAMPLED_KINDS]
+    for name in names:
+        if name not in known:
+            raise InputError(f"actions: {shown(name)} is unknown; use one or more of {', '.join(known)}")

@@ -62,8 +62,8 @@ def _timing_of(subject: Literal["existence", "graspability"], what: str) -> Call
         from mechsearch_jax.benchmarks import bench as benches
 
         at_least_one(f"bench {subject}", repeats=repeats, batch=batch)
-        config = options.config()
-        _print_timing(subject, out, lambda: benches.bench_part(subject, objects, config, batch, repeats=repeats))
+        settings = options.settings()
+        _print_timing(subject, out, lambda: benches.bench_part(subject, objects, settings, batch, repeats=repeats))
 
     command.__name__ = subject
     command.__doc__ = f"""Time {what}: compilation, median and spread.
@@ -103,7 +103,8 @@ def bench_plan(
 
     at_least_one("bench plan", repeats=repeats, batch=batch)
     (chosen,) = options.methods(chosen_policies("bench plan", method and (method,), policy and (policy,)))
-    _print_timing("plan", out, lambda: benches.bench_plan(objects, chosen, batch, repeats=repeats))
+    sizes = options.settings().objects
+    _print_timing("plan", out, lambda: benches.bench_plan(objects, chosen, batch, repeats=repeats, sizes=sizes))
 
 
 def bench_perceive(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mechsearch_jax.commands.options import DEFAULTS, EpisodeOptions, Scenarios, find_scenarios
+from mechsearch_jax.errors import InputError
 
 
 def inspect(
@@ -29,22 +30,27 @@ def inspect(
     from mechsearch_jax.envs.pictures import inspect_scenario
     from mechsearch_jax.envs.recognisers import recogniser
     from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import cached_problem, keep_compilations
+    from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.viz.drawing import save_figure
     from mechsearch_jax.viz.maps import save_maps
-    from mechsearch_jax.workspace.scenario import load_scenario
+    from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
     options.only_native("inspect")
     (method,) = options.methods(("search-for-grasp",))
-    scenes = [load_scenario(file) for file in find_scenarios(scenarios)]
+    workcell = method.workcell
+    scenes: dict[str, Scenario] = {}
+    for file in find_scenarios(scenarios):
+        scene = load_scenario(file, workcell.shelf)
+        if scene.name in scenes:
+            raise InputError(f"{file}: another scenario is called {scene.name}, too, as its maps would be; rename one")
+        scenes[scene.name] = scene
     check_writable(out)
     keep_compilations()
-    problems = {
-        target: cached_problem(target, method.config.problem) for target in {target_of(scene) for scene in scenes}
-    }
-    for scene in track(scenes, "inspecting"):
-        see = recogniser(method.recognition, target_of(scene))
-        maps, figure = inspect_scenario(scene, problems[target_of(scene)], see, seed)
+    targets = {name: target_of(scene, workcell.target) for name, scene in scenes.items()}
+    problems = {target: workcell.problem(target, method.config.problem) for target in set(targets.values())}
+    for scene in track(scenes.values(), "inspecting"):
+        target = targets[scene.name]
+        maps, figure = inspect_scenario(scene, problems[target], recogniser(method.recognition, target), seed)
         save_maps(maps, out / f"{scene.name}.npz")
         save_figure(figure, out / f"{scene.name}.png")
     print(f"{len(scenes)} scenario{'s' if len(scenes) > 1 else ''} inspected: {out}")

@@ -17,7 +17,8 @@ from mechsearch_jax.shapes import SHAPES
 if TYPE_CHECKING:
     from mechsearch_jax.envs.method import EngineName, Method
     from mechsearch_jax.envs.scene_sets import Block
-    from mechsearch_jax.planner import Config, Option
+    from mechsearch_jax.planner import Option
+    from mechsearch_jax.planner.settings import Settings
 
 PaperMethod = Literal["search-for-grasp", "search-and-grasp"]
 PushModel = Literal["quasi-static", "learned", "physics"]
@@ -32,31 +33,29 @@ class EpisodeOptions:
     """What episodes run with. `with_planner_options` adds the preset and all of the planner's options.
 
     Attributes:
+      config_file: a file of settings of camera, shelf, gripper, target, objects and planner; what else is given here
+        goes before it. `mechsearch config` prints an example.
       recognition: what the planner sees the objects through: "oracle" knows their true shapes and poses; the others see
         a noisy depth image, "masks" with the true segmentation, "full" without.
       simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
         batches where there is a GPU.
     """
 
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
     recognition: Literal["oracle", "masks", "full"] = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
 
-    def config(self) -> Config:
-        """The preset's configuration, with what is given in its place.
+    def settings(self) -> Settings:
+        """The configuration file's settings, with what is given in their place.
 
         Raises:
-          InputError: an option is impossible.
+          InputError: the file cannot be used, or an option is impossible.
         """
-        from mechsearch_jax.planner import OPTIONS, PRESETS, action_set
+        from mechsearch_jax.planner import OPTIONS
 
         named = {option.name: getattr(self, option.name, None) for option in OPTIONS}
         given = {name: value for name, value in named.items() if value is not None}
-        sets = [name for name in given.get("actions", ()) if name in PRESETS]
-        if sets:
-            if len(given["actions"]) > 1:
-                raise InputError(f"--actions: {sets[0]} is a whole set of actions; give it alone")
-            given = {**action_set(sets[0]), **{name: given[name] for name in given if name != "actions"}}
-        return PRESETS[getattr(self, "preset", DEFAULT_PRESET)]().with_options(**given)
+        return settings_of(self.config_file).with_options(getattr(self, "preset", None), **given)
 
     def methods(self, policies: Sequence[str], engine: EngineName = "NativeSimulator") -> list[Method]:
         """What episodes are run with: one for each policy.
@@ -70,8 +69,8 @@ class EpisodeOptions:
         if any(":" in policy for policy in policies) and "" not in sys.path:
             # As Python itself does for a program that is not installed.
             sys.path.append("")
-        config = self.config()
-        methods = [Method(policy, config, self.recognition, engine) for policy in policies]
+        settings = self.settings()
+        methods = [Method(name, settings.config, self.recognition, engine, settings.workcell) for name in policies]
         for method in methods:
             method.check()
         return methods
@@ -108,7 +107,6 @@ class EpisodeOptions:
             )
 
 
-DEFAULT_PRESET = "standard"
 # What a command's parameter `options` is until `with_planner_options` knows the rest.
 DEFAULTS = EpisodeOptions()
 
@@ -119,10 +117,14 @@ def with_planner_options() -> type[EpisodeOptions]:
 
     They are those of the configuration, which takes a second to import.
     """
-    from mechsearch_jax.planner import OPTIONS, PRESETS
+    from mechsearch_jax.planner import DEFAULT_PRESET, OPTIONS, PRESETS
 
-    preset = tyro.conf.arg(help="where settings come from that are not given: what is best known, or the paper.")
-    fields: list[tuple[str, Any, Any]] = [("preset", Annotated[Literal[tuple(PRESETS)], preset], DEFAULT_PRESET)]
+    preset = tyro.conf.arg(
+        metavar="{" + ",".join(PRESETS) + "}",
+        help="where settings come from that are not given: what is best known, or the paper.",
+        help_behavior_hint=f"(default: {DEFAULT_PRESET})",
+    )
+    fields: list[tuple[str, Any, Any]] = [("preset", Annotated[Literal[tuple(PRESETS)] | None, preset], None)]
     fields += [(option.name, _annotation(option), None) for option in OPTIONS]
     return dataclasses.make_dataclass("Options", fields, bases=(EpisodeOptions,), frozen=True, kw_only=True)
 
@@ -137,7 +139,7 @@ def _annotation(option: Option) -> Any:
 
 def _usual(option: Option) -> str:
     """What an option is where it is not given."""
-    from mechsearch_jax.planner import PRESETS
+    from mechsearch_jax.planner import DEFAULT_PRESET, PRESETS
 
     values = {name: preset().options()[option.name] for name, preset in PRESETS.items()}
     said = {name: " ".join(map(str, value)) if isinstance(value, list) else value for name, value in values.items()}
@@ -153,6 +155,17 @@ _METAVARS: dict[Any, str] = {
     tuple[float, ...]: "FLOAT ...",
     tuple[str, ...]: "NAME ...",
 }
+
+
+def settings_of(file: Path | None) -> Settings:
+    """What a configuration file says; the defaults without one.
+
+    Raises:
+      InputError: the file cannot be used.
+    """
+    from mechsearch_jax.planner.settings import Settings, load_settings
+
+    return Settings() if file is None else load_settings(file)
 
 
 def chosen_policies(command: str, method: Sequence[str] | None, policy: Sequence[str] | None) -> Sequence[str]:
@@ -179,6 +192,7 @@ Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metav
 
 GivenShape = Annotated[TargetShape | None, tyro.conf.arg(metavar="{" + ",".join(SHAPES) + "}")]
 SomeScenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER|SET ...]")]
+ConfigFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")]
 JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 WeightsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")]
 

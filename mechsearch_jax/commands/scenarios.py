@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from mechsearch_jax.commands.options import (
+    ConfigFile,
     GivenShape,
     Scenarios,
     TargetShape,
     at_least_one,
     find_scenarios,
+    settings_of,
     tell_strange,
 )
 from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.planner.settings import Settings
 
 
 def list_sets() -> None:
@@ -36,6 +41,7 @@ def generate(
     count: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     target: GivenShape = None,
     seed: Annotated[int | None, tyro.conf.arg(metavar="SEED")] = None,
+    config: ConfigFile = None,
 ) -> None:
     """Generate scenarios: objects dropped on the shelf, and a target that the camera cannot see.
 
@@ -44,35 +50,38 @@ def generate(
       scene_set: instead, the name of a set of scenes (mechsearch scenarios list).
       out: folder for the files.
       count: number of scenarios; 1 if not given.
-      target: shape of the target; a cylinder if not given.
+      target: shape of the target; a cylinder, or what the configuration file says, if not given.
       seed: of the first scenario, 0 if not given; the next ones follow.
+      config: a file of settings, of which camera, shelf, gripper, target and objects count.
     """
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
 
     if (objects is None) == (scene_set is None):
         raise InputError("scenarios generate: give either --objects N or --set NAME, not both")
-    if scene_set is not None and (count, target, seed) != (None, None, None):
-        raise InputError("scenarios generate: --count, --target and --seed are not for a set, which has its own")
+    if scene_set is not None and (count, target, seed, config) != (None,) * 4:
+        raise InputError(
+            "scenarios generate: --count, --target and --seed are not for a set, which has its own, nor is --config"
+        )
     at_least_one("scenarios generate", count=count)
     if scene_set is not None:
         made = _generate_set(scene_set, out)
     else:
+        settings = settings_of(config)
         check_writable(out)
         keep_compilations()
         made = count or 1
-        _generate_more(range(seed or 0, (seed or 0) + made), objects or 0, target or "cylinder", out)
+        _generate_more(range(seed or 0, (seed or 0) + made), objects or 0, settings, target, out)
     print(f"{made} scenario{'s' if made > 1 else ''} generated: {out}")
 
 
-def _generate_more(seeds: range, objects: int, target: TargetShape, out: Path) -> None:
+def _generate_more(seeds: range, objects: int, settings: Settings, target: TargetShape | None, out: Path) -> None:
     from rich.progress import track
 
     from mechsearch_jax.envs.generator import ScenarioGenerator
     from mechsearch_jax.workspace.scenario import save_scenario
-    from mechsearch_jax.workspace.target import Target
 
-    generator = ScenarioGenerator(Target.of(target))
+    generator = ScenarioGenerator.of(settings, target)
     for seed in track(seeds, "generating"):
         scenario = generator.generate(seed, objects)
         save_scenario(scenario, out / f"{scenario.name}.json")
@@ -97,18 +106,20 @@ def _generate_set(name: str, out: Path) -> int:
     return len(scenes)
 
 
-def check(scenarios: Scenarios, /) -> None:
+def check(scenarios: Scenarios, /, *, config: ConfigFile = None) -> None:
     """Check scenario files; every one that is malformed is named with its reason.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
+      config: a file of settings, of which the shelf counts.
     """
     from mechsearch_jax.workspace.scenario import load_scenario
 
+    shelf = None if config is None else settings_of(config).workcell.shelf
     bad = 0
     for file in find_scenarios(scenarios):
         try:
-            scenario = load_scenario(file)
+            scenario = load_scenario(file, shelf)
         except InputError as error:
             print(error, file=sys.stderr)
             bad += 1

@@ -36,7 +36,7 @@ def search(
     Args:
       scenario: a scenario file, or the name of one that ships with the package or is in a scene set, as c2-4-017.
       objects: instead of a scenario, generate one with so many objects.
-      target: shape of a generated target; a cylinder if not given.
+      target: shape of a generated target; a cylinder, or what the configuration file says, if not given.
       method: "search-for-grasp", the default, minds the grasp while it searches, "search-and-grasp" only afterwards.
       policy: instead of a method, the name of a policy ("random" is one more), or the import path of another.
       seed: of the planner, of the environment, and of a generated scenario.
@@ -46,13 +46,13 @@ def search(
     from rich.console import Console
 
     from mechsearch_jax.envs.episodes import run_episode, target_of
-    from mechsearch_jax.envs.generator import generate_scenario
+    from mechsearch_jax.envs.generator import ScenarioGenerator
     from mechsearch_jax.envs.narration import Narrator, verdict
     from mechsearch_jax.envs.native import NativeSimulator
     from mechsearch_jax.envs.recognisers import recogniser
     from mechsearch_jax.envs.records import save_episode
     from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import cached_problem, keep_compilations
+    from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.viz.drawing import save_figure
     from mechsearch_jax.viz.filmstrip import filmstrip
     from mechsearch_jax.workspace.scenario import load_scenario, save_scenario
@@ -63,24 +63,25 @@ def search(
         raise InputError("search: --target is for a generated scenario; a scenario file says itself what its target is")
     options.only_native("search")
     (chosen,) = options.methods(chosen_policies("search", method and (method,), policy and (policy,)))
-    known = load_scenario(find_scenario(scenario)) if scenario is not None else None
+    settings, workcell = options.settings(), chosen.workcell
+    known = load_scenario(find_scenario(scenario), workcell.shelf) if scenario is not None else None
     check_writable(out)
     keep_compilations()
     console = Console(highlight=False)
     with console.status("preparing") as status:
-        scene = known or generate_scenario(seed, objects or 0, target or "cylinder")
+        scene = known or ScenarioGenerator.of(settings, target).generate(seed, objects or 0)
         console.print(
             f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
         )
-        wanted = target_of(scene)
-        problem = cached_problem(wanted, chosen.config.problem)
+        wanted = target_of(scene, workcell.target)
+        problem = workcell.problem(wanted, chosen.config.problem)
         narrator = Narrator(console, status, problem)
         episode = run_episode(
             seed,
             scene,
             problem,
             chosen.policy(),
-            NativeSimulator(),
+            NativeSimulator(shelf=workcell.shelf, camera=workcell.camera),
             recogniser(chosen.recognition, wanted),
             chosen.config.max_steps,
             chosen.options(),

@@ -196,7 +196,9 @@ def load_weights(path: PathLike, name: str) -> Weights:
     try:
         shapes = _shapes(name, config)
     except (TypeError, ValueError):
-        raise InputError(f"{path.with_suffix('.json')}: config makes no {name} network; train or install anew") from None
+        raise InputError(
+            f"{path.with_suffix('.json')}: config makes no {name} network; train or install anew"
+        ) from None
     for key in sorted(shapes.keys() | arrays.keys()):
         expected = shapes.get(key)
         found = arrays[key].shape if key in arrays else None

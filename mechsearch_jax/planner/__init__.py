@@ -13,12 +13,13 @@ from mechsearch_jax.planner.policies import (
     search_and_grasp,
     search_for_grasp,
 )
-from mechsearch_jax.planner.presets import PRESETS, action_set, best, paper, standard
+from mechsearch_jax.planner.presets import DEFAULT_PRESET, PRESETS, action_set, best, expanded, paper, standard
 from mechsearch_jax.planner.problem import Problem, build_problem
 from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at
 from mechsearch_jax.planner.state import Decision, Sequences
 
 __all__ = [
+    "DEFAULT_PRESET",
     "OPTIONS",
     "POLICIES",
     "PRESETS",
@@ -37,6 +38,7 @@ __all__ = [
     "action_set",
     "best",
     "build_problem",
+    "expanded",
     "graspability_map",
     "graspable_at",
     "initial_belief",

@@ -59,9 +59,15 @@ def keep_compilations() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
-def cached_problem(target: Target | None = None, config: ProblemConfig | None = None) -> Problem:
-    """`build_problem` for a target and a configuration, with everything else at its default: read from disk if it was
-    built before.
+def cached_problem(
+    target: Target | None = None,
+    config: ProblemConfig | None = None,
+    *,
+    camera: Camera | None = None,
+    shelf: Shelf | None = None,
+    gripper: Gripper | None = None,
+) -> Problem:
+    """`build_problem`, read from disk if the same was built before.
 
     The file is told apart by the package's source, the versions of what computes it, the device and the settings. One
     that is damaged or of something else is built anew, and a folder that cannot be written to is done without.
@@ -70,9 +76,9 @@ def cached_problem(target: Target | None = None, config: ProblemConfig | None = 
       InputError: the target cannot be grasped by the gripper.
     """
     parts: dict[str, Any] = {
-        "camera": Camera(),
-        "shelf": Shelf(),
-        "gripper": Gripper(),
+        "camera": camera or Camera(),
+        "shelf": shelf or Shelf(),
+        "gripper": gripper or Gripper(),
         "target": target or Target(),
         "config": config or ProblemConfig(),
     }

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner.config import Config
 
 # How often preset `paper` draws an action until one is possible: an approximation of the paper's, which never gives up.
@@ -69,6 +70,7 @@ def best(**changes: Any) -> Config:
 
 
 PRESETS: Mapping[str, Callable[..., Config]] = {"standard": standard, "paper": paper, "best": best}
+DEFAULT_PRESET = "standard"
 
 # The options that say which actions there are, and not how they are chosen.
 ACTION_OPTIONS = ("actions", "push_directions", "push_distances", "object_grasp_tilts")
@@ -78,3 +80,17 @@ def action_set(name: str) -> dict[str, Any]:
     """The options that say which actions there are, as in a preset."""
     options = PRESETS[name]().options()
     return {option: options[option] for option in ACTION_OPTIONS}
+
+
+def expanded(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options by name, with all that the name of a preset among `actions` stands for; what is given beside it counts.
+
+    Raises:
+      InputError: there is more than that name among them.
+    """
+    sets = [name for name in options.get("actions", ()) if name in PRESETS]
+    if not sets:
+        return dict(options)
+    if len(options["actions"]) > 1:
+        raise InputError(f"actions: {sets[0]} is a whole set of actions; give it alone")
+    return {**action_set(sets[0]), **{name: value for name, value in options.items() if name != "actions"}}

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tables
-from mechsearch_jax.actions.registry import SAMPLED_KINDS
+from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceTables, existence_tables
 from mechsearch_jax.graspability import GraspConfig, GraspTables, grasp_tables
@@ -103,10 +103,7 @@ def build_problem(
     if not isinstance(config, ProblemConfig):
         raise InputError(f"config: is a {type(config).__name__}; give a ProblemConfig, such as paper().problem")
     check_outside(gripper, shelf)
-    known = [kind.name for kind in SAMPLED_KINDS]
-    for name in config.actions.actions:
-        if name not in known:
-            raise InputError(f'actions: "{name}" is unknown; use {" or ".join(known)}')
+    check_kinds(config.actions.actions)
     grasps = grasp_tables(shelf, gripper, target, config.grasps)
     return Problem(
         existence=existence_tables(camera, shelf, target, config.existence),

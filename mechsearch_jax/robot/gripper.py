@@ -27,6 +27,7 @@ from mechsearch_jax.robot.kinematics import Numbers
 from mechsearch_jax.workspace.shelf import Shelf, spheres_hit_shelf
 
 FINGER_BASE = 0.0584  # z of the fingers' frames in the hand frame [m]
+LONGEST = 1.0  # that a gripper opens or approaches [m]
 FINE = 0.5  # spacing of a cloud near the front, relative to the rest
 
 
@@ -52,8 +53,10 @@ class Gripper:
 
     def __post_init__(self):
         for field in ("max_opening", "usable_opening", "approach"):
-            if not getattr(self, field) > 0:
-                raise InputError(f"Gripper: {field} ({getattr(self, field)}) must be positive, in metres")
+            if not 0 < getattr(self, field) <= LONGEST:
+                raise InputError(
+                    f"Gripper: {field} ({getattr(self, field)}) must be positive, in metres, at most {LONGEST}"
+                )
         if not self.outside or list(self.outside) != sorted(self.outside):
             raise InputError(f"Gripper: outside {self.outside} must be one or more places in ascending order")
         if self.usable_opening > self.max_opening:

@@ -8,8 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.errors import InputError, check_range
 from mechsearch_jax.geometry.transforms import rotate
+
+# More pixels along a side, or metres from the robot, no camera here has.
+LARGEST = 16384
+FARTHEST = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,10 +43,19 @@ class Camera:
     position: tuple[float, float, float] = (-0.04457319, 0.44833383, 0.65361773)
 
     def __post_init__(self):
-        if self.width < 1 or self.height < 1 or self.fx <= 0 or self.fy <= 0:
-            raise InputError(f"Camera: size {self.width} x {self.height} and focal lengths must be positive")
-        if not np.allclose(np.array(self.rotation) @ np.array(self.rotation).T, np.eye(3), atol=1e-4):
+        for name in ("width", "height"):
+            check_range(f"Camera: {name}", getattr(self, name), 1, LARGEST, "pixels")
+        for name in ("fx", "fy"):
+            check_range(f"Camera: {name}", getattr(self, name), 1e-3, 100 * LARGEST, "pixels")
+        for name in ("cx", "cy"):
+            check_range(f"Camera: {name}", getattr(self, name), -10 * LARGEST, 10 * LARGEST, "pixels")
+        rotation = np.array(self.rotation, float)
+        if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
             raise InputError("Camera: rotation must be a rotation matrix, three orthonormal rows")
+        if np.linalg.det(rotation) < 0:
+            raise InputError("Camera: rotation mirrors; its columns are the camera's x, y and z, a right-handed frame")
+        for axis, value in zip("xyz", self.position, strict=True):
+            check_range(f"Camera: position {axis}", value, -FARTHEST, FARTHEST, "m")
 
     def scaled(self, factor: int) -> Camera:
         """The same view at `1/factor` of the resolution, its size rounded down."""

@@ -163,7 +163,8 @@ def parse_scenario(value: Any, where: str, shelf: Shelf | None = None) -> Scenar
 
     Raises:
       InputError: the format or version is another one; a key is unknown or missing; the name cannot be one of a file; a
-        number is not finite; a size is that of nothing on the shelf; a quaternion is not of unit length; a body is off the board.
+        number is not finite; a size is that of nothing on the shelf; a quaternion is not of unit length; a body is off
+        the board.
     """
     shelf = shelf or Shelf()
     _check_keys(value, ("format", "version", "name", "objects", "target"), where, None)

@@ -7,7 +7,10 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.errors import InputError, check_range
+
+# Nothing is farther from the robot, and no board thicker [m].
+FARTHEST, THICKEST = 10.0, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,9 +45,17 @@ class Shelf:
     spawn_y: tuple[float, float] = (-0.18, 0.38)
 
     def __post_init__(self):
+        for name in ("front", "back", "right", "left", "board", "ceiling"):
+            check_range(f"Shelf: {name}", getattr(self, name), -FARTHEST, FARTHEST, "m")
+        for name, least in (("thickness", 1e-3), ("side_margin", 0.0), ("ceiling_margin", 0.0)):
+            check_range(f"Shelf: {name}", getattr(self, name), least, THICKEST, "m")
         for low, high in (("front", "back"), ("right", "left"), ("board", "ceiling")):
             if not getattr(self, low) < getattr(self, high):
                 raise InputError(f"Shelf: {low} ({getattr(self, low)}) must be below {high} ({getattr(self, high)})")
+        for name in ("spawn_x", "spawn_y"):
+            low, high = getattr(self, name)
+            if not -FARTHEST <= low < high <= FARTHEST:
+                raise InputError(f"Shelf: {name} ({low}, {high}) must be two places in metres, the smaller first")
 
 
 def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:

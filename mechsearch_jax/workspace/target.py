@@ -7,9 +7,13 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.errors import InputError, check_range
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
+
+# Half-extents and margins are no longer [m], and f and g are no finer.
+LARGEST = 1.0
+MOST_POSES = 100_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,14 +36,19 @@ class Target:
 
     def __post_init__(self):
         shape = shape_of(self.shape, "Target: shape")
-        if len(self.half_size) != 3 or not all(s > 0 for s in self.half_size):
-            raise InputError(f"Target: half_size {self.half_size} must be three positive lengths in metres")
+        if len(self.half_size) != 3 or not all(0 < s <= LARGEST for s in self.half_size):
+            raise InputError(
+                f"Target: half_size {self.half_size} must be three positive lengths in metres, at most {LARGEST}"
+            )
         if fault := shape.fault(self.half_size):
             raise InputError(f"Target: half_size {self.half_size}: {fault}")
         if min(self.grid) < 2 or self.yaws < 1:
             raise InputError(
                 f"Target: grid {self.grid} needs at least 2 positions an axis and yaws {self.yaws} at least 1"
             )
+        if self.grid[0] * self.grid[1] * self.yaws > MOST_POSES:
+            raise InputError(f"Target: grid {self.grid} and yaws {self.yaws} make more than {MOST_POSES} poses")
+        check_range("Target: inset", self.inset, 0.0, LARGEST, "m")
 
     @classmethod
     def of(cls, shape: str, half_size: tuple[float, float, float] | None = None) -> Target:
@@ -54,6 +63,20 @@ class Target:
         """
         known = shape_of(shape)
         return cls(known.name, half_size or known.target_half_size, yaws=known.yaws)
+
+    def resized(self, shape: str, half_size: tuple[float, float, float]) -> Target:
+        """The target of a shape and a size, searched for as finely as this one.
+
+        Args:
+          shape: its name; of another shape than this one's, it has that shape's usual yaw angles.
+          half_size: half-extents [m].
+
+        Raises:
+          InputError: as `of`.
+        """
+        other = Target.of(shape, half_size)
+        yaws = self.yaws if other.shape == self.shape else other.yaws
+        return dataclasses.replace(other, grid=self.grid, inset=self.inset, yaws=yaws)
 
     @classmethod
     def cylinder(cls) -> Target:

@@ -1,0 +1,127 @@
+"""All settings of a workcell and a planner in one file (docs/commands.md, "The configuration file")."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.resources
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from mechsearch_jax.actions.registry import check_kinds
+from mechsearch_jax.errors import InputError, nearest
+from mechsearch_jax.files import PathLike
+from mechsearch_jax.planner.config import OPTIONS, Config, Option
+from mechsearch_jax.planner.presets import DEFAULT_PRESET, PRESETS, expanded
+from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.tables import Document, apply, check_names, checked, read_document, with_table
+from mechsearch_jax.workspace.object_sizes import ObjectSizes
+from mechsearch_jax.workspace.target import Target
+
+PLANNER = "planner"
+# The example in the folder `data` of the package.
+EXAMPLE = "example-config.toml"
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What a configuration file says.
+
+    Attributes:
+      workcell: camera, shelf, gripper and target.
+      objects: what scenes are generated with.
+      preset: where the planner's settings come from that `given` does not hold.
+      given: options of the planner by name.
+    """
+
+    workcell: Workcell = dataclasses.field(default_factory=Workcell)
+    objects: ObjectSizes = dataclasses.field(default_factory=ObjectSizes)
+    preset: str = DEFAULT_PRESET
+    given: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def config(self) -> Config:
+        """The planner's configuration."""
+        return PRESETS[self.preset]().with_options(**self.given)
+
+    def with_options(self, preset: str | None = None, **options: Any) -> Settings:
+        """The same settings with another preset or other options of the planner, which go before those of a file.
+
+        Raises:
+          InputError: an option is impossible.
+        """
+        told = dataclasses.replace(self, preset=preset or self.preset, given={**self.given, **expanded(options)})
+        # What is impossible is told of now.
+        check_kinds(told.config.problem.actions.actions)
+        return told
+
+
+# The tables of a file beside the planner's, and what they are without it.
+_PARTS: Mapping[str, Any] = {
+    **{field.name: getattr(Workcell(), field.name) for field in dataclasses.fields(Workcell)},
+    "objects": ObjectSizes(),
+}
+
+
+def tables() -> dict[str, dict[str, Any]]:
+    """Every table and key that a file may have, and what each is where it is not given."""
+    parts = {
+        name: {field.name: getattr(usual, field.name) for field in dataclasses.fields(usual)}
+        for name, usual in _PARTS.items()
+    }
+    return {**parts, PLANNER: {"preset": DEFAULT_PRESET, **PRESETS[DEFAULT_PRESET]().options()}}
+
+
+def load_settings(path: PathLike) -> Settings:
+    """Read a configuration file (TOML); what it does not give takes its default.
+
+    Lengths in metres, angles in radians, poses in the robot's base frame.
+
+    Raises:
+      InputError: the file cannot be read or is not TOML; a table or key is unknown; a value is of the wrong type or
+        impossible. The message names file, line, table and key.
+    """
+    document = read_document(path)
+    known = [*_PARTS, PLANNER]
+    for table in document.tables:
+        if table and table not in known:
+            raise InputError(f"{document.where(table)} is unknown; {nearest(table, known)}")
+    for key in document.tables[""]:
+        begin = ", ".join(f"[{table}]" for table in known)
+        raise InputError(f"{document.where('', key)} stands in no table; begin one of {begin}")
+    parts = {name: with_table(document, name, usual) for name, usual in _PARTS.items() if name != "target"}
+    objects = parts.pop("objects")
+    target = _target(document)
+    workcell = apply(
+        document,
+        "target",
+        {"inset": target.inset},
+        lambda given: Workcell(target=target if given else Target(), **parts),
+    )
+    return _with_planner(document, Settings(workcell, objects))
+
+
+def _target(document: Document) -> Target:
+    """The target; where its shape is given, the rest is what is usual for that."""
+    told = document.tables.get("target", {}).get("shape", Target().shape)
+    shape = checked(told, str, document.where("target", "shape"))
+    usual = apply(document, "target", {"shape": shape}, lambda given: Target.of(given.get("shape", Target().shape)))
+    return with_table(document, "target", usual)
+
+
+def _with_planner(document: Document, settings: Settings) -> Settings:
+    """Settings with what the planner's table gives."""
+    types = {option.name: _type(option) for option in OPTIONS}
+    check_names(document, PLANNER, {"preset": str, **types})
+    table = dict(document.tables.get(PLANNER, {}))
+    preset = checked(table.pop("preset", DEFAULT_PRESET), Literal[tuple(PRESETS)], document.where(PLANNER, "preset"))
+    given = {name: checked(value, types[name], document.where(PLANNER, name)) for name, value in table.items()}
+    return apply(document, PLANNER, given, lambda options: settings.with_options(preset, **options))
+
+
+def _type(option: Option) -> Any:
+    return Literal[option.choices] if option.choices else option.type
+
+
+def example_config() -> str:
+    """The text of the example file, which holds every key with its default."""
+    return (importlib.resources.files("mechsearch_jax") / "data" / EXAMPLE).read_text(encoding="utf-8")

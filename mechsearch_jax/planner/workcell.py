@@ -1,0 +1,46 @@
+"""What stands around the objects, and what is searched among them: everything of a problem but how it is decided."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner.cache import cached_problem
+from mechsearch_jax.planner.config import ProblemConfig
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+
+@dataclasses.dataclass(frozen=True)
+class Workcell:
+    """Camera, shelf, gripper and target; hashable. Frame: the robot's base.
+
+    Attributes:
+      camera: what looks into the shelf.
+      shelf: where the objects stand.
+      gripper: what grasps them.
+      target: what is searched; of a scenario, which has its own, how finely it is searched.
+    """
+
+    camera: Camera = dataclasses.field(default_factory=Camera)
+    shelf: Shelf = dataclasses.field(default_factory=Shelf)
+    gripper: Gripper = dataclasses.field(default_factory=Gripper)
+    target: Target = dataclasses.field(default_factory=Target)
+
+    def __post_init__(self):
+        room = min(self.shelf.back - self.shelf.front, self.shelf.left - self.shelf.right)
+        if not 2 * self.target.inset < room:
+            raise InputError(
+                f"Target: inset ({self.target.inset}) leaves no place on a board of {room:g} m; it must be below half"
+            )
+
+    def problem(self, target: Target | None = None, config: ProblemConfig | None = None) -> Problem:
+        """The problem of a target, this workcell's if None; read from disk if it was built before.
+
+        Raises:
+          InputError: the target cannot be grasped by the gripper.
+        """
+        return cached_problem(target or self.target, config, camera=self.camera, shelf=self.shelf, gripper=self.gripper)

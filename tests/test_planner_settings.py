@@ -1,0 +1,168 @@
+"""The configuration file: what it gives, what it leaves alone, and how it refuses what is wrong."""
+
+import dataclasses
+import re
+
+import pytest
+
+from mechsearch_jax import errors, tables
+from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import OPTIONS, PRESETS, settings
+from mechsearch_jax.planner.settings import Settings, load_settings
+from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+
+def load(tmp_path, text):
+    (tmp_path / "mine.toml").write_text(text)
+    return load_settings(tmp_path / "mine.toml")
+
+
+def test_the_example_holds_every_key_with_its_default(tmp_path):
+    text = settings.example_config()
+    assert load(tmp_path, text) == Settings()
+    (tmp_path / "all.toml").write_text(re.sub(r"(?m)^#(?=\w|\]|  )", "", text))
+    said = tables.read_document(tmp_path / "all.toml").tables
+    assert {name: list(keys) for name, keys in said.items() if name} == {
+        name: list(keys) for name, keys in settings.tables().items()
+    }
+    found = load_settings(tmp_path / "all.toml")
+    assert dataclasses.replace(found, given={}) == Settings()
+    assert found.config == Settings().config == PRESETS["standard"]()
+
+
+def test_every_option_of_the_planner_is_a_key():
+    assert set(settings.tables()["planner"]) == {"preset", *(option.name for option in OPTIONS)}
+
+
+def test_what_is_given_goes_where_it_belongs(tmp_path):
+    found = load(
+        tmp_path,
+        """
+[camera]
+width = 848
+height = 480
+position = [0, 0.4, 0.7]
+[shelf]
+front = 0.9
+back = 1.3
+[target]
+shape = "box"
+half_size = [0.02, 0.025, 0.06]
+inset = 0.04
+[objects]
+boxes = [[0.1, 0.1, 0.1]]
+cylinders = []
+[planner]
+preset = "paper"
+gamma = 1
+push_distances = [0.1]
+""",
+    )
+    assert found.workcell.camera == dataclasses.replace(Camera(), width=848, height=480, position=(0.0, 0.4, 0.7))
+    assert found.workcell.shelf == dataclasses.replace(Shelf(), front=0.9, back=1.3)
+    assert found.workcell.target == dataclasses.replace(Target.box(), half_size=(0.02, 0.025, 0.06), inset=0.04)
+    assert found.objects.catalogue == (("box", (0.05, 0.05, 0.05)),)
+    assert found.config == PRESETS["paper"](gamma=1.0, push_distances=(0.1,))
+    assert isinstance(found.config.planner.gamma, float)
+
+
+WRONG = {
+    "[camera]\nwidth = 0": ":2: [camera] width (0) must be from 1 to",
+    "[camera]\n\nwidth = 1.5": ":3: [camera] width must be a whole number, not 1.5",
+    "[camera]\nwidth = true": ":2: [camera] width must be a whole number, not true",
+    "[camera]\nwidht = 3": ":2: [camera] widht is unknown; did you mean width?",
+    "[camera]\nx.width = 3": ':1: [camera] "x" is unknown',
+    "[camera]\nposition = [0, 0, nan]": ":2: [camera] position[2] must be a number that is finite",
+    "[camera]\nposition = [0, 0]": ":2: [camera] position must be a list of 3, not of 2",
+    "[camera]\nposition = [0, 700, 0]": ":2: [camera] position y (700.0) must be from -10 to 10 m",
+    "[camera]\nrotation = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]": ":2: [camera] rotation mirrors",
+    "[camera]\nrotation = 1": ":2: [camera] rotation must be a list, not 1",
+    "[camera]\nfx = 1" + "0" * 400: ":2: [camera] fx must be a number that is finite",
+    "[shelf]\nfront = 0.5\nback = 0.4": ":2: [shelf] front (0.5) must be below back (0.4)",
+    "[shelf]\nfront = 1.0\nback = 1.4\nthickness = 0": ":4: [shelf] thickness (0.0) must be from",
+    "[shelves]\nfront = 0.5": ":1: [shelves] is unknown; did you mean shelf?",
+    "# mine\nfront = 0.5": ":2: front stands in no table; begin one of [camera], [shelf]",
+    '[target]\nshape = "ball"': ':2: [target] shape: "ball" is unknown',
+    '[target]\nshape = ["box"]': ':2: [target] shape must be a text, not ["box"]',
+    "[target]\ninset = 0.2": ":2: [target] inset (0.2) leaves no place",
+    "[target]\ngrid = [1000, 1000]": ":2: [target] grid (1000, 1000) and yaws 1 make more than",
+    "[objects]\nboxes = []\ncylinders = []": ":2: [objects] boxes and cylinders are both empty",
+    "[objects]\nboxes = [[100, 50, 50]]": ":2: [objects] boxes (100.0, 50.0, 50.0) must be lengths in metres",
+    '[planner]\npreset = "papr"': ':2: [planner] preset must be one of "standard", "paper"',
+    '[planner]\ncriterion = "eye"': ':2: [planner] criterion must be one of "detector"',
+    "[planner]\nhorizon = 3\ngamma = 3": ":3: [planner] gamma 3.0 is outside",
+    '[planner]\nactions = ["fly"]': ':2: [planner] actions: "fly" is unknown',
+    '[planner]\nactions = ["push", "paper"]': ":2: [planner] actions: paper is a whole set",
+    "[planner]\nmax_steps = 99999999999999999999": ":2: [planner] max_steps must be a whole number within 32 bits",
+    "[planner]\ngama = 1": ":2: [planner] gama is unknown; did you mean gamma?",
+    "[planner\n": ":1: is not TOML",
+    "[planner]\ngamma = 2024-01-01": ':2: [planner] gamma must be a number, not "2024-01-01"',
+    "a = " + "[" * 100_000: ": is not TOML",
+    "#" * 300_000: ": is too large",
+}
+
+
+@pytest.mark.parametrize("text", list(WRONG), ids=lambda text: text[:40])
+def test_what_is_wrong_is_named_by_line_and_key(tmp_path, text):
+    with pytest.raises(InputError) as refused:
+        load(tmp_path, text)
+    said = str(refused.value)
+    assert said.startswith(f"{tmp_path / 'mine.toml'}{WRONG[text]}")
+    assert "\n" not in said
+    assert len(said) < 500
+
+
+def test_a_missing_file_and_one_that_is_no_text_are_refused(tmp_path):
+    (tmp_path / "mine.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="UTF-8"):
+        load_settings(tmp_path / "mine.toml")
+    with pytest.raises(InputError, match=r"none\.toml: cannot be read"):
+        load_settings(tmp_path / "none.toml")
+
+
+def options_of(tmp_path, text, *arguments):
+    (tmp_path / "mine.toml").write_text(text)
+    asked = ["inspect", "first-light", "--out", "out", "--config", str(tmp_path / "mine.toml"), *arguments]
+    return cli.parse(asked).keywords["options"]
+
+
+def test_the_command_line_goes_before_the_file(tmp_path):
+    text = '[planner]\npreset = "paper"\ngamma = 0.5\nactions = ["standard"]\n[shelf]\nback = 0.8\n'
+    standard = {name: PRESETS["standard"]().options()[name] for name in ("push_directions", "object_grasp_tilts")}
+    given = options_of(tmp_path, text)
+    assert given.settings().config == PRESETS["paper"](gamma=0.5, **standard)
+    assert given.settings().workcell.shelf.back == 0.8
+    given = options_of(tmp_path, text, "--gamma", "0.7", "--preset", "best", "--push-directions", "0")
+    assert given.settings().config == PRESETS["best"](gamma=0.7, **{**standard, "push_directions": (0.0,)})
+
+
+@pytest.mark.parametrize(
+    "command", ["search first-light", "inspect first-light", "evaluate first-light", "bench existence", "bench plan"]
+)
+def test_every_command_that_builds_a_problem_takes_it(tmp_path, command, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text("[camera]\nwidht = 3\n")
+    monkeypatch.setattr("sys.argv", ["mechsearch", *command.split(), "--out", "out", "--config", "mine.toml"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    assert "mine.toml:2: [camera] widht is unknown; did you mean width?" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.toml"]
+
+
+def test_a_method_carries_its_workcell_to_other_processes():
+    usual = Method()
+    cell = Workcell(shelf=Shelf(back=0.8), camera=Camera(position=(0.0, 0.4, 0.7)))
+    method = dataclasses.replace(usual, workcell=cell)
+    assert Method.from_json(method.to_json()) == method
+    assert set(method.options()) - set(usual.options()) == {"workcell.shelf.back", "workcell.camera.position"}
+
+
+def test_the_nearest_name_is_offered():
+    assert errors.nearest("widht", ["height", "width"]) == "did you mean width?"
+    assert errors.nearest("zzz", ["height", "width"]) == "known are height, width"
