@@ -4,25 +4,19 @@ at all; read with bounds on their size, and whatever they hold, an `InputError` 
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import tempfile
 import uuid
-import warnings
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
-import numpy as np
-
 from mechsearch_jax.errors import InputError
 
 PathLike = str | os.PathLike[str]
-# What is larger is none of ours [bytes]: the largest scenario has 10 kB, the largest archive 20 MB.
+# A text that is larger is none of ours [bytes]: the largest scenario has 10 kB.
 TEXT_LIMIT = 4 * 2**20
-ARRAYS_LIMIT = 512 * 2**20
 
 
 @contextlib.contextmanager
@@ -71,6 +65,22 @@ def check_writable(folder: PathLike) -> None:
         raise InputError(f"{folder}: cannot be written to ({error.strerror or error})") from error
 
 
+def is_file(path: PathLike) -> bool:
+    """Whether there is a file; there is none at a path that cannot be one, or may not be looked at."""
+    try:
+        return Path(path).is_file()
+    except OSError:
+        return False
+
+
+def is_folder(path: PathLike) -> bool:
+    """The same of a folder."""
+    try:
+        return Path(path).is_dir()
+    except OSError:
+        return False
+
+
 def read_bytes(path: PathLike, limit: int) -> bytes:
     """What a file holds.
 
@@ -114,29 +124,3 @@ def read_json(path: PathLike, limit: int = TEXT_LIMIT) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
-
-
-def read_arrays(data: bytes, where: PathLike, limit: int = ARRAYS_LIMIT) -> dict[str, np.ndarray]:
-    """The arrays in a NumPy archive, by name; no code can run from it.
-
-    Args:
-      data: what the archive's file holds.
-      where: how to name it in messages.
-      limit: an archive that unpacks to more bytes is refused.
-
-    Raises:
-      InputError: it is damaged or none, or unpacks to too much.
-    """
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > limit:
-            raise InputError(f"{where}: unpacks to {size} bytes; at most {limit} are read")
-        with warnings.catch_warnings(), np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            warnings.simplefilter("ignore")
-            return {name: archive[name] for name in archive.files}
-    except InputError:
-        raise
-    # To damage the parsers beneath answer with a dozen kinds of exception, and document none.
-    except Exception as error:
-        raise InputError(f"{where}: is no whole archive of arrays, .npz ({type(error).__name__})") from error

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import check_writable, is_file, is_folder
 from mechsearch_jax.shapes import SHAPES
 
 if TYPE_CHECKING:
@@ -214,8 +215,6 @@ def check_files(*files: Path | None) -> None:
     Raises:
       InputError: one cannot.
     """
-    from mechsearch_jax.files import check_writable
-
     for file in files:
         if file is not None:
             check_writable(file.parent)
@@ -238,7 +237,7 @@ def find_scenario(name: str) -> Path:
     from mechsearch_jax.workspace.scenario import example_scenarios
 
     shipped = example_scenarios()
-    if Path(name).is_file():
+    if is_file(name):
         _tell_what_is_taken(name)
         return Path(name)
     if name in shipped:
@@ -268,10 +267,10 @@ def find_scenarios(names: Sequence[str]) -> list[Path]:
 
     files: list[Path] = []
     for name in names:
-        if Path(name).is_dir():
+        if is_folder(name):
             _tell_what_is_taken(name)
             files += _files_in(Path(name))
-        elif name in SETS and not Path(name).exists():
+        elif name in SETS and not is_file(name):
             files += files_of(set_scenes(SETS[name]))
         else:
             files.append(find_scenario(name))
@@ -285,7 +284,7 @@ def _tell_what_is_taken(name: str) -> None:
     from mechsearch_jax.envs.scene_sets import SETS, find_scene
 
     if name in SETS or find_scene(name):
-        what = "folder" if Path(name).is_dir() else "file"
+        what = "folder" if is_folder(name) else "file"
         print(f"{name}: the {what} of this name is taken, not the scene set's", file=sys.stderr)
 
 

@@ -21,8 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from mechsearch_jax.arrays import ARRAYS_LIMIT, read_arrays
 from mechsearch_jax.errors import InputError, shown
-from mechsearch_jax.files import ARRAYS_LIMIT, PathLike, read_arrays, read_bytes, read_json, replacing
+from mechsearch_jax.files import PathLike, read_bytes, read_json, replacing
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.networks.push import PushConfig, PushNetwork
 from mechsearch_jax.networks.push_geometry import push_start
@@ -146,7 +147,7 @@ def read_card(archive: PathLike, name: str) -> dict[str, Any]:
 
 
 @functools.cache
-def _shapes(name: str, config: Any) -> dict[str, tuple[int, ...]]:
+def weight_shapes(name: str, config: Any) -> dict[str, tuple[int, ...]]:
     """The shapes of a network's parameters, by their paths."""
     shapes: dict[str, Any] = flatten_dict(ARCHITECTURES[name].shapes(config), sep="/")
     return {key: value.shape for key, value in shapes.items()}
@@ -194,7 +195,7 @@ def load_weights(path: PathLike, name: str) -> Weights:
     arrays = read_arrays(data, path)
     config = _config(name, card.get("config"), arrays, path.with_suffix(".json"))
     try:
-        shapes = _shapes(name, config)
+        shapes = weight_shapes(name, config)
     except (TypeError, ValueError):
         raise InputError(
             f"{path.with_suffix('.json')}: config makes no {name} network; train or install anew"

@@ -6,17 +6,25 @@ import dataclasses
 import importlib.resources
 import io
 import json
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.arrays import ARRAYS_LIMIT, read_arrays
+from mechsearch_jax.errors import InputError, shown
+from mechsearch_jax.files import PathLike, read_bytes, replacing
+from mechsearch_jax.perception.labels import INSTANCES
+from mechsearch_jax.tables import Document, with_table
 from mechsearch_jax.workspace.camera import Camera
 
 # The shipped file, in the folder `data` of the package.
 FILE = "example-images.npz"
 # Depths are kept as whole multiples of this [m], as depth cameras deliver them.
 STEP = 0.001
+# The images in a file: their types, and the channels of a pixel.
+IMAGES = {"depth": (np.uint16, ()), "colour": (np.uint8, (3,)), "mask": (np.int8, ())}
+REST = "rest"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,11 +52,46 @@ def example_images() -> Images:
     1280 x 720 pixels; depths in whole millimetres with Gaussian noise of 1 mm, one in two hundred missing. They are
     made by `python -m mechsearch_jax.envs.example_images`.
     """
-    file = importlib.resources.files("mechsearch_jax") / "data" / FILE
-    with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as kept:
-        rest = json.loads(str(kept["rest"]))
-        depth = kept["depth"].astype(np.float32) * np.float32(STEP)
-        return Images(depth, kept["colour"], kept["mask"], rest["target_id"], _camera(rest["camera"]))
+    return load_images(Path(str(importlib.resources.files("mechsearch_jax") / "data" / FILE)))
+
+
+def load_images(path: PathLike) -> Images:
+    """Read what `save_images` wrote.
+
+    Raises:
+      InputError: the file cannot be read or is damaged, an image has another size than the camera's or another type,
+        or the camera is impossible.
+    """
+    arrays = read_arrays(read_bytes(path, ARRAYS_LIMIT), path)
+    missing = {*IMAGES, REST} - arrays.keys()
+    if missing:
+        raise InputError(f"{path}: {sorted(missing)[0]} is missing; it must hold {', '.join((*IMAGES, REST))}")
+    target_id, camera = _rest(arrays[REST], path)
+    size = (camera.height, camera.width)
+    for name, (kind, channels) in IMAGES.items():
+        image = arrays[name]
+        if image.shape != (*size, *channels) or image.dtype != kind:
+            raise InputError(
+                f"{path}: {name} is {image.dtype} of shape {image.shape}; it must be {np.dtype(kind)} of shape"
+                f" {(*size, *channels)}, as the camera's images are"
+            )
+    depth = arrays["depth"].astype(np.float32) * np.float32(STEP)
+    return Images(depth, arrays["colour"], arrays["mask"], target_id, camera)
+
+
+def _rest(array: np.ndarray, path: PathLike) -> tuple[int | None, Camera]:
+    """What an archive says of the target and the camera, which is text."""
+    try:
+        value = json.loads(str(array)) if array.dtype.kind == "U" and array.ndim == 0 else None
+    except (ValueError, RecursionError):
+        value = None
+    if not isinstance(value, dict) or set(value) != {"target_id", "camera"} or not isinstance(value["camera"], dict):
+        raise InputError(f"{path}: {REST} must be JSON with the keys target_id and camera")
+    target_id = value["target_id"]
+    if target_id is not None and (type(target_id) is not int or not 0 <= target_id < INSTANCES):
+        raise InputError(f"{path}: target_id {shown(target_id)} must be null or from 0 to {INSTANCES - 1}")
+    document = Document(str(path), {"camera": value["camera"]}, {})
+    return target_id, with_table(document, "camera", Camera())
 
 
 def save_images(images: Images, path: PathLike) -> None:
@@ -68,8 +111,3 @@ def save_images(images: Images, path: PathLike) -> None:
     )
     with replacing(path) as file:
         file.write(buffer.getvalue())
-
-
-def _camera(value: dict) -> Camera:
-    rotation = tuple(tuple(row) for row in value["rotation"])
-    return Camera(**{**value, "rotation": rotation, "position": tuple(value["position"])})

@@ -1,0 +1,188 @@
+"""Files that a user gives and that are not what they should be: taken, or refused in one line; nothing else happens."""
+
+import contextlib
+import hashlib
+import io
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flax.traverse_util import unflatten_dict
+from mutations import bomb, damaged, mutated_archive, mutated_json, mutated_toml, seeded
+
+from mechsearch_jax.arrays import read_arrays
+from mechsearch_jax.commands import main as cli
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.networks.push import PushConfig
+from mechsearch_jax.networks.weights import load_weights, save_weights, weight_shapes
+from mechsearch_jax.perception.examples import Images, load_images, save_images
+from mechsearch_jax.planner.settings import example_config, load_settings
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import check_name, example_scenarios, load_scenario
+
+FEW, MANY = 25, 1000
+SMALL = Camera(width=16, height=9, fx=7.6, fy=7.6, cx=8.0, cy=4.5)
+
+
+def either(rng, data, change):
+    return change(rng, data) if rng.random() < 0.7 else damaged(rng, data)
+
+
+def scenario(rng, folder):
+    good = example_scenarios()["first-light"].read_bytes()
+    (folder / "file.json").write_bytes(either(rng, good, mutated_json))
+    return lambda: load_scenario(folder / "file.json")
+
+
+def config(rng, folder):
+    lines = [line.lstrip("#") for line in example_config().splitlines() if not line.startswith("# ")]
+    text = "\n".join(lines)
+    (folder / "file.toml").write_bytes(either(rng, text.encode(), mutated_toml))
+    return lambda: load_settings(folder / "file.toml")
+
+
+def camera(rng, folder):
+    """The camera's part of a configuration file."""
+    text = "[camera]\n" + "\n".join(
+        f"{key} = {json.dumps(value)}" for key, value in json.loads(json.dumps(vars(SMALL))).items()
+    )
+    (folder / "file.toml").write_bytes(either(rng, text.encode(), mutated_toml))
+    return lambda: load_settings(folder / "file.toml")
+
+
+def images(rng, folder):
+    """Depth, colour, mask and camera in one archive."""
+    depth = np.full((9, 16), 0.7, np.float32)
+    told = Images(depth, np.zeros((9, 16, 3), np.uint8), np.zeros((9, 16), np.int8), 3, SMALL)
+    save_images(told, folder / "file.npz")
+    good = (folder / "file.npz").read_bytes()
+    (folder / "file.npz").write_bytes(either(rng, good, lambda rng, data: mutated_archive(rng, data, mutated_json)))
+    return lambda: load_images(folder / "file.npz")
+
+
+def weights(rng, folder):
+    """An archive and its card, which may know of the damage."""
+    small = PushConfig(width=4, layers=1)
+    zeros = {key: np.zeros(shape, np.float32) for key, shape in weight_shapes("push", small).items()}
+    save_weights(folder / "file.npz", "push", small, unflatten_dict(zeros, sep="/"), {})
+    archive, card = folder / "file.npz", folder / "file.json"
+    if rng.random() < 0.4:
+        card.write_bytes(either(rng, card.read_bytes(), mutated_json))
+    else:
+        archive.write_bytes(either(rng, archive.read_bytes(), mutated_archive))
+        told = json.loads(card.read_text()) | {"sha256": hashlib.sha256(archive.read_bytes()).hexdigest()}
+        card.write_text(json.dumps(told))
+    return lambda: load_weights(archive, "push")
+
+
+KINDS = {kind.__name__: kind for kind in (scenario, config, camera, images, weights)}
+
+
+def check(kind, number, folder):
+    """Try one mutation; whether it was taken."""
+    inside = folder / str(number)
+    inside.mkdir()
+    load = KINDS[kind](seeded(kind, number), inside)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            load()
+        except InputError as error:
+            said = str(error)
+            assert said.startswith(str(inside)), said
+            assert len(said.splitlines()) == 1, said
+            assert len(said) < 600, said
+            taken = False
+        else:
+            taken = True
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    for path in inside.iterdir():
+        path.unlink()
+    return taken
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_mutated_files_are_taken_or_refused_in_one_line(kind, tmp_path):
+    taken = sum(check(kind, number, tmp_path) for number in range(FEW))
+    assert taken < FEW
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_thousand_mutated_files_are_taken_or_refused_in_one_line(kind, tmp_path):
+    taken = sum(check(kind, number, tmp_path) for number in range(FEW, FEW + MANY))
+    assert 0 < taken < MANY
+
+
+def program(monkeypatch, *arguments):
+    """Run the command line in this process; its status and what it wrote to standard error."""
+    monkeypatch.setattr("sys.argv", ["mechsearch", *arguments])
+    told = io.StringIO()
+    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            cli.main()
+        except SystemExit as end:
+            return end.code, told.getvalue()
+    return 0, told.getvalue()
+
+
+def check_command(number, folder, monkeypatch):
+    inside = folder / str(number)
+    inside.mkdir()
+    rng = seeded("command", number)
+    scenario(rng, inside)
+    settings = ("--config", str(inside / "file.toml")) if config(rng, inside) and rng.random() < 0.5 else ()
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    status, said = program(monkeypatch, "scenarios", "check", str(inside / "file.json"), *settings)
+    assert status in (0, 2)
+    assert len(said.splitlines()) == (1 if status else 0), said
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    for path in inside.iterdir():
+        path.unlink()
+
+
+def test_the_command_line_ends_with_one_line(tmp_path, monkeypatch):
+    for number in range(FEW):
+        check_command(number, tmp_path, monkeypatch)
+
+
+@pytest.mark.slow
+def test_the_command_line_ends_with_one_line_a_thousand_times(tmp_path, monkeypatch):
+    for number in range(FEW, FEW + MANY):
+        check_command(number, tmp_path, monkeypatch)
+
+
+def test_a_name_is_no_path(tmp_path, monkeypatch):
+    for name in ("..", ".", "/tmp/x", "a/b", "", "x" * 200, "a\nb", "a\0", "\ud800", 3, None):
+        with pytest.raises(InputError, match="name: must be a text"):
+            check_name(name, "file: name")
+    value = json.loads(example_scenarios()["first-light"].read_text())
+    (tmp_path / "bad.json").write_text(json.dumps(value | {"name": "../../x"}))
+    status, said = program(monkeypatch, "scenarios", "check", str(tmp_path / "bad.json"))
+    assert (status, len(said.splitlines())) == (2, 1), said
+    assert "name: must be a text" in said
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.json"]
+
+
+def test_two_scenarios_of_one_name_do_not_overwrite_each_others_maps(tmp_path, monkeypatch):
+    text = example_scenarios()["first-light"].read_text()
+    for name in ("a.json", "b.json"):
+        (tmp_path / name).write_text(text)
+    status, said = program(monkeypatch, "inspect", str(tmp_path), "--out", str(tmp_path / "out"))
+    assert status == 2
+    assert "b.json: another scenario is called first-light" in said
+
+
+def test_an_archive_that_unpacks_to_too_much_is_refused():
+    assert len(bomb()) < 2**15
+    with pytest.raises(InputError, match=r"bomb\.npz: unpacks to 16777216 bytes; at most 1048576"):
+        read_arrays(bomb(), "bomb.npz", 2**20)
+
+
+def test_a_path_that_is_none_is_one_line(tmp_path, monkeypatch):
+    for name in ("x" * 5000, "a" * 300 + ".json", "/dev/null/x", str(Path(tmp_path) / ("y" * 256))):
+        status, said = program(monkeypatch, "inspect", name, "--out", str(tmp_path / "out"))
+        assert (status, len(said.splitlines())) == (2, 1), said
