@@ -1,7 +1,8 @@
 """Episodes one after the other in several worker processes.
 
-Workers are separate programs with one thread each: on a machine with few cores and no GPU this is faster than sharing
-all threads, and a worker that dies takes one episode with it, not the run.
+Workers are separate programs with one thread each, and their share of the cores for pushes that they simulate: on a
+machine with few cores and no GPU this is faster than sharing all threads, and a worker that dies takes one episode with
+it, not the run.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from mechsearch_jax.benchmarks.evaluate import Job
 from mechsearch_jax.benchmarks.rows import Row, identity
+from mechsearch_jax.cores import share_of_cores
 
 WORKER = (sys.executable, "-m", "mechsearch_jax.benchmarks.worker")
 # Several processes cannot share a GPU's memory, of which the first takes most.
@@ -47,7 +49,8 @@ class Processes:
         for job in jobs:
             todo.put(job)
         results: queue.SimpleQueue[Row] = queue.SimpleQueue()
-        feeders = [_Feeder(todo, results, self.command) for _ in range(min(self.workers, len(jobs)))]
+        count = min(self.workers, len(jobs))
+        feeders = [_Feeder(todo, results, self.command, share_of_cores(count)) for _ in range(count)]
         try:
             for feeder in feeders:
                 feeder.start()
@@ -61,11 +64,20 @@ class Processes:
 class _Feeder(threading.Thread):
     """Feeds one worker process with jobs, and starts another one if it dies."""
 
-    def __init__(self, todo: queue.SimpleQueue[Job], results: queue.SimpleQueue[Row], command: Sequence[str]):
+    def __init__(
+        self,
+        todo: queue.SimpleQueue[Job],
+        results: queue.SimpleQueue[Row],
+        command: Sequence[str],
+        environment: Mapping[str, str],
+    ):
         super().__init__(daemon=True)
         self._todo = todo
         self._results = results
         self._command = command
+        # What this process can import, a user's policy among it, its workers can.
+        importable = os.pathsep.join(folder for folder in sys.path if folder)
+        self._environment = {**ENVIRONMENT, **environment, "PYTHONPATH": importable}
         self._process: subprocess.Popen[str] | None = None
         self._complaints = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the workers)
         self._stopped = False
@@ -123,7 +135,11 @@ class _Feeder(threading.Thread):
             stderr=self._complaints,
             text=True,
             # What this process can import, a user's policy among it, its workers can.
-            env={**os.environ, **ENVIRONMENT, "PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)},
+            env={
+                **os.environ,
+                **self._environment,
+                "PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder),
+            },
             start_new_session=True,
         )
 

@@ -282,7 +282,14 @@ def panda_shelf_mjcf(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> s
 
 
 def compile_model(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> mujoco.MjModel:
-    """The compiled `panda_shelf_mjcf`."""
+    """The compiled `panda_shelf_mjcf`.
+
+    From then on MuJoCo, in this process, writes no MUJOCO_LOG.TXT into the folder that it was started in: what goes
+    wrong in a simulation, its outcome tells.
+    """
+    log = mujoco.MjLogConfig.get()
+    log.logto_file = False
+    mujoco.MjLogConfig.set(log)
     return mujoco.MjModel.from_xml_string(panda_shelf_mjcf(shelf, camera, timestep))
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -28,6 +27,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
+from mechsearch_jax.cores import cores
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.outcome import Failure, Outcome
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, check_actions, controls
@@ -327,7 +327,7 @@ class NativeSimulator:
         """
         self.world: World | None = None
         self._config, self._shelf, self._camera = config, shelf, camera
-        self._threads = threads or os.cpu_count() or 1
+        self._threads = threads or cores()
         self._worlds: list[NativeWorld] = []
 
     @property

@@ -18,7 +18,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -32,6 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
+from mechsearch_jax.cores import cores
 from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
@@ -159,7 +159,7 @@ class NativePhysics:
 
     Attributes:
       simulation: how it is simulated.
-      threads: how many; one for each core if left out.
+      threads: how many; one for each of `cores.cores` if left out.
     """
 
     simulation: SimulatorConfig = dataclasses.field(default_factory=push_simulation)
@@ -174,7 +174,7 @@ class NativePhysics:
         pushes = jnp.any(displacement != 0.0)
         poses = Poses(jax.ShapeDtypeStruct((BODIES, 3), jnp.float32), jax.ShapeDtypeStruct((BODIES, 3, 3), jnp.float32))
         told = jax.pure_callback(
-            functools.partial(_simulate, shelf, self.simulation, self.threads or _cores()),
+            functools.partial(_simulate, shelf, self.simulation, self.threads or cores()),
             Simulated(poses, poses, jax.ShapeDtypeStruct((), jnp.bool_)),
             world,
             reference,
@@ -251,10 +251,6 @@ def _batched(shelf: Shelf, config: MjxConfig) -> Callable[[World, Action], Simul
         return told, jax.tree.map(lambda _: True, told)
 
     return simulate
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @functools.cache

@@ -1,7 +1,9 @@
 """The command line, mostly from outside the checkout: what it does, and how it refuses what is wrong."""
 
+import importlib.metadata
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -15,6 +17,7 @@ from mechsearch_jax.commands import options
 from mechsearch_jax.envs.records import Episode, save_episode
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.planner.settings import Settings, load_settings
 from mechsearch_jax.viz.maps import load_maps
 from mechsearch_jax.workspace.scenario import (
     Body,
@@ -69,7 +72,19 @@ def folder(tmp_path):
 
 WRONG = {
     "no command": ([], "Expected one of"),
-    "unknown command": (["sweep"], "sweep"),
+    "unknown command": (["sweep"], 'there is no command "mechsearch sweep"; known are search, inspect'),
+    "mistyped command": (["serch"], "did you mean search? (mechsearch --help tells more)"),
+    "mistyped command of a group": (["bench", "plam"], "did you mean plan? (mechsearch bench --help tells more)"),
+    "mistyped option": (
+        ["search", "good.json", "--out", "out", "--gama", "1"],
+        "--gama, 1; did you mean --gamma? (mechsearch search --help tells more)",
+    ),
+    "help of the subcommand": (["bench", "plan", "--batch", "x"], "(mechsearch bench plan --help tells more)"),
+    "no configuration file": (["search", "good.json", "--out", "out", "--config", "none.toml"], "none.toml: cannot be"),
+    "configuration of a set": (
+        ["scenarios", "generate", "--set", "d1", "--config", "good.toml", "--out", "new"],
+        "nor is --config",
+    ),
     "unknown option": (["search", "good.json", "--out", "out", "--speed", "3"], "--speed"),
     "unknown choice": (["search", "good.json", "--out", "out", "--actions", "fly"], '"fly" is unknown'),
     "no number": (["search", "good.json", "--out", "out", "--gamma", "high"], "--gamma"),
@@ -268,9 +283,9 @@ def options_of(*arguments):
 
 @pytest.mark.parametrize("preset", list(PRESETS))
 def test_what_is_given_goes_before_the_preset(preset):
-    assert options_of("--preset", preset).config() == PRESETS[preset]()
+    assert options_of("--preset", preset).settings().config == PRESETS[preset]()
     given = options_of("--preset", preset, "--gamma", "0.5", "--actions", "push", "--push-distances", "0.1", "0.2")
-    assert given.config() == PRESETS[preset](gamma=0.5, actions=("push",), push_distances=(0.1, 0.2))
+    assert given.settings().config == PRESETS[preset](gamma=0.5, actions=("push",), push_distances=(0.1, 0.2))
 
 
 def test_actions_go_by_the_name_of_a_set():
@@ -278,17 +293,17 @@ def test_actions_go_by_the_name_of_a_set():
     names = ("actions", "push_directions", "push_distances", "object_grasp_tilts")
     of_paper = {name: paper[name] for name in names}
     assert of_paper != {name: standard[name] for name in names}
-    assert options_of("--actions", "paper").config() == PRESETS["standard"](**of_paper)
-    assert options_of("--preset", "paper", "--actions", "paper").config() == PRESETS["paper"]()
+    assert options_of("--actions", "paper").settings().config == PRESETS["standard"](**of_paper)
+    assert options_of("--preset", "paper", "--actions", "paper").settings().config == PRESETS["paper"]()
     given = options_of("--actions", "paper", "--push-distances", "0.2", "--draws", "3")
-    assert given.config() == PRESETS["standard"](**{**of_paper, "push_distances": (0.2,), "draws": 3})
-    with pytest.raises(InputError, match="--actions: paper is a whole set of actions; give it alone"):
-        options_of("--actions", "push", "paper").config()
+    assert given.settings().config == PRESETS["standard"](**{**of_paper, "push_distances": (0.2,), "draws": 3})
+    with pytest.raises(InputError, match="actions: paper is a whole set of actions; give it alone"):
+        options_of("--actions", "push", "paper").settings().config
 
 
 def test_the_default_preset_is_the_standard():
-    assert options_of().config() == PRESETS["standard"]()
-    assert options.DEFAULTS.config() == PRESETS["standard"]()
+    assert options_of().settings().config == PRESETS["standard"]()
+    assert options.DEFAULTS.settings().config == PRESETS["standard"]()
 
 
 @pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
@@ -297,7 +312,7 @@ def test_every_option_of_the_configuration_is_one_of_the_command_line(option):
     given = [str(value) for value in (usual if isinstance(usual, list) else [usual])]
     parsed = options_of(f"--{option.name.replace('_', '-')}", *given)
     assert getattr(parsed, option.name) == (tuple(usual) if isinstance(usual, list) else usual)
-    assert parsed.config() == PRESETS["standard"]()
+    assert parsed.settings().config == PRESETS["standard"]()
 
 
 def test_a_policy_goes_by_a_methods_name_or_its_own():
@@ -319,7 +334,32 @@ def test_help_names_options_with_their_defaults(capsys):
     assert "(default: 0.7, in preset paper 0.0)" in shown
     assert "(default: 1, in preset paper 8, in preset best 4)" in shown
     assert "(default: 30)" in shown
+    assert "the paper's is 0" not in shown
     assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)
+
+
+@pytest.mark.parametrize("command", ["search", "evaluate", "scenarios generate", "train push", "bench ceiling"])
+def test_help_tells_a_default_once(command, capsys):
+    with pytest.raises(SystemExit):
+        cli.parse([*command.split(), "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "(default: None)" not in shown
+    assert "(default: )" not in shown
+    for option in re.split(r" (?=--[a-z])", shown):
+        assert not ("(default:" in option and re.search(r"by default|if not given|if left out", option)), option
+
+
+def test_the_version_is_told(capsys):
+    with pytest.raises(SystemExit) as end:
+        cli.parse(["--version"])
+    assert not end.value.code
+    assert capsys.readouterr().out == f"mechsearch {importlib.metadata.version('mechsearch-jax')}\n"
+
+
+def test_an_example_configuration_is_printed(tmp_path, capsys):
+    cli.parse(["config"])()
+    (tmp_path / "mine.toml").write_text(capsys.readouterr().out)
+    assert load_settings(tmp_path / "mine.toml") == Settings()
 
 
 def test_help_on_what_has_no_such_options_does_without_the_planner():
@@ -367,3 +407,23 @@ def test_generated_scenarios_are_good_and_reproducible(folder):
     for name in names:
         assert len(load_scenario(folder / "a" / name).objects) == 3
         assert (folder / "a" / name).read_bytes() == (folder / "b" / name).read_bytes()
+
+
+def test_a_complaint_is_one_line_on_a_terminal_that_knows_ascii_alone(folder):
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    program = (
+        sys.executable,
+        "-m",
+        "mechsearch_jax.commands.main",
+        "scenarios",
+        "generate",
+        "--out",
+        "o",
+        "--ojects",
+        "3",
+    )
+    answer = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True)
+    assert answer.stderr == (
+        "mechsearch: Unrecognized options: --ojects, 3; did you mean --objects? "
+        "(mechsearch scenarios generate --help tells more)\n"
+    )

@@ -63,7 +63,7 @@ class ActionConfig:
     """
 
     actions: tuple[str, ...] = option(
-        ("push", "pick-and-place"), "kinds of action that are sampled; or, on the command line, those of a preset"
+        ("push", "pick-and-place"), "kinds of action that are sampled, or the name of a preset for its actions"
     )
     push_directions: tuple[float, ...] = option(
         tuple(math.radians(angle) for angle in (90, -90, 0, 35, -35, 65, -65)),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from mechsearch_jax.commands.options import JsonFile, SomeScenarios, at_least_one, check_files, files_of, find_scenarios
+from mechsearch_jax.cores import cores
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -145,8 +145,7 @@ def bench_guard(
     jobs = make_jobs(files_of(guard.suite(scenes)), [Method()], (guard.SEED,))
     console = Console(highlight=False)
     with EpisodeProgress(console, len(jobs)) as progress:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        rows = evaluate(jobs, out, Processes(workers or cores), progress.ended)
+        rows = evaluate(jobs, out, Processes(workers or cores()), progress.ended)
     if before is None:
         guard.save_reference(rows, _command(), stored)
         console.print(str(stored), soft_wrap=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -18,6 +17,7 @@ from mechsearch_jax.commands.options import (
     find_scenarios,
     has_gpu,
 )
+from mechsearch_jax.cores import cores
 from mechsearch_jax.errors import InputError
 
 
@@ -67,8 +67,7 @@ def evaluate(
     console = Console(highlight=False)
     with EpisodeProgress(console, len(jobs)) as progress:
         if in_processes:
-            cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-            runner = Processes(workers or cores)
+            runner = Processes(workers or cores())
         else:
             keep_compilations()
             runner = Batches(batch, progress.busy)

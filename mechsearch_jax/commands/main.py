@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
+import importlib.metadata
 import inspect
 import io
 import re
@@ -19,12 +20,13 @@ from typing import Annotated, Any, get_type_hints
 import tyro
 
 from mechsearch_jax.commands import bench, bench_episodes, bench_quality, scenarios, train
+from mechsearch_jax.commands.doctor import doctor, print_config
 from mechsearch_jax.commands.evaluate import evaluate
 from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
 from mechsearch_jax.commands.options import with_planner_options
 from mechsearch_jax.commands.report import report
 from mechsearch_jax.commands.search import search
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.errors import InputError, nearest
 
 Commands = Mapping[str, Callable[..., None]]
 
@@ -43,6 +45,8 @@ COMMANDS: Commands = {
     "inspect": inspect_scenarios,
     "evaluate": evaluate,
     "report": report,
+    "config": print_config,
+    "doctor": doctor,
     "scenarios": _only_described(
         "List scene sets, generate and check scenarios: mechsearch scenarios list|generate|check."
     ),
@@ -69,23 +73,32 @@ def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]
         options = with_planner_options()
         hints["options"] = Annotated[options, tyro.conf.arg(name="")]
         parameters["options"] = parameters["options"].replace(default=options())
+    for name, parameter in parameters.items():
+        # What happens without such an option its help says.
+        given_by_place = parameter.kind is inspect.Parameter.POSITIONAL_ONLY
+        if parameter.default is None or parameter.default == () or given_by_place:
+            hints[name] = Annotated[hints[name], tyro.conf.arg(help_behavior_hint="")]
     parsed.__name__, parsed.__doc__, parsed.__annotations__ = command.__name__, command.__doc__, hints
     parsed.__signature__ = signature.replace(parameters=list(parameters.values()))
     return parsed
 
 
 def one_line(complaint: str) -> str:
-    """The message in the box that the parser draws around it, on one line."""
+    """The message in the box that the parser draws around it, on one line, with the option that it takes for meant."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", complaint)
     rows = [row.strip("│╭╰╮╯ \t") for row in plain.splitlines()]
     title, *rows = [row for row in rows if row] or ["the arguments are wrong"]
+    # Where the terminal knows no box, the title has a line beneath it.
+    while rows and not rows[0].strip("─-"):
+        del rows[0]
     body: list[str] = []
     for row in rows:
-        if not row.strip("─"):
+        if not row.strip("─-"):
             break
         body.append(row)
     text = " ".join(body) if body else title.strip("─ ")
-    return re.sub(r"\s+", " ", text)
+    meant = re.search(r"Perhaps you meant:\s+(--[\w-]+)", " ".join(rows))
+    return re.sub(r"\s+", " ", f"{text}; did you mean {meant[1]}?" if meant else text)
 
 
 def parse(arguments: Sequence[str]) -> Callable[[], None]:
@@ -93,14 +106,21 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
 
     Raises:
       InputError: the arguments are wrong.
-      SystemExit: after help was printed.
+      SystemExit: after help or the version was printed.
     """
+    if list(arguments) == ["--version"]:
+        print(f"mechsearch {importlib.metadata.version('mechsearch-jax')}")
+        raise SystemExit
     group = arguments[0] if arguments and arguments[0] in GROUPS else None
     program = f"mechsearch {group}" if group else "mechsearch"
     commands = GROUPS[group] if group else COMMANDS
     description = COMMANDS[group].__doc__ if group else "Find a hidden object on a cluttered shelf and take it out."
     rest = list(arguments[1:] if group else arguments)
     asked = rest[0] if rest else None
+    if asked is not None and asked not in commands and not asked.startswith("-"):
+        raise InputError(
+            f'there is no command "{program} {asked}"; {nearest(asked, commands)} ({program} --help tells more)'
+        )
     # What options there are takes long to find out, and is of no use to other commands.
     known = {n: _deferred(c) if n == asked else _only_described(c.__doc__) for n, c in commands.items()}
     complaint = io.StringIO()
@@ -110,7 +130,8 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     except SystemExit as end:
         if not end.code:
             raise
-        raise InputError(f"{one_line(complaint.getvalue())} ({program} --help tells more)") from None
+        helpful = f"{program} {asked}" if asked in commands else program
+        raise InputError(f"{one_line(complaint.getvalue())} ({helpful} --help tells more)") from None
     return command
 
 

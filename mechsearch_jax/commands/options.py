@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -42,7 +43,7 @@ class EpisodeOptions:
         batches where there is a GPU.
     """
 
-    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml")] = None
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
     recognition: Literal["oracle", "masks", "full"] = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
 
@@ -134,7 +135,9 @@ def _annotation(option: Option) -> Any:
     """The type of a command line's option that may be left out."""
     kind = Literal[option.choices] if option.choices else option.type
     shown = "{" + ",".join(option.choices) + "}" if option.choices else _METAVARS.get(option.type)
-    about = tyro.conf.arg(metavar=shown, help=f"{option.help}.", help_behavior_hint=_usual(option))
+    # What the paper's is, the presets say.
+    said = re.sub(r"; (the paper's .*|not in the paper)$", "", option.help)
+    about = tyro.conf.arg(metavar=shown, help=f"{said}.", help_behavior_hint=_usual(option))
     return Annotated[kind | None, about]
 
 
@@ -143,10 +146,14 @@ def _usual(option: Option) -> str:
     from mechsearch_jax.planner import DEFAULT_PRESET, PRESETS
 
     values = {name: preset().options()[option.name] for name, preset in PRESETS.items()}
-    said = {name: " ".join(map(str, value)) if isinstance(value, list) else value for name, value in values.items()}
+    said = {name: " ".join(map(_short, value)) if isinstance(value, list) else value for name, value in values.items()}
     usual = said.pop(DEFAULT_PRESET)
     others = [f", in preset {name} {value}" for name, value in said.items() if value != usual]
     return f"(default: {usual}{''.join(others)})"
+
+
+def _short(value: Any) -> str:
+    return str(round(value, 4) if isinstance(value, float) else value)
 
 
 _METAVARS: dict[Any, str] = {

@@ -75,18 +75,12 @@ def cached_problem(
     Raises:
       InputError: the target cannot be grasped by the gripper.
     """
-    parts: dict[str, Any] = {
-        "camera": camera or Camera(),
-        "shelf": shelf or Shelf(),
-        "gripper": gripper or Gripper(),
-        "target": target or Target(),
-        "config": config or ProblemConfig(),
-    }
+    parts = _parts(target, config, camera, shelf, gripper)
     folder = cache_folder()
     if folder is None:
         return problems.build_problem(**parts)
     key = _key(parts)
-    file = folder / f"problem-{key[:32]}.npz"
+    file = _file(folder, key)
     problem = _load(file, key, parts)
     if problem is None:
         problem = problems.build_problem(**parts)
@@ -94,6 +88,40 @@ def cached_problem(
             _save(problem, file, key)
             _forget_old(folder)
     return problem
+
+
+def is_cached(
+    target: Target | None = None,
+    config: ProblemConfig | None = None,
+    *,
+    camera: Camera | None = None,
+    shelf: Shelf | None = None,
+    gripper: Gripper | None = None,
+) -> bool:
+    """Whether `cached_problem` would find a file."""
+    folder = cache_folder()
+    return folder is not None and _file(folder, _key(_parts(target, config, camera, shelf, gripper))).is_file()
+
+
+def _parts(
+    target: Target | None,
+    config: ProblemConfig | None,
+    camera: Camera | None,
+    shelf: Shelf | None,
+    gripper: Gripper | None,
+) -> dict[str, Any]:
+    """The arguments of `build_problem`."""
+    return {
+        "camera": camera or Camera(),
+        "shelf": shelf or Shelf(),
+        "gripper": gripper or Gripper(),
+        "target": target or Target(),
+        "config": config or ProblemConfig(),
+    }
+
+
+def _file(folder: Path, key: str) -> Path:
+    return folder / f"problem-{key[:32]}.npz"
 
 
 @functools.cache

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner.cache import cached_problem
+from mechsearch_jax.planner.cache import cached_problem, is_cached
 from mechsearch_jax.planner.config import ProblemConfig
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.robot.gripper import Gripper
@@ -43,4 +44,12 @@ class Workcell:
         Raises:
           InputError: the target cannot be grasped by the gripper.
         """
-        return cached_problem(target or self.target, config, camera=self.camera, shelf=self.shelf, gripper=self.gripper)
+        return cached_problem(target or self.target, config, **self._around)
+
+    def is_cached(self, target: Target, config: ProblemConfig) -> bool:
+        """Whether the problem of a target was built before, and need only be read."""
+        return is_cached(target, config, **self._around)
+
+    @property
+    def _around(self) -> dict[str, Any]:
+        return {"camera": self.camera, "shelf": self.shelf, "gripper": self.gripper}

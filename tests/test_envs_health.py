@@ -1,0 +1,116 @@
+"""`mechsearch doctor`: what it finds, what it advises, and when it says that nothing works."""
+
+import importlib.metadata
+import subprocess
+
+import pytest
+
+from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs import health
+from mechsearch_jax.envs.episodes import target_of
+from mechsearch_jax.envs.health import State
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.networks import weights
+from mechsearch_jax.planner import cache
+from mechsearch_jax.planner.settings import Settings
+from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+from mechsearch_jax.workspace.shelf import Shelf
+
+SCENE = load_scenario(example_scenarios()["first-light"])
+
+
+def found(subject, settings=None):
+    return list(health.examine(subject, health.checks(SCENE, settings or Settings())[subject]))
+
+
+def test_versions_devices_and_simulator_are_named():
+    (versions,) = found("versions")
+    assert versions.state is State.FINE
+    assert f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')}" in versions.says
+    assert "JAX computes on cpu" in found("devices")[0].says
+    assert found("simulator")[0].state is State.FINE
+
+
+def test_a_package_that_is_missing_breaks_the_main_job(monkeypatch):
+    monkeypatch.setattr(health, "PACKAGES", ("jax", "no-such-package"))
+    broken = found("versions")[-1]
+    assert (broken.state, broken.remedy) == (State.BROKEN, "pip install no-such-package")
+
+
+def test_a_gpu_that_jax_does_not_see_is_told(monkeypatch):
+    monkeypatch.setattr(health.shutil, "which", lambda name: f"/usr/bin/{name}")
+    assert "mechsearch-jax[gpu]" in found("devices")[-1].remedy
+
+
+def test_the_weights_are_told_with_their_digests(monkeypatch):
+    digests = [finding.says.split()[-1] for finding in found("weights")]
+    assert digests == [weights.shipped_weights(name).card["sha256"][:12] for name in weights.ARCHITECTURES]
+
+    def damaged(path, name):
+        raise InputError(f"{path}: is not the file that its card describes")
+
+    monkeypatch.setattr(weights, "load_weights", damaged)
+    assert {finding.state for finding in found("weights")} == {State.BROKEN}
+
+
+def test_the_caches_are_measured(tmp_path, monkeypatch):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    (tmp_path / "some").write_bytes(bytes(2_000_000))
+    (whole,) = found("cache")
+    assert whole.says.endswith(f"{tmp_path}, 1 files, 2 MB, writable")
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "some"))
+    (broken,) = found("cache")
+    assert (broken.state, cache.VARIABLE in broken.remedy) == (State.MISSING, True)
+    monkeypatch.setenv(cache.VARIABLE, "")
+    assert "every start takes minutes" in found("cache")[0].says
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    assert [finding.says.split(":")[0] for finding in found("cache")] == ["problems are not kept", "compilations"]
+
+
+def test_a_problem_is_looked_for_in_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
+    assert found("problem")[0].state is State.MISSING
+    built = []
+    monkeypatch.setattr(cache.problems, "build_problem", lambda **parts: built.append(parts))
+    monkeypatch.setattr(cache, "_save", lambda problem, file, key: file.touch())
+    cache.cached_problem(target_of(SCENE))
+    assert len(built) == 1
+    assert found("problem")[0].state is State.FINE
+    assert found("problem", Settings(Workcell(shelf=Shelf(back=0.8))))[0].state is State.MISSING
+
+
+def test_what_cannot_be_rendered_is_no_harm(monkeypatch):
+    monkeypatch.setattr(health.subprocess, "run", lambda *a, **k: subprocess.CompletedProcess((), 1))
+    assert found("rendering")[0].state is State.MISSING
+
+
+def test_a_check_that_fails_is_told():
+    def fails():
+        raise RuntimeError("two\nlines")
+        yield
+
+    (needed,) = health.examine("simulator", fails)
+    assert (needed.state, needed.says) == (State.BROKEN, "RuntimeError: two lines")
+    assert next(iter(health.examine("meshes", fails))).state is State.MISSING
+
+
+@pytest.mark.parametrize(("state", "status"), [(State.MISSING, None), (State.BROKEN, 1)])
+def test_the_status_says_whether_the_main_job_runs(monkeypatch, capsys, state, status):
+    def check():
+        yield health.Finding("weights", state, "gone", "install them")
+
+    monkeypatch.setattr(health, "CHECKS", {"weights": check})
+    monkeypatch.setattr(cache, "is_cached", lambda *args, **parts: True)
+    command = cli.parse(["doctor"])
+    if status:
+        with pytest.raises(SystemExit) as end:
+            command()
+        assert end.value.code == status
+    else:
+        command()
+    told = capsys.readouterr().out
+    assert "gone" in told
+    assert "-> install them" in told
+    assert told.splitlines()[-1] == ("nothing can be searched here" if status else "searching works here")
