@@ -18,6 +18,7 @@ from mechsearch_jax.files import PathLike, read_text
 LIMIT = 2**18
 T = TypeVar("T")
 
+_BARE = re.compile(r"[A-Za-z0-9_-]{1,60}")
 _HEADER = re.compile(r"\s*\[\s*([A-Za-z0-9_-]+)\s*\]\s*(?:#.*)?$")
 _KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")
 # What complaints of dataclasses begin with.
@@ -43,7 +44,11 @@ class Document:
         """How a complaint about a table, or a key in it, begins."""
         line = self.lines.get((table, key), self.lines.get((table, "")))
         place = f"{self.path}:{line}" if line else self.path
-        return f"{place}:{table and f' [{table}]'}{key and f' {key}'}"
+        return f"{place}:{table and f' [{_told(table)}]'}{key and f' {_told(key)}'}"
+
+
+def _told(name: str) -> str:
+    return name if _BARE.fullmatch(name) else shown(name)
 
 
 def read_document(path: PathLike) -> Document:
@@ -87,12 +92,7 @@ def check_names(document: Document, table: str, known: Mapping[str, Any]) -> Non
     """
     for key in document.tables.get(table, {}):
         if key not in known:
-            place = (
-                document.where(table, key)
-                if (table, key) in document.lines
-                else f"{document.where(table)} {shown(key)}"
-            )
-            raise InputError(f"{place} is unknown; {nearest(key, known)}")
+            raise InputError(f"{document.where(table, key)} is unknown; {nearest(key, known)}")
 
 
 def with_table(document: Document, table: str, usual: T) -> T:

@@ -298,7 +298,7 @@ def test_actions_go_by_the_name_of_a_set():
     given = options_of("--actions", "paper", "--push-distances", "0.2", "--draws", "3")
     assert given.settings().config == PRESETS["standard"](**{**of_paper, "push_distances": (0.2,), "draws": 3})
     with pytest.raises(InputError, match="actions: paper is a whole set of actions; give it alone"):
-        options_of("--actions", "push", "paper").settings().config
+        options_of("--actions", "push", "paper").settings()
 
 
 def test_the_default_preset_is_the_standard():

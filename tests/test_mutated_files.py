@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import io
 import json
+import re
 import warnings
 from pathlib import Path
 
@@ -37,8 +38,7 @@ def scenario(rng, folder):
 
 
 def config(rng, folder):
-    lines = [line.lstrip("#") for line in example_config().splitlines() if not line.startswith("# ")]
-    text = "\n".join(lines)
+    text = re.sub(r"(?m)^#(?=\w|\]|  )", "", example_config())
     (folder / "file.toml").write_bytes(either(rng, text.encode(), mutated_toml))
     return lambda: load_settings(folder / "file.toml")
 
