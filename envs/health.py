@@ -212,7 +212,7 @@ def _meshes() -> Iterator[Finding]:
     if importlib.util.find_spec("example_robot_data") is not None:
         yield Finding("meshes", State.FINE, "the robot's meshes are installed")
     else:
-        says = "the robot's meshes are not installed; pictures show its primitives"
+        says = "the robot's meshes are not installed; only the test of the collision primitives needs them"
         yield Finding("meshes", State.MISSING, says, "pip install 'mechsearch-jax[meshes]'")
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from pathlib import Path
 
 import pytest
 
@@ -33,6 +34,13 @@ def test_the_example_holds_every_key_with_its_default(tmp_path):
     found = load_settings(tmp_path / "all.toml")
     assert dataclasses.replace(found, given={}) == Settings()
     assert found.config == Settings().config == PRESETS["standard"]()
+
+
+def test_the_example_of_the_guide_is_read(tmp_path):
+    guide = (Path(__file__).parents[1] / "docs" / "commands.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```toml\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
+    assert load(tmp_path, block).config == PRESETS["best"](gamma=0.8)
+    assert all(f"| `[{name}]` |" in guide for name in settings.tables())
 
 
 def test_every_option_of_the_planner_is_a_key():

@@ -1,0 +1,53 @@
+"""Who shares a machine keeps its share of the cores busy, and leaves no files behind that nobody asked for."""
+
+import os
+import sys
+
+import mujoco
+import numpy as np
+import pytest
+
+from mechsearch_jax.benchmarks.evaluate import make_jobs
+from mechsearch_jax.benchmarks.processes import Processes
+from mechsearch_jax.cores import VARIABLE, cores, share_of_cores
+from mechsearch_jax.envs import model
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import example_scenarios
+from mechsearch_jax.workspace.shelf import Shelf
+
+
+def test_the_cores_are_those_given_or_all(monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    everything = cores()
+    assert 1 <= everything <= (os.cpu_count() or 1)
+    for wrong in ("", "0", "-1", "many"):
+        monkeypatch.setenv(VARIABLE, wrong)
+        assert cores() == everything
+    monkeypatch.setenv(VARIABLE, "6")
+    assert cores() == 6
+
+
+@pytest.mark.parametrize(("processes", "each"), [(1, "6"), (2, "3"), (4, "1"), (7, "1")])
+def test_processes_share_them(monkeypatch, processes, each):
+    monkeypatch.setenv(VARIABLE, "6")
+    assert share_of_cores(processes) == {VARIABLE: each}
+
+
+def test_workers_are_told_their_share(monkeypatch):
+    monkeypatch.setenv(VARIABLE, "6")
+    tells = (sys.executable, "-c", f"import os, sys; sys.exit('share ' + os.environ['{VARIABLE}'])")
+    jobs = make_jobs([example_scenarios()["first-light"]], [Method()], (0, 1))
+    rows = []
+    Processes(4, tells)(jobs, rows.extend)
+    assert [row.failure.endswith("share 3") for row in rows] == [True, True]
+
+
+def test_a_simulation_that_diverges_leaves_no_log(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    compiled = model.compile_model(Shelf(), Camera())
+    data = mujoco.MjData(compiled)
+    data.qvel[:] = 1e30
+    mujoco.mj_step(compiled, data)
+    assert np.sum([warning.number for warning in data.warning]) > 0
+    assert list(tmp_path.iterdir()) == []
