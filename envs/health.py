@@ -1,5 +1,8 @@
 """What is usable on this machine, and what to do about what is not."""
 
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import contextlib

@@ -106,6 +106,7 @@ def with_table(document: Document, table: str, usual: T) -> T:
     Raises:
       InputError: a key is no field, or a value is of another type or impossible.
     """
+    known: Any = usual
     kind: Any = type(usual)
     hints = get_type_hints(kind)
     check_names(document, table, {field.name: field for field in dataclasses.fields(kind)})
@@ -113,7 +114,7 @@ def with_table(document: Document, table: str, usual: T) -> T:
         key: checked(value, hints[key], document.where(table, key))
         for key, value in document.tables.get(table, {}).items()
     }
-    return apply(document, table, given, lambda changes: dataclasses.replace(usual, **changes))
+    return apply(document, table, given, lambda changes: dataclasses.replace(known, **changes))
 
 
 def apply(document: Document, table: str, given: Mapping[str, Any], make: Callable[[Mapping[str, Any]], T]) -> T:

@@ -5,6 +5,7 @@ import hashlib
 import io
 import json
 import re
+import shutil
 import warnings
 from pathlib import Path
 
@@ -99,8 +100,7 @@ def check(kind, number, folder):
         else:
             taken = True
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
-    for path in inside.iterdir():
-        path.unlink()
+    shutil.rmtree(inside)
     return taken
 
 
@@ -140,8 +140,7 @@ def check_command(number, folder, monkeypatch):
     assert status in (0, 2)
     assert len(said.splitlines()) == (1 if status else 0), said
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
-    for path in inside.iterdir():
-        path.unlink()
+    shutil.rmtree(inside)
 
 
 def test_the_command_line_ends_with_one_line(tmp_path, monkeypatch):
