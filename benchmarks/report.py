@@ -228,10 +228,11 @@ def success_figure(rows: Sequence[Row]) -> Figure:
     for i, (goal, title) in enumerate(GOALS.items()):
         for j, count in enumerate(objects):
             axes: Axes = grid[i][j]
+            # Not found out anew for every one of a hundred curves.
+            axes.set(xlim=(-0.05 * actions, 1.05 * actions), ylim=(-0.03, 1.03))
             for k, variant in enumerate(variants):
                 if group := groups.get((variant, count)):
                     _curve(axes, group, goal, actions, COLOURS[k % len(COLOURS)], variant)
-            axes.set_ylim(-0.03, 1.03)
             axes.grid(color=MUTED, alpha=0.2)
             axes.spines[["top", "right"]].set_visible(False)
             axes.tick_params(colors=INK, labelsize=8)

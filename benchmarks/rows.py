@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import operator
 import os
 import types
 from collections.abc import Mapping, Sequence
@@ -27,6 +28,8 @@ PLANNING = ("recognise", "believe", "grasp", "plan", "judge")
 COMPILING = "compile"
 # Options that are fields of a row; the others are in its `configuration`.
 OPTIONS = ("target", "policy", "recognition", "gamma", "horizon", "sequences", "actions")
+# Of an `episode_key`.
+KEY_DIGITS = 32
 # What happened on the way.
 EVENTS = (
     *("looks", "truth_lost", "truth_lost_step", "restarts"),
@@ -244,18 +247,29 @@ def _present(known: str) -> str:
     return configuration(present_options(value))
 
 
+_named = operator.attrgetter("scenario", "content_hash", *OPTIONS, "seed")
+
+
 def identity(row: Row) -> tuple[Any, ...]:
     """What tells the rows of a table apart: the scenario, by its name and content, every option and the seed.
 
     A row that does not say what its scenario held is apart from all that do.
     """
     known = None if row.configuration is None else _present(row.configuration)
-    return row.scenario, row.content_hash, *(getattr(row, name) for name in OPTIONS), row.seed, known
+    return *_named(row), known
 
 
 def episode_key(row: Row) -> str:
-    """32 hexadecimal digits that are the same for rows of the same `identity`."""
-    return hashlib.sha256(json.dumps(identity(row)).encode()).hexdigest()[:32]
+    """`KEY_DIGITS` hexadecimal digits that are the same for rows of the same `identity`."""
+    *named, known = identity(row)
+    text = repr((*named, None if known is None else _digest(known)))
+    return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]
+
+
+@functools.lru_cache(maxsize=4096)
+def _digest(known: str) -> str:
+    """Of a configuration, which many rows share."""
+    return hashlib.sha256(known.encode()).hexdigest()
 
 
 def _options(row: Row) -> dict[str, Any]:
@@ -265,12 +279,15 @@ def _options(row: Row) -> dict[str, Any]:
     return {**present_options(json.loads(row.configuration or "{}")), **known, "actions": actions}
 
 
+_variant = operator.attrgetter("configuration", *OPTIONS)
+
+
 def label_variants(rows: Sequence[Row]) -> list[str]:
     """For each row the policy and those options that are not the same in all rows: "search-for-grasp, gamma 0.5".
 
     Rows that ran under different options never share a label.
     """
-    variants = [(row.configuration, *(getattr(row, name) for name in OPTIONS)) for row in rows]
+    variants = list(map(_variant, rows))
     # Thousands of rows have the same few options.
     each = {variant: _options(row) for variant, row in dict(zip(variants, rows, strict=True)).items()}
     names = sorted({name for options in each.values() for name in options} - {"policy"})
@@ -309,15 +326,44 @@ def read_rows(path: PathLike) -> list[Row]:
     if not _ALWAYS.issubset(names):
         raise InputError(f"{path}: is a table of something else, not of episodes; use another file")
     columns = table.select(names).to_pydict()
-    columns["actions"] = [_present_actions(actions) for actions in columns["actions"]]
-    if "configuration" in columns:
-        columns["configuration"] = [
-            known if known is None else _present_of(known, scenario, path)
-            for known, scenario in zip(columns["configuration"], columns["scenario"], strict=True)
-        ]
     if "code" not in columns and (code := said.get(_CODE)) is not None:
         columns["code"] = [code.decode(errors="replace")] * table.num_rows
-    return [Row(**dict(zip(columns, values, strict=True))) for values in zip(*columns.values(), strict=True)]
+    try:
+        return [_present_row(dict(zip(columns, values, strict=True))) for values in zip(*columns.values(), strict=True)]
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; use another file") from error
+
+
+def parse_row(text: str | bytes) -> Row:
+    """A row from the JSON object of its fields, today's or an earlier one, by the present names of options.
+
+    Raises:
+      ValueError: it is none.
+    """
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise ValueError("it is not a JSON object")
+    value = {RENAMED.get(name, name): part for name, part in value.items()}
+    missing = _ALWAYS - value.keys()
+    if missing:
+        raise ValueError(f"it lacks {min(missing)}")
+    return _present_row({name: part for name, part in value.items() if name in _FIELDS})
+
+
+def _present_row(fields: dict[str, Any]) -> Row:
+    """The row of these fields, with its options as they are said today.
+
+    Raises:
+      ValueError: its configuration is not a JSON object.
+    """
+    fields["actions"] = _present_actions(fields["actions"])
+    known = fields.get("configuration")
+    if known is not None:
+        try:
+            fields["configuration"] = _present(known)
+        except ValueError as error:
+            raise ValueError(f"the configuration of {fields['scenario']!r} is not a JSON object") from error
+    return Row(**fields)
 
 
 @functools.lru_cache(maxsize=4096)
@@ -325,13 +371,6 @@ def _present_actions(actions: str) -> str:
     """The column `actions` with the kinds as they are said today."""
     kinds = present_options({"actions": actions})["actions"]
     return kinds if isinstance(kinds, str) else ACTIONS_BETWEEN.join(kinds)
-
-
-def _present_of(known: str, scenario: str, path: PathLike) -> str:
-    try:
-        return _present(known)
-    except ValueError as error:
-        raise InputError(f"{path}: the configuration of {scenario!r} is not a JSON object; use another file") from error
 
 
 @functools.lru_cache(maxsize=4096)

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
-from mechsearch_jax.benchmarks.rows import Row, episode_key, read_rows, write_rows
+from mechsearch_jax.benchmarks.rows import Row, episode_key, parse_row, read_rows, write_rows
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, check_writable
 
@@ -43,11 +43,9 @@ def _names(folder: Path, ending: str) -> set[str]:
 
 
 def _parse(line: bytes, path: Path) -> Row:
-    """A row from its line in an open shard; what later versions add to it is left out."""
-    fields = {field.name for field in dataclasses.fields(Row)}
     try:
-        return Row(**{name: value for name, value in json.loads(line).items() if name in fields})
-    except (ValueError, TypeError, AttributeError) as error:
+        return parse_row(line)
+    except ValueError as error:
         raise InputError(
             f"{path}: holds a line that is no row ({error}); delete the line, and its episode is run again"
         ) from error
