@@ -18,7 +18,7 @@ import socket
 import threading
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from mechsearch_jax.benchmarks.shards import OPEN, close_shards_of
@@ -105,6 +105,18 @@ class Claims:
             self.mine.add(episode)
             return True
         return False
+
+    def free(self, episodes: Iterable[str]) -> set[str]:
+        """Those of many episodes that nobody runs.
+
+        Raises:
+          InputError: the folder cannot be read.
+        """
+        try:
+            taken = set(os.listdir(self._claims))
+        except OSError as error:
+            raise InputError(f"{self._claims}: cannot be read ({error.strerror or error})") from error
+        return {episode for episode in episodes if episode not in taken or self.is_free(episode)}
 
     def is_free(self, episode: str) -> bool:
         """Whether nobody runs an episode; a claim of one that is gone is removed."""

@@ -197,14 +197,14 @@ def evaluate(
         claims.close_what_is_left()
         work = _Work(jobs, Results(out), claims, writer, ended, retry_errors)
         while left := work.left():
-            free = [job for job in left if claims.is_free(job.key)]
-            if free:
-                runner(free, work.take, work.begin)
+            if free := claims.free(job.key for job in left):
+                runner([job for job in left if job.key in free], work.take, work.begin)
                 work.check()
             else:
                 waiting(len(left))
                 time.sleep(LOOK_EVERY)
             work.look()
+        claims.close_what_is_left()
         return work.rows
 
 
@@ -224,7 +224,10 @@ class _Work:
         self._jobs, self._results, self._claims, self._writer = jobs, results, claims, writer
         self._ended = ended
         self._lock = threading.Lock()
+        # Episodes of which rows were read that nobody has been told of.
+        self._fresh: list[str] = []
         self._refresh()
+        self._fresh.clear()
         # How many rows there must be of each episode before it is over.
         self._needed = dict.fromkeys((job.key for job in jobs), 1)
         if retry_errors:
@@ -281,7 +284,8 @@ class _Work:
         """Take note of all that has ended, elsewhere too."""
         with self._lock:
             self._refresh()
-            over = [key for key in self._left if self._is_over(key)]
+            over = [key for key in dict.fromkeys(self._fresh) if key in self._left and self._is_over(key)]
+            self._fresh.clear()
             rows = [self._results.rows[key] for key in over]
             for key in over:
                 del self._left[key]
@@ -298,9 +302,10 @@ class _Work:
         Raises:
           InputError: other code ran some of it.
         """
-        code = present_code()
-        for row in self._results.refresh():
-            if row.code != code:
+        fresh, code = self._results.refresh(), present_code()
+        self._fresh += fresh
+        for key in fresh:
+            if (row := self._results.rows[key]).code != code:
                 other = row.code or "other code, it does not say which"
                 raise InputError(
                     f"{self._results.folder}: its episodes were run by {other}, this is {code}; give another folder, "

@@ -96,22 +96,19 @@ class Results:
         self._ranks: dict[str, tuple[bool, str, int]] = {}
         self._shards: dict[str, _Shard] = {}
 
-    def refresh(self) -> list[Row]:
-        """Read what was added since the last time, by whomever; all of that, repeated episodes too.
+    def refresh(self) -> list[str]:
+        """Read what was added since the last time, by whomever; the `episode_key` of every row of that.
 
         Raises:
           InputError: a file cannot be read or holds something else.
         """
         # In this order, one that is closed meanwhile is in the second list at least.
         still_open, closed = _names(self.folder / OPEN, OPEN_ENDING), _names(self.folder, CLOSED_ENDING)
-        fresh: list[Row] = []
+        fresh: list[str] = []
         for name in sorted(still_open | closed):
             shard = self._shards.setdefault(name, _Shard())
             if not shard.closed:
-                rows = self._read(name, shard, name in closed)
-                for row in rows:
-                    self._add(row, name, shard)
-                fresh += rows
+                fresh += [self._add(row, name, shard) for row in self._read(name, shard, name in closed)]
         return fresh
 
     def _read(self, name: str, shard: _Shard, closed: bool) -> list[Row]:
@@ -127,7 +124,7 @@ class Results:
         shard.closed = True
         return rows
 
-    def _add(self, row: Row, name: str, shard: _Shard) -> None:
+    def _add(self, row: Row, name: str, shard: _Shard) -> str:
         key, rank = episode_key(row), (row.is_error, name, shard.rows)
         shard.rows += 1
         self.attempts[key] = self.attempts.get(key, 0) + 1
@@ -138,6 +135,7 @@ class Results:
             )
         if key not in self._ranks or rank < self._ranks[key]:
             self.rows[key], self._ranks[key] = row, rank
+        return key
 
 
 class ShardWriter:
@@ -178,10 +176,11 @@ class ShardWriter:
         path = self._folder / OPEN / f"{self._name}{OPEN_ENDING}"
         try:
             if self._file is not None and not _is_at(self._file, path):
-                # Somebody has closed or removed what this process was still writing to: it goes on in another.
+                # Somebody took this process for dead, and has closed its shard: it goes on in another.
+                lost = [] if (self._folder / f"{self._name}{CLOSED_ENDING}").exists() else self._rows
                 self._file.close()
                 self._file, self._number = None, self._number + 1
-                self.append([*self._rows, *rows])
+                self.append([*lost, *rows])
                 return
             if self._file is None:
                 self._file, self._rows = path.open("xb", buffering=0), []

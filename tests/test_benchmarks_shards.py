@@ -31,6 +31,10 @@ def read(folder):
     return sorted(results.rows.values(), key=lambda row: row.seed)
 
 
+def follow(results):
+    return [results.rows[key] for key in results.refresh()]
+
+
 def open_shards(folder):
     return sorted(path.name for path in (folder / OPEN).glob("*.jsonl"))
 
@@ -41,7 +45,7 @@ def test_rows_are_there_as_soon_as_they_are_added_and_shards_close_when_they_are
         for count, row in enumerate(ROWS, start=1):
             writer.append([row])
             assert read(tmp_path) == ROWS[:count]
-            assert follower.refresh() == [row]
+            assert follow(follower) == [row]
         assert open_shards(tmp_path) == ["shard-me-00002.jsonl"]
     assert follower.refresh() == []
     assert open_shards(tmp_path) == []
@@ -60,7 +64,7 @@ def test_a_line_that_a_kill_cut_short_does_not_count(tmp_path):
     follower.refresh()
     assert read(tmp_path) == list(follower.rows.values()) == ROWS[:2]
     (tmp_path / OPEN / name).write_bytes(whole)
-    assert follower.refresh() == ROWS[2:3]
+    assert follow(follower) == ROWS[2:3]
     (tmp_path / OPEN / name).write_bytes(b"nonsense\n" + whole)
     with pytest.raises(InputError, match=r"killed-00000\.jsonl: holds a line that is no row"):
         read(tmp_path)
@@ -81,7 +85,7 @@ def test_an_open_shard_of_an_earlier_version_is_read_by_todays_names(tmp_path):
 def test_a_shard_that_was_left_open_is_closed_later(tmp_path):
     ShardWriter(tmp_path, "killed").append(ROWS[:3])
     follower = Results(tmp_path)
-    assert follower.refresh() == ROWS[:3]
+    assert follow(follower) == ROWS[:3]
     close_shards_of(tmp_path, "kil")
     assert len(open_shards(tmp_path)) == 1
     close_shards_of(tmp_path, "killed")
@@ -96,7 +100,7 @@ def test_a_kill_between_closing_a_shard_and_removing_what_it_was_doubles_nothing
     write_rows(ROWS[:3], tmp_path / name.replace(".jsonl", ".parquet"))
     (tmp_path / ".shard-killed-00000.parquet.half").write_text("half")
     results = Results(tmp_path)
-    assert results.refresh() == ROWS[:3]
+    assert follow(results) == ROWS[:3]
     assert set(results.attempts.values()) == {1}
     close_shards_of(tmp_path, "killed")
     assert open_shards(tmp_path) == []
@@ -110,6 +114,8 @@ def test_who_is_taken_for_dead_loses_nothing(tmp_path):
     writer.append(ROWS[3:5])
     writer.close()
     assert read(tmp_path) == ROWS[:5]
+    results = Results(tmp_path)
+    assert len(results.refresh()) == 5
 
 
 def test_of_several_rows_of_an_episode_one_counts_whatever_order_they_came_in(tmp_path):
