@@ -73,11 +73,10 @@ def _read_open(path: Path, offset: int = 0) -> tuple[list[Row], int]:
 
 @dataclasses.dataclass
 class _Shard:
-    """How far a shard has been read."""
+    """How far an open shard has been read."""
 
     rows: int = 0
     offset: int = 0
-    closed: bool = False
 
 
 class Results:
@@ -95,6 +94,8 @@ class Results:
         self.attempts: dict[str, int] = {}
         self._ranks: dict[str, tuple[bool, str, int]] = {}
         self._shards: dict[str, _Shard] = {}
+        # The closed ones, which have been read to their end.
+        self._done: set[str] = set()
 
     def refresh(self) -> list[str]:
         """Read what was added since the last time, by whomever; the `episode_key` of every row of that.
@@ -105,10 +106,9 @@ class Results:
         # In this order, one that is closed meanwhile is in the second list at least.
         still_open, closed = _names(self.folder / OPEN, OPEN_ENDING), _names(self.folder, CLOSED_ENDING)
         fresh: list[str] = []
-        for name in sorted(still_open | closed):
+        for name in sorted((still_open | closed) - self._done):
             shard = self._shards.setdefault(name, _Shard())
-            if not shard.closed:
-                fresh += [self._add(row, name, shard) for row in self._read(name, shard, name in closed)]
+            fresh += [self._add(row, name, shard) for row in self._read(name, shard, name in closed)]
         return fresh
 
     def _read(self, name: str, shard: _Shard, closed: bool) -> list[Row]:
@@ -121,7 +121,7 @@ class Results:
                 rows, shard.offset = _read_open(path, shard.offset)
                 return rows
         rows = read_rows(self.folder / (name + CLOSED_ENDING))[shard.rows :]
-        shard.closed = True
+        self._done.add(name)
         return rows
 
     def _add(self, row: Row, name: str, shard: _Shard) -> str:
