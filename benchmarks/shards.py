@@ -28,7 +28,7 @@ OPEN = "_open"
 CLOSED_ENDING, OPEN_ENDING = ".parquet", ".jsonl"
 PREFIX = "shard-"
 # A reader wants few files; what is open is read as text.
-ROWS_PER_SHARD = 1000
+ROWS_PER_SHARD = 5000
 
 
 def _names(folder: Path, ending: str) -> set[str]:

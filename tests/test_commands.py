@@ -1,5 +1,6 @@
 """The command line, mostly from outside the checkout: what it does, and how it refuses what is wrong."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -8,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from mechsearch_jax.benchmarks import evaluate as evaluation
 from mechsearch_jax.benchmarks.report import FILES
 from mechsearch_jax.benchmarks.rows import Row, write_rows
 from mechsearch_jax.commands import main as cli
@@ -342,6 +344,26 @@ def test_help_on_what_has_no_such_options_does_without_the_planner():
     for arguments in (["--help"], ["scenarios", "generate", "--help"], ["bench", "--help"]):
         answer = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
         assert answer.stdout.endswith("False\n"), answer.stderr
+
+
+def test_many_episodes_are_run_as_asked(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    broken = dataclasses.replace(ROW, failure="error: no", retrieved=False)
+    seen = {}
+
+    def evaluate(jobs, out, runner, ended, waiting, retry_errors):
+        seen.update(jobs=jobs, out=str(out), limit=runner.time_limit, retry_errors=retry_errors)
+        return [ROW, broken]
+
+    monkeypatch.setattr(evaluation, "evaluate", evaluate)
+    arguments = ["evaluate", "good.json", "--seed", *map(str, range(5)), "--workers", "2", "--out", "new"]
+    cli.parse([*arguments, "--shard", "2/2", "--retry-errors", "--time-limit", "9"])()
+    assert (len(seen["jobs"]), seen["out"], seen["limit"], seen["retry_errors"]) == (2, "new", 9.0, True)
+    said = capsys.readouterr()
+    assert "1 of 2 episodes ended in an error; --retry-errors runs them again" in said.err
+    assert said.out.endswith("new\n")
+    cli.parse(arguments)()
+    assert (len(seen["jobs"]), seen["limit"], seen["retry_errors"]) == (5, 3600.0, False)
 
 
 def test_a_report_is_printed_and_written(folder, monkeypatch, capsys):
