@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import get_args
 
 import jax
 
-from mechsearch_jax.benchmarks.evaluate import Job
+from mechsearch_jax.benchmarks.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.envs.episodes import Start, run_episodes, target_of
 from mechsearch_jax.envs.method import EngineName, Method
@@ -25,6 +26,8 @@ MOST_WORLDS = 1024
 MOST_WORLDS_ON_CPU = 16
 # Of the device's memory; the planner and what comes and goes have the rest.
 SHARE_OF_WORLDS = 0.4
+# So many episodes that fail alone, one after the other, say that it is not they that are bad.
+MOST_FAILURES = 8
 # How many slots look or decide in one computation.
 AT_ONCE, AT_ONCE_ON_CPU = 64, 4
 
@@ -58,49 +61,72 @@ class Batches:
     worlds: int | None = None
     busy: Callable[[str, int], None] = lambda stage, episodes: None
 
-    def __call__(self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None]) -> None:
+    def __call__(
+        self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
+    ) -> None:
         """Run all jobs; see `evaluate.Runner`.
 
         Where the device's memory does not suffice, it goes on with half as many worlds. Where anything else fails, the
-        episodes that were running become rows with the reason.
+        episodes that were running are run again in halves, and so on: only those that fail alone become rows with the
+        reason.
 
         Raises:
-          Exception: whatever failed, if no episode has ended since the start or the last failure, or if the memory
-            does not suffice for a single world.
+          Exception: whatever failed, if it did before an episode had begun, or if `MOST_FAILURES` of them fail alone
+            and none ends between them; if none has ended before them either, they get no rows. Or the memory does
+            not suffice for a single world.
         """
+        failures = _Failures(ended)
         for (target, method), group in _groups(jobs):
             simulator = new_simulator(method.engine, method.workcell)
-            worlds = self.worlds or fitting_worlds(simulator)
+            worlds = min(self.worlds or fitting_worlds(simulator), len(group))
             # Those that take longest come first, so that none of them begins when all others are over.
-            todo = sorted(group, key=lambda job: -len(job.scenario.objects))
-            while todo:
-                attempt = _Attempt(todo, ended)
+            longest_first = sorted(group, key=lambda job: -len(job.scenario.objects))
+            batches = [_Batch(begin, [], [(job, False) for job in longest_first])]
+            while batches:
+                batch = batches.pop()
                 try:
-                    self._run(attempt, target, method, simulator, worlds)
-                except jax.errors.JaxRuntimeError as error:
-                    used = min(worlds, len(todo))
-                    if "RESOURCE_EXHAUSTED" not in str(error):
-                        attempt.fail(error)
-                    elif used == 1:
-                        raise
-                    else:
-                        worlds = used // 2
-                    simulator = new_simulator(method.engine, method.workcell)
+                    self._run(batch, failures.ended, target, method, simulator, worlds)
                 except InputError:
                     raise
                 except Exception as error:
-                    attempt.fail(error)
                     simulator = new_simulator(method.engine, method.workcell)
-                todo = attempt.left
+                    if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error):
+                        if worlds == 1:
+                            raise
+                        worlds //= 2
+                        batches += batch.again()
+                    elif not batch.running:
+                        raise
+                    elif len(batch.running) == 1:
+                        batches += batch.rest()
+                        failures.add(batch.running[0], error)
+                    else:
+                        batches += batch.halves()
+        failures.hand_on()
 
-    def _run(self, attempt: _Attempt, target: Target, method: Method, simulator: Simulator, worlds: int) -> None:
+    def _run(
+        self,
+        batch: _Batch,
+        ended: Callable[[Sequence[Row]], None],
+        target: Target,
+        method: Method,
+        simulator: Simulator,
+        worlds: int,
+    ) -> None:
+        code = present_code()
+
+        def take(episodes: Sequence[tuple[int, Episode]]) -> None:
+            own = batch.take(episodes)
+            if own:
+                ended([Row.of_episode(episode, code) for episode in own])
+
         run_episodes(
-            attempt.starts(),
+            batch.starts(worlds),
             method.workcell.problem(target, method.config.problem),
             method.policy(),
             simulator,
             worlds,
-            attempt.take,
+            take,
             recogniser=recogniser(method.recognition, target),
             max_steps=method.config.max_steps,
             options=method.options(),
@@ -109,43 +135,93 @@ class Batches:
         )
 
 
-class _Attempt:
-    """Which of the jobs have been begun, and which have ended."""
+class _Batch:
+    """Jobs that are run together: which of them have been begun, and which have ended."""
 
-    def __init__(self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None]) -> None:
-        self._jobs = jobs
-        self._ended = ended
-        self._begun = 0
+    def __init__(
+        self, begin: Callable[[Job], bool], again: Sequence[Job], todo: Iterable[tuple[Job, bool]] = ()
+    ) -> None:
+        """Args:
+        begin: see `evaluate.Runner`.
+        again: jobs that were running when something failed, to be run first.
+        todo: others, and whether they have been begun before.
+        """
+        self._begin, self._fill = begin, bool(again)
+        self._todo = deque([*((job, True) for job in again), *todo])
+        self._begun: list[Job] = []
         self._over: set[int] = set()
 
-    def starts(self) -> Iterator[Start]:
-        """The jobs as episodes to begin."""
-        for job in self._jobs:
-            self._begun += 1
+    def starts(self, worlds: int) -> Iterator[Start]:
+        """The jobs as episodes to begin.
+
+        Where jobs are run again and are fewer than the worlds, they come several times, since another number of worlds
+        would have to be compiled; what the copies come to does not count.
+        """
+        while self._todo:
+            job, begun = self._todo.popleft()
+            if begun or self._begin(job):
+                self._begun.append(job)
+                yield Start(job.scenario, job.seed)
+        for place in range(worlds - len(self._begun) if self._fill else 0):
+            job = self._begun[place % len(self._begun)]
             yield Start(job.scenario, job.seed)
 
-    def take(self, episodes: Sequence[tuple[int, Episode]]) -> None:
-        """Hand on the rows of episodes that ended."""
-        self._over |= {place for place, _ in episodes}
-        self._ended([Row.of_episode(episode) for _, episode in episodes])
-
-    def fail(self, error: Exception) -> None:
-        """Make a row of every episode that was running when an error came.
-
-        Raises:
-          Exception: the error, if no episode has ended before it.
-        """
-        if not self._over:
-            raise error
-        running = [place for place in range(self._begun) if place not in self._over]
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"[:500]
-        self._over |= set(running)
-        self._ended([self._jobs[place].failed(reason) for place in running])
+    def take(self, episodes: Sequence[tuple[int, Episode]]) -> list[Episode]:
+        """Take note of episodes that ended, by their places; those that count."""
+        own = {place: episode for place, episode in episodes if place < len(self._begun)}
+        self._over |= own.keys()
+        return list(own.values())
 
     @property
-    def left(self) -> list[Job]:
-        """The jobs that have not ended."""
-        return [job for place, job in enumerate(self._jobs) if place not in self._over]
+    def running(self) -> list[Job]:
+        """The jobs that were begun and have not ended."""
+        return [job for place, job in enumerate(self._begun) if place not in self._over]
+
+    def again(self) -> list[_Batch]:
+        """What has not ended, once more."""
+        return [_Batch(self._begin, self.running, self._todo)]
+
+    def rest(self) -> list[_Batch]:
+        """What has not been begun."""
+        return [_Batch(self._begin, [], self._todo)] if self._todo else []
+
+    def halves(self) -> list[_Batch]:
+        """What was running in two parts, of which the last is to be run first; before them what comes after them."""
+        running, half = self.running, (len(self.running) + 1) // 2
+        return [*self.rest(), *(_Batch(self._begin, part) for part in (running[half:], running[:half]))]
+
+
+class _Failures:
+    """Episodes that failed alone, until it is known whether it is they that are bad, or everything."""
+
+    def __init__(self, ended: Callable[[Sequence[Row]], None]) -> None:
+        self._ended = ended
+        self._any_ended = False
+        self._waiting: list[Row] = []
+
+    def ended(self, rows: Sequence[Row]) -> None:
+        """Hand on the rows of episodes that ended, after those of the ones that failed."""
+        self._any_ended = True
+        self.hand_on()
+        self._ended(rows)
+
+    def add(self, job: Job, error: Exception) -> None:
+        """Take note of an episode that failed alone.
+
+        Raises:
+          Exception: the error, if too many have failed one after the other.
+        """
+        self._waiting.append(job.failed(f"{type(error).__name__}: {' '.join(str(error).split())}"[:500]))
+        if len(self._waiting) == MOST_FAILURES:
+            if self._any_ended:
+                self.hand_on()
+            raise error
+
+    def hand_on(self) -> None:
+        """Make rows of those that failed."""
+        rows, self._waiting = self._waiting, []
+        if rows:
+            self._ended(rows)
 
 
 def _groups(jobs: Sequence[Job]) -> list[tuple[tuple[Target, Method], list[Job]]]:

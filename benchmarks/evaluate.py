@@ -1,8 +1,8 @@
 """Many scenarios, methods and seeds: what is wanted, what is there already, and what becomes of the rest.
 
 How the episodes are run is a slot: `processes.Processes` runs one after the other in several worker processes,
-`batches.Batches` many at a time in this one. The table is written anew whenever episodes have ended, so that a run that
-was killed goes on where it stopped.
+`batches.Batches` many at a time in this one. Rows are on disk as soon as their episodes have ended, so that a run that
+was killed goes on where it stopped. `shards` keeps them, `claims` divides the work among those who share a folder.
 """
 
 from __future__ import annotations
@@ -10,16 +10,23 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib.metadata
-from collections.abc import Callable, Sequence
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from mechsearch_jax.benchmarks.rows import Row, identity, read_code, read_rows, write_rows
+from mechsearch_jax.benchmarks.claims import Claims
+from mechsearch_jax.benchmarks.rows import Row, episode_key
+from mechsearch_jax.benchmarks.shards import CLOSED_ENDING, Results, ShardWriter
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.versions import source_digest
 from mechsearch_jax.workspace.scenario import Scenario, load_scenario
+
+# How often a process that has nothing to do looks at what the others do [s].
+LOOK_EVERY = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,11 +49,22 @@ class Job:
     def options(self) -> dict[str, Any]:
         """As in `Episode.config`."""
         asked = {"target": self.scenario.target.shape, "simulator": self.method.engine, "seed": self.seed}
-        return {**self.method.options(), **asked}
+        return {**_options(self.method), **asked}
+
+    @functools.cached_property
+    def key(self) -> str:
+        """The `episode_key` of its row."""
+        return episode_key(self.failed(""))
 
     def failed(self, reason: str) -> Row:
         """The row of an episode that could not be run to its end."""
-        return Row.failed(self.scenario, self.options, reason)
+        return Row.failed(self.scenario, self.options, reason, present_code())
+
+
+@functools.lru_cache(maxsize=4096)
+def _options(method: Method) -> Mapping[str, Any]:
+    """The same for thousands of jobs."""
+    return method.options()
 
 
 def make_jobs(
@@ -77,6 +95,21 @@ def make_jobs(
     return jobs
 
 
+def shard_of(jobs: Sequence[Job], shard: int, shards: int) -> list[Job]:
+    """The jobs of one of several machines: each job is in one shard, and shards differ in size by one job at most.
+
+    Which job is in which depends on nothing but the jobs, and not on their order. Jobs that differ in one thing alone,
+    as the seed, are spread at random.
+
+    Raises:
+      InputError: there is no such shard.
+    """
+    if not 1 <= shard <= shards:
+        raise InputError(f"shard {shard}/{shards}: give K/N with K from 1 to N")
+    mine = set(sorted({job.key for job in jobs})[shard - 1 :: shards])
+    return [job for job in jobs if job.key in mine]
+
+
 @functools.cache
 def present_code() -> str:
     """The code that decides about an episode: the package's version, and a digest of planner, perception (with its
@@ -88,25 +121,47 @@ def present_code() -> str:
     return f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')} ({digest[:12]})"
 
 
-def _check_code(path: PathLike, rows: Sequence[Row]) -> None:
-    """Refuse a table whose rows would be taken for those of the present code.
+@dataclasses.dataclass(frozen=True)
+class Tally:
+    """What has become of the episodes that are wanted.
 
-    Raises:
-      InputError: some of them would, but other code ran them.
+    Attributes:
+      wanted: how many there are.
+      ended, found, graspable, retrieved, errors: how many of them are over, and so on.
     """
-    code = read_code(path)
-    if code != present_code() and any(row.configuration is not None for row in rows):
-        raise InputError(
-            f"{path}: its episodes were run by {code or 'other code, it does not say which'}, this is "
-            f"{present_code()}; give another file, or delete this one to run all of them again"
+
+    wanted: int
+    ended: int = 0
+    found: int = 0
+    graspable: int = 0
+    retrieved: int = 0
+    errors: int = 0
+
+    def plus(self, row: Row) -> Tally:
+        """With one more episode."""
+        return dataclasses.replace(
+            self,
+            ended=self.ended + 1,
+            found=self.found + (row.found_step is not None),
+            graspable=self.graspable + (row.graspable_step is not None),
+            retrieved=self.retrieved + row.retrieved,
+            errors=self.errors + row.is_error,
         )
 
 
 class Runner(Protocol):
     """Runs episodes in whatever order it likes."""
 
-    def __call__(self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None]) -> None:
-        """Run all jobs; `ended` is told of every one's row once, of several at a time if they ended together."""
+    def __call__(
+        self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
+    ) -> None:
+        """Run all jobs that are still to be run.
+
+        Args:
+          jobs: what is wanted.
+          ended: told of every one's row once, of several at a time if they ended together; never from two threads.
+          begin: asked of every job once, right before it is begun, whether it is to be run: another process may have.
+        """
         ...
 
 
@@ -114,40 +169,147 @@ def evaluate(
     jobs: Sequence[Job],
     out: PathLike,
     runner: Runner,
-    ended: Callable[[Row, Sequence[Row]], None] = lambda row, rows: None,
+    ended: Callable[[Row, Tally], None] = lambda row, tally: None,
+    waiting: Callable[[int], None] = lambda episodes: None,
+    retry_errors: bool = False,
 ) -> list[Row]:
-    """Run the jobs that the table at `out` does not hold yet, and add each as its episode ends.
+    """Run the jobs of which the folder at `out` holds no row yet, and add each as its episode ends.
+
+    Any number of processes may do so at the same time, in the same folder and for the same jobs: each episode is run by
+    one of them. One that has nothing left to run waits for what the others run, and runs it if they are gone.
 
     Args:
       jobs: what is wanted.
-      out: the Parquet file; rows that it holds already are kept, and stand for a job only if every option and what
-        the scenario holds were the same. (Files of earlier versions do not say all of that: their rows are kept, but
-        run again.) The file says which code ran the episodes, and only that code adds to it.
+      out: the folder, of which `shards` tells; a row in it stands for a job only if every option and what the scenario
+        holds are the same. All of its episodes were run by the same code.
       runner: runs the episodes.
-      ended: called after every episode with its row and with all rows.
+      ended: called for every row that is new, other processes' among them, with what is known by then.
+      waiting: called while there is nothing to do but to wait for so many episodes that others run.
+      retry_errors: whether jobs whose row is an error are run again, once.
 
     Returns:
       The rows of all jobs, in the order of the jobs.
 
     Raises:
-      InputError: the table is there, but not one of episodes, or other code ran them, or it cannot be written.
+      InputError: `out` is no folder, it holds rows of other code, or it cannot be read or written.
     """
-    rows: list[Row] = []
-    if Path(out).exists():
-        rows = read_rows(out)
-        _check_code(out, rows)
-    done = {identity(row) for row in rows}
-    missing = [job for job in jobs if identity(job.failed("")) not in done]
-    write_rows(rows, out, present_code())
+    if Path(out).suffix == CLOSED_ENDING or Path(out).is_file():
+        raise InputError(f"{out}: results are kept in a folder, not in a file; give the name of a folder")
+    with Claims(out) as claims, ShardWriter(out, claims.owner) as writer:
+        claims.close_what_is_left()
+        work = _Work(jobs, Results(out), claims, writer, ended, retry_errors)
+        while left := work.left():
+            if free := claims.free(job.key for job in left):
+                runner([job for job in left if job.key in free], work.take, work.begin)
+                work.check()
+            else:
+                waiting(len(left))
+                time.sleep(LOOK_EVERY)
+            work.look()
+        claims.close_what_is_left()
+        return work.rows
 
-    def take(new: Sequence[Row]) -> None:
-        start = len(rows)
-        rows.extend(new)
-        write_rows(rows, out, present_code())
-        for i, row in enumerate(new):
-            ended(row, rows[: start + i + 1])
 
-    if missing:
-        runner(missing, take)
-    by_identity = {identity(row): row for row in rows}
-    return [by_identity[identity(job.failed(""))] for job in jobs]
+class _Work:
+    """The jobs of this process, and what has become of them."""
+
+    def __init__(
+        self,
+        jobs: Sequence[Job],
+        results: Results,
+        claims: Claims,
+        writer: ShardWriter,
+        ended: Callable[[Row, Tally], None],
+        retry_errors: bool,
+    ) -> None:
+        """Args are as `evaluate` has them; `results` have not been read."""
+        self._jobs, self._results, self._claims, self._writer = jobs, results, claims, writer
+        self._ended = ended
+        self._lock = threading.Lock()
+        # Episodes of which rows were read that nobody has been told of.
+        self._fresh: list[str] = []
+        self._refresh()
+        self._fresh.clear()
+        # How many rows there must be of each episode before it is over.
+        self._needed = dict.fromkeys((job.key for job in jobs), 1)
+        if retry_errors:
+            self._needed |= {
+                key: results.attempts[key] + 1
+                for key in self._needed
+                if key in results.rows and results.rows[key].is_error
+            }
+        self._left = {job.key: job for job in jobs if not self._is_over(job.key)}
+        self._tally = Tally(wanted=len(self._needed))
+        for key in self._needed.keys() - self._left.keys():
+            self._tally = self._tally.plus(results.rows[key])
+
+    @property
+    def rows(self) -> list[Row]:
+        """The rows of all jobs; all must have ended."""
+        return [self._results.rows[job.key] for job in self._jobs]
+
+    def left(self) -> list[Job]:
+        """The jobs that are not over."""
+        return list(self._left.values())
+
+    def begin(self, job: Job) -> bool:
+        """Whether a job is for this process to run; from any thread."""
+        with self._lock:
+            if self._is_over(job.key) or not self._claims.take(job.key):
+                return False
+            # It may have ended elsewhere before it was taken.
+            self._refresh()
+            if self._is_over(job.key):
+                self._claims.release(job.key)
+                return False
+            return True
+
+    def take(self, rows: Sequence[Row]) -> None:
+        """Keep the rows of episodes that ended."""
+        with self._lock:
+            self._writer.append(rows)
+            for row in rows:
+                self._claims.release(episode_key(row))
+        self.look()
+
+    def check(self) -> None:
+        """Fail where a runner is done, and lacks the row of an episode that it began.
+
+        Raises:
+          RuntimeError: it does; the row that it gave is of other options, perhaps.
+        """
+        lacking = [job.scenario.name for key, job in self._left.items() if key in self._claims.mine]
+        if lacking:
+            raise RuntimeError(f"evaluate: the episode of {lacking[0]} ended without a row of its own")
+
+    def look(self) -> None:
+        """Take note of all that has ended, elsewhere too."""
+        with self._lock:
+            self._refresh()
+            over = [key for key in dict.fromkeys(self._fresh) if key in self._left and self._is_over(key)]
+            self._fresh.clear()
+            rows = [self._results.rows[key] for key in over]
+            for key in over:
+                del self._left[key]
+        for row in rows:
+            self._tally = self._tally.plus(row)
+            self._ended(row, self._tally)
+
+    def _is_over(self, key: str) -> bool:
+        return self._results.attempts.get(key, 0) >= self._needed[key]
+
+    def _refresh(self) -> None:
+        """Read what is new.
+
+        Raises:
+          InputError: other code ran some of it.
+        """
+        fresh, code = self._results.refresh(), present_code()
+        self._fresh += fresh
+        for key in fresh:
+            if (row := self._results.rows[key]).code != code:
+                other = row.code or "other code, it does not say which"
+                raise InputError(
+                    f"{self._results.folder}: its episodes were run by {other}, this is {code}; give another folder, "
+                    "or delete this one to run all of them again"
+                )

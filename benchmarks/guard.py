@@ -18,7 +18,6 @@ import scipy.stats
 
 from mechsearch_jax.benchmarks.evaluate import present_code
 from mechsearch_jax.benchmarks.images import save_rows
-from mechsearch_jax.benchmarks.rates import is_error
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.envs.scene_sets import SETS, Block
 from mechsearch_jax.errors import InputError
@@ -189,7 +188,7 @@ def save_reference(rows: Sequence[Row], command: str, path: PathLike) -> None:
     Raises:
       InputError: an episode could not be run to its end, there are none, or the file cannot be written.
     """
-    errors = [row for row in rows if is_error(row)]
+    errors = [row for row in rows if row.is_error]
     if errors or not rows:
         told = f"{errors[0].scenario} ended with {errors[0].failure!r}" if errors else "there are no episodes"
         raise InputError(f"bench guard: {told}; nothing is stored")

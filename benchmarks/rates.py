@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 from collections.abc import Iterator, Sequence
 
 import scipy.stats
@@ -83,17 +85,13 @@ class Events:
     unsettled: float
 
 
+@functools.lru_cache(maxsize=65_536)
 def wilson(successes: int, count: int) -> tuple[float, float]:
     """Wilson's 95% confidence interval of a share: low and high; (0, 1) if nothing was counted."""
     if count == 0:
         return 0.0, 1.0
     interval = scipy.stats.binomtest(successes, count).proportion_ci(method="wilson")
     return float(interval.low), float(interval.high)
-
-
-def is_error(row: Row) -> bool:
-    """Whether an episode ended because the program failed, not the robot."""
-    return row.failure is not None and row.failure.startswith("error: ")
 
 
 def summarise(rows: Sequence[Row]) -> list[Rates]:
@@ -110,7 +108,7 @@ def summarise(rows: Sequence[Row]) -> list[Rates]:
                 method=method,
                 objects=objects,
                 episodes=len(group),
-                errors=sum(is_error(row) for row in group),
+                errors=sum(row.is_error for row in group),
                 found=found / len(group),
                 graspable=graspable / len(group),
                 retrieved=retrieved / len(group),
@@ -158,8 +156,10 @@ def summarise_events(rows: Sequence[Row]) -> list[Events]:
 
 def _groups(rows: Sequence[Row]) -> Iterator[tuple[str, int | None, list[Row]]]:
     """The rows of every method, by their number of objects, and then, with None, all of them."""
-    labels = label_variants(rows)
-    for method in sorted(set(labels)):
-        of_method = [row for row, label in zip(rows, labels, strict=True) if label == method]
-        for objects in [*sorted({row.objects for row in of_method}), None]:
-            yield method, objects, [row for row in of_method if objects is None or row.objects == objects]
+    methods: dict[str, dict[int, list[Row]]] = {}
+    for row, method in zip(rows, label_variants(rows), strict=True):
+        methods.setdefault(method, {}).setdefault(row.objects, []).append(row)
+    for method, by_objects in sorted(methods.items()):
+        for objects, group in sorted(by_objects.items()):
+            yield method, objects, group
+        yield method, None, list(itertools.chain.from_iterable(by_objects.values()))

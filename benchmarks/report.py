@@ -6,6 +6,7 @@ import collections
 import csv
 import dataclasses
 import io
+import itertools
 import json
 import re
 from collections.abc import Sequence
@@ -17,7 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from mechsearch_jax.benchmarks.rates import EVENTS, Events, Rates, summarise, summarise_events, wilson
-from mechsearch_jax.benchmarks.rows import Row, identity, label_variants, read_rows
+from mechsearch_jax.benchmarks.rows import Row, identity, label_variants
+from mechsearch_jax.benchmarks.shards import result_tables
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, check_writable, replacing
 from mechsearch_jax.viz.drawing import INK, MUTED, save_figure
@@ -38,23 +40,23 @@ SHARES = {
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 
 
-def read_tables(files: Sequence[PathLike]) -> list[Row]:
-    """The rows of several tables of `evaluate`.
+def read_tables(paths: Sequence[PathLike]) -> list[Row]:
+    """The rows of several results of `evaluate`: folders, folders of them, and Parquet files.
 
     Raises:
-      InputError: a file is no such table, an episode is in two of them, or there is none at all.
+      InputError: one holds no such results, an episode is in two tables, or there is none at all.
     """
     rows: list[Row] = []
     origin: dict[tuple, PathLike] = {}
-    for file in files:
-        for row in read_rows(file):
-            if identity(row) in origin:
-                raise InputError(
-                    f"{file}: holds scenario {row.scenario!r}, seed {row.seed}, with the same options as "
-                    f"{origin[identity(row)]}; report them one by one"
-                )
-            origin[identity(row)] = file
-            rows.append(row)
+    for path in paths:
+        for table, found in result_tables(path):
+            for row in found:
+                if (other := origin.setdefault(identity(row), table)) is not table:
+                    raise InputError(
+                        f"{table}: holds scenario {row.scenario!r}, seed {row.seed}, with the same options as {other}; "
+                        "report them one by one"
+                    )
+            rows += found
     if not rows:
         raise InputError("report: there are no episodes in these tables")
     return rows
@@ -69,8 +71,8 @@ def step_of(row: Row, goal: str) -> int | None:
 
 def reached(rows: Sequence[Row], goal: str, actions: int) -> list[int]:
     """How many episodes had reached a goal after 0, 1, ..., `actions` actions."""
-    steps = [step_of(row, goal) for row in rows]
-    return [sum(step is not None and step <= k for step in steps) for k in range(actions + 1)]
+    after = collections.Counter(step_of(row, goal) for row in rows)
+    return list(itertools.accumulate(after[k] for k in range(actions + 1)))
 
 
 def changed_scenarios(rows: Sequence[Row]) -> list[str]:
@@ -110,10 +112,11 @@ class Failures:
 
 def failures(rows: Sequence[Row]) -> list[Failures]:
     """Why episodes ended without a retrieval, the most frequent reason first."""
-    labels = label_variants(rows)
+    groups: dict[str, list[Row]] = {}
+    for row, label in zip(rows, label_variants(rows), strict=True):
+        groups.setdefault(label, []).append(row)
     result = []
-    for method in sorted(set(labels)):
-        group = [row for row, label in zip(rows, labels, strict=True) if label == method]
+    for method, group in sorted(groups.items()):
         told = [row.failure or "unknown" for row in group if not row.retrieved]
         reasons = collections.Counter(_WHICH_ACTION.sub("", reason) for reason in told)
         result += [Failures(method, reason, n, n / len(group)) for reason, n in reasons.most_common()]
@@ -214,8 +217,10 @@ def _curve(axes: Axes, rows: Sequence[Row], goal: str, actions: int, colour: str
 
 def success_figure(rows: Sequence[Row]) -> Figure:
     """Share of episodes that reached each goal over the number of actions: a column for each number of objects."""
-    labels = label_variants(rows)
-    variants, objects = sorted(set(labels)), sorted({row.objects for row in rows})
+    groups: dict[tuple[str, int], list[Row]] = {}
+    for row, label in zip(rows, label_variants(rows), strict=True):
+        groups.setdefault((label, row.objects), []).append(row)
+    variants, objects = (sorted(set(values)) for values in zip(*groups, strict=True))
     actions = max(max(row.steps for row in rows), 1)
     size = (2.6 * len(objects) + 1.2, 2.2 * len(GOALS) + 0.9 + 0.2 * len(variants))
     figure = Figure(figsize=(max(size[0], 5.0), size[1]), layout="constrained")
@@ -223,12 +228,11 @@ def success_figure(rows: Sequence[Row]) -> Figure:
     for i, (goal, title) in enumerate(GOALS.items()):
         for j, count in enumerate(objects):
             axes: Axes = grid[i][j]
+            # Not found out anew for every one of a hundred curves.
+            axes.set(xlim=(-0.05 * actions, 1.05 * actions), ylim=(-0.03, 1.03))
             for k, variant in enumerate(variants):
-                chosen = zip(rows, labels, strict=True)
-                group = [row for row, label in chosen if label == variant and row.objects == count]
-                if group:
+                if group := groups.get((variant, count)):
                     _curve(axes, group, goal, actions, COLOURS[k % len(COLOURS)], variant)
-            axes.set_ylim(-0.03, 1.03)
             axes.grid(color=MUTED, alpha=0.2)
             axes.spines[["top", "right"]].set_visible(False)
             axes.tick_params(colors=INK, labelsize=8)

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import hashlib
 import json
+import operator
+import os
 import types
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, get_args, get_type_hints
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args, get_origin, get_type_hints
 
 import pyarrow
 import pyarrow.parquet
@@ -15,26 +19,33 @@ from mechsearch_jax.envs.earlier import RENAMED, present_options
 from mechsearch_jax.envs.records import Episode, Step
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.planner import OPTIONS as PLANNER_OPTIONS
 from mechsearch_jax.workspace.scenario import Scenario
 
 # The stages of a step that the robot spends thinking; simulation is another.
 PLANNING = ("recognise", "believe", "grasp", "plan", "judge")
-# Options that have a column of their own.
+# Where a step's timings say how long it waited for compilations.
+COMPILING = "compile"
+# Options that are fields of a row; the others are in its `configuration`.
 OPTIONS = ("target", "policy", "recognition", "gamma", "horizon", "sequences", "actions")
+# Of an `episode_key`.
+KEY_DIGITS = 32
 # What happened on the way.
 EVENTS = (
     *("looks", "truth_lost", "truth_lost_step", "restarts"),
     *("objects_fallen", "fallen_step", "held_up", "unsettled"),
 )
+# How the reason begins where the program failed, not the robot.
+ERROR = "error: "
 # Between kinds of action in their column.
 ACTIONS_BETWEEN = "+"
-# Where the table's metadata say what ran the episodes.
+# Where the metadata of earlier tables say what ran the episodes.
 _CODE = b"mechsearch_code"
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One episode in a table of results; its fields are the table's columns.
+    """One episode in a table of results; its fields are columns of the table, to which `write_rows` adds more.
 
     Attributes:
       scenario: its name.
@@ -44,7 +55,8 @@ class Row:
         joined by "+".
       found_step, graspable_step, retrieved, failure: as in `Episode`.
       steps: number of actions, attempts to take the target out among them.
-      planning_seconds, simulation_seconds: wall time in total [s].
+      planning_seconds, simulation_seconds: wall time in total, without compilations [s]; with them in files of earlier
+        versions, which do not say `compile_seconds`.
       configuration: everything that decides about the episode beside its scenario and its seed, as `configuration`
         writes it; None in files of version 0.1.0, which do not say.
       content_hash: of the scenario, as in `Episode`; None in files of earlier versions, which do not say.
@@ -59,9 +71,14 @@ class Row:
       paper_graspable: whether the target could be grasped with the paper's grasps alone at some step; None in files of
         earlier versions, which do not say.
       paper_graspable_step: as in `Episode`.
+      compile_seconds: wall time that its steps waited for compilations [s]; in a batch, its share of it.
+      code: what ran it, as `evaluate.present_code` says it.
+      device: that computed it, as `versions` says it.
+      versions: of Python and the libraries, and the machine, as JSON.
 
     From `looks` to `unsettled` they are None where that is not known: in files of earlier versions, and of an episode
-    that could not be run to its end.
+    that could not be run to its end. The same goes for `compile_seconds`, `device` and `versions`; `code` is None in
+    the very first files alone.
     """
 
     scenario: str
@@ -93,11 +110,16 @@ class Row:
     unsettled: int | None = None
     paper_graspable: bool | None = None
     paper_graspable_step: int | None = None
+    compile_seconds: float | None = None
+    code: str | None = None
+    device: str | None = None
+    versions: str | None = None
 
     @classmethod
-    def of_episode(cls, episode: Episode) -> Row:
-        """The row of an episode that ran to its end."""
+    def of_episode(cls, episode: Episode, code: str | None = None) -> Row:
+        """The row of an episode that ran to its end, by the code that ran it."""
         spent = [{"simulate": 0.0, **step.timings} for step in episode.steps]
+        libraries = {name: version for name, version in episode.versions.items() if name != "device"}
         return cls(
             scenario=episode.scenario,
             objects=episode.objects,
@@ -113,10 +135,14 @@ class Row:
             **_event_columns(episode.steps),
             paper_graspable=_paper_graspable(episode.steps),
             paper_graspable_step=episode.paper_graspable_step,
+            compile_seconds=sum(timings.get(COMPILING, 0.0) for timings in spent),
+            code=code,
+            device=episode.versions.get("device"),
+            versions=json.dumps(libraries, sort_keys=True),
         )
 
     @classmethod
-    def failed(cls, scenario: Scenario, options: Mapping[str, Any], reason: str) -> Row:
+    def failed(cls, scenario: Scenario, options: Mapping[str, Any], reason: str, code: str | None = None) -> Row:
         """The row of an episode that could not be run to its end; `options` are as in `Episode.config`."""
         return cls(
             scenario=scenario.name,
@@ -126,12 +152,18 @@ class Row:
             graspable_step=None,
             retrieved=False,
             steps=0,
-            failure=f"error: {reason}",
+            failure=f"{ERROR}{reason}",
             planning_seconds=0.0,
             simulation_seconds=0.0,
             content_hash=scenario.content_hash,
             paper_graspable=False,
+            code=code,
         )
+
+    @property
+    def is_error(self) -> bool:
+        """Whether it ended because the program failed, not the robot."""
+        return self.failure is not None and self.failure.startswith(ERROR)
 
 
 def _event_columns(steps: Sequence[Step]) -> dict[str, Any]:
@@ -172,18 +204,25 @@ _ARROW = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64(),
 
 
 def _column(kind: Any) -> pyarrow.DataType:
-    """The type of a column, from that of a field, which may also be None."""
+    """The type of a column, from that of a field or an option, which may also be None or a tuple."""
+    if get_origin(kind) is tuple:
+        return pyarrow.list_(_ARROW[get_args(kind)[0]])
     plain = [part for part in get_args(kind) if part is not types.NoneType]
     return _ARROW[plain[0] if plain else kind]
 
 
-SCHEMA = pyarrow.schema([(name, _column(kind)) for name, kind in get_type_hints(Row).items()])
-# The last column before rows told of the paper's grasps, before that of what happened on the way, before that of what
-# their scenario holds, and before that of the configuration.
-_EARLIER_COLUMNS = tuple(
-    SCHEMA.names[: SCHEMA.names.index(last) + 1]
-    for last in ("unsettled", "content_hash", "configuration", "simulation_seconds")
-)
+_FIELDS = {name: _column(kind) for name, kind in get_type_hints(Row).items()}
+# The same in rows of the same episode, whichever table they are in.
+EPISODE = "episode"
+# Columns for who reads the table with something else; a row has all of it in its other fields.
+_MORE = {
+    **{option.name: _column(option.type) for option in PLANNER_OPTIONS if option.name not in _FIELDS},
+    "simulator": pyarrow.string(),
+    EPISODE: pyarrow.string(),
+}
+SCHEMA = pyarrow.schema([*_FIELDS.items(), *_MORE.items()])
+# Every table has these columns; those that came later are None where one lacks them.
+_ALWAYS = frozenset(field.name for field in dataclasses.fields(Row) if field.default is dataclasses.MISSING)
 
 
 def configuration(options: Mapping[str, Any]) -> str:
@@ -195,13 +234,42 @@ def configuration(options: Mapping[str, Any]) -> str:
     return json.dumps(kept, sort_keys=True, allow_nan=False)
 
 
+@functools.lru_cache(maxsize=4096)
+def _present(known: str) -> str:
+    """A `Row.configuration` with its options as they are said today.
+
+    Raises:
+      ValueError: it is not a JSON object.
+    """
+    value = json.loads(known)
+    if not isinstance(value, dict):
+        raise ValueError("not an object")
+    return configuration(present_options(value))
+
+
+_named = operator.attrgetter("scenario", "content_hash", *OPTIONS, "seed")
+
+
 def identity(row: Row) -> tuple[Any, ...]:
     """What tells the rows of a table apart: the scenario, by its name and content, every option and the seed.
 
     A row that does not say what its scenario held is apart from all that do.
     """
-    known = None if row.configuration is None else configuration(present_options(json.loads(row.configuration)))
-    return row.scenario, row.content_hash, *(getattr(row, name) for name in OPTIONS), row.seed, known
+    known = None if row.configuration is None else _present(row.configuration)
+    return *_named(row), known
+
+
+def episode_key(row: Row) -> str:
+    """`KEY_DIGITS` hexadecimal digits that are the same for rows of the same `identity`."""
+    *named, known = identity(row)
+    text = repr((*named, None if known is None else _digest(known)))
+    return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]
+
+
+@functools.lru_cache(maxsize=4096)
+def _digest(known: str) -> str:
+    """Of a configuration, which many rows share."""
+    return hashlib.sha256(known.encode()).hexdigest()
 
 
 def _options(row: Row) -> dict[str, Any]:
@@ -211,14 +279,19 @@ def _options(row: Row) -> dict[str, Any]:
     return {**present_options(json.loads(row.configuration or "{}")), **known, "actions": actions}
 
 
+_variant = operator.attrgetter("configuration", *OPTIONS)
+
+
 def label_variants(rows: Sequence[Row]) -> list[str]:
     """For each row the policy and those options that are not the same in all rows: "search-for-grasp, gamma 0.5".
 
     Rows that ran under different options never share a label.
     """
-    each = [_options(row) for row in rows]
-    names = sorted({name for options in each for name in options} - {"policy"})
-    differing = [name for name in names if len({json.dumps(options.get(name)) for options in each}) > 1]
+    variants = list(map(_variant, rows))
+    # Thousands of rows have the same few options.
+    each = {variant: _options(row) for variant, row in dict(zip(variants, rows, strict=True)).items()}
+    names = sorted({name for options in each.values() for name in options} - {"policy"})
+    differing = [name for name in names if len({json.dumps(options.get(name)) for options in each.values()}) > 1]
 
     def said(options: dict[str, Any], name: str) -> str:
         value = options.get(name, "unknown")
@@ -226,21 +299,11 @@ def label_variants(rows: Sequence[Row]) -> list[str]:
         shown = "/".join(f"{v:g}" if isinstance(v, float) else str(v) for v in values)
         return f"{name.replace('_', ' ')} {shown}"
 
-    return [", ".join([str(o["policy"]), *(said(o, name) for name in differing)]) for o in each]
-
-
-def _parquet(path: PathLike, read: Callable[[PathLike], Any]) -> Any:
-    """What `read` makes of a file.
-
-    Raises:
-      InputError: the file cannot be read or is none of Parquet.
-    """
-    try:
-        return read(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or ' '.join(str(error).split())})") from error
-    except pyarrow.ArrowException as error:
-        raise InputError(f"{path}: is not a Parquet file ({' '.join(str(error).split())})") from error
+    labels = {
+        variant: ", ".join([str(options["policy"]), *(said(options, name) for name in differing)])
+        for variant, options in each.items()
+    }
+    return [labels[variant] for variant in variants]
 
 
 def read_rows(path: PathLike) -> list[Row]:
@@ -249,50 +312,87 @@ def read_rows(path: PathLike) -> list[Row]:
     Raises:
       InputError: the file cannot be read or is a table of something else.
     """
-    table = _parquet(path, pyarrow.parquet.read_table)
-    table = table.rename_columns([RENAMED.get(name, name) for name in table.schema.names])
-    if table.schema.names not in (SCHEMA.names, *_EARLIER_COLUMNS):
-        raise InputError(f"{path}: is a table of something else, not of episodes; use another file")
-    return [_with_present_options(Row(**row), path) for row in table.to_pylist()]
-
-
-def _with_present_options(row: Row, path: PathLike) -> Row:
-    """The row with its options as they are said today."""
-    kinds = present_options({"actions": row.actions})["actions"]
-    row = dataclasses.replace(row, actions=kinds if isinstance(kinds, str) else ACTIONS_BETWEEN.join(kinds))
-    if row.configuration is None:
-        return row
     try:
-        value = json.loads(row.configuration)
-    except ValueError:
-        value = None
-    if not isinstance(value, dict):
-        raise InputError(f"{path}: the configuration of {row.scenario!r} is not a JSON object; use another file")
-    return dataclasses.replace(row, configuration=configuration(present_options(value)))
+        # As a file of its own: the names of the folders that it is in say nothing of it.
+        with open(path, "rb") as file, pyarrow.parquet.ParquetFile(file) as parquet:
+            table = parquet.read()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or ' '.join(str(error).split())})") from error
+    except pyarrow.ArrowException as error:
+        raise InputError(f"{path}: is not a Parquet file ({' '.join(str(error).split())})") from error
+    said = table.schema.metadata or {}
+    table = table.rename_columns([RENAMED.get(name, name) for name in table.schema.names])
+    names = [name for name in _FIELDS if name in table.schema.names]
+    if not _ALWAYS.issubset(names):
+        raise InputError(f"{path}: is a table of something else, not of episodes; use another file")
+    columns = table.select(names).to_pydict()
+    if "code" not in columns and (code := said.get(_CODE)) is not None:
+        columns["code"] = [code.decode(errors="replace")] * table.num_rows
+    try:
+        return [_present_row(dict(zip(columns, values, strict=True))) for values in zip(*columns.values(), strict=True)]
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; use another file") from error
 
 
-def read_code(path: PathLike) -> str | None:
-    """What `write_rows` was told of the code that ran the episodes; None where it was told nothing.
+def parse_row(text: str | bytes) -> Row:
+    """A row from the JSON object of its fields, today's or an earlier one, by the present names of options.
 
     Raises:
-      InputError: the file cannot be read.
+      ValueError: it is none.
     """
-    code = (_parquet(path, pyarrow.parquet.read_schema).metadata or {}).get(_CODE)
-    return None if code is None else code.decode(errors="replace")
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise ValueError("it is not a JSON object")
+    value = {RENAMED.get(name, name): part for name, part in value.items()}
+    missing = _ALWAYS - value.keys()
+    if missing:
+        raise ValueError(f"it lacks {min(missing)}")
+    return _present_row({name: part for name, part in value.items() if name in _FIELDS})
 
 
-def write_rows(rows: Sequence[Row], path: PathLike, code: str | None = None) -> None:
+def _present_row(fields: dict[str, Any]) -> Row:
+    """The row of these fields, with its options as they are said today.
+
+    Raises:
+      ValueError: its configuration is not a JSON object.
+    """
+    fields["actions"] = _present_actions(fields["actions"])
+    known = fields.get("configuration")
+    if known is not None:
+        try:
+            fields["configuration"] = _present(known)
+        except ValueError as error:
+            raise ValueError(f"the configuration of {fields['scenario']!r} is not a JSON object") from error
+    return Row(**fields)
+
+
+@functools.lru_cache(maxsize=4096)
+def _present_actions(actions: str) -> str:
+    """The column `actions` with the kinds as they are said today."""
+    kinds = present_options({"actions": actions})["actions"]
+    return kinds if isinstance(kinds, str) else ACTIONS_BETWEEN.join(kinds)
+
+
+@functools.lru_cache(maxsize=4096)
+def _more(known: str | None) -> Mapping[str, Any]:
+    """The columns `_MORE` that a `Row.configuration` tells."""
+    options = json.loads(known or "{}")
+    return {name: options.get(name) for name in _MORE}
+
+
+def write_rows(rows: Sequence[Row], path: PathLike) -> None:
     """Write a table of episodes as Parquet, in place of the one that is there.
 
-    Args:
-      rows: the episodes.
-      path: of the file.
-      code: what ran them, which is kept beside them: see `read_code`.
+    Beside the fields of a row it has a column for every other option and for the simulator, and `episode`, which is
+    `episode_key`: for who reads it with something else.
 
     Raises:
       InputError: the file cannot be written.
     """
-    schema = SCHEMA if code is None else SCHEMA.with_metadata({_CODE: code.encode()})
-    table = pyarrow.Table.from_pylist([dataclasses.asdict(row) for row in rows], schema=schema)
+    values = [{**vars(row), **_more(row.configuration), EPISODE: episode_key(row)} for row in rows]
+    table = pyarrow.Table.from_pylist(values, schema=SCHEMA)
     with replacing(path) as file:
         pyarrow.parquet.write_table(table, file)
+        # What a row was kept in until now goes when this file is there.
+        file.flush()
+        os.fsync(file.fileno())

@@ -18,7 +18,7 @@ from mechsearch_jax.benchmarks import unsolved
 from mechsearch_jax.benchmarks.evaluate import present_code
 from mechsearch_jax.benchmarks.images import save_rows
 from mechsearch_jax.benchmarks.rates import wilson
-from mechsearch_jax.benchmarks.rows import read_rows
+from mechsearch_jax.benchmarks.shards import result_tables
 from mechsearch_jax.envs.episodes import target_of
 from mechsearch_jax.envs.known_search import Found, KnownSearchConfig, Node, known_search
 from mechsearch_jax.envs.known_target import InFullView
@@ -84,7 +84,7 @@ class Outcomes:
 
 
 def read_outcomes(files: Sequence[PathLike]) -> Outcomes:
-    """What tables of `mechsearch evaluate` (Parquet) and stored results with episodes (JSON) say of scenes.
+    """What results of `mechsearch evaluate` (folders, Parquet files) and stored ones (JSON) say of scenes.
 
     Raises:
       InputError: a file cannot be read, or there are no episodes in it.
@@ -92,7 +92,7 @@ def read_outcomes(files: Sequence[PathLike]) -> Outcomes:
     by_content: dict[str, tuple[int, int]] = {}
     by_name: dict[str, tuple[int, int]] = {}
     for file in files:
-        episodes = list(_parquet(file) if Path(file).suffix == ".parquet" else _stored(file))
+        episodes = list(_evaluated(file) if Path(file).is_dir() or Path(file).suffix == ".parquet" else _stored(file))
         if not episodes:
             raise InputError(f"{file}: there are no episodes in it")
         for name, content, retrieved in episodes:
@@ -102,9 +102,9 @@ def read_outcomes(files: Sequence[PathLike]) -> Outcomes:
     return Outcomes(by_content, by_name)
 
 
-def _parquet(file: PathLike) -> Iterator[tuple[str, str | None, bool]]:
+def _evaluated(path: PathLike) -> Iterator[tuple[str, str | None, bool]]:
     """Name and content hash of the scene, and whether the target was taken out, of every episode."""
-    return ((row.scenario, row.content_hash, row.retrieved) for row in read_rows(file))
+    return ((row.scenario, row.content_hash, row.retrieved) for _, rows in result_tables(path) for row in rows)
 
 
 def _stored(file: PathLike) -> Iterator[tuple[str, str | None, bool]]:

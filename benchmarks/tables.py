@@ -13,6 +13,7 @@ from rich.text import Text
 from mechsearch_jax.benchmarks import push, scenes, segmentation
 from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
+from mechsearch_jax.benchmarks.evaluate import Tally
 from mechsearch_jax.benchmarks.rates import EVENTS, summarise, summarise_events
 from mechsearch_jax.benchmarks.recognition import SHARES, Measured
 from mechsearch_jax.benchmarks.rows import Row
@@ -304,7 +305,7 @@ class EpisodeProgress:
 
     def __init__(self, console: Console, total: int):
         self._console = console
-        self._total = total
+        self._waited = False
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -329,19 +330,22 @@ class EpisodeProgress:
         """Say what a batch is at."""
         self._bar.update(self._task, stage=f"{stage} ({episodes})")
 
-    def ended(self, row: Row, rows: Sequence[Row]) -> None:
-        """Take note of one more episode; `rows` are all of them, those of earlier runs too."""
-        found, graspable, retrieved = (
-            sum(flags) / len(rows)
-            for flags in (
-                [r.found_step is not None for r in rows],
-                [r.graspable_step is not None for r in rows],
-                [r.retrieved for r in rows],
-            )
-        )
-        rates = f"found {found:.2f}  graspable {graspable:.2f}  retrieved {retrieved:.2f}"
-        self._bar.update(self._task, completed=len(rows), total=max(self._total, len(rows)), description=rates)
+    def waiting(self, episodes: int) -> None:
+        """Say that other processes run what is left."""
+        if not self._console.is_terminal and not self._waited:
+            self._console.print(f"waiting for {episodes} episodes that other processes run", soft_wrap=True)
+        self._waited = True
+        self._bar.update(self._task, stage=f"other processes run the rest ({episodes})")
+
+    def ended(self, row: Row, tally: Tally) -> None:
+        """Take note of one more episode, of this process or another, and of what is known of all that are wanted."""
+        shares = (count / tally.ended for count in (tally.found, tally.graspable, tally.retrieved))
+        rates = "found {:.2f}  graspable {:.2f}  retrieved {:.2f}".format(*shares)
+        errors = f"  errors {tally.errors}" if tally.errors else ""
+        self._bar.update(self._task, completed=tally.ended, total=tally.wanted, description=rates + errors)
         if not self._console.is_terminal:
             outcome = "retrieved" if row.retrieved else row.failure
-            count = f"{len(rows)}/{self._total}"
-            self._console.print(f"{count} {row.scenario}: {outcome}, {row.steps} actions  ({rates})", soft_wrap=True)
+            count = f"{tally.ended}/{tally.wanted}"
+            self._console.print(
+                f"{count} {row.scenario}: {outcome}, {row.steps} actions  ({rates}{errors})", soft_wrap=True
+            )

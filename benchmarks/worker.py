@@ -5,13 +5,13 @@ It is started as `python -m mechsearch_jax.benchmarks.worker` and ends when its 
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import json
 import os
 import sys
 from typing import TextIO
 
+from mechsearch_jax.benchmarks.evaluate import present_code
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.envs.episodes import run_episode, target_of
 from mechsearch_jax.envs.method import Method
@@ -49,7 +49,7 @@ class Worker:
             method.config.max_steps,
             method.options(),
         )
-        return Row.of_episode(episode)
+        return Row.of_episode(episode, present_code())
 
 
 def _simulator(workcell: Workcell) -> NativeSimulator:
@@ -63,7 +63,7 @@ def serve(jobs: TextIO, answers: TextIO) -> None:
         job = json.loads(line)
         try:
             row = worker.run(job["path"], Method.from_json(job["method"]), job["seed"])
-            answer = {"row": dataclasses.asdict(row)}
+            answer = {"row": vars(row)}
         except Exception as error:  # Whatever fails in one episode must not end the run.
             answer = {"error": f"{type(error).__name__}: {' '.join(str(error).split())}"[:500]}
         print(json.dumps(answer), file=answers, flush=True)
@@ -71,6 +71,8 @@ def serve(jobs: TextIO, answers: TextIO) -> None:
 
 def main() -> None:
     """Serve on the standard streams. What libraries print goes to standard error, so that answers stay clean."""
+    # Before anybody changes it: what is imported from here on is taken for it.
+    present_code()
     keep_compilations()
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Int, UInt
 
 from mechsearch_jax.actions import Action, no_action
+from mechsearch_jax.envs.compile_clock import CompileClock
 from mechsearch_jax.envs.episode_log import (
     Choice,
     EpisodeLog,
@@ -185,16 +186,17 @@ def run_episodes(
         known: Slots = OneSlot(problem, policy, recogniser)
     else:
         known = ManySlots(problem, policy, recogniser, world, min(at_once, count))
-    pool = _EpisodePool(simulator, problem, known, count, _Run(max_steps, options or {}, busy, watcher))
-    pool.begin(dict(enumerate(first)))
-    while pool.running:
-        done = pool.round()
-        if done:
-            ended([pair for _, pair in done])
-        fresh = {slot: pair for (slot, _), pair in zip(done, queue, strict=False)}
-        if fresh:
-            simulator.replace({slot: start.scenario for slot, (_, start) in fresh.items()})
-            pool.begin(fresh)
+    with CompileClock() as compiling:
+        pool = _EpisodePool(simulator, problem, known, count, _Run(max_steps, options or {}, busy, watcher, compiling))
+        pool.begin(dict(enumerate(first)))
+        while pool.running:
+            done = pool.round()
+            if done:
+                ended([pair for _, pair in done])
+            fresh = {slot: pair for (slot, _), pair in zip(done, queue, strict=False)}
+            if fresh:
+                simulator.replace({slot: start.scenario for slot, (_, start) in fresh.items()})
+                pool.begin(fresh)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,6 +207,7 @@ class _Run:
     options: Mapping[str, Any]
     told: Callable[[str, int], None]
     watcher: Watcher | None
+    compiling: CompileClock
 
     def busy(self, stage: str, episodes: int) -> None:
         """Say that a stage begins."""
@@ -214,21 +217,28 @@ class _Run:
 
 
 class _Clock:
-    """Wall time of the stages of a round, shared equally by the slots that took part."""
+    """Wall time of the stages of a round, shared equally by the slots that took part.
 
-    def __init__(self, slots: int, busy: Callable[[str, int], None]) -> None:
+    What JAX compiled meanwhile is apart from them, as "compile".
+    """
+
+    def __init__(self, slots: int, busy: Callable[[str, int], None], compiling: CompileClock) -> None:
         self._timings: list[dict[str, float]] = [{} for _ in range(slots)]
         self._busy = busy
+        self._compiling = compiling
 
     @contextmanager
     def __call__(self, stage: str, rows: Sequence[int]) -> Iterator[None]:
         if rows:
             self._busy(stage, len(rows))
-        start = time.perf_counter()
+        start, before = time.perf_counter(), self._compiling.seconds
         yield
-        share = (time.perf_counter() - start) / max(len(rows), 1)
+        took, compiled = time.perf_counter() - start, self._compiling.seconds - before
         for row in rows:
-            self._timings[row][stage] = round(share, 6)
+            timings = self._timings[row]
+            timings[stage] = round(max(took - compiled, 0.0) / len(rows), 6)
+            if compiled:
+                timings["compile"] = round(timings.get("compile", 0.0) + compiled / len(rows), 6)
 
     def timings(self, row: int) -> dict[str, float]:
         return self._timings[row]
@@ -277,7 +287,7 @@ class _EpisodePool:
         """Look, decide and act once in all slots; the slots whose episodes ended, with their places and records."""
         world, logs = self._simulator.world, {row: slot.log for row, slot in self.running.items()}
         assert world is not None
-        clock = _Clock(len(self._slots), self._run.busy)
+        clock = _Clock(len(self._slots), self._run.busy, self._run.compiling)
         steps = [slot.log.index if slot else 0 for slot in self._slots]
         planner_keys, environment_keys = _keys_at(jnp.asarray(self._keys), jnp.array(steps, jnp.int32))
 

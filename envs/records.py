@@ -69,7 +69,7 @@ class Step:
       observed_cost: J at the next observation; None if there was none.
       sequences: number of valid action sequences that the plan was chosen from.
       failure: why the action could not be carried out as planned; None if it was.
-      timings: wall time of each stage [s].
+      timings: wall time of each stage [s]; "compile", where anything was compiled, is in no other.
       truth_possible: whether f holds the candidate pose that is nearest to the target's true pose; None once the target
         is found, and where it has fallen, so that no candidate is near its pose.
       restarts: how often f had become empty and was started anew.

@@ -9,7 +9,8 @@ from stage import HIDDEN, OPEN
 from mechsearch_jax.benchmarks import batches
 from mechsearch_jax.benchmarks.batches import Batches, fitting_worlds
 from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
-from mechsearch_jax.benchmarks.rows import identity, read_rows
+from mechsearch_jax.benchmarks.rows import identity
+from mechsearch_jax.benchmarks.shards import Results
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.native import NativeSimulator
@@ -26,6 +27,12 @@ def files(tmp_path):
     for scene in scenes:
         save_scenario(scene, tmp_path / f"{scene.name}.json")
     return [tmp_path / f"{scene.name}.json" for scene in scenes]
+
+
+def read_rows(folder):
+    results = Results(folder)
+    results.refresh()
+    return list(results.rows.values())
 
 
 def jobs_of(files, seeds=(0,)):
@@ -57,7 +64,7 @@ class Stand:
 def test_every_job_becomes_a_row_with_its_options(problem, tmp_path, files, monkeypatch):
     stand = Stand(problem, monkeypatch)
     jobs = jobs_of(files, seeds=(0, 1))
-    rows = evaluate(jobs, tmp_path / "rows.parquet", Batches(worlds=3))
+    rows = evaluate(jobs, tmp_path / "rows", Batches(worlds=3))
     assert [(r.scenario, r.seed) for r in rows] == [(j.scenario.name, j.seed) for j in jobs]
     assert {identity(r) for r in rows} == {identity(j.failed("")) for j in jobs}
     assert stand.slots == [3]
@@ -68,7 +75,7 @@ def test_where_memory_does_not_suffice_it_goes_on_with_half_the_worlds(problem, 
         return jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory") if slots > 1 else None
 
     stand = Stand(problem, monkeypatch, fail)
-    rows = evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=4))
+    rows = evaluate(jobs_of(files), tmp_path / "rows", Batches(worlds=4))
     assert stand.slots == [4, 2, 1]
     assert all(row.failure == "not found" for row in rows)
 
@@ -76,8 +83,8 @@ def test_where_memory_does_not_suffice_it_goes_on_with_half_the_worlds(problem, 
 def test_where_memory_does_not_suffice_for_one_world_the_run_ends(problem, tmp_path, files, monkeypatch):
     stand = Stand(problem, monkeypatch, lambda name, slots: jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: full"))
     with pytest.raises(jax.errors.JaxRuntimeError, match="full"):
-        evaluate(jobs_of(files[:2]), tmp_path / "rows.parquet", Batches(worlds=16))
-    assert stand.slots == [16, 1]
+        evaluate(jobs_of(files[:2]), tmp_path / "rows", Batches(worlds=16))
+    assert stand.slots == [2, 1]
 
 
 def test_an_error_of_the_device_costs_its_episode_alone(problem, tmp_path, files, monkeypatch):
@@ -85,7 +92,7 @@ def test_an_error_of_the_device_costs_its_episode_alone(problem, tmp_path, files
         return jax.errors.JaxRuntimeError("INTERNAL: no luck") if name == "hidden-1" else None
 
     stand = Stand(problem, monkeypatch, fail)
-    rows = evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=1))
+    rows = evaluate(jobs_of(files), tmp_path / "rows", Batches(worlds=1))
     assert stand.slots == [1, 1]
     assert [row.failure for row in rows if row.scenario == "hidden-1"] == ["error: JaxRuntimeError: INTERNAL: no luck"]
     assert sum(row.failure == "not found" for row in rows) == 3
@@ -93,7 +100,7 @@ def test_an_error_of_the_device_costs_its_episode_alone(problem, tmp_path, files
 
 def test_what_fails_in_a_batch_is_a_row_and_the_others_go_on(problem, tmp_path, files, monkeypatch):
     Stand(problem, monkeypatch, lambda name, slots: ValueError("out of\nluck") if name == "hidden-1" else None)
-    rows = evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=2))
+    rows = evaluate(jobs_of(files), tmp_path / "rows", Batches(worlds=2))
     assert {r.scenario: r.failure for r in rows} == {
         "hidden-0": "not found",
         "open-0": "not found",
@@ -102,24 +109,77 @@ def test_what_fails_in_a_batch_is_a_row_and_the_others_go_on(problem, tmp_path, 
     }
 
 
-def test_what_fails_at_once_ends_the_run(problem, tmp_path, files, monkeypatch):
-    Stand(problem, monkeypatch, lambda name, slots: ValueError("never"))
+class Together(Stand):
+    """The same, but all episodes of a batch end at its end, if none of them fails."""
+
+    def __call__(self, starts, problem, policy, simulator, slots, ended, **rest):
+        batch = list(starts)
+        self.slots.append(len(batch))
+        errors = [error for start in batch if (error := self._fail(start.scenario.name, slots))]
+        if errors:
+            raise errors[0]
+        told = self.slots[:]
+        super().__call__(batch, problem, policy, simulator, slots, ended, **rest)
+        self.slots = told
+
+
+def test_a_batch_that_fails_is_run_again_in_halves(problem, tmp_path, files, monkeypatch):
+    stand = Together(problem, monkeypatch, lambda name, slots: ValueError("no") if name == "hidden-1" else None)
+    rows = evaluate(jobs_of(files, seeds=(0, 1)), tmp_path / "rows", Batches(worlds=8))
+    failed = {(row.scenario, row.seed): row.failure for row in rows if row.failure != "not found"}
+    assert failed == {("hidden-1", seed): "error: ValueError: no" for seed in (0, 1)}
+    assert len(read_rows(tmp_path / "rows")) == 8
+    # No other number of worlds is compiled for it.
+    assert set(stand.slots) == {8}
+
+
+def test_what_fails_whatever_is_run_ends_the_run(problem, tmp_path, files, monkeypatch):
+    stand = Together(problem, monkeypatch, lambda name, slots: ValueError("never"))
+    jobs = jobs_of(files, seeds=(0, 1, 2, 3))
     with pytest.raises(ValueError, match="never"):
-        evaluate(jobs_of(files), tmp_path / "rows.parquet", Batches(worlds=2))
-    assert read_rows(tmp_path / "rows.parquet") == []
+        evaluate(jobs, tmp_path / "rows", Batches(worlds=16))
+    assert read_rows(tmp_path / "rows") == []
+    assert len(stand.slots) < 2 * batches.MOST_FAILURES + 4
+    # Once an episode has ended, those that fail have rows, so that the next run does not come upon them.
+    bad = {job.scenario.name for job in jobs[4:]}
+    Together(problem, monkeypatch, lambda name, slots: ValueError("never") if name in bad else None)
+    with pytest.raises(ValueError, match="never"):
+        evaluate(jobs, tmp_path / "rows", Batches(worlds=16))
+    assert len(read_rows(tmp_path / "rows")) == 4 + batches.MOST_FAILURES
+    rows = evaluate(jobs, tmp_path / "rows", Batches(worlds=16), retry_errors=False)
+    assert sum(row.is_error for row in rows) == 12
+
+
+def test_a_few_that_fail_are_rows_even_if_nothing_else_is_run(problem, tmp_path, files, monkeypatch):
+    Together(problem, monkeypatch, lambda name, slots: ValueError("never"))
+    rows = evaluate(jobs_of(files), tmp_path / "rows", Batches(worlds=2))
+    assert [row.failure for row in rows] == ["error: ValueError: never"] * 4
+
+
+def test_what_fails_before_any_episode_ends_the_run(problem, tmp_path, files, monkeypatch):
+    Stand(problem, monkeypatch)
+
+    def cached_problem(target, config):
+        raise ValueError("no problem")
+
+    monkeypatch.setattr(batches, "cached_problem", cached_problem)
+    with pytest.raises(ValueError, match="no problem"):
+        evaluate(jobs_of(files), tmp_path / "rows", Batches(worlds=2))
+    assert read_rows(tmp_path / "rows") == []
 
 
 @pytest.mark.slow
 def test_a_run_that_was_killed_goes_on_to_the_same_rows(tmp_path, files):
     def facts(rows):
-        return [dataclasses.replace(row, planning_seconds=0.0, simulation_seconds=0.0) for row in rows]
+        spent = ("planning_seconds", "simulation_seconds", "compile_seconds")
+        return [dataclasses.replace(row, **dict.fromkeys(spent, 0.0)) for row in rows]
 
     def stop(row, rows):
         raise KeyboardInterrupt
 
     jobs = jobs_of(files)
-    whole = evaluate(jobs, tmp_path / "whole.parquet", Batches(worlds=2))
-    out = tmp_path / "killed.parquet"
+    whole = evaluate(jobs, tmp_path / "whole", Batches(worlds=2))
+    out = tmp_path / "killed"
     with pytest.raises(KeyboardInterrupt):
         evaluate(jobs, out, Batches(worlds=2), stop)
     kept = read_rows(out)
@@ -127,7 +187,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_rows(tmp_path, files):
     rows = evaluate(jobs, out, Batches(worlds=2))
     assert facts(rows) == facts(whole)
     assert len(read_rows(out)) == len(jobs)
-    assert read_rows(out)[: len(kept)] == kept
+    assert [row for row in read_rows(out) if row in kept] == kept
 
 
 def test_the_memory_of_the_device_bounds_the_worlds(monkeypatch):

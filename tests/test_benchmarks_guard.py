@@ -113,9 +113,7 @@ def run(tmp_path, monkeypatch):
 
     def run(retrieved, *arguments):
         monkeypatch.setattr(evaluation, "evaluate", lambda *_: rows(retrieved))
-        cli.parse(
-            ["bench", "guard", "--out", str(tmp_path / "rows.parquet"), "--reference", str(reference), *arguments]
-        )()
+        cli.parse(["bench", "guard", "--out", str(tmp_path / "rows"), "--reference", str(reference), *arguments])()
 
     run.reference = reference
     return run

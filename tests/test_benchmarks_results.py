@@ -18,17 +18,19 @@ from mechsearch_jax.benchmarks.rows import (
     SCHEMA,
     Row,
     configuration,
+    episode_key,
     identity,
     label_variants,
-    read_code,
     read_rows,
     write_rows,
 )
 from mechsearch_jax.envs.earlier import EARLIER, RENAMED
+from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.records import Episode, Step, load_episode, record_action, save_episode
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import check_writable, replacing
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.viz.maps import Maps, load_maps, save_maps
 
 PUSH = no_action().replace(
@@ -212,11 +214,13 @@ def test_rows_are_read_back(tmp_path):
 
 
 BY_PAPER = ["paper_graspable", "paper_graspable_step"]
+BESIDES = ["compile_seconds", "code", "device", "versions"]
 EARLIER_LACKED = [
-    BY_PAPER,
-    [*EVENTS, *BY_PAPER],
-    ["content_hash", *EVENTS, *BY_PAPER],
-    ["configuration", "content_hash", *EVENTS, *BY_PAPER],
+    BESIDES,
+    [*BY_PAPER, *BESIDES],
+    [*EVENTS, *BY_PAPER, *BESIDES],
+    ["content_hash", *EVENTS, *BY_PAPER, *BESIDES],
+    ["configuration", "content_hash", *EVENTS, *BY_PAPER, *BESIDES],
 ]
 
 
@@ -229,10 +233,15 @@ def test_rows_of_earlier_versions_are_read(tmp_path, columns):
         **dict.fromkeys(EVENTS, 3),
         paper_graspable=True,
         paper_graspable_step=2,
+        compile_seconds=4.0,
+        code="mechsearch-jax 0.1.0 (0123456789ab)",
+        device="cpu: cpu",
+        versions="{}",
     )
     write_rows([row], tmp_path / "rows.parquet")
     table = pyarrow.parquet.read_table(tmp_path / "rows.parquet")
-    pyarrow.parquet.write_table(table.drop_columns(columns), tmp_path / "rows.parquet")
+    more = [name for name in table.column_names if name not in vars(row)]
+    pyarrow.parquet.write_table(table.drop_columns([*columns, *more]), tmp_path / "rows.parquet")
     assert read_rows(tmp_path / "rows.parquet") == [dataclasses.replace(row, **dict.fromkeys(columns))]
 
 
@@ -252,7 +261,10 @@ def test_an_episode_that_does_not_say_what_its_scenario_held_is_read(tmp_path):
 
 @pytest.mark.parametrize("text", ["{", "3"])
 def test_a_configuration_that_is_none_is_one_line(tmp_path, text):
-    write_rows([dataclasses.replace(ROW, configuration=text)], tmp_path / "rows.parquet")
+    write_rows([dataclasses.replace(ROW, configuration="{}")], tmp_path / "rows.parquet")
+    table = pyarrow.parquet.read_table(tmp_path / "rows.parquet")
+    place = table.column_names.index("configuration")
+    pyarrow.parquet.write_table(table.set_column(place, "configuration", [[text]]), tmp_path / "rows.parquet")
     with pytest.raises(InputError, match=r"rows\.parquet: the configuration of 'two-things'"):
         read_rows(tmp_path / "rows.parquet")
 
@@ -313,10 +325,11 @@ def test_tables_with_earlier_names_of_options_are_read(tmp_path):
     }
     for name in ("method", "caution", "focus"):
         del now[name]
-    assert first == dataclasses.replace(ROW, policy="search-and-grasp", configuration=configuration(now))
+    assert first == dataclasses.replace(
+        ROW, policy="search-and-grasp", configuration=configuration(now), code="mechsearch-jax 0.1.0 (0123456789ab)"
+    )
     assert json.loads(second.configuration) == {**now, "push_model": "learned", "topple_charge": 0.5}
     assert (tmp_path / "rows.parquet").read_bytes() == before
-    assert read_code(tmp_path / "rows.parquet") == "mechsearch-jax 0.1.0 (0123456789ab)"
     assert not set(RENAMED) & set(SCHEMA.names)
 
 
@@ -393,10 +406,35 @@ def test_confidence_intervals_are_those_of_the_formula():
 
 def test_the_columns_are_those_of_earlier_tables_but_for_names():
     since = [pyarrow.string(), *[pyarrow.int64()] * len(EVENTS), pyarrow.bool_(), pyarrow.int64()]
-    assert SCHEMA.types == [*OLD_SCHEMA.types, *since]
+    besides = [pyarrow.float64(), *[pyarrow.string()] * 3]
+    names = [field.name for field in dataclasses.fields(Row)]
+    assert SCHEMA.types[: len(names)] == [*OLD_SCHEMA.types, *since, *besides]
     known = [RENAMED.get(name, name) for name in OLD_SCHEMA.names]
-    assert SCHEMA.names == [*known, "content_hash", *EVENTS, *BY_PAPER]
-    assert SCHEMA.names == [field.name for field in dataclasses.fields(Row)]
+    assert SCHEMA.names[: len(names)] == names == [*known, "content_hash", *EVENTS, *BY_PAPER, *BESIDES]
+
+
+def test_every_option_is_a_column(tmp_path):
+    method = Method(config=PRESETS["standard"](gamma=0.5, push_distances=(0.1,), max_steps=7))
+    options = {**method.options(), "target": "box", "simulator": "NativeSimulator", "seed": 3}
+    row = Row.of_episode(dataclasses.replace(EPISODE, config=options))
+    write_rows([row, ROW], tmp_path / "rows.parquet")
+    first, second = pyarrow.parquet.read_table(tmp_path / "rows.parquet").to_pylist()
+    for name, value in options.items():
+        assert first[name] == ("+".join(value) if name == "actions" else value), name
+    assert second["max_steps"] is None
+    assert [first["episode"], second["episode"]] == [episode_key(row), episode_key(ROW)]
+    assert len({row["episode"] for row in (first, second)}) == 2
+    assert read_rows(tmp_path / "rows.parquet") == [row, ROW]
+
+
+def test_a_row_says_what_ran_it_and_how_long_compiling_took():
+    timings = ({"plan": 0.5, "simulate": 1.0, "compile": 20.0}, {"plan": 0.25, "compile": 2.0})
+    steps = tuple(dataclasses.replace(step, timings=spent) for step, spent in zip(STEPS, timings, strict=True))
+    versions = {"jax": "1.2.3", "device": "cpu: cpu"}
+    config = {**OLD, "policy": "random", "actions": ["push"], "target": "box", "seed": 3}
+    row = Row.of_episode(dataclasses.replace(EPISODE, steps=steps, versions=versions, config=config), "this code")
+    assert (row.planning_seconds, row.simulation_seconds, row.compile_seconds) == (0.75, 1.0, 22.0)
+    assert (row.code, row.device, json.loads(row.versions)) == ("this code", "cpu: cpu", {"jax": "1.2.3"})
 
 
 def test_what_is_no_table_of_episodes_is_one_line(tmp_path):

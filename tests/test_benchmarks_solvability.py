@@ -18,6 +18,7 @@ from mechsearch_jax.benchmarks.episode_tables import ceiling_table
 from mechsearch_jax.benchmarks.rates import wilson
 from mechsearch_jax.benchmarks.rows import Row as EpisodeRow
 from mechsearch_jax.benchmarks.rows import write_rows
+from mechsearch_jax.benchmarks.shards import ShardWriter
 from mechsearch_jax.benchmarks.solvability import Ceiling, Outcomes, Row, read_outcomes, summary
 from mechsearch_jax.benchmarks.unsolved import blockers, in_the_way, reason
 from mechsearch_jax.envs.known_search import Found, KnownSearchConfig, Node
@@ -65,6 +66,9 @@ def test_episodes_count_by_content_and_by_name_only_where_they_do_not_say(tmp_pa
     listed.write_text(json.dumps({"columns": columns, "runs": runs}))
 
     assert read_outcomes([table]).of(TWO) == (2, 1)
+    with ShardWriter(tmp_path / "folder" / "inside", "me") as writer:
+        writer.append([known])
+    assert read_outcomes([tmp_path / "folder"]).of(TWO) == (1, 0)
     assert read_outcomes([stored]).of(TWO) == (1, 1)
     # The scene of that name held something else.
     assert read_outcomes([listed]).of(TWO) == (0, 0)

@@ -1,5 +1,6 @@
 """The command line, mostly from outside the checkout: what it does, and how it refuses what is wrong."""
 
+import dataclasses
 import importlib.metadata
 import json
 import os
@@ -10,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 
+from mechsearch_jax.benchmarks import evaluate as evaluation
 from mechsearch_jax.benchmarks.report import FILES
 from mechsearch_jax.benchmarks.rows import Row, write_rows
 from mechsearch_jax.commands import main as cli
@@ -103,9 +105,19 @@ WRONG = {
     "bad among good": (["inspect", "good.json", "negative.json", "--out", "out"], "negative.json: objects[0]"),
     "nothing to inspect": (["inspect", "--out", "out"], "no scenario is given"),
     "empty folder": (["inspect", "empty", "--out", "out"], "empty: there are no scenario files"),
-    "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new.parquet"], "'one-box'"),
-    "no table": (["evaluate", "good.json", "--out", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
-    "no worker": (["evaluate", "good.json", "--out", "new.parquet", "--workers", "0"], "--workers 0"),
+    "the same name twice": (["evaluate", "good.json", "good.json", "--out", "new"], "'one-box'"),
+    "results in a file": (
+        ["evaluate", "good.json", "--out", "out/rows.parquet"],
+        "rows.parquet: results are kept in a folder, not in a file",
+    ),
+    "no worker": (["evaluate", "good.json", "--out", "new", "--workers", "0"], "--workers 0"),
+    "no shard": (["evaluate", "good.json", "--out", "new", "--shard", "3/2"], "--shard 3/2 is not K/N"),
+    "half a shard": (["evaluate", "good.json", "--out", "new", "--shard", "1"], "--shard 1 is not K/N"),
+    "no time": (["evaluate", "good.json", "--out", "new", "--time-limit", "0"], "--time-limit 0 must be"),
+    "time of a batch": (
+        ["evaluate", "good.json", "--out", "new", "--batch", "2", "--time-limit", "9"],
+        "--time-limit is for worker processes",
+    ),
     "nowhere to report to": (["report", "table.parquet", "--out", "good.json"], "good.json: cannot be written to"),
     "the same table twice": (["report", "table.parquet", "table.parquet"], "report them one by one"),
     "unknown preset": (["search", "good.json", "--out", "out", "--preset", "worst"], "'worst'"),
@@ -120,9 +132,10 @@ WRONG = {
     ),
     "unknown method": (["search", "good.json", "--out", "out", "--method", "random"], "'random'"),
     "unknown policy": (["search", "good.json", "--out", "out", "--policy", "guess"], 'policy "guess"'),
-    "missing policy": (["evaluate", "good.json", "--out", "new.parquet", "--policy", "nobody.there:Mine"], "nobody"),
+    "missing policy": (["evaluate", "good.json", "--out", "new", "--policy", "nobody.there:Mine"], "nobody"),
     "unknown subject": (["bench", "speed"], "speed"),
     "no table to report": (["report", "out/rows.parquet"], "rows.parquet: is not a Parquet file"),
+    "no results to report": (["report", "empty"], "empty: there are no results in this folder or those in it"),
     "no scenarios": (["scenarios", "generate", "--objects", "2", "--count", "0", "--out", "new"], "--count 0"),
     "negative scenario": (
         ["scenarios", "generate", "--objects", "2", "--seed", "-1", "--out", "out"],
@@ -154,9 +167,9 @@ WRONG = {
         ["bench", "ceiling", "good.json", "good.json", "--out", "new"],
         "two scenes are called one-box",
     ),
-    "no such suite": (["bench", "guard", "--scenes", "41", "--out", "new.parquet"], "--scenes"),
+    "no such suite": (["bench", "guard", "--scenes", "41", "--out", "new"], "--scenes"),
     "no reference": (
-        ["bench", "guard", "--reference", "none.json", "--out", "new.parquet"],
+        ["bench", "guard", "--reference", "none.json", "--out", "new"],
         "none.json: cannot be read",
     ),
     "malformed to check": (["scenarios", "check", "broken.json"], "broken.json: is not JSON"),
@@ -371,6 +384,26 @@ def test_help_on_what_has_no_such_options_does_without_the_planner():
     for arguments in (["--help"], ["scenarios", "generate", "--help"], ["bench", "--help"]):
         answer = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
         assert answer.stdout.endswith("False\n"), answer.stderr
+
+
+def test_many_episodes_are_run_as_asked(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    broken = dataclasses.replace(ROW, failure="error: no", retrieved=False)
+    seen = {}
+
+    def evaluate(jobs, out, runner, ended, waiting, retry_errors):
+        seen.update(jobs=jobs, out=str(out), limit=runner.time_limit, retry_errors=retry_errors)
+        return [ROW, broken]
+
+    monkeypatch.setattr(evaluation, "evaluate", evaluate)
+    arguments = ["evaluate", "good.json", "--seed", *map(str, range(5)), "--workers", "2", "--out", "new"]
+    cli.parse([*arguments, "--shard", "2/2", "--retry-errors", "--time-limit", "9"])()
+    assert (len(seen["jobs"]), seen["out"], seen["limit"], seen["retry_errors"]) == (2, "new", 9.0, True)
+    said = capsys.readouterr()
+    assert "1 of 2 episodes ended in an error; --retry-errors runs them again" in said.err
+    assert said.out.endswith("new\n")
+    cli.parse(arguments)()
+    assert (len(seen["jobs"]), seen["limit"], seen["retry_errors"]) == (5, 3600.0, False)
 
 
 def test_a_report_is_printed_and_written(folder, monkeypatch, capsys):

@@ -57,7 +57,7 @@ def test_a_target_in_sight_is_taken_out_at_once(problem):
     assert (step.cost, step.predicted_cost) == (1.0, None)
     assert step.action.kind == "retrieve"
     assert step.action.object is None
-    assert set(step.timings) == {"recognise", "plan", "judge", "simulate"}
+    assert set(step.timings) - {"compile"} == {"recognise", "plan", "judge", "simulate"}
     assert episode.config == {
         "recognition": "oracle",
         "target": "cylinder",

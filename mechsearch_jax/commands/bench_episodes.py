@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.envs.known_search import Node
     from mechsearch_jax.workspace.scenario import Scenario
 
-Results = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...")]
+Results = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FOLDER|FILE ...")]
 
 
 def _command() -> str:
@@ -68,7 +68,7 @@ def bench_ceiling(
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
       out: folder for a file for every scene that is searched, a picture of each that stays unsolved, and ceiling.json.
         Scenes that have a file of the same code and options are not searched again.
-      results: tables of `evaluate` (.parquet) and stored results (.json); what was retrieved in any is solvable.
+      results: of `evaluate` (folders, .parquet) and stored ones (.json); what was retrieved in any is solvable.
       sequences: sampled from each world of a round.
       simulated: so many of them, the best, are executed in a round.
       worlds: from which sequences are sampled in a round: those nearest to being solved.
@@ -122,7 +122,7 @@ def bench_guard(
     """Run a fixed suite of episodes and compare them with stored ones; status 1 after a significant loss.
 
     Args:
-      out: Parquet file for the rows; one that is there is gone on with, if the same code wrote it.
+      out: folder for the rows; one that is there is gone on with, if the same code wrote it.
       scenes: size of the suite: the first scenes of each number of objects in the scene set `development`.
       reference: what it is compared with; benchmarks/results/guard-cpu.json of the checkout if not given.
       write: store what it came to in that place, instead of comparing.
@@ -145,7 +145,7 @@ def bench_guard(
     jobs = make_jobs(files_of(guard.suite(scenes)), [Method()], (guard.SEED,))
     console = Console(highlight=False)
     with EpisodeProgress(console, len(jobs)) as progress:
-        rows = evaluate(jobs, out, Processes(workers or cores()), progress.ended)
+        rows = evaluate(jobs, out, Processes(workers or cores()), progress.ended, progress.waiting)
     if before is None:
         guard.save_reference(rows, _command(), stored)
         console.print(str(stored), soft_wrap=True)

@@ -10,7 +10,7 @@ import tyro
 
 
 def report(
-    tables: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE ...")],
+    results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER|FILE ...")],
     /,
     *,
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None,
@@ -20,7 +20,7 @@ def report(
     What happened on the way is told too: the truth ruled out, objects fallen, the arm held up, bodies never at rest.
 
     Args:
-      tables: Parquet files.
+      results: folders of `evaluate`, folders of those, and Parquet files of earlier versions.
       out: folder for report.md, rates.csv, rates.json, failures.csv, events.csv and success.png; only prints if not
         given.
     """
@@ -29,7 +29,7 @@ def report(
     from mechsearch_jax.benchmarks.report import read_tables, told_of_changes, write_report
     from mechsearch_jax.benchmarks.tables import events_table, rates_table
 
-    rows = read_tables(tables)
+    rows = read_tables(results)
     if out is not None:
         write_report(rows, out)
     console = Console(highlight=False)
