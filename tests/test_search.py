@@ -186,7 +186,7 @@ def test_a_wrong_camera_is_told(camera, words):
     [
         (moved(CAMERA, (0.0, 0.0, 0.02)), "2.0 cm too high"),
         (moved(CAMERA, (0.0, 0.0, -0.03)), "3.0 cm too low"),
-        (moved(CAMERA, (0.0, 0.0, 0.3)), "shows no board"),
+        (moved(CAMERA, (0.0, 0.0, 0.12)), "shows no board"),
     ],
 )
 def test_a_board_elsewhere_is_told(camera, words):

@@ -114,6 +114,11 @@ class Searcher:
         return self._now.finished
 
     @property
+    def moving(self) -> bool:
+        """Whether a motion was handed out of which nothing was said since."""
+        return self._now.handed
+
+    @property
     def _now(self) -> State:
         if self._state is None:
             self._state = beginning(self.problem)

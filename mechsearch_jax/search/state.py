@@ -14,8 +14,9 @@ import numpy as np
 
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.arrays import ARRAYS_LIMIT, read_arrays
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import ARRAYS_LIMIT, PathLike, read_arrays, read_bytes, replacing
+from mechsearch_jax.files import PathLike, read_bytes, replacing
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.belief import Belief, initial_belief
