@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -128,9 +129,24 @@ def clearance(body: ArmBody, obstacles: Obstacles, q: Float[np.ndarray, "m 7"]) 
     return Clearance(np.concatenate([p.free for p in parts]), np.concatenate([p.inside for p in parts]))
 
 
+def link_poses(q: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "m 8 4 4"]:
+    """`kinematics.forward_kinematics` by blocks, so that nothing is compiled for another number of rows."""
+    parts = []
+    for i in range(0, len(q), BLOCK):
+        rows = q[i : i + BLOCK]
+        padded = np.concatenate([rows, np.repeat(rows[-1:], BLOCK - len(rows), axis=0)])
+        parts.append(np.asarray(kinematics.forward_kinematics(padded.astype(np.float32)))[: len(rows)])
+    return np.concatenate(parts)
+
+
+def tip_positions(q: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "m 3"]:
+    """Where the point between the finger tips is [m]."""
+    hand = link_poses(q)[:, HAND_FRAME]
+    return hand[:, :3, 3] + kinematics.FINGER_TIPS * hand[:, :3, 2]
+
+
 def _block_clearance(body: ArmBody, obstacles: Obstacles, q: np.ndarray) -> Clearance:
-    padded = np.concatenate([q, np.repeat(q[-1:], BLOCK - len(q), axis=0)]).astype(np.float32)
-    frames = np.asarray(kinematics.forward_kinematics(padded))[: len(q)]
+    frames = link_poses(q)
     centres, radius = _placed(body.fine, frames), body.fine.radius
     to_shelf = _shelf_distance(obstacles.shelf, centres) - radius
     # The foot and links 1 and 2 stand on the floor.
@@ -220,7 +236,7 @@ def _in_hand(held: Held) -> tuple[Primitive, ...]:
     return (Primitive("box", tuple(held.half_size), pose),)
 
 
-def _spheres(bodies, cell: float) -> Spheres:
+def _spheres(bodies: Sequence[tuple[int, tuple[Primitive, ...]]], cell: float) -> Spheres:
     """Spheres around all primitives of pairs of a frame, ascending, and its primitives."""
     frames, centres, radii = [], [], []
     for frame, primitives in bodies:
