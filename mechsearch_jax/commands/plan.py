@@ -30,6 +30,7 @@ def plan(
     camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None,
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None,
     example: bool = False,
+    joints: Annotated[tuple[float, ...], tyro.conf.arg(metavar="RAD ...")] = (),
     state: Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")] = None,
     failed: bool = False,
     seed: int = 0,
@@ -47,6 +48,7 @@ def plan(
       camera: JSON with the fields of a ROS CameraInfo and T_world_camera; the configuration's camera if not given.
       config: file of settings of camera, shelf, gripper, target and planner; `mechsearch config` prints an example.
       example: take the images that ship with the package, and write them to --out, too, as files like yours.
+      joints: where the arm is, seven angles; at home if not given.
       state: where the search is kept from call to call. If it is there, the last motion is taken to be over.
       failed: whether that motion failed.
       seed: of all random numbers.
@@ -87,7 +89,7 @@ def plan(
             console.print(f"{state}: the target was taken out; the search is finished", soft_wrap=True)
             return
         status.update("looking and planning; the first time in a workcell this takes minutes")
-        step = searcher.next(**images)
+        step = searcher.next(**images, joints=joints or None)
         status.update("writing")
         files = _write(step, out)
         if state is not None:
@@ -131,8 +133,9 @@ def _example(out: Path) -> tuple[dict[str, np.ndarray], Camera]:
 
 
 def _write(step: SearchStep, out: Path) -> list[Path]:
-    """Write a step; the files, of which a trajectory's are gone where there is none."""
+    """Write a step; the files. Where it has no trajectory, an earlier one's files are removed: nobody is to follow it."""
     from mechsearch_jax.files import save_json
+    from mechsearch_jax.robot.trajectory_files import save_csv, save_ros
     from mechsearch_jax.viz.drawing import save_figure
 
     told = {
@@ -140,10 +143,17 @@ def _write(step: SearchStep, out: Path) -> list[Path]:
         "kind": step.kind,
         "reason": step.reason,
         "warnings": list(step.warnings),
+        "motion": None if step.trajectory is None else dataclasses.asdict(step.trajectory.report()),
         "cost": float(step.decision.cost),
         "poses": int(step.belief.exists.sum()),
         "found": bool(step.belief.found),
     }
+    files = {"trajectory.csv": save_csv, "trajectory.json": save_ros}
+    for name, save in files.items():
+        if step.trajectory is None:
+            (out / name).unlink(missing_ok=True)
+        else:
+            save(step.trajectory, out / name, overwrite=True)
     save_json(told, out / "step.json")
     save_figure(step.picture, out / "step.png")
-    return [out / "step.json", out / "step.png"]
+    return [out / "step.json", out / "step.png", *(out / name for name in files if step.trajectory is not None)]

@@ -225,7 +225,9 @@ def _fingers(opening: float) -> tuple[Primitive, ...]:
     right = np.diag([-1.0, -1.0, 1.0, 1.0])
     right[:3, 3] = (0.0, -opening / 2, FINGER_BASE)
     return tuple(
-        dataclasses.replace(part, T_frame_primitive=T @ part.T_frame_primitive) for T in (left, right) for part in FINGER
+        dataclasses.replace(part, T_frame_primitive=T @ part.T_frame_primitive)
+        for T in (left, right)
+        for part in FINGER
     )
 
 

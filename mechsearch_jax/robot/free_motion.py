@@ -166,7 +166,9 @@ def free_motion(
     rows = _timed(_respaced(path, WAYPOINTS), timestep, pace, least)
     if not straight and not space.allowed(_thinned(rows, config.step)).all():
         # The smooth curve cuts a corner where there is no room: stop at each.
-        pieces = [_timed(_respaced(np.array(pair), WAYPOINTS), timestep, pace, 0.0) for pair in itertools.pairwise(path)]
+        pieces = [
+            _timed(_respaced(np.array(pair), WAYPOINTS), timestep, pace, 0.0) for pair in itertools.pairwise(path)
+        ]
         rows = np.concatenate(pieces)
     nearest = clearance(body, obstacles, np.concatenate([start[None], _thinned(rows, config.step)])).free.min()
     return FreeMotion(rows, float(nearest), straight)
@@ -236,7 +238,9 @@ def _connected(
     for attempt in range(config.attempts):
         # The way round is rarely far from both ends; where it is, later attempts look everywhere.
         near = attempt < config.attempts // 2
-        lower, upper = (np.maximum(low, JOINT_LOWER), np.minimum(high, JOINT_UPPER)) if near else (JOINT_LOWER, JOINT_UPPER)
+        lower, upper = (
+            (np.maximum(low, JOINT_LOWER), np.minimum(high, JOINT_UPPER)) if near else (JOINT_LOWER, JOINT_UPPER)
+        )
         place = rng.uniform(lower, upper)
         grown = _grown(trees[attempt % 2], place, space, config.extension)
         if grown is None:

@@ -6,13 +6,12 @@
         ...                                         # move along step.trajectory
         searcher.acted(ok=True)
 
-A thin shell over `Recogniser`, `update_belief`, a policy and `joint_trajectory`; it keeps the belief between the steps,
+A thin shell over `Recogniser`, `update_belief`, a policy and `whole_trajectory`; it keeps the belief between the steps,
 and says in words what the arrays say. It is the only part of the library that has a state.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -24,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions.nothing import no_action
-from mechsearch_jax.actions.registry import kind_of
-from mechsearch_jax.actions.trajectory import joint_trajectory
+from mechsearch_jax.actions.registry import KINDS, kind_of
+from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.observation import Observation
@@ -37,8 +36,11 @@ from mechsearch_jax.planner.policies import Policy, search_for_grasp
 from mechsearch_jax.planner.presets import standard
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.robot.free_motion import check_joints
+from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.search.state import State, beginning, load_state, save_state
 from mechsearch_jax.search.step import SearchStep, motion, shown
+from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
 
 # Share of the candidate poses below which a target that is found would often be out of reach.
 LEAST_REACH = 0.5
@@ -73,6 +75,7 @@ class Searcher:
         seed: int = 0,
         policy: Policy | None = None,
         recogniser: Callable[[Problem], Any] = Recogniser,
+        trajectories: TrajectoryConfig | None = None,
     ):
         """Set up a search. Nothing is compiled yet; see `warm_up`.
 
@@ -82,6 +85,8 @@ class Searcher:
           seed: of all random numbers.
           policy: what decides; by default search-for-grasp with the planner's part of `config`.
           recogniser: makes what recognises of a problem, with the signature of `Recogniser`.
+          trajectories: how motions are made, where a controller should stop, and when recognition is too doubtful to
+            move; the default if left out.
 
         Raises:
           InputError: the target cannot be grasped by the gripper, or the camera does not see the shelf.
@@ -91,6 +96,7 @@ class Searcher:
         self._seed = seed
         self._policy = policy or search_for_grasp(self.config.planner)
         self._make_recogniser = recogniser
+        self._trajectories = trajectories
         self._state: State | None = None
 
     @functools.cached_property
@@ -165,10 +171,12 @@ class Searcher:
         stage(STAGES[4])
         middle = jnp.mean(problem.poses, axis=0)
         found = seen.replace(target_visible=jnp.array(True), target_pose=middle)
-        jax.block_until_ready(self._policy(key, problem, update_belief(problem, belief, found), found))
+        belief = update_belief(problem, belief, found)
+        decision = jax.block_until_ready(self._policy(key, problem, belief, found))
         stage(STAGES[5])
-        with contextlib.suppress(InputError):
-            joint_trajectory(problem, nothing)
+        for kind in KINDS.values():
+            reference_motion(kind, decision.action, MotionConfig(gripper=problem.gripper))
+        motion(problem, belief, found, decision, depth, None, self.workcell.arm, self._trajectories)
 
     def next(
         self,
@@ -176,6 +184,7 @@ class Searcher:
         colour: Any = None,
         mask: Any = None,
         target_id: int | None = None,
+        joints: Any = None,
     ) -> SearchStep:
         """Look, and decide what to do next.
 
@@ -186,6 +195,7 @@ class Searcher:
           colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
           mask: integers (H, W), the number of the object that a pixel shows; see `Recogniser`.
           target_id: the target's number in the mask; negative where the mask does not show it.
+          joints: where the arm is, seven angles [rad]; at home if left out.
 
         Returns:
           The step. Its trajectory is to be followed as it is; then `acted` is to be told.
@@ -198,6 +208,9 @@ class Searcher:
             raise InputError("next: the target was taken out, and the search is finished; make another Searcher")
         seeing, deciding = jax.random.split(jax.random.fold_in(jax.random.key(self._seed), now.index))
         depth = np.asarray(depth)
+        if joints is not None:
+            joints = np.asarray(joints, float)
+            check_joints("joints", joints)
         observation = self.recogniser(seeing, depth, colour, mask, target_id)
         warnings = [*camera_faults(problem.camera, problem.shelf)]
         warnings += image_faults(problem.camera, problem.shelf, depth, None if mask is None else np.asarray(mask))
@@ -209,20 +222,21 @@ class Searcher:
                 "f became empty and was started anew: something moved that was not seen, or a shape is wrong"
             )
         decision = self._policy(deciding, problem, belief, observation)
-        kind, reason, trajectory = motion(problem, belief, observation, decision)
+        arm = self.workcell.arm
+        done = motion(problem, belief, observation, decision, depth, joints, arm, self._trajectories)
         step = SearchStep(
             index=now.index,
-            kind=kind,
-            reason=reason,
+            kind=done.kind,
+            reason=done.reason,
             warnings=tuple(warnings),
-            trajectory=trajectory,
+            trajectory=done.trajectory,
             observation=observation,
             belief=belief,
             decision=decision,
             problem=problem,
             image=shown(depth, colour),
         )
-        handed = trajectory is not None
+        handed = done.trajectory is not None
         self._state = State(now.index, belief, observation, decision.action, handed, acted=False, finished=False)
         return step
 

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from mechsearch_jax.actions.registry import ActionKind, kind_of
 from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.actions.trajectory import JointTrajectory, joint_trajectory
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.belief import Belief, graspability_map
 from mechsearch_jax.planner.impasse import impasse
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.state import Decision
+from mechsearch_jax.robot.arm_config import ArmConfig
+from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
+from mechsearch_jax.search.whole_trajectory import TrajectoryConfig, whole_trajectory
 from mechsearch_jax.viz.filmstrip import Frame, filmstrip
 
 
@@ -32,7 +35,7 @@ class SearchStep:
       kind: name of the kind of action: "push", "pick-and-place", "retrieve", or "none" where nothing is possible.
       reason: what is to be done and what for, or why nothing can be, in one line.
       warnings: what does not fit, a line each; empty where all is well.
-      trajectory: the motion; None where there is no action.
+      trajectory: the motion, from where the arm is, through the action, and home; None where there is no action.
       observation, belief, decision: everything behind it.
       problem: what it was decided for.
       image: what was seen, uint8 (H, W, 3): the colour image, or the depth as shades of grey.
@@ -42,7 +45,7 @@ class SearchStep:
     kind: str
     reason: str
     warnings: tuple[str, ...]
-    trajectory: JointTrajectory | None
+    trajectory: RobotTrajectory | None
     observation: Observation
     belief: Belief
     decision: Decision
@@ -73,24 +76,62 @@ class SearchStep:
         return filmstrip([frame], self.problem.camera, self.problem.shelf, self.problem.target, heading)
 
 
+class Motion(NamedTuple):
+    """What is done.
+
+    Attributes:
+      kind: name of the kind of action; that of doing nothing where the action cannot be executed.
+      reason: why it is done, or why nothing is.
+      trajectory: the motion, if anything is done.
+    """
+
+    kind: str
+    reason: str
+    trajectory: RobotTrajectory | None
+
+
 def motion(
-    problem: Problem, belief: Belief, observation: Observation, decision: Decision
-) -> tuple[str, str, JointTrajectory | None]:
-    """The name of the kind of action, why it is taken or none is, and its motion."""
-    kind = kind_of(int(decision.action.kind))
+    problem: Problem,
+    belief: Belief,
+    observation: Observation,
+    decision: Decision,
+    depth: Float[np.ndarray, "h w"],
+    joints: Float[np.ndarray, " 7"] | None,
+    arm: ArmConfig,
+    config: TrajectoryConfig | None,
+) -> Motion:
+    """The motion of a decision, or why there is none.
+
+    Args:
+      problem, belief, observation, decision: what was decided, and on what.
+      depth: what `observation` comes from.
+      joints: where the arm is [rad]; at home if None.
+      arm: how it is used.
+      config: how trajectories are made.
+    """
+    kind, nothing = kind_of(int(decision.action.kind)), kind_of(ActionKind.NONE).name
     found = bool(belief.found)
     known = "the target is found" if found else f"the target can be at {int(jnp.sum(belief.exists))} poses"
     if kind.code == ActionKind.NONE:
-        return kind.name, f"{known}; {impasse(problem, belief, observation.objects)}", None
+        return Motion(nothing, f"{known}; {impasse(problem, belief, observation.objects)}", None)
     does = kind.describe(decision.action, observation.objects.capacity)
     try:
-        trajectory = joint_trajectory(problem, decision.action)
+        trajectory = whole_trajectory(
+            problem,
+            observation,
+            decision,
+            joints=joints,
+            home=np.array(arm.home),
+            speed=arm.speed,
+            depth=depth,
+            config=config,
+        )
     except InputError as error:
-        return kind_of(ActionKind.NONE).name, f"{known}; {does}: {error}", None
+        return Motion(nothing, f"{known}; to {does} is not possible: {error}", None)
     if kind.takes_target:
-        return kind.name, f"{known}; {does}: a grasp is known that meets nothing", trajectory
+        return Motion(kind.name, f"{known}; {does}: a grasp is known that meets nothing", trajectory)
     cost = f"cost {float(decision.cost):.0f}, {float(decision.predicted_cost):.0f} expected afterwards"
-    return kind.name, f"{known}; {does}: {cost}", trajectory
+    return Motion(kind.name, f"{known}; {does}: {cost}", trajectory)
 
 
 def shown(depth: np.ndarray, colour: Any) -> np.ndarray:
