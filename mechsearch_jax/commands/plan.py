@@ -133,7 +133,7 @@ def _example(out: Path) -> tuple[dict[str, np.ndarray], Camera]:
 
 
 def _write(step: SearchStep, out: Path) -> list[Path]:
-    """Write a step; the files. Where it has no trajectory, an earlier one's files are removed: nobody is to follow it."""
+    """Write a step; the files. Without a trajectory those of an earlier one are removed: nobody is to follow it."""
     from mechsearch_jax.files import save_json
     from mechsearch_jax.robot.trajectory_files import save_csv, save_ros
     from mechsearch_jax.viz.drawing import save_figure

@@ -1,4 +1,4 @@
-"""Whether what was recognised explains the depth image that it was recognised in: if not, the robot had better not move.
+"""Whether what was recognised explains the depth image that it was recognised in: if not, the robot must not move.
 
 An `Observation` holds shapes without a word of how sure they are. The image itself tells: what stands on the board must
 lie on a recognised surface, and no ray may pass through a recognised object.

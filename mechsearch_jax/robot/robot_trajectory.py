@@ -132,7 +132,7 @@ class RobotTrajectory:
 
 
 def limit_shares(position: Float[np.ndarray, "t 7"], timestep: float) -> tuple[float, float, float]:
-    """The highest shares of the limits of velocity, acceleration and jerk in the differences of rows, from rest to rest."""
+    """The highest shares of the limits of velocity, acceleration and jerk in differences of rows, from rest to rest."""
     still = (np.repeat(end, 3, axis=0) for end in (position[:1], position[-1:]))
     first, last = still
     values, shares = np.concatenate([first, position, last]), []
