@@ -33,7 +33,11 @@ if TYPE_CHECKING:
     from mechsearch_jax.planner.problem import Problem, build_problem
     from mechsearch_jax.planner.settings import Settings, load_settings
     from mechsearch_jax.planner.state import Decision
+    from mechsearch_jax.planner.workcell import Workcell
+    from mechsearch_jax.robot.arm_config import ArmConfig
     from mechsearch_jax.robot.gripper import Gripper
+    from mechsearch_jax.search.searcher import Searcher
+    from mechsearch_jax.search.step import SearchStep
     from mechsearch_jax.workspace.camera import Camera
     from mechsearch_jax.workspace.render import render_depth
     from mechsearch_jax.workspace.scenario import load_scenario
@@ -44,6 +48,7 @@ if TYPE_CHECKING:
 _ROOMS = {
     "Action": "actions.types",
     "ActionKind": "actions.registry",
+    "ArmConfig": "robot.arm_config",
     "Belief": "planner.belief",
     "Camera": "workspace.camera",
     "Config": "planner.config",
@@ -55,10 +60,13 @@ _ROOMS = {
     "Policy": "planner.policies",
     "Problem": "planner.problem",
     "Recogniser": "perception.recogniser",
+    "SearchStep": "search.step",
+    "Searcher": "search.searcher",
     "Settings": "planner.settings",
     "Shelf": "workspace.shelf",
     "Superquadrics": "geometry.superquadric",
     "Target": "workspace.target",
+    "Workcell": "planner.workcell",
     "best": "planner.presets",
     "build_problem": "planner.problem",
     "cached_problem": "planner.cache",
@@ -79,6 +87,7 @@ _ROOMS = {
 __all__ = [
     "Action",
     "ActionKind",
+    "ArmConfig",
     "Belief",
     "Camera",
     "Config",
@@ -90,10 +99,13 @@ __all__ = [
     "Policy",
     "Problem",
     "Recogniser",
+    "SearchStep",
+    "Searcher",
     "Settings",
     "Shelf",
     "Superquadrics",
     "Target",
+    "Workcell",
     "best",
     "build_problem",
     "cached_problem",

@@ -20,6 +20,16 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.push import PushConfig
 from mechsearch_jax.networks.weights import load_weights, save_weights, weight_shapes
 from mechsearch_jax.perception.examples import Images, load_images, save_images
+from mechsearch_jax.perception.image_files import (
+    load_camera,
+    load_colour,
+    load_depth,
+    load_mask,
+    save_camera,
+    save_colour,
+    save_depth,
+    save_mask,
+)
 from mechsearch_jax.planner.settings import example_config, load_settings
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import check_name, example_scenarios, load_scenario
@@ -78,7 +88,33 @@ def weights(rng, folder):
     return lambda: load_weights(archive, "push")
 
 
-KINDS = {kind.__name__: kind for kind in (scenario, config, camera, images, weights)}
+def camera_file(rng, folder):
+    save_camera(SMALL, folder / "file.json")
+    (folder / "file.json").write_bytes(either(rng, (folder / "file.json").read_bytes(), mutated_json))
+    return lambda: load_camera(folder / "file.json")
+
+
+def picture(rng, folder):
+    """A depth or colour image or a mask, as another one or with its bytes changed."""
+    kind = ("depth", "colour", "mask")[rng.randrange(3)]
+    path = folder / ("file.png", "file.npy")[rng.randrange(2)]
+    if path.suffix == ".npy":
+        shape = ((9, 16), (9, 16, 3), (0, 4), (9,), (1, 2, 3, 4))[rng.randrange(5)]
+        np.save(path, np.full(shape, 1, (np.float32, np.uint16, np.int8, bool, "U3", complex)[rng.randrange(6)]))
+    else:
+        saves = (
+            lambda: save_depth(np.ones((9, 16), np.float32), path),
+            lambda: save_colour(np.ones((9, 16, 3), np.uint8), path),
+            lambda: save_mask(np.ones((9, 16), np.int8), path),
+        )
+        saves[rng.randrange(3)]()
+    if rng.random() < 0.7:
+        path.write_bytes(damaged(rng, path.read_bytes()))
+    load = {"depth": load_depth, "colour": load_colour, "mask": lambda path: load_mask(path, 255)}[kind]
+    return lambda: load(path)
+
+
+KINDS = {kind.__name__: kind for kind in (scenario, config, camera, camera_file, images, picture, weights)}
 
 
 def check(kind, number, folder):

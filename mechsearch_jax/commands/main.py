@@ -24,6 +24,7 @@ from mechsearch_jax.commands.doctor import doctor, print_config
 from mechsearch_jax.commands.evaluate import evaluate
 from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
 from mechsearch_jax.commands.options import with_planner_options
+from mechsearch_jax.commands.plan import plan
 from mechsearch_jax.commands.report import report
 from mechsearch_jax.commands.search import search
 from mechsearch_jax.errors import InputError, nearest
@@ -42,6 +43,7 @@ def _only_described(description: str | None) -> Callable[[], None]:
 
 COMMANDS: Commands = {
     "search": search,
+    "plan": plan,
     "inspect": inspect_scenarios,
     "evaluate": evaluate,
     "report": report,

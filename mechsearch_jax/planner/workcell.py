@@ -9,6 +9,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner.cache import cached_problem, is_cached
 from mechsearch_jax.planner.config import ProblemConfig
 from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -17,19 +18,21 @@ from mechsearch_jax.workspace.target import Target
 
 @dataclasses.dataclass(frozen=True)
 class Workcell:
-    """Camera, shelf, gripper and target; hashable. Frame: the robot's base.
+    """Camera, shelf, gripper, target and arm; hashable. Frame: the robot's base.
 
     Attributes:
       camera: what looks into the shelf.
       shelf: where the objects stand.
       gripper: what grasps them.
       target: what is searched; of a scenario, which has its own, how finely it is searched.
+      arm: how the arm is used.
     """
 
     camera: Camera = dataclasses.field(default_factory=Camera)
     shelf: Shelf = dataclasses.field(default_factory=Shelf)
     gripper: Gripper = dataclasses.field(default_factory=Gripper)
     target: Target = dataclasses.field(default_factory=Target)
+    arm: ArmConfig = dataclasses.field(default_factory=ArmConfig)
 
     def __post_init__(self):
         room = min(self.shelf.back - self.shelf.front, self.shelf.left - self.shelf.right)

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.interpolate import CubicSpline
 
 from mechsearch_jax.robot.kinematics import ACCELERATION_LIMIT, JERK_LIMIT, VELOCITY_LIMIT
 
@@ -112,6 +113,20 @@ def angles_along(curves: Curve, which: Int[Array, " m"], s: Float[Array, " m"]) 
     apart = (curves.knots + 2.0 * jnp.arange(count)[:, None]).reshape(-1)
     segment = jnp.searchsorted(apart, s + 2.0 * which, side="right", method="scan_unrolled") - 1
     return _derivatives(flat, jnp.clip(segment, which * n, which * n + n - 2), s)[0]
+
+
+def travelled(curve: Curve, ramp: int, steps: int) -> Float[np.ndarray, "{steps} 7"]:
+    """Joint angles [rad] along one curve after each of `steps` equal parts of its time, in float64; not for `jit`.
+
+    Args:
+      curve: without leading axes.
+      ramp: which of `RAMPS` its profile has.
+      steps: into how many parts the time is divided; the last row is the curve's end.
+    """
+    share = _profile(np.arange(1, steps + 1) / steps, RAMPS[ramp])
+    knots = np.asarray(curve.knots, float)
+    spline = CubicSpline(knots / knots[-1], np.asarray(curve.q, float), bc_type="natural")
+    return spline(np.clip(share, 0.0, 1.0))
 
 
 def _derivatives(curve: Curve, segment: Array, s: Array) -> tuple[Array, Array, Array, Array]:

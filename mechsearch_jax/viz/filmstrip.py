@@ -35,7 +35,7 @@ class Frame:
       scene: the objects as the planner knew them.
       existence: f at the candidate poses.
       graspability: g at the candidate poses.
-      target_pose: x, y [m] and yaw [rad] of the true target.
+      target_pose: x, y [m] and yaw [rad] of the true target; None where nobody knows it.
       found: whether the robot knows that pose.
       after: the objects as the planner expects them after the action.
       sketch: what there is to show of the action.
@@ -48,7 +48,7 @@ class Frame:
     scene: Superquadrics
     existence: Bool[np.ndarray, " x"]
     graspability: Int[np.ndarray, " x"]
-    target_pose: Float[np.ndarray, " 3"]
+    target_pose: Float[np.ndarray, " 3"] | None
     found: bool
     after: Superquadrics
     sketch: Sketch
@@ -111,6 +111,7 @@ def _draw(view, above, frame: Frame, camera: Camera, shelf: Shelf, target: Targe
     image = drawing.map_image(frame.existence, frame.graspability, target, frame.scene.capacity)
     drawing.draw_map(above, image, shelf, target)
     drawing.draw_objects(above, frame.scene)
-    drawing.draw_target(above, frame.target_pose, target, frame.found)
+    if frame.target_pose is not None:
+        drawing.draw_target(above, frame.target_pose, target, frame.found)
     drawing.draw_sketch_in_view(view, frame.sketch, camera)
     drawing.draw_sketch(above, frame.sketch, frame.after)

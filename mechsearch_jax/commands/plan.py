@@ -1,0 +1,159 @@
+"""`mechsearch plan`: one decision from images in files."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from mechsearch_jax.search.step import SearchStep
+    from mechsearch_jax.workspace.camera import Camera
+
+# What stands for no object in a mask of 8 bits, if not said otherwise.
+BACKGROUND = 255
+
+
+def plan(
+    *,
+    depth: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE")] = None,
+    color: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE")] = None,
+    mask: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE")] = None,
+    background: int = BACKGROUND,
+    target_id: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None,
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None,
+    example: bool = False,
+    joints: Annotated[tuple[float, ...], tyro.conf.arg(metavar="RAD ...")] = (),
+    state: Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")] = None,
+    failed: bool = False,
+    seed: int = 0,
+    out: Path,
+) -> None:
+    """Decide on the next action from images of a real camera, and write its motion.
+
+    Args:
+      depth: depth image: PNG or TIFF of 16 bits in millimetres, or TIFF or .npy of floats in metres.
+      color: colour image, registered to the depth image; the target is seen by its colour.
+      mask: image of whole numbers, one for each object, registered to the depth image; without it the segmentation
+        network tells the objects apart.
+      background: the number in the mask that stands for no object.
+      target_id: the target's number in the mask, where the mask shows it.
+      camera: JSON with the fields of a ROS CameraInfo and T_world_camera; the configuration's camera if not given.
+      config: file of settings of camera, shelf, gripper, target and planner; `mechsearch config` prints an example.
+      example: take the images that ship with the package, and write them to --out, too, as files like yours.
+      joints: where the arm is, seven angles; at home if not given.
+      state: where the search is kept from call to call. If it is there, the last motion is taken to be over.
+      failed: whether that motion failed.
+      seed: of all random numbers.
+      out: folder for step.json, trajectory.csv, trajectory.json and step.png.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.commands.options import settings_of
+    from mechsearch_jax.files import check_writable, is_file
+    from mechsearch_jax.perception.image_files import load_camera
+    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.search.searcher import Searcher
+
+    if example == (depth is not None):
+        raise InputError("plan: give either --depth IMAGE or --example, not both")
+    if example and (color is not None or mask is not None or camera is not None):
+        raise InputError("plan: --example has images and a camera of its own; leave --color, --mask and --camera out")
+    if target_id is not None and mask is None:
+        raise InputError("plan: --target-id names a number of a mask; give --mask, too")
+    settings = settings_of(config)
+    workcell = settings.workcell
+    check_writable(out)
+    if example:
+        images, seen_by = _example(out)
+    else:
+        assert depth is not None
+        seen_by = workcell.camera if camera is None else load_camera(camera)
+        images = _images(depth, color, mask, background, target_id)
+    keep_compilations()
+    console = Console(highlight=False)
+    with console.status("preparing") as status:
+        searcher = Searcher(dataclasses.replace(workcell, camera=seen_by), settings.config, seed=seed)
+        if state is not None and is_file(state):
+            searcher.load(state)
+            if searcher.moving:
+                searcher.acted(ok=not failed)
+        if searcher.finished:
+            console.print(f"{state}: the target was taken out; the search is finished", soft_wrap=True)
+            return
+        status.update("looking and planning; the first time in a workcell this takes minutes")
+        step = searcher.next(**images, joints=joints or None)
+        status.update("writing")
+        files = _write(step, out)
+        if state is not None:
+            searcher.save(state)
+    for warning in step.warnings:
+        console.print(f"[yellow]warning[/yellow]: {warning}", soft_wrap=True)
+    console.print(f"[bold]{step.kind}[/bold]: {step.reason}", soft_wrap=True)
+    console.print("\n".join(str(file) for file in files), soft_wrap=True)
+
+
+def _images(
+    depth: Path, color: Path | None, mask: Path | None, background: int, target_id: int | None
+) -> dict[str, Any]:
+    """The arguments of `Searcher.next` from files."""
+    from mechsearch_jax.perception import image_files
+
+    images: dict[str, Any] = {"depth": image_files.load_depth(depth)}
+    if color is not None:
+        images["colour"] = image_files.load_colour(color)
+    if mask is not None:
+        images["mask"], numbers = image_files.load_mask(mask, background)
+        if target_id is not None:
+            # A number that the mask does not show: the target is not seen.
+            images["target_id"] = numbers.get(target_id, -1)
+        elif color is None and len(numbers) == 9:
+            raise InputError(f"{mask}: names nine objects; say with --target-id which is the target, or leave one out")
+    return images
+
+
+def _example(out: Path) -> tuple[dict[str, np.ndarray], Camera]:
+    """The shipped images, and copies of them as files."""
+    from mechsearch_jax.perception import image_files
+    from mechsearch_jax.perception.examples import example_images
+
+    images = example_images()
+    image_files.save_depth(images.depth, out / "depth.png")
+    image_files.save_colour(images.colour, out / "color.png")
+    image_files.save_mask(images.mask, out / "mask.png", BACKGROUND)
+    image_files.save_camera(images.camera, out / "camera.json")
+    return {"depth": images.depth, "colour": images.colour}, images.camera
+
+
+def _write(step: SearchStep, out: Path) -> list[Path]:
+    """Write a step; the files. Without a trajectory those of an earlier one are removed: nobody is to follow it."""
+    from mechsearch_jax.files import save_json
+    from mechsearch_jax.robot.trajectory_files import save_csv, save_ros
+    from mechsearch_jax.viz.drawing import save_figure
+
+    told = {
+        "index": step.index,
+        "kind": step.kind,
+        "reason": step.reason,
+        "warnings": list(step.warnings),
+        "motion": None if step.trajectory is None else dataclasses.asdict(step.trajectory.report()),
+        "cost": float(step.decision.cost),
+        "poses": int(step.belief.exists.sum()),
+        "found": bool(step.belief.found),
+    }
+    files = {"trajectory.csv": save_csv, "trajectory.json": save_ros}
+    for name, save in files.items():
+        if step.trajectory is None:
+            (out / name).unlink(missing_ok=True)
+        else:
+            save(step.trajectory, out / name, overwrite=True)
+    save_json(told, out / "step.json")
+    save_figure(step.picture, out / "step.png")
+    return [out / "step.json", out / "step.png", *(out / name for name in files if step.trajectory is not None)]

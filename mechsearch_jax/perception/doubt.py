@@ -1,0 +1,219 @@
+"""Whether what was recognised explains the depth image that it was recognised in: if not, the robot must not move.
+
+An `Observation` holds shapes without a word of how sure they are. The image itself tells: what stands on the board must
+lie on a recognised surface, and no ray may pass through a recognised object.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.cloud import OVERHANG, shelf_view
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+# Of the shelf's part of the image at most about so many pixels are looked at, spread evenly over it.
+PIXELS = 20_000
+# A share of fewer points than this says nothing.
+FEWEST_POINTS = 50
+# How near to the shelf's faces a point counts as the shelf [m].
+FACES = 0.012
+# An object is looked at if so many rays pass through it.
+FEWEST_RAYS = 20
+# The part of a round object's box that is inside it, across.
+INSCRIBED = 0.7
+
+
+@dataclasses.dataclass(frozen=True)
+class DoubtConfig:
+    """When recognition is too doubtful to move.
+
+    Attributes:
+      tolerance: how far a point may be from a recognised surface, and how deep a ray may pass through an object [m].
+      missing: share of the shelf's part of the image without a measured depth.
+      unexplained: share of the points on the board that are on no recognised surface.
+      passed: share of the rays towards an object that pass through it, of the worst object.
+    """
+
+    tolerance: float = 0.012
+    missing: float = 0.5
+    unexplained: float = 0.25
+    passed: float = 0.3
+
+    def __post_init__(self):
+        if not (self.tolerance > 0 and math.isfinite(self.tolerance)):
+            raise InputError(f"DoubtConfig: tolerance {self.tolerance} must be positive, in metres")
+        for name in ("missing", "unexplained", "passed"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"DoubtConfig: {name} {getattr(self, name)} must be a share from 0 to 1")
+
+
+class Doubt(NamedTuple):
+    """How badly a depth image is explained; all shares from 0 to 1.
+
+    Attributes:
+      missing: of the shelf's part of the image: without a measured depth.
+      unexplained: of the points on the board: on no recognised surface.
+      passed: of the rays that reach the worst object: pass through it.
+      worst: what that object is called; empty where no ray reaches any.
+    """
+
+    missing: float
+    unexplained: float
+    passed: float
+    worst: str
+
+    def reason(self, config: DoubtConfig) -> str | None:
+        """Why recognition is too doubtful, in one line; None where it is not."""
+        checks = (
+            (self.missing, config.missing, "of the shelf's part of the depth image are not measured"),
+            (self.unexplained, config.unexplained, "of what stands on the board is on no recognised object"),
+            (self.passed, config.passed, f"of the rays that reach {self.worst} pass through where it was recognised"),
+        )
+        for share, most, what in checks:
+            if share > most:
+                return f"{100 * share:.0f} % {what}; at most {100 * most:.0f} % may be"
+        return None
+
+
+class _Thing(NamedTuple):
+    """What was recognised: its name, half-extents [m], whether it is round about z, and the world in its frame."""
+
+    name: str
+    size: Float[np.ndarray, "3"]
+    is_round: bool
+    rotation: Float[np.ndarray, "3 3"]
+    position: Float[np.ndarray, "3"]
+
+    def local(self, vectors: np.ndarray) -> np.ndarray:
+        """Directions in the world, in its own frame."""
+        return vectors @ self.rotation
+
+
+def recognition_doubt(
+    camera: Camera,
+    shelf: Shelf,
+    target: Target,
+    observation: Observation,
+    depth: Float[np.ndarray, "height width"],
+    tolerance: float = DoubtConfig.tolerance,
+) -> Doubt:
+    """How badly what was recognised explains the depth image; some milliseconds, not for `jit`.
+
+    Args:
+      camera: the camera of the image.
+      shelf: whose space is looked at.
+      target: an object like the others where it was seen.
+      observation: what was recognised; without batch axes.
+      depth: as `Recogniser` takes it [m].
+      tolerance: as in `DoubtConfig` [m].
+
+    Raises:
+      InputError: the image is not of the camera's size, or the camera does not see the shelf.
+    """
+    if np.shape(depth) != (camera.height, camera.width):
+        raise InputError(f"depth image: its shape is {np.shape(depth)}, not {(camera.height, camera.width)}")
+    rays, depths = _seen(camera, shelf, np.asarray(depth, float))
+    measured = depths > 0.0
+    missing = 1.0 - float(measured.mean())
+    rays, depths = rays[measured], depths[measured]
+    finite = np.isfinite(depths)
+    origin = np.array(camera.position, float)
+    points = origin + depths[finite, None] * rays[finite]
+    points = points[_on_the_board(shelf, points)]
+    things = _things(shelf, target, observation)
+
+    apart = np.full(len(points), np.inf)
+    for thing in things:
+        apart = np.minimum(apart, _surface_distance(thing, thing.local(points - thing.position)))
+    enough = len(points) >= FEWEST_POINTS
+    unexplained = float((apart > tolerance).mean()) if enough else 0.0
+    passed = [(_passed(thing, origin, rays, depths, tolerance), thing.name) for thing in things]
+    return Doubt(missing, unexplained, *max(passed, default=(0.0, "")))
+
+
+def check_recognition(problem: Any, observation: Observation, depth: Any, config: DoubtConfig) -> None:
+    """Refuse what was recognised where it does not explain the image.
+
+    Args:
+      problem: whose camera, shelf and target are meant; see `recogniser.Setting`.
+      observation, depth: as in `recognition_doubt`.
+      config: what is too much.
+
+    Raises:
+      InputError: it is too doubtful; the line says why.
+    """
+    doubt = recognition_doubt(
+        problem.camera, problem.shelf, problem.target, observation, np.asarray(depth), config.tolerance
+    )
+    if reason := doubt.reason(config):
+        raise InputError(f"recognition is too doubtful to move: {reason}; look again")
+
+
+def _seen(camera: Camera, shelf: Shelf, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rays of pixels of the shelf's part of the image, scaled to unit depth, and their depths; 0 if not measured."""
+    whole = shelf_view(camera, shelf, 1)
+    stride = max(1, math.ceil(math.sqrt(whole.camera.width * whole.camera.height / PIXELS)))
+    rows = whole.row + np.arange(0, whole.camera.height, stride)
+    columns = whole.column + np.arange(0, whole.camera.width, stride)
+    depths = depth[np.ix_(rows, columns)].reshape(-1)
+    v, u = np.meshgrid((rows + 0.5 - camera.cy) / camera.fy, (columns + 0.5 - camera.cx) / camera.fx, indexing="ij")
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.array(camera.rotation, float).T
+    return rays, np.where(np.isnan(depths), 0.0, depths)
+
+
+def _on_the_board(shelf: Shelf, points: np.ndarray) -> np.ndarray:
+    x, y, z = points.T
+    deep = (x > shelf.front - OVERHANG) & (x < shelf.back - FACES)
+    wide = (y > shelf.right + FACES) & (y < shelf.left - FACES)
+    return deep & wide & (z > shelf.board + FACES) & (z < shelf.ceiling - FACES)
+
+
+def _things(shelf: Shelf, target: Target, observation: Observation) -> list[_Thing]:
+    objects = observation.objects
+    sizes, exponents, positions, rotations, valid = (
+        np.asarray(a, float)
+        for a in (objects.size, objects.exponents, objects.position, objects.rotation, objects.valid)
+    )
+    things = [
+        _Thing(f"object {i}", sizes[i], bool(exponents[i, 1] > 0.5), rotations[i], positions[i])
+        for i in np.flatnonzero(valid)
+    ]
+    if bool(observation.target_visible):
+        x, y, yaw = np.asarray(observation.target_pose, float)
+        turned = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
+        place, is_round = np.array([x, y, target.height(shelf)]), target.exponents[1] > 0.5
+        things.append(_Thing("the target", np.array(target.half_size), is_round, turned, place))
+    return things
+
+
+def _surface_distance(thing: _Thing, points: np.ndarray) -> np.ndarray:
+    """About how far points in its own frame are from its surface [m], inside or outside."""
+    past = np.abs(points) - thing.size
+    if thing.is_round:
+        across = np.hypot(points[:, 0] / thing.size[0], points[:, 1] / thing.size[1]) - 1.0
+        past = np.stack([across * min(thing.size[:2]), past[:, 2]], axis=1)
+    return np.abs(np.linalg.norm(np.maximum(past, 0.0), axis=1) + np.minimum(past.max(axis=1), 0.0))
+
+
+def _passed(thing: _Thing, origin: np.ndarray, rays: np.ndarray, depths: np.ndarray, tolerance: float) -> float:
+    """Share of the rays that reach the inner part of an object and are measured beyond it."""
+    inner = np.maximum(thing.size - tolerance, 0.3 * thing.size)
+    if thing.is_round:
+        inner[:2] *= INSCRIBED
+    start, way = thing.local(origin - thing.position), thing.local(rays)
+    way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+    ends = np.sort(np.stack([(-inner - start) / way, (inner - start) / way]), axis=0)
+    enter, leave = ends[0].max(axis=1), ends[1].min(axis=1)
+    reaches = (enter < leave) & (depths > enter - 3.0 * tolerance)
+    if reaches.sum() < FEWEST_RAYS:
+        return 0.0
+    return float((depths[reaches] > leave[reaches]).mean())

@@ -1,0 +1,237 @@
+"""Images and cameras in files, as cameras' drivers write them.
+
+| what | files |
+|---|---|
+| depth | PNG or TIFF of 16 bits in millimetres; TIFF or `.npy` of floats in metres; 0 or NaN for not measured |
+| colour | PNG or JPEG, 8 bits a channel |
+| mask | PNG or `.npy` of whole numbers, one for each object, and one that stands for none |
+| camera | JSON with the fields of a ROS `sensor_msgs/CameraInfo` and `T_world_camera` |
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from PIL import Image
+
+from mechsearch_jax.errors import InputError, nearest, shown
+from mechsearch_jax.files import PathLike, read_bytes, read_json, replacing, save_json
+from mechsearch_jax.perception.labels import INSTANCES, OTHER
+from mechsearch_jax.workspace.camera import Camera
+
+# What is larger is no image of a depth camera [bytes, pixels].
+IMAGE_LIMIT = 256 * 2**20
+PIXEL_LIMIT = 64 * 10**6
+MILLIMETRE = 0.001
+# No intrinsics and no pose hold a larger number.
+LARGEST_NUMBER = 1e7
+# An object that covers more of a mask is none: its number stands for no object [share].
+LARGEST = 0.5
+# What in a camera's file is not looked at, since it says nothing of an image that is rectified.
+_UNUSED = ("header", "distortion_model", "R", "r", "P", "p", "binning_x", "binning_y", "roi", "frame_id")
+_CAMERA_KEYS = ("width", "height", "K", "D", "T_world_camera")
+
+
+def load_depth(path: PathLike) -> Float[np.ndarray, "h w"]:
+    """A depth image in metres along the camera's z, 0 or NaN where nothing was measured.
+
+    Raises:
+      InputError: the file cannot be read, or holds no depth image.
+    """
+    image = _pixels(path)
+    if image.ndim != 2:
+        raise InputError(f"{path}: has {image.shape[-1]} channels; a depth image has one")
+    if image.dtype.kind == "f":
+        return image.astype(np.float32)
+    if image.dtype.kind in "iu" and image.dtype.itemsize > 1:
+        return image.astype(np.float32) * np.float32(MILLIMETRE)
+    raise InputError(
+        f"{path}: holds {image.dtype}; a depth image has 16 bits in millimetres, or floats in metres (.npy, .tiff)"
+    )
+
+
+def load_colour(path: PathLike) -> UInt8[np.ndarray, "h w 3"]:
+    """A colour image: red, green and blue.
+
+    Raises:
+      InputError: the file cannot be read, or holds no colour image.
+    """
+    image = _pixels(path)
+    if image.ndim != 3 or image.shape[-1] not in (3, 4) or image.dtype != np.uint8:
+        raise InputError(
+            f"{path}: holds {image.dtype} of shape {image.shape}; give red, green and blue with 8 bits each"
+        )
+    return np.ascontiguousarray(image[..., :3])
+
+
+def load_mask(path: PathLike, background: int) -> tuple[Int[np.ndarray, "h w"], dict[int, int]]:
+    """A mask with the numbers that a `Recogniser` takes, and which number in the file each of them was.
+
+    Args:
+      path: of the file; its objects may have any numbers.
+      background: the number that stands for no object, as negative ones do.
+
+    Raises:
+      InputError: the file cannot be read, holds no mask, or more objects than there can be.
+    """
+    image = _pixels(path)
+    if image.ndim != 2 or image.dtype.kind not in "iu":
+        raise InputError(f"{path}: holds {image.dtype} of shape {image.shape}; a mask has one whole number a pixel")
+    numbers, count = np.unique(image, return_counts=True)
+    named = [(int(n), int(c)) for n, c in zip(numbers, count, strict=True) if n != background and n >= 0]
+    for number, pixels in named:
+        if pixels > LARGEST * image.size:
+            raise InputError(
+                f"{path}: number {number} covers {100 * pixels / image.size:.0f}% of the image; if it stands for no "
+                f"object, say so: --background {number}"
+            )
+    if len(named) > INSTANCES:
+        raise InputError(f"{path}: names {len(named)} objects; at most {INSTANCES} can be told apart")
+    numbered = {number: i for i, (number, _) in enumerate(named)}
+    mask = np.full(image.shape, OTHER, np.int32)
+    for number, i in numbered.items():
+        mask[image == number] = i
+    return mask, numbered
+
+
+def load_camera(path: PathLike) -> Camera:
+    """A camera: the fields `width`, `height` and `K` of a ROS `CameraInfo`, and `T_world_camera`.
+
+    `K` is for pixels whose first has its centre at 0, as in ROS. `T_world_camera` is 4 x 4, the camera's pose in the
+    frame of the robot's base; the camera's own frame has x right, y down, z forward (ROS: the optical frame).
+
+    Raises:
+      InputError: the file cannot be read, or a field is missing, unknown or impossible, or the lens distorts.
+    """
+    value = read_json(path)
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: must hold an object with {', '.join(_CAMERA_KEYS)}")
+    value = {{"k": "K", "d": "D"}.get(key, key): part for key, part in value.items() if key not in _UNUSED}
+    for key in value:
+        if key not in _CAMERA_KEYS:
+            raise InputError(f"{path}: {shown(key)} is unknown; {nearest(key, _CAMERA_KEYS)}")
+    for key in ("width", "height", "K", "T_world_camera"):
+        if key not in value:
+            raise InputError(f"{path}: {key} is missing")
+    for key in ("width", "height"):
+        if type(value[key]) is not int or not 0 < value[key] <= 2**15:
+            raise InputError(f"{path}: {key} must be a whole number of pixels, not {shown(value[key])}")
+    if np.any(_numbers(value.get("D", []), None, "D", path)):
+        raise InputError(f"{path}: D says that the lens distorts; give images that are rectified, and D of zeros")
+    K, T = _numbers(value["K"], (3, 3), "K", path), _numbers(value["T_world_camera"], (4, 4), "T_world_camera", path)
+    if not np.allclose(T[3], (0, 0, 0, 1)):
+        raise InputError(f"{path}: T_world_camera: its last row must be 0 0 0 1; is it transposed?")
+    if abs(K[0, 1]) > 1e-6 or abs(K[1, 0]) > 1e-6:
+        raise InputError(f"{path}: K: pixels must not be skewed")
+    try:
+        return Camera(
+            width=value["width"],
+            height=value["height"],
+            fx=float(K[0, 0]),
+            fy=float(K[1, 1]),
+            cx=float(K[0, 2]) + 0.5,
+            cy=float(K[1, 2]) + 0.5,
+            rotation=tuple(tuple(float(v) for v in row[:3]) for row in T[:3]),
+            position=(float(T[0, 3]), float(T[1, 3]), float(T[2, 3])),
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def save_depth(depth: Float[np.ndarray, "h w"], path: PathLike) -> None:
+    """Write a depth image as a PNG of 16 bits in millimetres.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    known = np.where(np.isfinite(depth), depth, 0.0)
+    _save_png(np.round(np.clip(known / MILLIMETRE, 0, 65535)).astype(np.uint16), path)
+
+
+def save_colour(colour: UInt8[np.ndarray, "h w 3"], path: PathLike) -> None:
+    """Write a colour image as a PNG.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    _save_png(colour, path)
+
+
+def save_mask(mask: Int[np.ndarray, "h w"], path: PathLike, background: int = 255) -> None:
+    """Write a mask as a PNG of 8 bits, `background` where no object is.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    _save_png(np.where(mask < 0, background, mask).astype(np.uint8), path)
+
+
+def save_camera(camera: Camera, path: PathLike) -> None:
+    """Write what `load_camera` reads.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    rows = [[*row, place] for row, place in zip(camera.rotation, camera.position, strict=True)]
+    value = {
+        "width": camera.width,
+        "height": camera.height,
+        "K": [camera.fx, 0.0, camera.cx - 0.5, 0.0, camera.fy, camera.cy - 0.5, 0.0, 0.0, 1.0],
+        "D": [0.0, 0.0, 0.0, 0.0, 0.0],
+        "T_world_camera": [*rows, [0.0, 0.0, 0.0, 1.0]],
+    }
+    save_json(value, path)
+
+
+def _save_png(image: np.ndarray, path: PathLike) -> None:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="PNG")
+    with replacing(path) as file:
+        file.write(buffer.getvalue())
+
+
+def _pixels(path: PathLike) -> np.ndarray:
+    """The pixels of an image file, in whatever type it has them."""
+    data = read_bytes(path, IMAGE_LIMIT)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            image = _array(data) if Path(path).suffix.lower() == ".npy" else _picture(data)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    # To damage the decoders beneath answer with a dozen kinds of exception.
+    except Exception as error:
+        raise InputError(f"{path}: is no whole image ({type(error).__name__})") from error
+    if image.ndim not in (2, 3) or image.size == 0:
+        raise InputError(f"{path}: has the shape {image.shape}, which is no image's")
+    return image
+
+
+def _array(data: bytes) -> np.ndarray:
+    return np.load(io.BytesIO(data), allow_pickle=False)
+
+
+def _picture(data: bytes) -> np.ndarray:
+    with Image.open(io.BytesIO(data)) as image:
+        if image.width * image.height > PIXEL_LIMIT:
+            raise InputError(f"has {image.width} x {image.height} pixels; at most {PIXEL_LIMIT} are read")
+        return np.asarray(image)
+
+
+def _numbers(value: Any, shape: tuple[int, ...] | None, key: str, path: PathLike) -> np.ndarray:
+    """Numbers of a shape, given as nested lists or row by row."""
+    try:
+        array = np.array(value, float)
+        array = array if shape is None else array.reshape(shape)
+        if array.size and not float(np.abs(array).max()) < LARGEST_NUMBER:
+            raise ValueError
+    except (ValueError, TypeError, OverflowError):
+        size = "" if shape is None else f"{math.prod(shape)} "
+        raise InputError(f"{path}: {key} must be {size}numbers, not {shown(value)}") from None
+    return array

@@ -1,0 +1,49 @@
+"""Why nothing can be done: what a person is told where a decision has no action."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from mechsearch_jax.actions.candidates import candidates, free_ways
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.planner.belief import Belief, possible_space, with_target
+from mechsearch_jax.planner.problem import Problem
+
+
+@jax.jit
+def _movable(problem: Problem, belief: Belief, objects: Superquadrics) -> tuple[Bool[Array, " n"], Bool[Array, " n"]]:
+    """Which objects the arm reaches in some way that the shelf allows, and which with nothing in that way."""
+    scene, is_target = with_target(problem, belief, objects)
+    possible = possible_space(problem, belief, belief.exists)
+    ways = candidates(problem.space, problem.actions, scene, possible)
+    theirs = scene.valid & ~is_target
+    reached, free = (
+        jnp.any(jnp.stack([jnp.any(which(kind), axis=(1, 2)) for kind in ways]), axis=0) & theirs
+        for which in (lambda kind: kind.reached, free_ways)
+    )
+    return reached, free
+
+
+def impasse(problem: Problem, belief: Belief, objects: Superquadrics) -> str:
+    """Why no action is possible, in one line. Not to be called inside `jit`.
+
+    Args:
+      problem: what does not change.
+      belief: what is known of the target.
+      objects: as recognised, without the target.
+    """
+    count = int(jnp.sum(objects.valid))
+    if count == 0:
+        return "nothing that could be moved is recognised on the shelf"
+    reached, free = (int(jnp.sum(a)) for a in _movable(problem, belief, objects))
+    what = "the only object" if count == 1 else f"any of the {count} objects"
+    if reached == 0:
+        return f"the arm does not reach {what}, neither to grasp nor to push; is the shelf where it should be?"
+    if free == 0:
+        return f"the arm reaches {reached} of {count} objects, but each way to grasp or push one meets another"
+    return (
+        f"{free} of {count} objects could be moved, but every sampled action is predicted to fail: to jam, tip "
+        "an object, push one over the edge, or find no place for it"
+    )

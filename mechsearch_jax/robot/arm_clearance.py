@@ -1,0 +1,269 @@
+"""How far the whole arm is from the shelf, from objects and from itself: for motions in free space.
+
+Every primitive of links 1 to 7, the hand, the fingers and what is held is covered by spheres, which reach at most
+`CELL` / 2 beyond it; objects are taken as the boxes that hold them. So a distance that is found is never too large,
+and up to about a centimetre too small. Unlike the tests of the planner, which look at straight approaches of a fixed
+wrist inside the shelf, any joint may turn here, and NumPy suffices: some milliseconds for a path.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.robot import kinematics
+from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
+from mechsearch_jax.workspace.shelf import Shelf
+
+# Edge of the cells of which boxes are made up [m]: each has a sphere around it. Coarse ones serve against the arm
+# itself, from which the hand is far as a rule.
+CELL, COARSE_CELL = 0.03, 0.06
+# Distances are told up to this [m].
+FARTHEST = 0.2
+# Joint angles that are looked at together: one compiled function serves all paths.
+BLOCK = 64
+# The foot of the robot, which has no primitive of its own: a capsule about the axis of joint 1 [m].
+FOOT = ((0.0, 0.0, 0.06), (0.0, 0.0, 0.333), 0.08)
+HAND_FRAME = 7
+
+
+class Spheres(NamedTuple):
+    """Spheres that are rigid in frames of `forward_kinematics`.
+
+    Attributes:
+      frame: of each, ascending, shape (n,).
+      centre: in that frame [m], shape (n, 3).
+      radius: [m], shape (n,).
+    """
+
+    frame: Int[np.ndarray, " n"]
+    centre: Float[np.ndarray, "n 3"]
+    radius: Float[np.ndarray, " n"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Held:
+    """What is in the closed hand, as a box.
+
+    Attributes:
+      T_gripper_held: its pose in the gripper frame, shape (4, 4).
+      half_size: half-extents [m].
+    """
+
+    T_gripper_held: np.ndarray
+    half_size: tuple[float, float, float]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ArmBody:
+    """The arm with its fingers at some distance and perhaps something in the hand.
+
+    Attributes:
+      fine: spheres around all of it.
+      coarse: fewer and larger ones around links 6 and 7, the hand, the fingers and what is held.
+    """
+
+    fine: Spheres
+    coarse: Spheres
+
+    @classmethod
+    def of(cls, opening: float, held: Held | None = None) -> ArmBody:
+        """The arm with `opening` m between the fingers."""
+        extra = ((HAND_FRAME, _in_hand(held)),) if held else ()
+        bodies = (*((i, LINKS[i]) for i in range(7)), (HAND_FRAME, HAND), (HAND_FRAME, _fingers(opening)), *extra)
+        return cls(_spheres(bodies, CELL), _spheres(bodies[5:], COARSE_CELL))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Obstacles:
+    """What the arm must not touch.
+
+    Attributes:
+      shelf: with the planner's margins; all beyond its front plane and outside its free space counts as solid.
+      half_size: of the boxes that hold the objects [m], shape (n, 3).
+      T_box_world: their poses, inverted, shape (n, 4, 4).
+      floor: what the robot stands on, as a height [m].
+    """
+
+    shelf: Shelf
+    half_size: Float[np.ndarray, "n 3"]
+    T_box_world: Float[np.ndarray, "n 4 4"]
+    floor: float
+
+    @classmethod
+    def of(cls, shelf: Shelf, scenes: tuple[Superquadrics, ...] = (), floor: float = 0.0) -> Obstacles:
+        """The shelf and the valid objects of some scenes, fields (N, ...)."""
+        sizes, poses = [np.zeros((0, 3))], [np.zeros((0, 4, 4))]
+        for scene in scenes:
+            valid = np.asarray(scene.valid)
+            pose = np.tile(np.eye(4), (int(valid.sum()), 1, 1))
+            pose[:, :3, :3] = np.asarray(scene.rotation, float)[valid]
+            pose[:, :3, 3] = np.asarray(scene.position, float)[valid]
+            sizes.append(np.asarray(scene.size, float)[valid])
+            poses.append(np.linalg.inv(pose))
+        return cls(shelf, np.concatenate(sizes).astype(np.float32), np.concatenate(poses).astype(np.float32), floor)
+
+
+class Clearance(NamedTuple):
+    """Of several joint angles.
+
+    Attributes:
+      free: distance to the nearest obstacle, or of the hand from the arm's foot and upper arm, at most `FARTHEST`;
+        0 or less where the arm may touch [m], shape (m,).
+      inside: how far the arm reaches beyond the plane of the shelf's front; negative in front of it [m], shape (m,).
+    """
+
+    free: Float[np.ndarray, " m"]
+    inside: Float[np.ndarray, " m"]
+
+
+def clearance(body: ArmBody, obstacles: Obstacles, q: Float[np.ndarray, "m 7"]) -> Clearance:
+    """How far the arm is from everything at joint angles `q` [rad]."""
+    parts = [_block_clearance(body, obstacles, q[i : i + BLOCK]) for i in range(0, len(q), BLOCK)]
+    return Clearance(np.concatenate([p.free for p in parts]), np.concatenate([p.inside for p in parts]))
+
+
+def link_poses(q: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "m 8 4 4"]:
+    """`kinematics.forward_kinematics` by blocks, so that nothing is compiled for another number of rows."""
+    parts = []
+    for i in range(0, len(q), BLOCK):
+        rows = q[i : i + BLOCK]
+        padded = np.concatenate([rows, np.repeat(rows[-1:], BLOCK - len(rows), axis=0)])
+        parts.append(np.asarray(kinematics.forward_kinematics(padded.astype(np.float32)))[: len(rows)])
+    return np.concatenate(parts)
+
+
+def tip_positions(q: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "m 3"]:
+    """Where the point between the finger tips is [m]."""
+    hand = link_poses(q)[:, HAND_FRAME]
+    return hand[:, :3, 3] + kinematics.FINGER_TIPS * hand[:, :3, 2]
+
+
+def _block_clearance(body: ArmBody, obstacles: Obstacles, q: np.ndarray) -> Clearance:
+    frames = link_poses(q)
+    centres, radius = _placed(body.fine, frames), body.fine.radius
+    to_shelf = _shelf_distance(obstacles.shelf, centres) - radius
+    # The foot and links 1 and 2 stand on the floor.
+    to_floor = (centres[..., 2] - radius - obstacles.floor)[:, body.fine.frame >= 2]
+    free = np.minimum(np.minimum(to_shelf.min(axis=1), to_floor.min(axis=1)), FARTHEST)
+    free = np.minimum(free, _objects_distance(obstacles, centres, radius))
+    free = np.minimum(free, _own_distance(body.coarse, frames))
+    inside = np.max(centres[..., 0] + radius, axis=1) - obstacles.shelf.front
+    return Clearance(free.astype(float), inside.astype(float))
+
+
+def _placed(spheres: Spheres, frames: np.ndarray) -> np.ndarray:
+    """Centres of spheres in the base frame, shape (m, n, 3)."""
+    placed = []
+    for frame in np.unique(spheres.frame):
+        local = spheres.centre[spheres.frame == frame]
+        placed.append(local @ np.swapaxes(frames[:, frame, :3, :3], 1, 2) + frames[:, frame, None, :3, 3])
+    return np.concatenate(placed, axis=1)
+
+
+def _shelf_distance(shelf: Shelf, points: np.ndarray) -> np.ndarray:
+    """Distance to what is solid of the shelf, negative in it; beside the free space that of its front plane."""
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    to_wall = np.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
+    to_board = np.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
+    beside, before = np.minimum(to_wall, to_board), shelf.front - x
+    in_front = np.hypot(np.maximum(beside, 0.0), before)
+    return np.where(before > 0.0, in_front, np.minimum(beside, shelf.back - x))
+
+
+def _objects_distance(obstacles: Obstacles, centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Distance to the nearest box, at most `FARTHEST`, for each of the joint angles."""
+    least = np.full(len(centres), FARTHEST)
+    for half_size, T in zip(obstacles.half_size, obstacles.T_box_world, strict=True):
+        middle, reach = -T[:3, :3].T @ T[:3, 3], float(np.linalg.norm(half_size)) + FARTHEST
+        row, column = np.nonzero(np.sum((centres - middle) ** 2, axis=-1) < (reach + radius) ** 2)
+        if len(row):
+            past = np.abs(centres[row, column] @ T[:3, :3].T + T[:3, 3]) - half_size
+            outside = np.linalg.norm(np.maximum(past, 0.0), axis=-1) + np.minimum(past.max(axis=-1), 0.0)
+            np.minimum.at(least, row, outside - radius[column])
+    return least
+
+
+def _own_distance(coarse: Spheres, frames: np.ndarray) -> np.ndarray:
+    """Distance of the wrist, the hand and what it holds from the foot and links 1 and 2."""
+    points = _placed(coarse, frames)
+    least = np.full(len(frames), np.inf)
+    for frame, start, end, radius in _own_capsules():
+        T = frames[:, frame] if frame >= 0 else np.broadcast_to(np.eye(4, dtype=np.float32), (len(frames), 4, 4))
+        a = (T[:, :3, :3] @ start + T[:, :3, 3])[:, None]
+        along = (T[:, :3, :3] @ (end - start))[:, None]
+        share = np.sum((points - a) * along, axis=-1) / np.sum(along**2, axis=-1)
+        nearest = a + np.clip(share, 0.0, 1.0)[..., None] * along
+        apart = np.linalg.norm(points - nearest, axis=-1) - coarse.radius - radius
+        least = np.minimum(least, apart.min(axis=1))
+    return least
+
+
+@functools.cache
+def _own_capsules() -> tuple[tuple[int, np.ndarray, np.ndarray, float], ...]:
+    """Capsules of the foot (frame -1) and of links 1 and 2: frame, ends of the axis, radius."""
+    start, end, radius = FOOT
+    capsules = [(-1, np.array(start, np.float32), np.array(end, np.float32), radius)]
+    for frame in (0, 1):
+        for capsule in LINKS[frame]:
+            T, (radius, half) = capsule.T_frame_primitive, capsule.size
+            ends = (T[:3, 3] + sign * half * T[:3, 2] for sign in (-1.0, 1.0))
+            capsules.append((frame, *(e.astype(np.float32) for e in ends), radius))
+    return tuple(capsules)
+
+
+def _fingers(opening: float) -> tuple[Primitive, ...]:
+    """Both fingers in the hand frame."""
+    left = np.eye(4)
+    left[:3, 3] = (0.0, opening / 2, FINGER_BASE)
+    right = np.diag([-1.0, -1.0, 1.0, 1.0])
+    right[:3, 3] = (0.0, -opening / 2, FINGER_BASE)
+    return tuple(
+        dataclasses.replace(part, T_frame_primitive=T @ part.T_frame_primitive)
+        for T in (left, right)
+        for part in FINGER
+    )
+
+
+def _in_hand(held: Held) -> tuple[Primitive, ...]:
+    """What is held, in the hand frame."""
+    pose = np.array(held.T_gripper_held, float)
+    pose[2, 3] += kinematics.FINGER_TIPS
+    return (Primitive("box", tuple(held.half_size), pose),)
+
+
+def _spheres(bodies: Sequence[tuple[int, tuple[Primitive, ...]]], cell: float) -> Spheres:
+    """Spheres around all primitives of pairs of a frame, ascending, and its primitives."""
+    frames, centres, radii = [], [], []
+    for frame, primitives in bodies:
+        for primitive in primitives:
+            local, radius = _cover(primitive.kind, primitive.size, cell)
+            T = primitive.T_frame_primitive
+            frames.append(np.full(len(local), frame))
+            centres.append(local @ T[:3, :3].T + T[:3, 3])
+            radii.append(np.full(len(local), radius))
+    return Spheres(
+        np.concatenate(frames), np.concatenate(centres).astype(np.float32), np.concatenate(radii).astype(np.float32)
+    )
+
+
+@functools.cache
+def _cover(kind: str, size: tuple[float, ...], cell: float) -> tuple[np.ndarray, float]:
+    """Centres and radius of spheres that cover a primitive, in its own frame."""
+    if kind == "capsule":
+        radius, half = size
+        count = max(2, int(np.ceil(2 * half / cell)) + 1)
+        z = np.linspace(-half, half, count)
+        between = half / (count - 1)
+        return np.stack([0 * z, 0 * z, z], axis=1), float(np.hypot(radius, between))
+    counts = [max(1, int(np.ceil(2 * s / cell))) for s in size]
+    steps = [2 * s / n for s, n in zip(size, counts, strict=True)]
+    axes = [(np.arange(n) - (n - 1) / 2) * step for n, step in zip(counts, steps, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return grid, float(np.linalg.norm(steps)) / 2

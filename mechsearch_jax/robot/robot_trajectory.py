@@ -1,0 +1,168 @@
+"""A whole motion as a robot's controller takes it, and how close it comes to the limits."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.interpolate import CubicSpline
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.robot.kinematics import (
+    ACCELERATION_LIMIT,
+    JERK_LIMIT,
+    JOINT_LOWER,
+    JOINT_UPPER,
+    VELOCITY_LIMIT,
+)
+
+
+class Part(enum.IntEnum):
+    """Which part of a motion a row belongs to."""
+
+    WAY_THERE = 0
+    ACTION = 1
+    WAY_HOME = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """Where a controller should stop, and how it grips.
+
+    Attributes:
+      tracking: a joint farther than this from its reference is held up [rad]. In the simulator ordinary actions stay
+        below 0.01, a few reach 0.027; a hand that shoves a box against a wall reaches 0.065 and more.
+      effort: of each joint, the torque beyond what gravity and the motion itself ask for [N m].
+      force: that the hand feels beside its grip and the weight of what it holds [N].
+      grip_force: with which the fingers hold [N].
+    """
+
+    tracking: float = 0.05
+    effort: tuple[float, ...] = (40.0, 40.0, 40.0, 40.0, 10.0, 10.0, 10.0)
+    force: float = 40.0
+    grip_force: float = 60.0
+
+    def __post_init__(self):
+        for name in ("tracking", "force", "grip_force"):
+            if not (getattr(self, name) > 0 and math.isfinite(getattr(self, name))):
+                raise InputError(f"Bounds: {name} {getattr(self, name)} must be a positive number")
+        if len(self.effort) != len(JOINT_LOWER) or not all(0 < e < math.inf for e in self.effort):
+            raise InputError(f"Bounds: effort {self.effort} must be {len(JOINT_LOWER)} positive torques in N m")
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What is known of a trajectory before it is executed.
+
+    Attributes:
+      duration: [s].
+      position_margin: of the joint that comes closest to its limits, how far it stays away [rad]; negative beyond.
+      velocity, acceleration, jerk: the highest share of the limits that any joint reaches, by differences of the rows.
+      clearance: least distance from everything in free space [m], at most 0.2.
+      straight: whether the ways through free space are straight lines in the joints.
+      ends_at_home: false where the way home is not free and the arm stops outside the shelf.
+    """
+
+    duration: float
+    position_margin: float
+    velocity: float
+    acceleration: float
+    jerk: float
+    clearance: float
+    straight: bool
+    ends_at_home: bool
+
+    def within(self, tolerance: float = 1e-3) -> bool:
+        """Whether all joints stay within their limits, their shares up to a tolerance for rounding."""
+        return self.position_margin >= -1e-4 and max(self.velocity, self.acceleration, self.jerk) <= 1.0 + tolerance
+
+    def __str__(self) -> str:
+        shares = ", ".join(f"{name} {100 * getattr(self, name):.0f} %" for name in ("velocity", "acceleration", "jerk"))
+        return (
+            f"{self.duration:.1f} s; of the limits: {shares}; joints {self.position_margin:.2f} rad from theirs; "
+            f"{1000 * self.clearance:.0f} mm from everything in free space"
+            f"{'' if self.straight else ', around what is in the way'}"
+            f"{'' if self.ends_at_home else '; stops outside the shelf: the way home is not free'}"
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RobotTrajectory:
+    """The motion of arm and fingers from where the arm is, through an action, and home; one row for each time step.
+
+    It begins and ends at rest. Positions, velocities and accelerations are those of one smooth curve.
+
+    Attributes:
+      time: since the motion began [s], shape (T,); the first row is 0.
+      position: joint angles [rad], shape (T, 7).
+      velocity: [rad/s], shape (T, 7).
+      acceleration: [rad/s2], shape (T, 7).
+      width: distance between the fingers that is commanded [m], shape (T,); 0 where they grip.
+      force: with which they grip [N], shape (T,); 0 where they hold nothing.
+      part: a `Part` for each row, shape (T,).
+      action: name of the kind of action.
+      bounds: where a controller should stop.
+      clearance: least distance from everything in free space [m], at most 0.2.
+      straight: whether the ways through free space are straight lines in the joints.
+      ends_at_home: false where the way home is not free and the arm stops outside the shelf.
+    """
+
+    time: Float[np.ndarray, " t"]
+    position: Float[np.ndarray, "t 7"]
+    velocity: Float[np.ndarray, "t 7"]
+    acceleration: Float[np.ndarray, "t 7"]
+    width: Float[np.ndarray, " t"]
+    force: Float[np.ndarray, " t"]
+    part: Int[np.ndarray, " t"]
+    action: str
+    bounds: Bounds
+    clearance: float
+    straight: bool
+    ends_at_home: bool
+
+    def report(self) -> Report:
+        """What a dry run tells: duration, shares of the limits, clearance."""
+        timestep = self.time[1] - self.time[0] if len(self.time) > 1 else 1.0
+        shares = limit_shares(self.position, float(timestep))
+        margin = np.minimum(self.position - JOINT_LOWER, JOINT_UPPER - self.position).min()
+        return Report(float(self.time[-1]), float(margin), *shares, self.clearance, self.straight, self.ends_at_home)
+
+
+def limit_shares(position: Float[np.ndarray, "t 7"], timestep: float) -> tuple[float, float, float]:
+    """The highest shares of the limits of velocity, acceleration and jerk in differences of rows, from rest to rest."""
+    still = (np.repeat(end, 3, axis=0) for end in (position[:1], position[-1:]))
+    first, last = still
+    values, shares = np.concatenate([first, position, last]), []
+    for limit in (VELOCITY_LIMIT, ACCELERATION_LIMIT, JERK_LIMIT):
+        values = np.diff(values, axis=0) / timestep
+        shares.append(float((np.abs(values) / limit).max()))
+    return shares[0], shares[1], shares[2]
+
+
+def derivatives(position: Float[np.ndarray, "t 7"], timestep: float) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities and accelerations of the smooth curve through rows, at rest at both ends; shapes (t, 7)."""
+    if len(position) < 2:
+        return np.zeros_like(position), np.zeros_like(position)
+    spline = CubicSpline(np.arange(len(position)) * timestep, position, bc_type="clamped")
+    return spline(spline.x, 1), spline(spline.x, 2)
+
+
+def slowed(position: Float[np.ndarray, "t 7"], factor: float) -> Float[np.ndarray, "s 7"]:
+    """Rows of a motion from rest to rest that takes about `factor` times as long, at least 1; the ends stay.
+
+    Args:
+      position: the rows, the one that it starts from included [rad].
+      factor: how much longer.
+    """
+    if len(position) < 2:
+        return position
+    spline = CubicSpline(np.arange(len(position)), position, bc_type="clamped")
+    return spline(places_when_slowed(len(position), factor))
+
+
+def places_when_slowed(rows: int, factor: float) -> Float[np.ndarray, " s"]:
+    """Where, in rows of the faster motion, the rows of one that takes about `factor` times as long lie."""
+    return np.linspace(0.0, rows - 1, math.ceil((rows - 1) * factor - 1e-9) + 1)

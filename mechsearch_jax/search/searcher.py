@@ -1,0 +1,287 @@
+"""The search as a robot programmer runs it: images in, the next motion out, told again when it is over.
+
+    searcher = ms.Searcher(ms.Workcell(camera=..., shelf=..., target=...))
+    while True:
+        step = searcher.next(depth, colour)         # kind, reason, warnings, trajectory
+        ...                                         # move along step.trajectory
+        searcher.acted(ok=True)
+
+A thin shell over `Recogniser`, `update_belief`, a policy and `whole_trajectory`; it keeps the belief between the steps,
+and says in words what the arrays say. It is the only part of the library that has a state.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.registry import KINDS, kind_of
+from mechsearch_jax.actions.trajectory import reference_motion
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.plausibility import camera_faults, image_faults
+from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.planner.belief import Belief, initial_belief, update_belief
+from mechsearch_jax.planner.config import Config
+from mechsearch_jax.planner.policies import Policy, search_for_grasp
+from mechsearch_jax.planner.presets import standard
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.robot.free_motion import check_joints
+from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.search.state import State, beginning, load_state, save_state
+from mechsearch_jax.search.step import SearchStep, motion, shown
+from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
+
+# Share of the candidate poses below which a target that is found would often be out of reach.
+LEAST_REACH = 0.5
+# What `warm_up` compiles, in this order.
+STAGES = ("the problem", "recognition", "the belief", "the plan", "the grasp", "the motion")
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """What is known of a workcell before the first image.
+
+    Attributes:
+      reach: share of the target's candidate poses at which the arm could grasp it in an empty shelf.
+      warnings: what should be looked at, a line each.
+    """
+
+    reach: float
+    warnings: tuple[str, ...]
+
+
+class Searcher:
+    """Searches for a target with a camera and an arm; the one object of this package that has a state.
+
+    Not thread-safe. What decides is a `Policy`, and what sees is a `Recogniser`; both can be others.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell | None = None,
+        config: Config | None = None,
+        *,
+        seed: int = 0,
+        policy: Policy | None = None,
+        recogniser: Callable[[Problem], Any] = Recogniser,
+        trajectories: TrajectoryConfig | None = None,
+    ):
+        """Set up a search. Nothing is compiled yet; see `warm_up`.
+
+        Args:
+          workcell: camera, shelf, gripper and target; the defaults if left out.
+          config: how the problem is built and how the planner decides; preset `standard` if left out.
+          seed: of all random numbers.
+          policy: what decides; by default search-for-grasp with the planner's part of `config`.
+          recogniser: makes what recognises of a problem, with the signature of `Recogniser`.
+          trajectories: how motions are made, where a controller should stop, and when recognition is too doubtful to
+            move; the default if left out.
+
+        Raises:
+          InputError: the target cannot be grasped by the gripper, or the camera does not see the shelf.
+        """
+        self.workcell = workcell or Workcell()
+        self.config = config or standard()
+        self._seed = seed
+        self._policy = policy or search_for_grasp(self.config.planner)
+        self._make_recogniser = recogniser
+        self._trajectories = trajectories
+        self._state: State | None = None
+
+    @functools.cached_property
+    def problem(self) -> Problem:
+        """What does not change; built when it is first needed, and kept on disk."""
+        return self.workcell.problem(config=self.config.problem)
+
+    @functools.cached_property
+    def recogniser(self) -> Any:
+        """What sees."""
+        return self._make_recogniser(self.problem)
+
+    @property
+    def belief(self) -> Belief:
+        """What is known of the target."""
+        return self._now.belief
+
+    @property
+    def finished(self) -> bool:
+        """Whether the target was taken out."""
+        return self._now.finished
+
+    @property
+    def moving(self) -> bool:
+        """Whether a motion was handed out of which nothing was said since."""
+        return self._now.handed
+
+    @property
+    def _now(self) -> State:
+        if self._state is None:
+            self._state = beginning(self.problem)
+        return self._state
+
+    def check(self) -> Check:
+        """Whether the arm can work in this shelf, and the camera sees it."""
+        poses = self.problem.poses.shape[0]
+        reach = len(np.unique(np.asarray(self.problem.grasps.pair_pose))) / poses
+        warnings = list(camera_faults(self.workcell.camera, self.workcell.shelf))
+        if reach == 0.0:
+            warnings.insert(0, "shelf: the arm reaches the target nowhere; check the shelf's place before the robot")
+        elif reach < LEAST_REACH:
+            warnings.append(f"shelf: the arm can grasp the target at {100 * reach:.0f}% of its possible poses only")
+        return Check(reach, tuple(warnings))
+
+    def warm_up(self, progress: Callable[[str, int], None] = lambda what, left: None) -> None:
+        """Compile and load all that the first steps need, so that they take as long as later ones.
+
+        Args:
+          progress: told what comes next, and how many things come after it.
+        """
+        camera = self.workcell.camera
+        depth = np.full((camera.height, camera.width), np.nan, np.float32)
+        colour = np.zeros((camera.height, camera.width, 3), np.uint8)
+        key = jax.random.key(0)
+        left = len(STAGES)
+
+        def stage(what: str) -> None:
+            nonlocal left
+            left -= 1
+            progress(what, left)
+
+        stage(STAGES[0])
+        problem = self.problem
+        stage(STAGES[1])
+        seen = jax.block_until_ready(self.recogniser(key, depth, colour))
+        stage(STAGES[2])
+        nothing = no_action()
+        belief = jax.block_until_ready(update_belief(problem, initial_belief(problem), seen, seen, nothing))
+        belief = update_belief(problem, belief, seen)
+        stage(STAGES[3])
+        jax.block_until_ready(self._policy(key, problem, belief, seen))
+        stage(STAGES[4])
+        middle = jnp.mean(problem.poses, axis=0)
+        found = seen.replace(target_visible=jnp.array(True), target_pose=middle)
+        belief = update_belief(problem, belief, found)
+        decision = jax.block_until_ready(self._policy(key, problem, belief, found))
+        stage(STAGES[5])
+        for kind in KINDS.values():
+            reference_motion(kind, decision.action, MotionConfig(gripper=problem.gripper))
+        motion(problem, belief, found, decision, depth, None, self.workcell.arm, self._trajectories)
+
+    def next(
+        self,
+        depth: Any,
+        colour: Any = None,
+        mask: Any = None,
+        target_id: int | None = None,
+        joints: Any = None,
+    ) -> SearchStep:
+        """Look, and decide what to do next.
+
+        Asked again without `acted` in between, it looks again: nothing was done since.
+
+        Args:
+          depth: float (H, W), metres along the camera's z; 0 or NaN where nothing was measured.
+          colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
+          mask: integers (H, W), the number of the object that a pixel shows; see `Recogniser`.
+          target_id: the target's number in the mask; negative where the mask does not show it.
+          joints: where the arm is, seven angles [rad]; at home if left out.
+
+        Returns:
+          The step. Its trajectory is to be followed as it is; then `acted` is to be told.
+
+        Raises:
+          InputError: an image's shape, type or unit is not as said, or the search is finished.
+        """
+        problem, now = self.problem, self._now
+        if now.finished:
+            raise InputError("next: the target was taken out, and the search is finished; make another Searcher")
+        seeing, deciding = jax.random.split(jax.random.fold_in(jax.random.key(self._seed), now.index))
+        depth = np.asarray(depth)
+        if joints is not None:
+            joints = np.asarray(joints, float)
+            check_joints("joints", joints)
+        observation = self.recogniser(seeing, depth, colour, mask, target_id)
+        warnings = [*camera_faults(problem.camera, problem.shelf)]
+        warnings += image_faults(problem.camera, problem.shelf, depth, None if mask is None else np.asarray(mask))
+        warnings += crowd_faults(observation)
+        last = (now.observation, now.action) if now.acted else (None, None)
+        belief = update_belief(problem, now.belief, observation, *last)
+        if int(belief.restarts) > int(now.belief.restarts):
+            warnings.append(
+                "f became empty and was started anew: something moved that was not seen, or a shape is wrong"
+            )
+        decision = self._policy(deciding, problem, belief, observation)
+        arm = self.workcell.arm
+        done = motion(problem, belief, observation, decision, depth, joints, arm, self._trajectories)
+        step = SearchStep(
+            index=now.index,
+            kind=done.kind,
+            reason=done.reason,
+            warnings=tuple(warnings),
+            trajectory=done.trajectory,
+            observation=observation,
+            belief=belief,
+            decision=decision,
+            problem=problem,
+            image=shown(depth, colour),
+        )
+        handed = done.trajectory is not None
+        self._state = State(now.index, belief, observation, decision.action, handed, acted=False, finished=False)
+        return step
+
+    def acted(self, ok: bool = True) -> None:
+        """Say that the last step's motion is over.
+
+        After a failure, too: whatever the hand may have moved unseen until it stopped is then reckoned with.
+
+        Args:
+          ok: whether it was carried out to its end. With a retrieval that was, the search is finished.
+
+        Raises:
+          InputError: there is no step whose motion could be over.
+        """
+        now = self._now
+        if not now.handed:
+            raise InputError("acted: no motion was handed out since the last one; call next first")
+        took = ok and kind_of(int(now.action.kind)).takes_target
+        self._state = dataclasses.replace(now, index=now.index + 1, handed=False, acted=True, finished=took)
+
+    def save(self, path: PathLike) -> None:
+        """Write down how far the search is, so that `load` can go on after a crash: an archive of arrays, .npz.
+
+        Raises:
+          InputError: the file cannot be written.
+        """
+        save_state(self._now, self._digest, path)
+
+    def load(self, path: PathLike) -> None:
+        """Go on where a search was that was saved by a searcher that was made as this one.
+
+        Raises:
+          InputError: the file cannot be read, is none of `save`, or is of another workcell or configuration.
+        """
+        self._state = load_state(self.problem, self._digest, path)
+
+    @functools.cached_property
+    def _digest(self) -> str:
+        """What tells searches apart that cannot go on with each other's state."""
+        return hashlib.sha256(repr((self.workcell, self.config, self._seed)).encode()).hexdigest()
+
+
+def crowd_faults(observation: Observation) -> list[str]:
+    """What there is too much of."""
+    slots = observation.objects.capacity
+    if not bool(jnp.all(observation.objects.valid)):
+        return []
+    return [f"recognition: all {slots} slots are taken; objects beyond the largest {slots} are not seen"]

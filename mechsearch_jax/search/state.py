@@ -1,0 +1,126 @@
+"""How far a search is, in memory and in a file."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.types import Action
+from mechsearch_jax.arrays import ARRAYS_LIMIT, read_arrays
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike, read_bytes, replacing
+from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner.belief import Belief, initial_belief
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS
+
+FORMAT = "mechsearch-search"
+VERSION = 1
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class State:
+    """How far a search is.
+
+    Attributes:
+      index: how many actions were taken.
+      belief: after the last look.
+      observation, action: of the last look and decision.
+      handed: whether the action's motion was handed out, and nothing was said of it since.
+      acted: whether the action was tried since the last look.
+      finished: whether the target was taken out.
+    """
+
+    index: int
+    belief: Belief
+    observation: Observation
+    action: Action
+    handed: bool
+    acted: bool
+    finished: bool
+
+
+_PLAIN: dict[str, Callable[[Any], Any]] = {"index": int, "handed": bool, "acted": bool, "finished": bool}
+_PYTREES = ("belief", "observation", "action")
+
+
+def save_state(state: State, digest: str, path: PathLike) -> None:
+    """Write a state as an archive of arrays, .npz.
+
+    Args:
+      state: to be written.
+      digest: of what it belongs to.
+      path: of the file.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    head = {"format": FORMAT, "version": VERSION, "digest": digest, **{name: getattr(state, name) for name in _PLAIN}}
+    buffer = io.BytesIO()
+    arrays = {name: np.asarray(value) for name, value in _arrays(state).items()}
+    np.savez_compressed(buffer, allow_pickle=False, head=np.array(json.dumps(head)), **arrays)
+    with replacing(path) as file:
+        file.write(buffer.getvalue())
+
+
+def load_state(problem: Problem, digest: str, path: PathLike) -> State:
+    """Read what `save_state` wrote.
+
+    Args:
+      problem: of the search.
+      digest: as it was given then.
+      path: of the file.
+
+    Raises:
+      InputError: the file cannot be read, is no state, or belongs to something else.
+    """
+    arrays = read_arrays(read_bytes(path, ARRAYS_LIMIT), path)
+    try:
+        head = json.loads(str(arrays.pop("head")))
+        if (head["format"], head["version"]) != (FORMAT, VERSION):
+            raise ValueError
+        kept, rest = head["digest"], {name: read(head[name]) for name, read in _PLAIN.items()}
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: is no search that was saved; begin a new one") from error
+    if kept != digest:
+        raise InputError(
+            f"{path}: is of another workcell, configuration or seed; make the Searcher as it was made then"
+        )
+    return _restored(beginning(problem), arrays, rest, path)
+
+
+def beginning(problem: Problem) -> State:
+    """Nothing was seen, and nothing done."""
+    nothing = Observation(empty(MAX_OBJECTS), jnp.array(False), jnp.zeros(3))
+    return State(0, initial_belief(problem), nothing, no_action(), handed=False, acted=False, finished=False)
+
+
+def _arrays(state: State) -> dict[str, Any]:
+    """The arrays of a state by the path to each."""
+    trees = {name: getattr(state, name) for name in _PYTREES}
+    return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(trees)}
+
+
+def _restored(like: State, arrays: dict[str, np.ndarray], rest: dict[str, Any], path: PathLike) -> State:
+    """A state from the arrays that `_arrays` gave, of the shapes and types of another one.
+
+    Raises:
+      InputError: an array is missing, or of another shape or type.
+    """
+    wanted = _arrays(like)
+    for name, value in wanted.items():
+        found = arrays.get(name)
+        if found is None or found.shape != value.shape or found.dtype != value.dtype:
+            raise InputError(f"{path}: {name} is missing or of another shape; begin a new search")
+    trees = {name: getattr(like, name) for name in _PYTREES}
+    leaves = [jnp.asarray(arrays[name]) for name in wanted]
+    return State(**jax.tree.unflatten(jax.tree.structure(trees), leaves), **rest)

@@ -1,0 +1,147 @@
+"""What to do next, and why, in words and in a picture."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from mechsearch_jax.actions.registry import ActionKind, kind_of
+from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner.belief import Belief, graspability_map
+from mechsearch_jax.planner.impasse import impasse
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.state import Decision
+from mechsearch_jax.robot.arm_config import ArmConfig
+from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
+from mechsearch_jax.search.whole_trajectory import TrajectoryConfig, whole_trajectory
+from mechsearch_jax.viz.filmstrip import Frame, filmstrip
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SearchStep:
+    """What to do next, and why.
+
+    Attributes:
+      index: how many actions were taken before.
+      kind: name of the kind of action: "push", "pick-and-place", "retrieve", or "none" where nothing is possible.
+      reason: what is to be done and what for, or why nothing can be, in one line.
+      warnings: what does not fit, a line each; empty where all is well.
+      trajectory: the motion, from where the arm is, through the action, and home; None where there is no action.
+      observation, belief, decision: everything behind it.
+      problem: what it was decided for.
+      image: what was seen, uint8 (H, W, 3): the colour image, or the depth as shades of grey.
+    """
+
+    index: int
+    kind: str
+    reason: str
+    warnings: tuple[str, ...]
+    trajectory: RobotTrajectory | None
+    observation: Observation
+    belief: Belief
+    decision: Decision
+    problem: Problem
+    image: np.ndarray
+
+    @functools.cached_property
+    def picture(self) -> Figure:
+        """What was seen, where the target can be and how it could be grasped there, and the action."""
+        objects, after = (jax.tree.map(np.asarray, s) for s in (self.observation.objects, self.decision.predicted))
+        action, found = self.decision.action, bool(self.belief.found)
+        kind, moves = kind_of(int(action.kind)), self.trajectory is not None
+        possible = np.asarray(self.belief.exists)
+        frame = Frame(
+            title=f"{self.index + 1}  {kind.describe(action, objects.capacity) if moves else 'nothing to be done'}",
+            caption=self.reason,
+            image=self.image,
+            owner=np.full(self.image.shape[:2], -1),
+            scene=objects,
+            existence=np.zeros_like(possible) if found else possible,
+            graspability=np.asarray(graspability_map(self.problem, self.belief, self.observation.objects)),
+            target_pose=np.asarray(self.belief.found_pose) if found else None,
+            found=found,
+            after=after,
+            sketch=kind.sketch(objects, after, action) if moves else Sketch(),
+        )
+        heading = "; ".join(self.warnings) or "What the robot sees, and what it is to do"
+        return filmstrip([frame], self.problem.camera, self.problem.shelf, self.problem.target, heading)
+
+
+class Motion(NamedTuple):
+    """What is done.
+
+    Attributes:
+      kind: name of the kind of action; that of doing nothing where the action cannot be executed.
+      reason: why it is done, or why nothing is.
+      trajectory: the motion, if anything is done.
+    """
+
+    kind: str
+    reason: str
+    trajectory: RobotTrajectory | None
+
+
+def motion(
+    problem: Problem,
+    belief: Belief,
+    observation: Observation,
+    decision: Decision,
+    depth: Float[np.ndarray, "h w"],
+    joints: Float[np.ndarray, " 7"] | None,
+    arm: ArmConfig,
+    config: TrajectoryConfig | None,
+) -> Motion:
+    """The motion of a decision, or why there is none.
+
+    Args:
+      problem, belief, observation, decision: what was decided, and on what.
+      depth: what `observation` comes from.
+      joints: where the arm is [rad]; at home if None.
+      arm: how it is used.
+      config: how trajectories are made.
+    """
+    kind, nothing = kind_of(int(decision.action.kind)), kind_of(ActionKind.NONE).name
+    found = bool(belief.found)
+    known = "the target is found" if found else f"the target can be at {int(jnp.sum(belief.exists))} poses"
+    if kind.code == ActionKind.NONE:
+        return Motion(nothing, f"{known}; {impasse(problem, belief, observation.objects)}", None)
+    does = kind.describe(decision.action, observation.objects.capacity)
+    try:
+        trajectory = whole_trajectory(
+            problem,
+            observation,
+            decision,
+            joints=joints,
+            home=np.array(arm.home),
+            speed=arm.speed,
+            depth=depth,
+            config=config,
+        )
+    except InputError as error:
+        return Motion(nothing, f"{known}; to {does} is not possible: {error}", None)
+    if kind.takes_target:
+        return Motion(kind.name, f"{known}; {does}: a grasp is known that meets nothing", trajectory)
+    cost = f"cost {float(decision.cost):.0f}, {float(decision.predicted_cost):.0f} expected afterwards"
+    return Motion(kind.name, f"{known}; {does}: {cost}", trajectory)
+
+
+def shown(depth: np.ndarray, colour: Any) -> np.ndarray:
+    """What was seen, as an image of 8 bits a channel."""
+    if colour is not None:
+        image = np.asarray(colour)
+        return image if image.dtype == np.uint8 else np.round(255 * image).astype(np.uint8)
+    measured = np.isfinite(depth) & (depth > 0)
+    low, high = np.percentile(depth[measured], (1, 99)) if measured.any() else (0.0, 1.0)
+    with np.errstate(invalid="ignore"):
+        shade = np.clip((high - depth) / max(high - low, 1e-6), 0.0, 1.0) * 200 + 30
+    grey = np.where(measured, shade, 0.0).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)
