@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array
 
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.errors import InputError
@@ -108,13 +109,13 @@ class Search(flax.struct.PyTreeNode):
         return jax.tree.map(lambda a, b: jnp.where(able, a, b), _take_out(self, observation, grasp), planned)
 
 
-@jax.jit
+@kept()
 def _plan(search: Search, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
     rollout = Rollout(problem, belief, search.config, search.propose, search.predict, search.objective)
     return plan(rollout, key, observation.objects)
 
 
-@jax.jit
+@kept()
 def _take_out(search: Search, observation: Observation, grasp: GraspChoice) -> Decision:
     return Decision(
         action=grasp.action,
