@@ -52,6 +52,7 @@ class _Keeping:
 
 
 _KEEPING = _Keeping()
+_TRACING = threading.RLock()
 
 
 def keep_in(folder: Path | None) -> None:
@@ -99,15 +100,15 @@ class Kept:
         self._executable(args, kwargs)
 
     def is_ready(self, *args: Any, **kwargs: Any) -> bool:
-        """Whether a call with these arguments compiles nothing, for what is kept; it may still have to be read."""
+        """Whether `prepare` with these arguments has nothing to compile; what was kept may still have to be read."""
         asked = self._asked(args, kwargs)
         if asked is None:
-            return False
+            return True
         executables, key, described = asked
         if key in self._loaded:
             return True
         said = described()
-        return said is not None and executables.has(self._name, said)
+        return said is None or executables.has(self._name, said)
 
     def _split(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any], Any]:
         """The arguments that are data, by position and by name, and those that are static."""
@@ -156,9 +157,7 @@ class Kept:
                     self._loaded[key] = self._found(executables, described(), args, kwargs)
         return self._loaded[key]
 
-    def _found(
-        self, executables: Executables, said: str | None, args: tuple[Any, ...], kwargs: dict[str, Any]
-    ) -> Any:
+    def _found(self, executables: Executables, said: str | None, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         if said is None:
             return None
         moving, named, _ = self._split(args, kwargs)
@@ -167,7 +166,6 @@ class Kept:
             found = self._compiled(args, kwargs)
             executables.save(self._name, said, found)
         return found
-
 
     def _compiled(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """The function, compiled for some arguments, such that it can be kept.
@@ -181,8 +179,10 @@ class Kept:
             return self.__wrapped__(*args, **kwargs)
 
         fresh.__name__ = f"{fresh.__name__}_{uuid.uuid4().hex[:8]}"
-        lowered = jax.jit(fresh, static_argnames=tuple(self._static)).lower(*args, **kwargs)
-        _forget_source(lowered)
+        # One after the other, so that the first is compiled, for which Python is not needed, as the next is traced.
+        with _TRACING:
+            lowered = jax.jit(fresh, static_argnames=tuple(self._static)).lower(*args, **kwargs)
+            _forget_source(lowered)
         # On a CPU with `CPU_OPTIONS`, where XLA knows them and nobody else has a say.
         if jax.devices()[0].platform == "cpu" and not os.environ.get("XLA_FLAGS"):
             try:

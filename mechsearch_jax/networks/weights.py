@@ -147,6 +147,21 @@ def read_card(archive: PathLike, name: str) -> dict[str, Any]:
     return card
 
 
+def read_archive(path: Path, card: dict[str, Any]) -> bytes:
+    """An archive, as its card describes it.
+
+    Raises:
+      InputError: it is missing, or another than its card describes.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); train or install weights") from None
+    if hashlib.sha256(data).hexdigest() != card.get("sha256"):
+        raise InputError(f"{path}: is not the file that its card describes (SHA-256 differs); copy both again")
+    return data
+
+
 def load_weights(path: PathLike, name: str) -> Weights:
     """Read an archive, checked against its card and against the network that it is for.
 
@@ -159,13 +174,7 @@ def load_weights(path: PathLike, name: str) -> Weights:
     """
     path = Path(path)
     card = read_card(path, name)
-    architecture = ARCHITECTURES[name]
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); train or install weights") from None
-    if hashlib.sha256(data).hexdigest() != card.get("sha256"):
-        raise InputError(f"{path}: is not the file that its card describes (SHA-256 differs); copy both again")
+    architecture, data = ARCHITECTURES[name], read_archive(path, card)
     try:
         config = architecture.config(**card["config"])
         shapes: dict[str, Any] = flatten_dict(architecture.shapes(config), sep="/")

@@ -82,6 +82,14 @@ class Search(flax.struct.PyTreeNode):
     predict: Predict = flax.struct.field(pytree_node=False)
     objective: Objective = flax.struct.field(pytree_node=False)
 
+    def prepare(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> None:
+        """Load or compile what a plan with such arguments needs, without planning; see `compiled.Kept.prepare`."""
+        _plan.prepare(self, key, problem, belief, observation)
+
+    def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
+        """Whether nothing has to be compiled for a plan with such arguments; see `compiled.Kept.is_ready`."""
+        return _plan.is_ready(self, key, problem, belief, observation)
+
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """See `Policy`."""
         if not isinstance(belief.found, Tracer):
