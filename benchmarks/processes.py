@@ -177,12 +177,7 @@ class _Feeder(threading.Thread):
             stdout=subprocess.PIPE,
             stderr=self._complaints,
             text=True,
-            # What this process can import, a user's policy among it, its workers can.
-            env={
-                **os.environ,
-                **self._environment,
-                "PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder),
-            },
+            env={**os.environ, **self._environment},
             start_new_session=True,
         )
 

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Int, UInt
 
 from mechsearch_jax.actions import Action, no_action
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.compile_clock import CompileClock
 from mechsearch_jax.envs.episode_log import (
     Choice,
@@ -366,7 +367,7 @@ class _EpisodePool:
         return Moment(log.index, known.snapshot, known.observation, known.belief, decision, log.steps[-1], None)
 
 
-@jax.jit
+@kept()
 def _keys_at(data: UInt[Array, "slots 2 *words"], steps: Int[Array, " slots"]) -> tuple[Array, Array]:
     """The planner's and the environment's key of every slot at its present step."""
     keys, fold = jax.random.wrap_key_data(data), jax.vmap(jax.random.fold_in)

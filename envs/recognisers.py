@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, World
@@ -149,7 +150,7 @@ class ImageRecogniser:
         return Observation(objects, snapshot.target_seen, pose)
 
 
-@functools.partial(jax.jit, static_argnames=("recogniser", "view", "shelf"))
+@kept(static_argnames=("recogniser", "view", "shelf"))
 def labelled(
     keys: Key[Array, "2"],
     recogniser: ImageRecogniser,

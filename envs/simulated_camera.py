@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.model import shelf_boxes
 from mechsearch_jax.envs.world import BODIES, TARGET, World
 from mechsearch_jax.geometry.transforms import rotate
@@ -139,7 +140,7 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
     return jnp.where((owner == SHELF)[:, None], walls[wall], body).reshape(*flat, 3)
 
 
-@partial(jax.jit, static_argnames=("camera", "shelf"))
+@kept(static_argnames=("camera", "shelf"))
 def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Image:
     """The camera's image of the shelf and everything on it; the robot is out of the way.
 
@@ -163,7 +164,7 @@ def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Image:
     return Image(depth, owner, colour)
 
 
-@partial(jax.jit, static_argnames=("camera", "window"))
+@kept(static_argnames=("camera", "window"))
 def target_pixels(camera: Camera, world: World, window: int | None = None) -> Int[Array, ""]:
     """How many pixels of the target the camera sees: those of `observe`, counted in a window around the target only.
 

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action, no_action
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.episode_log import Choice, chosen
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
 from mechsearch_jax.envs.verdicts import Verdict, judge, judge_many
@@ -215,7 +216,7 @@ def _known(problem: Problem, belief: Belief, world: World) -> Known:
     return Known(*jax.device_get((belief.found, size, truth, belief.restarts)))
 
 
-@jax.jit
+@kept()
 def _told(poses: Array, exists: Bool[Array, "slots x"], world: World) -> tuple[Array, Array]:
     """At how many candidate poses the target can be, and whether at the one nearest to the truth."""
     nearest = jax.vmap(lambda here: nearest_candidate(poses, true_target_pose(here)))(world)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 from jaxtyping import Array, Bool, Float
 
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -65,7 +66,7 @@ def judge_many(problem: Problem, worlds: World, active: Bool[Array, " n"]) -> li
     return [Verdict(*map(bool, each)) for each in zip(*found, strict=True)]
 
 
-@jax.jit
+@kept()
 def _graspable(grasps: TargetGrasps, objects: Superquadrics, pose: Float[Array, " 3"]) -> Bool[Array, ""]:
     return best_grasp(grasps, objects, pose).success
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.perception.examples import example_images
     from mechsearch_jax.perception.recogniser import Recogniser
     from mechsearch_jax.planner.belief import Belief, initial_belief, update_belief
-    from mechsearch_jax.planner.cache import cached_problem
+    from mechsearch_jax.planner.cache import cached_problem, keep_compilations
     from mechsearch_jax.planner.config import Config
     from mechsearch_jax.planner.policies import Policy, random_action, search_and_grasp, search_for_grasp
     from mechsearch_jax.planner.presets import best, paper, standard
@@ -73,6 +73,7 @@ _ROOMS = {
     "example_images": "perception.examples",
     "initial_belief": "planner.belief",
     "joint_trajectory": "actions.trajectory",
+    "keep_compilations": "planner.cache",
     "load_scenario": "workspace.scenario",
     "load_settings": "planner.settings",
     "paper": "planner.presets",
@@ -112,6 +113,7 @@ __all__ = [
     "example_images",
     "initial_belief",
     "joint_trajectory",
+    "keep_compilations",
     "load_scenario",
     "load_settings",
     "paper",

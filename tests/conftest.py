@@ -130,8 +130,12 @@ def problem():
 
 @pytest.fixture(scope="module", autouse=True)
 def forget_compilations():
-    """Drop compiled functions between files where the process holds many of their memory mappings."""
+    """Drop compiled functions between files where the process holds many of their memory mappings, and keep none that
+    a command has kept."""
     yield
+    from mechsearch_jax.compiled import keep_in
+
+    keep_in(None)
     maps = Path("/proc/self/maps")
     if not maps.exists() or maps.read_bytes().count(b"\n") > MAPPINGS:
         jax.clear_caches()

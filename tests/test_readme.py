@@ -32,7 +32,9 @@ def test_the_first_screen_has_the_picture():
 
 
 @pytest.mark.slow
-def test_the_lines_of_python_lead_from_images_to_a_joint_trajectory(capsys):
+def test_the_lines_of_python_lead_from_images_to_a_joint_trajectory(capsys, monkeypatch):
+    # The process belongs to all tests, and keeps nothing.
+    monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
     (code,) = blocks("python")
     names = {}
     exec(code, names)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -12,6 +10,7 @@ from jaxtyping import Array, Bool
 from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference
@@ -37,7 +36,7 @@ class JointTrajectory(flax.struct.PyTreeNode):
     gripper: jax.Array
 
 
-@functools.partial(jax.jit, static_argnames=("kind", "config"))
+@kept(static_argnames=("kind", "config"))
 def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:
     """`Kind.reference`, compiled: the motion of an action and whether the arm reaches all of it, or None.
 

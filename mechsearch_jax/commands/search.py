@@ -47,14 +47,9 @@ def search(
 
     from mechsearch_jax.envs.episodes import run_episode, target_of
     from mechsearch_jax.envs.generator import ScenarioGenerator
-    from mechsearch_jax.envs.narration import Narrator, verdict
-    from mechsearch_jax.envs.native import NativeSimulator
-    from mechsearch_jax.envs.recognisers import recogniser
-    from mechsearch_jax.envs.records import save_episode
+    from mechsearch_jax.envs.warm_up import first_decision, prepared
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
-    from mechsearch_jax.viz.drawing import save_figure
-    from mechsearch_jax.viz.filmstrip import filmstrip
     from mechsearch_jax.workspace.scenario import load_scenario, save_scenario
 
     if (scenario is None) == (objects is None):
@@ -75,18 +70,28 @@ def search(
         )
         wanted = target_of(scene, workcell.target)
         problem = workcell.problem(wanted, chosen.config.problem)
-        narrator = Narrator(console, status, problem)
-        episode = run_episode(
-            seed,
-            scene,
-            problem,
-            chosen.policy(),
-            NativeSimulator(shelf=workcell.shelf, camera=workcell.camera),
-            recogniser(chosen.recognition, wanted),
-            chosen.config.max_steps,
-            chosen.options(),
-            narrator,
-        )
+        policy_now = chosen.policy()
+        with prepared(first_decision(problem, policy_now), lambda text: console.print(text, style="dim")):
+            # These take long to import, and meanwhile what the first decision needs is read or compiled.
+            from mechsearch_jax.envs.narration import Narrator, verdict
+            from mechsearch_jax.envs.native import NativeSimulator
+            from mechsearch_jax.envs.recognisers import recogniser
+            from mechsearch_jax.envs.records import save_episode
+            from mechsearch_jax.viz.drawing import save_figure
+            from mechsearch_jax.viz.filmstrip import filmstrip
+
+            narrator = Narrator(console, status, problem)
+            episode = run_episode(
+                seed,
+                scene,
+                problem,
+                policy_now,
+                NativeSimulator(shelf=workcell.shelf, camera=workcell.camera),
+                recogniser(chosen.recognition, wanted),
+                chosen.config.max_steps,
+                chosen.options(),
+                narrator,
+            )
         status.update("writing")
         strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
         save_figure(strip, out / "filmstrip.png")

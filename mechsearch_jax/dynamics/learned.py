@@ -19,7 +19,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.networks.push import PushNetwork, apply_network
 from mechsearch_jax.networks.push_geometry import push_start
-from mechsearch_jax.networks.weights import Weights, load_weights, read_card
+from mechsearch_jax.networks.weights import Weights, load_weights, read_archive, read_card
 from mechsearch_jax.workspace.shelf import Shelf
 
 NAME = "push"
@@ -62,11 +62,18 @@ class LearnedPush:
             raise InputError(
                 f"LearnedPush: likely {self.likely} must be from 0 to 1, and slack {self.slack} m must not be negative"
             )
+        shipped = self.path is None
         path = self.path or Path(str(importlib.resources.files("mechsearch_jax") / "networks" / f"{NAME}.npz"))
         # What a frozen instance derives from its arguments can be set in no other way.
         object.__setattr__(self, "path", path)
-        object.__setattr__(self, "digest", str(read_card(path, NAME).get("sha256")))
-        _weights(path, self.digest)
+        card = read_card(path, NAME)
+        object.__setattr__(self, "digest", str(card.get("sha256")))
+        if shipped:
+            # Of what ships it is known that the network fits; to find that out takes a second, and what was compiled
+            # before does not need the network any more.
+            read_archive(path, card)
+        else:
+            _weights(path, self.digest)
 
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array

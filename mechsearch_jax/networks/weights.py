@@ -146,6 +146,21 @@ def read_card(archive: PathLike, name: str) -> dict[str, Any]:
     return card
 
 
+def read_archive(path: Path, card: dict[str, Any]) -> bytes:
+    """An archive, as its card describes it.
+
+    Raises:
+      InputError: it is missing, or another than its card describes.
+    """
+    try:
+        data = read_bytes(path, ARRAYS_LIMIT)
+    except InputError as error:
+        raise InputError(f"{error}; train or install weights") from None
+    if hashlib.sha256(data).hexdigest() != card.get("sha256"):
+        raise InputError(f"{path}: is not the file that its card describes (SHA-256 differs); copy both again")
+    return data
+
+
 @functools.cache
 def weight_shapes(name: str, config: Any) -> dict[str, tuple[int, ...]]:
     """The shapes of a network's parameters, by their paths."""
@@ -186,13 +201,7 @@ def load_weights(path: PathLike, name: str) -> Weights:
     """
     path = Path(path)
     card = read_card(path, name)
-    try:
-        data = read_bytes(path, ARRAYS_LIMIT)
-    except InputError as error:
-        raise InputError(f"{error}; train or install weights") from None
-    if hashlib.sha256(data).hexdigest() != card.get("sha256"):
-        raise InputError(f"{path}: is not the file that its card describes (SHA-256 differs); copy both again")
-    arrays = read_arrays(data, path)
+    arrays = read_arrays(read_archive(path, card), path)
     config = _config(name, card.get("config"), arrays, path.with_suffix(".json"))
     try:
         shapes = weight_shapes(name, config)

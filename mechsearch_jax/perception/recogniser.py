@@ -16,6 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
@@ -179,7 +180,7 @@ def _view(camera: Camera, shelf: Shelf) -> View:
     return shelf_view(camera, shelf, max(1, round(camera.fx / _TRAINED_FOCAL)))
 
 
-@jax.jit
+@kept()
 def _labelled(
     recogniser: Recogniser, key: Array, depth: Any, colour: Any, mask: Any, target_id: Any
 ) -> tuple[LabelledImage, Bool[Array, ""]]:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import matmul, transform
 from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
@@ -109,7 +110,7 @@ class LabelledImage(flax.struct.PyTreeNode):
     of_target: jax.Array
 
 
-@functools.partial(jax.jit, static_argnames=("camera", "shelf", "target", "refinement"))
+@kept(static_argnames=("camera", "shelf", "target", "refinement"))
 def recognise_image(
     keys: Key[Array, "2"],
     image: LabelledImage,

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import allowances, existence, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -53,7 +54,7 @@ def initial_belief(problem: Problem) -> Belief:
     )
 
 
-@jax.jit
+@kept()
 def update_belief(
     problem: Problem,
     belief: Belief,
@@ -150,7 +151,7 @@ def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tup
     return everything, jnp.arange(everything.capacity) == objects.capacity
 
 
-@jax.jit
+@kept()
 def graspability_map(problem: Problem, belief: Belief, objects: Superquadrics) -> Int[Array, " x"]:
     """g at every candidate pose, whether the target can be there or not: 1, 0, -1, ... (section B.4), shape (X,)."""
     everywhere = jnp.ones(problem.poses.shape[0], bool)

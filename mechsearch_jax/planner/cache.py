@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions.config import ActionTables
+from mechsearch_jax.compiled import keep_in
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceTables
 from mechsearch_jax.files import replacing
@@ -52,7 +53,10 @@ def keep_compilations() -> None:
     `JAX_COMPILATION_CACHE_DIR` is left as it is.
     """
     folder = cache_folder()
-    if folder is None or os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+    if folder is None:
+        return
+    keep_in(folder / "executables")
+    if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # Small ones too: the many that a start needs add up to most of a second.

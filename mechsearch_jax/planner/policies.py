@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array
 
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.errors import InputError
@@ -81,6 +82,14 @@ class Search(flax.struct.PyTreeNode):
     predict: Predict = flax.struct.field(pytree_node=False)
     objective: Objective = flax.struct.field(pytree_node=False)
 
+    def prepare(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> None:
+        """Load or compile what a plan with such arguments needs, without planning; see `compiled.Kept.prepare`."""
+        _plan.prepare(self, key, problem, belief, observation)
+
+    def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
+        """Whether nothing has to be compiled for a plan with such arguments; see `compiled.Kept.is_ready`."""
+        return _plan.is_ready(self, key, problem, belief, observation)
+
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """See `Policy`."""
         if not isinstance(belief.found, Tracer):
@@ -108,13 +117,13 @@ class Search(flax.struct.PyTreeNode):
         return jax.tree.map(lambda a, b: jnp.where(able, a, b), _take_out(self, observation, grasp), planned)
 
 
-@jax.jit
+@kept()
 def _plan(search: Search, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
     rollout = Rollout(problem, belief, search.config, search.propose, search.predict, search.objective)
     return plan(rollout, key, observation.objects)
 
 
-@jax.jit
+@kept()
 def _take_out(search: Search, observation: Observation, grasp: GraspChoice) -> Decision:
     return Decision(
         action=grasp.action,

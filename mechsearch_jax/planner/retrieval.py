@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, upright_pose
 from mechsearch_jax.graspability import grasp_hits
@@ -38,7 +39,7 @@ class GraspChoice(flax.struct.PyTreeNode):
     action: Action
 
 
-@jax.jit
+@kept()
 def graspable_at(
     problem: Problem, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool = True
 ) -> GraspChoice:

@@ -1,0 +1,316 @@
+"""Compiled functions are kept on disk: a second process traces nothing, and nothing of something else is run."""
+
+import dataclasses
+import os
+import re
+import subprocess
+import sys
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mechsearch_jax import compiled, executables
+from mechsearch_jax.compiled import Kept, keep_in
+from mechsearch_jax.identity import Unidentified, identity
+from mechsearch_jax.planner.config import PlannerConfig
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+TRACED = []
+
+
+def scaled(camera, values, factor=2.0, config=None):
+    TRACED.append("scaled")
+    return {"scaled": values * factor * camera.width, "sum": jnp.sum(values) * (config.gamma if config else 1.0)}
+
+
+def told(value):
+    return jax.pure_callback(lambda a: np.asarray(a), jax.ShapeDtypeStruct((), jnp.float32), value)
+
+
+def another_process(function=scaled, static=("camera",)):
+    """The function as a new process knows it: not at all."""
+    TRACED.clear()
+    return Kept(function, static)
+
+
+def as_numbers(tree):
+    return jax.tree.map(np.asarray, tree)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    keep_in(tmp_path / "executables")
+    yield tmp_path / "executables"
+    keep_in(None)
+
+
+VALUES = np.float32([1.0, 2.0, 3.0])
+
+
+def test_a_second_process_traces_nothing(folder):
+    first = another_process()(Camera(), VALUES)
+    assert TRACED == ["scaled"]
+    (file,) = folder.iterdir()
+    assert file.name.startswith("scaled-")
+    again = another_process()
+    assert again.is_ready(Camera(), VALUES)
+    second = again(Camera(), VALUES)
+    again(Camera(), jnp.asarray(VALUES))
+    assert TRACED == []
+    jax.tree.map(np.testing.assert_array_equal, as_numbers(first), as_numbers(second))
+    expected = as_numbers(jax.jit(scaled, static_argnames="camera")(Camera(), VALUES))
+    jax.tree.map(np.testing.assert_array_equal, as_numbers(second), expected)
+
+
+def test_what_is_data_compiles_nothing_anew(folder):
+    another_process()(Camera(), VALUES, factor=3.0, config=PlannerConfig(gamma=0.9))
+    again = another_process()
+    result = again(Camera(), VALUES, factor=4.0, config=PlannerConfig(gamma=0.5))
+    assert TRACED == []
+    assert float(result["sum"]) == 3.0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        (dataclasses.replace(Camera(), width=640), VALUES),
+        (Camera(), VALUES[:2]),
+        (Camera(), VALUES.astype(np.int32)),
+        (Camera(), VALUES, 2.0),
+        (Camera(), VALUES, 2),
+        (Camera(), VALUES, 2.0, PlannerConfig()),
+        (Camera(), VALUES, 2.0, PlannerConfig(horizon=2)),
+    ],
+)
+def test_other_arguments_are_other_entries(folder, arguments):
+    known = [(Camera(), VALUES), (Camera(), VALUES, 2.5, PlannerConfig(horizon=1)), (Camera(), VALUES, jnp.ones(3))]
+    for others in known:
+        another_process()(*others)
+    again = another_process()
+    assert not again.is_ready(*arguments)
+    result = again(*arguments)
+    assert TRACED == ["scaled"]
+    expected = jax.jit(scaled, static_argnames="camera")(*arguments)
+    jax.tree.map(np.testing.assert_array_equal, as_numbers(result), as_numbers(expected))
+
+
+@pytest.mark.parametrize("what", ["_source", "_machine"])
+def test_other_code_versions_and_processors_are_other_entries(folder, monkeypatch, what):
+    another_process()(Camera(), VALUES)
+    monkeypatch.setattr(executables, what, lambda: "another")
+    another_process()(Camera(), VALUES)
+    assert TRACED == ["scaled"]
+
+
+def test_a_machine_is_told_by_versions_flags_and_what_its_processor_can(monkeypatch):
+    before = executables._machine.__wrapped__()
+    assert jax.__version__ in before
+    assert executables.processor() in before
+    assert not os.path.exists("/proc/cpuinfo") or "flags=" in before or "Features=" in before
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
+    assert executables._machine.__wrapped__() != before
+
+
+def test_settings_of_jax_are_other_entries(folder):
+    another_process()(Camera(), VALUES)
+    with jax.default_matmul_precision("highest"):
+        assert not another_process().is_ready(Camera(), VALUES)
+    assert another_process().is_ready(Camera(), VALUES)
+
+
+def test_the_code_that_counts_is_all_that_may_be_traced():
+    assert executables._source() == executables.source_digest((".py",), ("mechsearch_jax", "mechsearch_jax.envs"))
+
+
+@pytest.mark.parametrize("damage", ["cut", "garbage", "empty", "altered", "of another", "no executable"])
+def test_a_damaged_entry_is_compiled_anew(folder, damage):
+    expected = as_numbers(another_process()(Camera(), VALUES))
+    (file,) = folder.iterdir()
+    whole = file.read_bytes()
+    middle = len(whole) // 2
+    if damage == "of another":
+        another_process()(Camera(), VALUES[:2])
+        (other,) = set(folder.iterdir()) - {file}
+        file.write_bytes(other.read_bytes())
+        other.unlink()
+    elif damage == "no executable":
+        head, key, _, _ = whole.split(b"\n", 3)
+        data = b"\x80\x04N."
+        file.write_bytes(b"\n".join((head, key, executables.hashlib.sha256(data).hexdigest().encode(), data)))
+    else:
+        altered = whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]
+        file.write_bytes({"cut": whole[:middle], "garbage": b"nothing", "empty": b"", "altered": altered}[damage])
+    result = another_process()(Camera(), VALUES)
+    assert TRACED == ["scaled"]
+    jax.tree.map(np.testing.assert_array_equal, as_numbers(result), expected)
+    # Also where JAX's own cache has it, which cannot be written a second time.
+    result = another_process()(Camera(), VALUES)
+    assert TRACED == []
+    jax.tree.map(np.testing.assert_array_equal, as_numbers(result), expected)
+
+
+def test_nothing_is_kept_unless_a_program_asks_for_it():
+    function, values = another_process(), np.ones(7, np.float32)
+    function.prepare(Camera(), values)
+    assert TRACED == []
+    assert function.is_ready(Camera(), values)
+    function(Camera(), values)
+    assert TRACED == ["scaled"]
+    function(Camera(), values)
+    assert TRACED == ["scaled"]
+
+
+def test_inside_of_transformations_it_is_a_jitted_function(folder):
+    function = another_process()
+    rows = jnp.ones((2, 3))
+    assert jax.vmap(lambda row: function(Camera(), row)["sum"])(rows).shape == (2,)
+    assert float(jax.jit(lambda row: function(Camera(), row)["sum"])(rows[0])) == 3.0
+    assert float(jax.jit(lambda: function(Camera(), VALUES)["sum"])()) == 6.0
+    assert not folder.exists()
+
+
+def test_what_cannot_be_told_apart_is_not_kept(folder):
+    function = another_process(static=("camera", "factor"))
+
+    @dataclasses.dataclass(frozen=True)
+    class Own:
+        width: int = 3
+
+    assert float(function(Own(), VALUES)["scaled"][0]) == 6.0
+    # A function that calls back into Python holds an address of this process.
+    assert float(another_process(told, ())(VALUES[0])) == 1.0
+    assert not folder.exists() or not list(folder.iterdir())
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owners here")
+def test_a_folder_that_others_may_write_to_is_not_read(folder):
+    another_process()(Camera(), VALUES)
+    assert folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o777)
+    keep_in(folder)
+    again = another_process()
+    with pytest.warns(UserWarning, match="others may write to it"):
+        again(Camera(), VALUES)
+    assert TRACED == ["scaled"]
+
+
+def test_a_folder_that_cannot_be_made_is_done_without(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    keep_in(tmp_path / "file" / "executables")
+    try:
+        assert float(another_process()(Camera(), VALUES)["sum"]) == 6.0
+    finally:
+        keep_in(None)
+
+
+def test_the_oldest_entries_give_way(folder, monkeypatch):
+    monkeypatch.setattr(executables, "MOST_BYTES", 0)
+    another_process()(Camera(), VALUES)
+    assert not list(folder.iterdir())
+
+
+def test_an_option_that_xla_does_not_know_is_done_without(folder, monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    monkeypatch.setattr(compiled, "CPU_OPTIONS", {"xla_of_another_version": True})
+    assert float(another_process()(Camera(), VALUES)["sum"]) == 6.0
+
+
+class Colour(compiled.Kept):
+    pass
+
+
+def test_identities_are_of_values():
+    same = [(Shelf(), Shelf()), (np.ones(2), np.ones(2)), ({"a": 1, "b": 2.0}, {"b": 2.0, "a": 1})]
+    other = [
+        (Shelf(), dataclasses.replace(Shelf(), board=0.5)),
+        (np.ones(2), np.ones(3)),
+        (np.ones(2), np.ones(2, np.float32)),
+        (1, 1.0),
+        (1, True),
+        (1, "1"),
+        ((1, 2), [1, 2]),
+        (0.1, float(np.nextafter(0.1, 1.0))),
+        (identity, Unidentified),
+        (jax.tree.structure((1, 2)), jax.tree.structure((1, (2,)))),
+    ]
+    for a, b in same:
+        assert identity(a) == identity(b)
+    for a, b in other:
+        assert identity(a) != identity(b)
+
+
+@pytest.mark.parametrize("value", [lambda: 0, object(), re.compile("a"), scaled, Colour, np.array([object()])])
+def test_what_another_process_may_know_otherwise_has_no_identity(value):
+    with pytest.raises(Unidentified):
+        identity((1, {"a": value}))
+
+
+SEARCH = """
+    import re
+    import jax
+    from mechsearch_jax.envs.episodes import run_episode, target_of
+    from mechsearch_jax.envs.native import NativeSimulator
+    from mechsearch_jax.envs.warm_up import first_decision, prepared
+    from mechsearch_jax.planner import search_for_grasp
+    from mechsearch_jax.planner.cache import cached_problem, keep_compilations
+    from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+
+    traced = []
+
+    def note(event, seconds, **about):
+        if event.endswith("jaxpr_trace_duration"):
+            traced.append(re.sub("_[0-9a-f]{8}$", "", about["fun_name"]))
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    keep_compilations()
+    scene = load_scenario(example_scenarios()["first-light"])
+    problem, policy = cached_problem(target_of(scene)), search_for_grasp(sequences=2, horizon=1)
+    with prepared(first_decision(problem, policy), print):
+        episode = run_episode(0, scene, problem, policy, NativeSimulator(), max_steps=1)
+    names = "update_belief", "_plan", "target_pixels", "_told", "_keys_at"
+    print(*(f"{name} {traced.count(name)}" for name in names))
+    print([step.action for step in episode.steps], [step.cost for step in episode.steps])
+"""
+PERCEIVE = """
+    import jax
+    import mechsearch_jax as ms
+
+    ms.keep_compilations()
+    images = ms.example_images()
+    problem = ms.cached_problem()
+    print(ms.Recogniser(problem)(jax.random.key(0), images.depth, images.colour).target_pose.tolist())
+"""
+
+
+def run(script, folder):
+    environment = {**os.environ, "MECHSEARCH_CACHE_DIR": str(folder)}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.mark.slow
+def test_a_second_start_traces_nothing_that_ran_before(tmp_path):
+    *lines, counts, first = run(SEARCH, tmp_path)
+    assert lines == ["compiling the plan and the belief, once: 2 left", *lines[1:]]
+    assert sorted(lines[1:])[0].startswith("compiled the ")
+    assert lines[-1].endswith(": 0 left")
+    # What was prepared is what was called.
+    assert counts == "update_belief 1 _plan 1 target_pixels 1 _told 1 _keys_at 1"
+    *lines, counts, second = run(SEARCH, tmp_path)
+    assert lines == []
+    assert counts == "update_belief 0 _plan 0 target_pixels 0 _told 0 _keys_at 0"
+    assert second == first
+
+
+@pytest.mark.slow
+def test_recognition_which_uses_lapack_runs_from_disk(tmp_path):
+    assert run(PERCEIVE, tmp_path) == run(PERCEIVE, tmp_path)
+    assert {file.name.partition("-")[0] for file in (tmp_path / "executables").iterdir()} >= {"recognise_image"}
