@@ -16,6 +16,7 @@ from jaxtyping import Float
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.cloud import OVERHANG, shelf_view
+from mechsearch_jax.perception.recogniser import Setting
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -99,9 +100,7 @@ class _Thing(NamedTuple):
 
 
 def recognition_doubt(
-    camera: Camera,
-    shelf: Shelf,
-    target: Target,
+    setting: Setting,
     observation: Observation,
     depth: Float[np.ndarray, "height width"],
     tolerance: float = DoubtConfig.tolerance,
@@ -109,9 +108,7 @@ def recognition_doubt(
     """How badly what was recognised explains the depth image; some milliseconds, not for `jit`.
 
     Args:
-      camera: the camera of the image.
-      shelf: whose space is looked at.
-      target: an object like the others where it was seen.
+      setting: whose camera, shelf and target are meant; a problem or a `Recogniser` is one.
       observation: what was recognised; without batch axes.
       depth: as `Recogniser` takes it [m].
       tolerance: as in `DoubtConfig` [m].
@@ -119,6 +116,7 @@ def recognition_doubt(
     Raises:
       InputError: the image is not of the camera's size, or the camera does not see the shelf.
     """
+    camera, shelf = setting.camera, setting.shelf
     if np.shape(depth) != (camera.height, camera.width):
         raise InputError(f"depth image: its shape is {np.shape(depth)}, not {(camera.height, camera.width)}")
     rays, depths = _seen(camera, shelf, np.asarray(depth, float))
@@ -129,7 +127,7 @@ def recognition_doubt(
     origin = np.array(camera.position, float)
     points = origin + depths[finite, None] * rays[finite]
     points = points[_on_the_board(shelf, points)]
-    things = _things(shelf, target, observation)
+    things = _things(shelf, setting.target, observation)
 
     apart = np.full(len(points), np.inf)
     for thing in things:
@@ -140,20 +138,17 @@ def recognition_doubt(
     return Doubt(missing, unexplained, *max(passed, default=(0.0, "")))
 
 
-def check_recognition(problem: Any, observation: Observation, depth: Any, config: DoubtConfig) -> None:
+def check_recognition(setting: Setting, observation: Observation, depth: Any, config: DoubtConfig) -> None:
     """Refuse what was recognised where it does not explain the image.
 
     Args:
-      problem: whose camera, shelf and target are meant; see `recogniser.Setting`.
-      observation, depth: as in `recognition_doubt`.
+      setting, observation, depth: as in `recognition_doubt`.
       config: what is too much.
 
     Raises:
       InputError: it is too doubtful; the line says why.
     """
-    doubt = recognition_doubt(
-        problem.camera, problem.shelf, problem.target, observation, np.asarray(depth), config.tolerance
-    )
+    doubt = recognition_doubt(setting, observation, np.asarray(depth), config.tolerance)
     if reason := doubt.reason(config):
         raise InputError(f"recognition is too doubtful to move: {reason}; look again")
 

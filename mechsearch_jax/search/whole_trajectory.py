@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig, check_recognition
 from mechsearch_jax.robot.arm_clearance import ArmBody, Held, Obstacles, clearance, tip_positions
 from mechsearch_jax.robot.free_motion import SPARE, FreeMotion, FreeMotionConfig, check_joints, free_motion
+from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.robot.robot_trajectory import (
@@ -32,11 +33,30 @@ from mechsearch_jax.robot.robot_trajectory import (
     places_when_slowed,
     slowed,
 )
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 # How fast the fingers open and close on the ways through free space: how fast the distance between them changes [m/s].
 FINGER_SPEED = 0.1
 # A gripper this much nearer to the shelf than the nearest place outside still is outside [m].
 OUTSIDE = 2e-3
+
+
+class Setting(Protocol):
+    """What a trajectory has to know of a problem; a planner's `Problem` is one."""
+
+    @property
+    def camera(self) -> Camera: ...
+
+    @property
+    def shelf(self) -> Shelf: ...
+
+    @property
+    def gripper(self) -> Gripper: ...
+
+    @property
+    def target(self) -> Target: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +87,7 @@ class _Stage:
 
 
 def whole_trajectory(
-    problem: Any,
+    problem: Setting,
     observation: Observation,
     decision: Any,
     *,
@@ -123,7 +143,7 @@ class _Assembly:
 
     def __init__(
         self,
-        problem: Any,
+        problem: Setting,
         observation: Observation,
         action: Action,
         after: Superquadrics | None,
@@ -158,7 +178,8 @@ class _Assembly:
         body, obstacles = ArmBody.of(0.0 if held else left, held), self._obstacles(afterwards=True)
         at_home = held is None or _is_free(body, obstacles, home)
         if at_home:
-            back = self._free("the way home", end, home, body, obstacles, 0.0 if held else left)
+            pace = self.motion.carry_pace if held else 1.0
+            back = self._free("the way home", end, home, body, obstacles, 0.0 if held else left, pace)
             stages.append(self._travel(Part.WAY_HOME, back, left, left if held else 0.0, acting.force[-1]))
             ways.append(back)
         return self._joined(joints, width, stages, ways, at_home, between)
@@ -216,7 +237,14 @@ class _Assembly:
         return Held(np.linalg.inv(T_world_gripper) @ T_world_held, self.problem.target.half_size)
 
     def _free(
-        self, name: str, start: np.ndarray, end: np.ndarray, body: ArmBody, obstacles: Obstacles, opens: float
+        self,
+        name: str,
+        start: np.ndarray,
+        end: np.ndarray,
+        body: ArmBody,
+        obstacles: Obstacles,
+        opens: float,
+        pace: float = 1.0,
     ) -> FreeMotion:
         # The fingers start and stop smoothly, which takes half as long again.
         least = 1.5 * abs(opens) / (FINGER_SPEED * self.speed)
@@ -227,7 +255,7 @@ class _Assembly:
                 body,
                 obstacles,
                 timestep=self.motion.timestep,
-                pace=self.speed,
+                pace=self.speed * pace,
                 least=least,
                 config=self.config.free,
             )
