@@ -12,11 +12,13 @@ from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.perception.plausibility import camera_faults, image_faults
 from mechsearch_jax.planner import initial_belief, update_belief
 from mechsearch_jax.planner.impasse import impasse
 from mechsearch_jax.search.searcher import Searcher
+from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from tests.stage import HIDDEN, OPEN, grab, idle
@@ -24,6 +26,8 @@ from tests.stage import HIDDEN, OPEN, grab, idle
 IMAGES = example_images()
 CAMERA, SHELF = IMAGES.camera, Shelf()
 FLIP = np.diag([1.0, -1.0, -1.0])
+# The images are of another scene than what is recognised here.
+TRUSTING = TrajectoryConfig(doubt=DoubtConfig(missing=1.0, unexplained=1.0, passed=1.0))
 
 
 @functools.cache
@@ -34,7 +38,8 @@ def seen(scenario):
 def searcher_of(problem, scenario, policy=grab, **arguments):
     """A searcher that sees what stands in a scenario, whatever the images show."""
     observation = seen(scenario) if isinstance(scenario, type(HIDDEN)) else scenario
-    found = Searcher(policy=policy, recogniser=lambda problem: lambda *images: observation, **arguments)
+    given = {"trajectories": TRUSTING, **arguments}
+    found = Searcher(policy=policy, recogniser=lambda problem: lambda *images: observation, **given)
     found.problem = problem
     return found
 
@@ -60,6 +65,13 @@ def test_a_target_in_the_open_is_taken_out_and_the_search_is_over(problem, tmp_p
     assert searcher.finished
     with pytest.raises(InputError, match="finished"):
         searcher.next(IMAGES.depth)
+
+
+def test_no_motion_is_handed_out_where_recognition_is_doubtful(problem):
+    searcher = searcher_of(problem, OPEN, trajectories=None)
+    step = searcher.next(IMAGES.depth)
+    assert (step.kind, step.trajectory) == ("none", None)
+    assert "is on no recognised object" in step.reason
 
 
 def test_a_retrieval_that_failed_goes_on(problem):
