@@ -136,9 +136,10 @@ def _row(cells: Sequence[str]) -> str:
     return "| " + " | ".join(" ".join(cell.replace("|", "\\|").split()) for cell in cells) + " |"
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """The report as text."""
-    summary, reasons = summarise(rows), failures(rows)
+def markdown(
+    rows: Sequence[Row], summary: Sequence[Rates], reasons: Sequence[Failures], events: Sequence[Events]
+) -> str:
+    """The report as text, of the rows and what `summarise`, `failures` and `summarise_events` make of them."""
     names = ("method", "objects", "episodes", "errors", *SHARES.values(), "actions", "planning [s]", "simulation [s]")
     lines = [
         "# Results",
@@ -163,14 +164,13 @@ def markdown(rows: Sequence[Row]) -> str:
         lines += [_row((f.method, f.reason, str(f.episodes), f"{f.share:.2f}")) for f in reasons]
     else:
         lines.append("None did.")
-    lines += ["", "## What happened on the way", "", *_events(rows)]
+    lines += ["", "## What happened on the way", "", *_events(events)]
     lines += ["", "## Success over the number of actions", "", "![Success over the number of actions](success.png)", ""]
     return "\n".join(lines)
 
 
-def _events(rows: Sequence[Row]) -> list[str]:
+def _events(summary: Sequence[Events]) -> list[str]:
     """What happened on the way, as lines of the report."""
-    summary = summarise_events(rows)
     if not summary:
         return ["These episodes do not say: an earlier version ran them, or they ended in errors."]
     names = ("method", "objects", "episodes", *EVENTS.values())
@@ -262,11 +262,11 @@ def write_report(rows: Sequence[Row], out: PathLike) -> None:
     check_writable(out)
     folder = Path(out)
     figure = success_figure(rows)
-    flat = [_flat(rates) for rates in summarise(rows)]
-    reasons = [dataclasses.asdict(f) for f in failures(rows)]
-    events = [_flat(each) for each in summarise_events(rows)]
+    summary, why, happened = summarise(rows), failures(rows), summarise_events(rows)
+    flat, events = [_flat(rates) for rates in summary], [_flat(each) for each in happened]
+    reasons = [dataclasses.asdict(f) for f in why]
     texts = (
-        markdown(rows),
+        markdown(rows, summary, why, happened),
         _csv(flat, list(flat[0])),
         json.dumps({"rates": flat, "failures": reasons, "events": events}, indent=1, allow_nan=False) + "\n",
         _csv(reasons, [field.name for field in dataclasses.fields(Failures)]),
