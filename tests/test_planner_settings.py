@@ -8,12 +8,14 @@ import pytest
 
 from mechsearch_jax import errors, tables
 from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs.episodes import target_of
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS, settings
 from mechsearch_jax.planner.settings import Settings, load_settings
 from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -174,3 +176,26 @@ def test_a_method_carries_its_workcell_to_other_processes():
 def test_the_nearest_name_is_offered():
     assert errors.nearest("widht", ["height", "width"]) == "did you mean width?"
     assert errors.nearest("zzz", ["height", "width"]) == "known are height, width"
+
+
+@pytest.mark.slow
+def test_scenes_are_generated_in_the_shelf_and_of_the_sizes_that_are_given(tmp_path, monkeypatch):
+    text = """
+[shelf]
+back = 0.75
+left = 0.4
+[objects]
+boxes = [[0.1, 0.06, 0.14]]
+cylinders = []
+[target]
+half_size = [0.018, 0.018, 0.045]
+"""
+    (tmp_path / "mine.toml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    cli.parse(["scenarios", "generate", "--objects", "3", "--config", "mine.toml", "--out", "new"])()
+    (file,) = (tmp_path / "new").iterdir()
+    scene = load_scenario(file, load_settings(tmp_path / "mine.toml").workcell.shelf)
+    assert {tuple(sorted(body.half_size)) for body in scene.objects} == {(0.03, 0.05, 0.07)}
+    assert scene.target.half_size == (0.018, 0.018, 0.045)
+    assert all(body.position[0] < 0.75 and body.position[1] < 0.4 for body in (*scene.objects, scene.target))
+    assert target_of(scene, load_settings(tmp_path / "mine.toml").workcell.target).half_size == (0.018, 0.018, 0.045)

@@ -101,11 +101,21 @@ def test_projection_undoes_the_rays():
     np.testing.assert_allclose(pixels[..., 1], columns, atol=2e-3)
 
 
-def test_a_camera_that_is_none_is_refused():
-    with pytest.raises(InputError, match="must be positive"):
-        Camera(width=0)
-    with pytest.raises(InputError, match="rotation"):
-        Camera(rotation=((1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 1.0)))
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"width": 0}, r"width \(0\) must be from 1 to 16384 pixels"),
+        ({"height": 100_000}, r"height \(100000\) must be from"),
+        ({"fx": float("nan")}, r"fx \(nan\) must be from"),
+        ({"cx": float("inf")}, r"cx \(inf\) must be from"),
+        ({"position": (0.0, 448.0, 653.0)}, r"position y \(448.0\) must be from -10 to 10 m"),
+        ({"rotation": ((1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 1.0))}, "three orthonormal rows"),
+        ({"rotation": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))}, "rotation mirrors"),
+    ],
+)
+def test_a_camera_that_is_none_is_refused(change, reason):
+    with pytest.raises(InputError, match=reason):
+        Camera(**change)
 
 
 def test_root_depth_is_an_exact_ray_cast_of_the_superquadric():
