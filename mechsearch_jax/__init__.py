@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.actions.registry import ActionKind
     from mechsearch_jax.actions.trajectory import JointTrajectory, joint_trajectory
     from mechsearch_jax.actions.types import Action
+    from mechsearch_jax.actions.whole_trajectory import whole_trajectory
     from mechsearch_jax.errors import InputError
     from mechsearch_jax.geometry.superquadric import Superquadrics
     from mechsearch_jax.observation import Observation
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.planner.problem import Problem, build_problem
     from mechsearch_jax.planner.state import Decision
     from mechsearch_jax.robot.gripper import Gripper
+    from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
     from mechsearch_jax.workspace.camera import Camera
     from mechsearch_jax.workspace.render import render_depth
     from mechsearch_jax.workspace.scenario import load_scenario
@@ -54,6 +56,7 @@ _ROOMS = {
     "Policy": "planner.policies",
     "Problem": "planner.problem",
     "Recogniser": "perception.recogniser",
+    "RobotTrajectory": "robot.robot_trajectory",
     "Shelf": "workspace.shelf",
     "Superquadrics": "geometry.superquadric",
     "Target": "workspace.target",
@@ -71,6 +74,7 @@ _ROOMS = {
     "search_for_grasp": "planner.policies",
     "standard": "planner.presets",
     "update_belief": "planner.belief",
+    "whole_trajectory": "actions.whole_trajectory",
 }
 
 __all__ = [
@@ -87,6 +91,7 @@ __all__ = [
     "Policy",
     "Problem",
     "Recogniser",
+    "RobotTrajectory",
     "Shelf",
     "Superquadrics",
     "Target",
@@ -104,6 +109,7 @@ __all__ = [
     "search_for_grasp",
     "standard",
     "update_belief",
+    "whole_trajectory",
 ]
 
 
