@@ -1,6 +1,6 @@
 """Whole trajectories of many random actions: do they keep the limits, and does a simulated arm follow them?
 
-    python -m mechsearch_jax.benchmarks.trajectories SCENES --out trajectories.json [--actions 500] [--speed 1.0]
+python -m mechsearch_jax.benchmarks.trajectories SCENES --out trajectories.json [--actions 500] [--speed 1.0]
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -22,7 +22,6 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.actions import Action
-from mechsearch_jax.actions.whole_trajectory import Setting, whole_trajectory
 from mechsearch_jax.benchmarks.agreement import draw_actions
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.known_target import retrievals_of
@@ -35,6 +34,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Problem, build_problem
 from mechsearch_jax.robot.arm_clearance import tip_positions
 from mechsearch_jax.robot.robot_trajectory import Part, RobotTrajectory
+from mechsearch_jax.search.whole_trajectory import Setting, whole_trajectory
 from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
 # Of the actions so many are retrievals; from a scene with at most so many objects, at most so many of them.
@@ -147,7 +147,15 @@ def measure(setting: Setting, cases: Sequence[Case], speed: float = 1.0) -> list
         follower = follower or Follower(setting, float(trajectory.time[1]))
         told: dict[str, Any] = dataclasses.asdict(report)
         rows.append(
-            Row(scene.name, kind, None, seconds, **told, within=report.within(), tip_error=follower.tip_error(trajectory))
+            Row(
+                scene.name,
+                kind,
+                None,
+                seconds,
+                **told,
+                within=report.within(),
+                tip_error=follower.tip_error(trajectory),
+            )
         )
     return rows
 
@@ -164,7 +172,9 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "ends_at_home": sum(bool(row.ends_at_home) for row in made),
         **{f"{name}_max": max((getattr(row, name) for row in made), default=None) for name in numbers},
         **{f"{name}_median": float(np.median([getattr(row, name) for row in made])) for name in numbers if made},
-        "position_margin_min": min((row.position_margin for row in made if row.position_margin is not None), default=None),
+        "position_margin_min": min(
+            (row.position_margin for row in made if row.position_margin is not None), default=None
+        ),
         "clearance_min": min((row.clearance for row in made if row.clearance is not None), default=None),
     }
 

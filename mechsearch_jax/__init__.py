@@ -36,8 +36,10 @@ if TYPE_CHECKING:
     from mechsearch_jax.planner.workcell import Workcell
     from mechsearch_jax.robot.arm_config import ArmConfig
     from mechsearch_jax.robot.gripper import Gripper
+    from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
     from mechsearch_jax.search.searcher import Searcher
     from mechsearch_jax.search.step import SearchStep
+    from mechsearch_jax.search.whole_trajectory import whole_trajectory
     from mechsearch_jax.workspace.camera import Camera
     from mechsearch_jax.workspace.render import render_depth
     from mechsearch_jax.workspace.scenario import load_scenario
@@ -60,6 +62,7 @@ _ROOMS = {
     "Policy": "planner.policies",
     "Problem": "planner.problem",
     "Recogniser": "perception.recogniser",
+    "RobotTrajectory": "robot.robot_trajectory",
     "SearchStep": "search.step",
     "Searcher": "search.searcher",
     "Settings": "planner.settings",
@@ -83,6 +86,7 @@ _ROOMS = {
     "search_for_grasp": "planner.policies",
     "standard": "planner.presets",
     "update_belief": "planner.belief",
+    "whole_trajectory": "search.whole_trajectory",
 }
 
 __all__ = [
@@ -100,6 +104,7 @@ __all__ = [
     "Policy",
     "Problem",
     "Recogniser",
+    "RobotTrajectory",
     "SearchStep",
     "Searcher",
     "Settings",
@@ -123,6 +128,7 @@ __all__ = [
     "search_for_grasp",
     "standard",
     "update_belief",
+    "whole_trajectory",
 ]
 
 

@@ -148,11 +148,11 @@ def tip_positions(q: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "m 3"]:
 def _block_clearance(body: ArmBody, obstacles: Obstacles, q: np.ndarray) -> Clearance:
     frames = link_poses(q)
     centres, radius = _placed(body.fine, frames), body.fine.radius
-    to_shelf = _shelf_distance(obstacles.shelf, centres) - radius
     # The foot and links 1 and 2 stand on the floor.
     to_floor = (centres[..., 2] - radius - obstacles.floor)[:, body.fine.frame >= 2]
-    free = np.minimum(np.minimum(to_shelf.min(axis=1), to_floor.min(axis=1)), FARTHEST)
-    free = np.minimum(free, _objects_distance(obstacles, centres, radius))
+    free = np.minimum(to_floor.min(axis=1), FARTHEST)
+    free = np.minimum(free, _shelf_clearance(obstacles.shelf, centres, radius))
+    free = np.minimum(free, _objects_clearance(obstacles, centres, radius))
     free = np.minimum(free, _own_distance(body.coarse, frames))
     inside = np.max(centres[..., 0] + radius, axis=1) - obstacles.shelf.front
     return Clearance(free.astype(float), inside.astype(float))
@@ -167,6 +167,14 @@ def _placed(spheres: Spheres, frames: np.ndarray) -> np.ndarray:
     return np.concatenate(placed, axis=1)
 
 
+def _shelf_clearance(shelf: Shelf, centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Distance of the spheres to what is solid of the shelf, at most `FARTHEST`, for each of the joint angles."""
+    least = np.full(len(centres), FARTHEST)
+    row, column = np.nonzero(centres[..., 0] + radius > shelf.front - FARTHEST)
+    np.minimum.at(least, row, _shelf_distance(shelf, centres[row, column]) - radius[column])
+    return least
+
+
 def _shelf_distance(shelf: Shelf, points: np.ndarray) -> np.ndarray:
     """Distance to what is solid of the shelf, negative in it; beside the free space that of its front plane."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
@@ -177,7 +185,7 @@ def _shelf_distance(shelf: Shelf, points: np.ndarray) -> np.ndarray:
     return np.where(before > 0.0, in_front, np.minimum(beside, shelf.back - x))
 
 
-def _objects_distance(obstacles: Obstacles, centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def _objects_clearance(obstacles: Obstacles, centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Distance to the nearest box, at most `FARTHEST`, for each of the joint angles."""
     least = np.full(len(centres), FARTHEST)
     for half_size, T in zip(obstacles.half_size, obstacles.T_box_world, strict=True):

@@ -27,6 +27,8 @@ from mechsearch_jax.robot.time_scaling import smooth_curve, timing, travelled
 REACH = np.array([1.15, 1.15, 0.85, 0.8, 0.4, 0.4, 0.2])
 # Waypoints that are timed together.
 WAYPOINTS = 31
+# Places of a line that are looked at together, and the strides in which a line is looked at that is free or of no use.
+LOOK, STRIDES = 16, 8
 # Share of the limits that is left free, for what peaks between the places that `timing` looks at.
 SPARE = 0.01
 
@@ -56,7 +58,7 @@ class FreeMotionConfig:
     deepest: float = 0.03
     extension: float = 0.6
     attempts: int = 1500
-    shortcuts: int = 100
+    shortcuts: int = 60
     seed: int = 0
     floor: float = 0.0
 
@@ -106,17 +108,20 @@ class _Space:
     def travel(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """How far towards the end the arm gets on the straight line, looked at closely; the start itself if nowhere."""
         line = _line(start, end, self.step)
-        stopped = np.flatnonzero(~self.allowed(line))
-        if not len(stopped):
-            return end
-        return line[stopped[0] - 1] if stopped[0] else start
+        for first in range(0, len(line), LOOK):
+            stopped = np.flatnonzero(~self.allowed(line[first : first + LOOK]))
+            if len(stopped):
+                return line[max(first + stopped[0] - 1, 0)]
+        return end
 
     def passes(self, start: np.ndarray, end: np.ndarray) -> bool:
-        """Whether the straight line is free."""
-        return bool(self.allowed(_line(start, end, self.step)).all())
+        """Whether the straight line is free; looked at in strides, which soon find what is in the way."""
+        line = _line(start, end, self.step)
+        order = np.concatenate([np.arange(i, len(line), STRIDES) for i in range(STRIDES)])
+        return all(self.allowed(line[order[i : i + LOOK]]).all() for i in range(0, len(line), LOOK))
 
 
-def check_joints(name: str, q: Float[np.ndarray, " 7"]) -> None:
+def check_joints(name: str, q: Float[np.ndarray, "..."]) -> None:
     """Check that joint angles are seven numbers within the limits.
 
     Raises:
@@ -290,6 +295,13 @@ def _shortened(path: np.ndarray, space: _Space, config: FreeMotionConfig, rng: n
         a, b = (_at(path, lengths, place) for place in (first, last))
         if space.passes(a, b):
             path = np.concatenate([path[:i], [a, b], path[j:]])
+    # What is still a corner between its neighbours goes, where it can.
+    corner = 1
+    while corner < len(path) - 1:
+        if space.passes(path[corner - 1], path[corner + 1]):
+            path = np.delete(path, corner, axis=0)
+        else:
+            corner += 1
     return path
 
 

@@ -1,0 +1,319 @@
+"""Trajectories from the present joints through an action and home: what they hold, and the files made of them."""
+
+import dataclasses
+import functools
+import json
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mechsearch_jax.actions import Action
+from mechsearch_jax.actions.retrieve import retrieve_action
+from mechsearch_jax.envs.simulated_camera import observe
+from mechsearch_jax.envs.world import from_scenario, true_superquadrics
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.geometry.transforms import make
+from mechsearch_jax.graspability import WRIST_ORIGIN, gripper_rotation
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.doubt import DoubtConfig, recognition_doubt
+from mechsearch_jax.robot.arm_clearance import tip_positions
+from mechsearch_jax.robot.free_motion import FreeMotionConfig
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.robot.robot_trajectory import Bounds, Part
+from mechsearch_jax.robot.trajectory_files import csv_header, ros_messages, save_csv, save_ros
+from mechsearch_jax.search.whole_trajectory import TrajectoryConfig, whole_trajectory
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+SETTING = types.SimpleNamespace(camera=Camera(), shelf=Shelf(), gripper=Gripper(), target=Target())
+CONFIG = TrajectoryConfig(motion=MotionConfig(waypoints=7))
+PLACE = (0.62, 0.15)
+HERE = np.array(HOME, float)
+Q7 = jnp.float32(WRIST_ORIGIN)
+
+
+def seen(objects=None, visible=True):
+    return Observation(objects or empty(8), jnp.array(visible), jnp.float32([*PLACE, 0.0]))
+
+
+def grasp(height=0.05):
+    return make(gripper_rotation(jnp.float32(0.1), jnp.float32(0.4)), jnp.float32([*PLACE, Shelf().board + height]))
+
+
+@functools.cache
+def taken(speed=1.0):
+    return whole_trajectory(
+        SETTING, seen(), retrieve_action(grasp(), Q7, jnp.float32(0.08)), speed=speed, config=CONFIG
+    )
+
+
+def pushed(**options):
+    action = Action(
+        kind=jnp.int32(1),
+        object=jnp.int32(0),
+        T_world_gripper=grasp(0.04),
+        displacement=jnp.float32([0.0, -0.05, 0.0]),
+        T_world_place=grasp(0.04),
+        q7=Q7,
+        opening=jnp.float32(0.0),
+    )
+    return whole_trajectory(SETTING, options.pop("observation", seen()), action, config=CONFIG, **options)
+
+
+def test_it_leads_from_home_through_the_action_and_home():
+    trajectory = taken()
+    assert trajectory.action == "retrieve"
+    for row in (0, -1):
+        np.testing.assert_allclose(trajectory.position[row], HERE, atol=1e-9)
+        np.testing.assert_array_equal(trajectory.velocity[row], 0.0)
+    np.testing.assert_allclose(np.diff(trajectory.time), 0.004)
+    assert (np.diff(trajectory.part) >= 0).all()
+    assert set(trajectory.part) == set(Part)
+    tips = tip_positions(trajectory.position)
+    assert np.linalg.norm(tips - (*PLACE, Shelf().board + 0.05), axis=1).min() < 2e-3
+    assert tips[trajectory.part != Part.ACTION, 0].max() < Gripper().nearest_outside + 2e-3
+    report = trajectory.report()
+    assert report.within()
+    assert report.ends_at_home
+    assert report.clearance > 0.005
+    assert f"{report.duration:.1f} s" in str(report)
+
+
+def test_positions_velocities_and_accelerations_are_of_one_curve():
+    trajectory = taken()
+    step = trajectory.time[1]
+    middle = (trajectory.velocity[1:] + trajectory.velocity[:-1]) / 2
+    np.testing.assert_allclose(np.diff(trajectory.position, axis=0) / step, middle, atol=2e-3)
+    middle = (trajectory.acceleration[1:] + trajectory.acceleration[:-1]) / 2
+    np.testing.assert_allclose(np.diff(trajectory.velocity, axis=0) / step, middle, atol=1e-2)
+
+
+def test_the_fingers_open_on_the_way_grip_and_hold_on():
+    trajectory = taken()
+    width, force, part = trajectory.width, trajectory.force, trajectory.part
+    assert width[0] == 0.0
+    assert np.abs(np.diff(width[part == Part.WAY_THERE])).max() / 0.004 < 0.11
+    assert width[part == Part.WAY_THERE][-1] == pytest.approx(0.08, abs=1e-6)
+    gripping = force > 0.0
+    assert np.flatnonzero(np.diff(gripping.astype(int))).size == 1
+    assert (force[gripping] == Bounds().grip_force).all()
+    assert (width[part == Part.WAY_HOME] == 0.0).all()
+    assert gripping[part == Part.WAY_HOME].all()
+    assert not gripping[part == Part.WAY_THERE].any()
+
+
+def test_what_is_held_goes_home_gently():
+    trajectory = taken()
+    home = np.abs(trajectory.velocity[trajectory.part == Part.WAY_HOME]).max()
+    there = np.abs(trajectory.velocity[trajectory.part == Part.WAY_THERE]).max()
+    assert home < 2.175 * MotionConfig().carry_pace
+    assert there > 0.5
+
+
+def test_speed_is_a_share_of_the_limits():
+    slow, report = taken(0.4), taken(0.4).report()
+    assert report.velocity <= 0.4
+    assert report.acceleration <= 0.4**2
+    assert report.duration > 2.2 * taken().report().duration
+    fast = taken()
+    for trajectory in (fast, slow):
+        grips = np.argmax(trajectory.force > 0.0)
+        assert np.linalg.norm(tip_positions(trajectory.position[grips][None])[0] - (*PLACE, 0.4545)) < 3e-3
+
+
+def test_it_begins_at_the_present_joints_and_ends_at_another_home():
+    joints, home = HERE + (0.5, 0.2, 0, 0, 0, 0, 0), HERE + (-0.4, 0, 0, 0, 0, 0, 0.3)
+    trajectory = pushed(joints=joints, home=home, width=0.03)
+    np.testing.assert_allclose(trajectory.position[0], joints, atol=1e-9)
+    np.testing.assert_allclose(trajectory.position[-1], home, atol=1e-9)
+    assert trajectory.width[0] == 0.03
+    assert trajectory.width[-1] == 0.0
+    assert (trajectory.force == 0.0).all()
+    assert trajectory.report().within()
+
+
+def test_where_home_is_not_free_with_the_target_it_stops_outside():
+    """At this home the hand itself is in front of the shelf, but what it holds is not."""
+    near = np.array(taken().position[taken().part == Part.WAY_HOME][0])
+    deep = taken().position[np.argmax(tip_positions(taken().position)[:, 0] > 0.40)]
+    action = retrieve_action(grasp(), Q7, jnp.float32(0.08))
+    trajectory = whole_trajectory(SETTING, seen(), action, joints=near, home=deep, config=CONFIG)
+    assert not trajectory.ends_at_home
+    assert (trajectory.part != Part.WAY_HOME).all()
+    assert tip_positions(trajectory.position[-1:])[0, 0] < Gripper().nearest_outside
+    assert "stops outside" in str(trajectory.report())
+
+
+def test_to_do_nothing_is_the_way_home():
+    nothing = jax.tree.map(jnp.zeros_like, retrieve_action(grasp(), Q7, jnp.float32(0.08)))
+    still = whole_trajectory(SETTING, seen(), nothing, config=CONFIG)
+    np.testing.assert_array_equal(still.position, HERE[None])
+    assert still.report().within()
+    home = whole_trajectory(SETTING, seen(), nothing, joints=HERE + 0.1, config=CONFIG)
+    np.testing.assert_allclose(home.position[[0, -1]], [HERE + 0.1, HERE], atol=1e-9)
+
+
+def blocking():
+    """Something in front of the shelf, where the hand goes in."""
+    place = tip_positions(taken().position[taken().part == Part.WAY_THERE][-1:])[0]
+    scene = empty(8)
+    return scene.replace(
+        size=scene.size.at[2].set(0.03),
+        position=scene.position.at[2].set(jnp.float32(place)),
+        valid=scene.valid.at[2].set(True),
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"speed": 0.0}, "speed: 0.0 must be above 0"),
+        ({"speed": 1.5}, "at most 1"),
+        ({"width": 0.2}, "width: 0.2 m"),
+        ({"home": HERE + 9.0}, "home: joint 1"),
+        ({"joints": HERE[:6]}, "joints: .* seven"),
+    ],
+)
+def test_impossible_arguments_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        pushed(**options)
+
+
+def test_a_blocked_way_is_refused_in_one_line():
+    with pytest.raises(InputError, match="the way to the push: free motion: where it ends the arm touches"):
+        pushed(observation=seen(blocking()))
+
+
+def test_an_action_out_of_reach_is_refused():
+    far = grasp().at[0, 3].add(0.5)
+    with pytest.raises(InputError, match="retrieve: the arm does not reach"):
+        whole_trajectory(SETTING, seen(), retrieve_action(far, Q7, jnp.float32(0.08)), config=CONFIG)
+
+
+@functools.cache
+def pictured():
+    """A scene, what a perfect recogniser sees of it, and its depth image."""
+    world = from_scenario(load_scenario(example_scenarios()["first-light"]))
+    depth = np.asarray(observe(Camera(), world, Shelf()).depth)
+    return Observation(true_superquadrics(world), jnp.array(False), jnp.zeros(3)), depth
+
+
+def test_what_was_recognised_well_leaves_no_doubt():
+    observation, depth = pictured()
+    doubt = recognition_doubt(SETTING, observation, depth)
+    assert doubt.unexplained < 0.05
+    assert doubt.passed < 0.02
+    assert doubt.reason(DoubtConfig()) is None
+
+
+def moved_object(objects):
+    first = int(np.argmax(objects.valid))
+    return objects.replace(position=objects.position.at[first, 1].add(0.08))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "depth_of", "message"),
+    [
+        (moved_object, lambda d: d, "of the rays that reach object|is on no recognised object"),
+        (lambda o: o.replace(valid=jnp.zeros_like(o.valid)), lambda d: d, "100 % of what stands on the board"),
+        (lambda o: o, lambda d: np.where(np.arange(d.shape[1]) % 3 > 0, 0.0, d), "6. % .* are not measured"),
+    ],
+)
+def test_what_does_not_explain_the_image_is_refused(spoil, depth_of, message):
+    observation, depth = pictured()
+    wrong = observation.replace(objects=spoil(observation.objects))
+    with pytest.raises(InputError, match=f"recognition is too doubtful to move: .*(?:{message})") as error:
+        pushed(observation=wrong, depth=depth_of(depth))
+    assert "\n" not in str(error.value)
+
+
+def test_a_depth_image_of_another_size_is_refused():
+    with pytest.raises(InputError, match="depth image: its shape"):
+        pushed(depth=np.ones((4, 5)))
+
+
+@pytest.mark.parametrize("changes", [{"tracking": 0.0}, {"force": -1.0}, {"effort": (1.0, 2.0)}])
+def test_impossible_bounds_are_refused(changes):
+    with pytest.raises(InputError, match="Bounds"):
+        Bounds(**changes)
+    with pytest.raises(InputError, match="DoubtConfig"):
+        DoubtConfig(passed=2.0)
+
+
+def test_a_csv_file_holds_it(tmp_path):
+    trajectory, path = taken(), tmp_path / "out" / "t.csv"
+    save_csv(trajectory, path)
+    lines = path.read_text().splitlines()
+    assert lines[0].split(",") == csv_header()
+    assert [name.split()[0] for name in csv_header()] == [
+        "time", *(f"q{i}" for i in range(1, 8)), *(f"v{i}" for i in range(1, 8)), "width", "force",
+    ]  # fmt: skip
+    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    assert table.shape == (len(trajectory.time), 17)
+    np.testing.assert_allclose(table[:, 0], trajectory.time, atol=1e-9)
+    np.testing.assert_allclose(table[:, 1:8], trajectory.position, atol=1e-8)
+    np.testing.assert_allclose(table[:, 8:15], trajectory.velocity, atol=1e-8)
+    np.testing.assert_allclose(table[:, 15:], np.stack([trajectory.width, trajectory.force], axis=1), atol=1e-8)
+
+
+def test_ros_messages_hold_it(tmp_path):
+    trajectory, path = taken(), tmp_path / "t.json"
+    save_ros(trajectory, path)
+    message = json.loads(path.read_text())
+    assert message == ros_messages(trajectory)
+    arm, gripper = message["arm"], message["gripper"]
+    assert arm["joint_names"] == [f"panda_joint{i}" for i in range(1, 8)]
+    seconds = [p["time_from_start"]["secs"] + 1e-9 * p["time_from_start"]["nsecs"] for p in arm["points"]]
+    np.testing.assert_allclose(seconds, trajectory.time, atol=1e-9)
+    assert all(isinstance(p["time_from_start"]["nsecs"], int) for p in arm["points"])
+    for name in ("position", "velocity", "acceleration"):
+        found = [p[f"{name.replace('y', 'ie') if name == 'velocity' else name}s"] for p in arm["points"]]
+        np.testing.assert_allclose(found, getattr(trajectory, name))
+    times = [p["time_from_start"]["secs"] + 1e-9 * p["time_from_start"]["nsecs"] for p in gripper["points"]]
+    for values, key in ((trajectory.width, "positions"), (trajectory.force, "effort")):
+        told = [p[key][0] for p in gripper["points"]]
+        np.testing.assert_allclose(np.interp(trajectory.time, times, told), values, atol=1e-9)
+    assert len(times) < len(seconds) / 2
+    with pytest.raises(InputError, match="7 different names"):
+        ros_messages(trajectory, joint_names=["a"] * 7)
+
+
+@pytest.mark.parametrize("save", [save_csv, save_ros])
+def test_files_are_not_overwritten_silently(tmp_path, save):
+    path = tmp_path / "t"
+    path.write_text("mine")
+    with pytest.raises(InputError, match="is there already"):
+        save(taken(), path)
+    assert path.read_text() == "mine"
+    save(taken(), path, overwrite=True)
+    assert len(path.read_text()) > 1000
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.slow
+def test_a_simulated_arm_follows_random_actions():
+    """Pushes and retrievals all over the shelf; the benchmark `trajectories` does so for those that a planner draws."""
+    from mechsearch_jax.benchmarks.trajectories import Follower
+
+    follower, rng = Follower(SETTING, 0.004), np.random.default_rng(0)
+    config = dataclasses.replace(CONFIG, free=FreeMotionConfig(attempts=200))
+    made = 0
+    while made < 12:
+        x, y, z = rng.uniform(0.5, 0.7), rng.uniform(-0.15, 0.35), rng.uniform(0.04, 0.12)
+        rotation = gripper_rotation(jnp.float32(rng.uniform(-0.4, 0.4)), jnp.float32(0.4))
+        action = retrieve_action(make(rotation, jnp.float32([x, y, Shelf().board + z])), Q7, jnp.float32(0.08))
+        try:
+            trajectory = whole_trajectory(SETTING, seen(visible=False), action, config=config)
+        except InputError:
+            continue
+        made += 1
+        assert trajectory.report().within()
+        assert follower.tip_error(trajectory) < 2e-3
