@@ -52,7 +52,7 @@ def _program(name: str, function: Any, *args: Any) -> Program:
 def prepared(programs: Sequence[Program], told: Callable[[str], None]) -> Iterator[None]:
     """Prepare programs in threads while the block runs; who calls one before it is ready waits for it.
 
-    What is wrong with a program is said by who calls it.
+    What is wrong with a program is said by who calls it. Where the block raises, what has not begun is left out.
 
     Args:
       programs: the longest first.
@@ -63,7 +63,7 @@ def prepared(programs: Sequence[Program], told: Callable[[str], None]) -> Iterat
         told(f"compiling {' and '.join(missing)}, once: {len(missing)} left")
 
     def ready(name: str, future: Future[None]) -> None:
-        if name in missing and not future.cancelled():
+        if name in missing and not future.cancelled() and future.exception() is None:
             missing.remove(name)
             told(f"compiled {name}: {len(missing)} left")
 
@@ -72,5 +72,6 @@ def prepared(programs: Sequence[Program], told: Callable[[str], None]) -> Iterat
             for program in programs:
                 threads.submit(program.prepare).add_done_callback(functools.partial(ready, program.name))
             yield
-        finally:
+        except BaseException:
             threads.shutdown(wait=False, cancel_futures=True)
+            raise

@@ -29,7 +29,7 @@ from mechsearch_jax.identity import Unidentified, identity
 
 # What makes XLA on a CPU compile twice as fast, with the same results at the same speed. One that an XLA does not know
 # is done without.
-CPU_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+CPU_OPTIONS: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
 # Settings of JAX that decide what a function is compiled to; `XLA_FLAGS` counts, too.
 SETTINGS = (
     "jax_enable_x64",

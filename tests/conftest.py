@@ -42,6 +42,7 @@ GROUPS = {
         "test_envs_episode",
         "test_envs_batch_episode",
         "test_envs_verdicts",
+        "test_envs_warm_up",
         "test_readme",
         "test_docs",
     ),

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mechsearch_jax.actions import ActionConfig, action_tables
-from mechsearch_jax.dynamics import rigid
+from mechsearch_jax.dynamics import learned, rigid
 from mechsearch_jax.dynamics.learned import LearnedPush, predicted
 from mechsearch_jax.envs.generator import separation
 from mechsearch_jax.errors import InputError
@@ -23,7 +23,7 @@ from mechsearch_jax.networks import push
 from mechsearch_jax.networks import push_geometry as geometry
 from mechsearch_jax.networks.push import PushConfig, PushNetwork
 from mechsearch_jax.networks.push_geometry import REACH, push_geometry, push_start
-from mechsearch_jax.networks.weights import save_weights
+from mechsearch_jax.networks.weights import read_card, save_weights
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
@@ -534,6 +534,11 @@ def test_the_weights_that_ship_push_as_one_expects():
     slender = superquadric.pad(standing(((0.02, 0.02, 0.11), BOX, 0.6, 0.0, 0.0)), 3)
     high = push(SHELF, slender, pusher(), gripper_at(0.62, -0.14, z=0.18), jnp.float32([0.0, 0.1, 0.0]), jnp.zeros(()))
     assert float(high.topples[0]) > 0.5
+
+
+def test_the_network_that_ships_is_not_traced_before_it_is_needed(monkeypatch):
+    monkeypatch.setattr(learned, "load_weights", None)
+    assert LearnedPush().digest == read_card(LearnedPush().path, "push")["sha256"]
 
 
 def test_models_of_the_same_weights_are_the_same_to_jit(weights, tmp_path):
