@@ -11,8 +11,6 @@ import tyro
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from mechsearch_jax.search.step import SearchStep
     from mechsearch_jax.workspace.camera import Camera
 
@@ -119,7 +117,7 @@ def _images(
     return images
 
 
-def _example(out: Path) -> tuple[dict[str, np.ndarray], Camera]:
+def _example(out: Path) -> tuple[dict[str, Any], Camera]:
     """The shipped images, and copies of them as files."""
     from mechsearch_jax.perception import image_files
     from mechsearch_jax.perception.examples import example_images

@@ -112,7 +112,7 @@ def load_camera(path: PathLike) -> Camera:
     value = read_json(path)
     if not isinstance(value, dict):
         raise InputError(f"{path}: must hold an object with {', '.join(_CAMERA_KEYS)}")
-    value = {{"k": "K", "d": "D"}.get(key, key): part for key, part in value.items() if key not in _UNUSED}
+    value = {{"k": "K", "d": "D"}.get(str(key), str(key)): part for key, part in value.items() if key not in _UNUSED}
     for key in value:
         if key not in _CAMERA_KEYS:
             raise InputError(f"{path}: {shown(key)} is unknown; {nearest(key, _CAMERA_KEYS)}")
@@ -137,7 +137,7 @@ def load_camera(path: PathLike) -> Camera:
             fy=float(K[1, 1]),
             cx=float(K[0, 2]) + 0.5,
             cy=float(K[1, 2]) + 0.5,
-            rotation=tuple(tuple(float(v) for v in row[:3]) for row in T[:3]),
+            rotation=tuple((float(a), float(b), float(c)) for a, b, c, _ in T[:3].tolist()),
             position=(float(T[0, 3]), float(T[1, 3]), float(T[2, 3])),
         )
     except InputError as error:
