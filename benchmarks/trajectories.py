@@ -1,6 +1,6 @@
 """Whole trajectories of many random actions: do they keep the limits, and does a simulated arm follow them?
 
-    python -m mechsearch_jax.benchmarks.trajectories SCENES --out trajectories.json [--actions 500] [--speed 1.0]
+python -m mechsearch_jax.benchmarks.trajectories SCENES --out trajectories.json [--actions 500] [--speed 1.0]
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -147,7 +147,15 @@ def measure(setting: Setting, cases: Sequence[Case], speed: float = 1.0) -> list
         follower = follower or Follower(setting, float(trajectory.time[1]))
         told: dict[str, Any] = dataclasses.asdict(report)
         rows.append(
-            Row(scene.name, kind, None, seconds, **told, within=report.within(), tip_error=follower.tip_error(trajectory))
+            Row(
+                scene.name,
+                kind,
+                None,
+                seconds,
+                **told,
+                within=report.within(),
+                tip_error=follower.tip_error(trajectory),
+            )
         )
     return rows
 
@@ -164,7 +172,9 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "ends_at_home": sum(bool(row.ends_at_home) for row in made),
         **{f"{name}_max": max((getattr(row, name) for row in made), default=None) for name in numbers},
         **{f"{name}_median": float(np.median([getattr(row, name) for row in made])) for name in numbers if made},
-        "position_margin_min": min((row.position_margin for row in made if row.position_margin is not None), default=None),
+        "position_margin_min": min(
+            (row.position_margin for row in made if row.position_margin is not None), default=None
+        ),
         "clearance_min": min((row.clearance for row in made if row.clearance is not None), default=None),
     }
 

@@ -1,4 +1,4 @@
-"""How far the whole arm is from the shelf, from objects and from itself, at any joint angles: for motions in free space.
+"""How far the whole arm is from the shelf, from objects and from itself, at any joint angles, for free motions.
 
 Every primitive of links 1 to 7, the hand, the fingers and what is held is covered by spheres, which reach at most
 `CELL` / 2 beyond it; objects are taken as the boxes that hold them. So a distance that is found is never too large,
@@ -233,7 +233,9 @@ def _fingers(opening: float) -> tuple[Primitive, ...]:
     right = np.diag([-1.0, -1.0, 1.0, 1.0])
     right[:3, 3] = (0.0, -opening / 2, FINGER_BASE)
     return tuple(
-        dataclasses.replace(part, T_frame_primitive=T @ part.T_frame_primitive) for T in (left, right) for part in FINGER
+        dataclasses.replace(part, T_frame_primitive=T @ part.T_frame_primitive)
+        for T in (left, right)
+        for part in FINGER
     )
 
 

@@ -128,13 +128,11 @@ class RobotTrajectory:
         timestep = self.time[1] - self.time[0] if len(self.time) > 1 else 1.0
         shares = limit_shares(self.position, float(timestep))
         margin = np.minimum(self.position - JOINT_LOWER, JOINT_UPPER - self.position).min()
-        return Report(
-            float(self.time[-1]), float(margin), *shares, self.clearance, self.straight, self.ends_at_home
-        )
+        return Report(float(self.time[-1]), float(margin), *shares, self.clearance, self.straight, self.ends_at_home)
 
 
 def limit_shares(position: Float[np.ndarray, "t 7"], timestep: float) -> tuple[float, float, float]:
-    """The highest shares of the limits of velocity, acceleration and jerk in the differences of rows, from rest to rest."""
+    """The highest shares of the limits of velocity, acceleration and jerk in differences of rows, from rest to rest."""
     still = (np.repeat(end, 3, axis=0) for end in (position[:1], position[-1:]))
     first, last = still
     values, shares = np.concatenate([first, position, last]), []
