@@ -1,6 +1,7 @@
 """Motions through free space: the whole arm's clearance, straight and planned ways, and their timing."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 SHELF, HERE = Shelf(), np.array(HOME, float)
 BODY = ArmBody.of(0.04)
 # Turned aside.
-ASIDE = HERE + (1.6, 0.8, 0.0, 0.4, 0.0, 0.4, 0.0)
+ASIDE = HERE + np.array([1.6, 0.8, 0.0, 0.4, 0.0, 0.4, 0.0])
 DT = 0.004
 
 
@@ -152,7 +153,7 @@ def test_nothing_passes_the_shelfs_front_although_it_is_open():
     pose = make(gripper_rotation(jnp.float32(0.0), jnp.float32(0.4)), jnp.float32([0.47, 0.0, 0.56]))
     solutions, valid = inverse_kinematics(pose, jnp.float32(WRIST_ORIGIN))
     middle = np.array(solutions[np.argmax(valid)], float)
-    left, right = (middle + (side, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for side in (0.75, -0.75))
+    left, right = (middle + np.array([side, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) for side in (0.75, -0.75))
     obstacles = Obstacles.of(SHELF)
     halfway = clearance(BODY, obstacles, np.array([left, right, middle]))
     assert halfway.free[2] > 0.0
@@ -160,7 +161,7 @@ def test_nothing_passes_the_shelfs_front_although_it_is_open():
     assert halfway.inside[2] > 0.05
     config = FreeMotionConfig()
     path = free_path(left, right, BODY, obstacles, config)
-    lines = np.concatenate([a + np.linspace(0, 1, 40)[:, None] * (b - a) for a, b in zip(path, path[1:], strict=False)])
+    lines = np.concatenate([a + np.linspace(0, 1, 40)[:, None] * (b - a) for a, b in itertools.pairwise(path)])
     assert len(path) > 2
     assert clearance(BODY, obstacles, lines).inside.max() < 2 * config.slack
 
@@ -175,7 +176,7 @@ def test_what_cannot_be_reached_is_said_in_one_line():
         free_path(
             HERE, ASIDE, BODY, Obstacles.of(SHELF, (halfway_box(),)), FreeMotionConfig(attempts=3, extension=1e-3)
         )
-    deep = HERE + (0.0, 1.5, 0.0, 0.6, 0.0, 0.5, 0.0)
+    deep = HERE + np.array([0.0, 1.5, 0.0, 0.6, 0.0, 0.5, 0.0])
     with pytest.raises(InputError, match="inside the shelf; take it out"):
         free_motion(deep, HERE, BODY, Obstacles.of(SHELF), timestep=DT)
 

@@ -121,7 +121,7 @@ def recognition_doubt(
         raise InputError(f"depth image: its shape is {np.shape(depth)}, not {(camera.height, camera.width)}")
     rays, depths = _seen(camera, shelf, np.asarray(depth, float))
     measured = depths > 0.0
-    missing = 1.0 - float(measured.mean())
+    missing = 1.0 - float(measured.mean()) if len(measured) else 1.0
     rays, depths = rays[measured], depths[measured]
     finite = np.isfinite(depths)
     origin = np.array(camera.position, float)
@@ -154,15 +154,20 @@ def check_recognition(setting: Setting, observation: Observation, depth: Any, co
 
 
 def _seen(camera: Camera, shelf: Shelf, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rays of pixels of the shelf's part of the image, scaled to unit depth, and their depths; 0 if not measured."""
+    """Rays through the shelf's opening, scaled to unit depth, and their depths [m]; 0 where none was measured."""
     whole = shelf_view(camera, shelf, 1)
     stride = max(1, math.ceil(math.sqrt(whole.camera.width * whole.camera.height / PIXELS)))
     rows = whole.row + np.arange(0, whole.camera.height, stride)
     columns = whole.column + np.arange(0, whole.camera.width, stride)
-    depths = depth[np.ix_(rows, columns)].reshape(-1)
     v, u = np.meshgrid((rows + 0.5 - camera.cy) / camera.fy, (columns + 0.5 - camera.cx) / camera.fx, indexing="ij")
     rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.array(camera.rotation, float).T
-    return rays, np.where(np.isnan(depths), 0.0, depths)
+    depths = depth[np.ix_(rows, columns)].reshape(-1)
+    # Beside the opening there may be nothing to measure.
+    ahead = np.maximum(rays[:, 0], 1e-9)
+    entry = np.array(camera.position) + (shelf.front - camera.position[0]) / ahead[:, None] * rays
+    wide = (entry[:, 1] > shelf.right) & (entry[:, 1] < shelf.left)
+    enters = wide & (entry[:, 2] > shelf.board) & (entry[:, 2] < shelf.ceiling)
+    return rays[enters], np.where(np.isnan(depths), 0.0, depths)[enters]
 
 
 def _on_the_board(shelf: Shelf, points: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""How far the whole arm is from the shelf, from objects and from itself: for motions in free space.
+"""How far the whole arm is from the shelf, from objects and from itself, at any joint angles, for free motions.
 
 Every primitive of links 1 to 7, the hand, the fingers and what is held is covered by spheres, which reach at most
 `CELL` / 2 beyond it; objects are taken as the boxes that hold them. So a distance that is found is never too large,

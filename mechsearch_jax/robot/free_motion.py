@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Obstacles, clearance
 from mechsearch_jax.robot.kinematics import JOINT_LOWER, JOINT_UPPER
+from mechsearch_jax.robot.robot_trajectory import limit_shares
 from mechsearch_jax.robot.time_scaling import smooth_curve, timing, travelled
 
 # No point of the arm, the hand or what it holds is farther than this from the axis of each joint [m].
@@ -320,7 +321,13 @@ def _timed(points: np.ndarray, timestep: float, pace: float, least: float) -> np
     """Joint angles after each time step of the fastest way along a smooth curve through the points."""
     curve = _smooth_curve(points.astype(np.float32))
     seconds, ramp = _timing(curve, np.float32(least), np.float32(pace * (1.0 - SPARE)))
-    rows = travelled(curve, int(ramp), max(1, math.ceil(float(seconds) / timestep - 1e-6)))
+    steps = max(1, math.ceil(float(seconds) / timestep - 1e-6))
+    rows = travelled(curve, int(ramp), steps)
+    # Near the corners of a planned path there may be peaks between the places that `timing` looks at.
+    velocity, acceleration, jerk = limit_shares(np.concatenate([points[:1], rows]), timestep)
+    over = max(velocity, acceleration ** (1 / 2), jerk ** (1 / 3)) / pace
+    if over > 1.0:
+        rows = travelled(curve, int(ramp), math.ceil(steps * over * (1.0 + SPARE)))
     # The curve knows its ends in single precision.
     share = np.linspace(0.0, 1.0, len(rows) + 1)[1:, None]
     return rows + (1.0 - share) * (points[0] - points[0].astype(np.float32)) + share * (points[-1] - rows[-1])

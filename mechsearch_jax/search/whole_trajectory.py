@@ -8,7 +8,6 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
@@ -91,8 +90,8 @@ def whole_trajectory(
     observation: Observation,
     decision: Any,
     *,
-    joints: Float[np.ndarray, " 7"] | None = None,
-    home: Float[np.ndarray, " 7"] | None = None,
+    joints: Any = None,
+    home: Any = None,
     width: float = 0.0,
     speed: float = 1.0,
     depth: Any = None,
@@ -109,7 +108,7 @@ def whole_trajectory(
       problem: what does not change.
       observation: what was seen before the action; without batch axes.
       decision: a `Decision`, or its `Action`, whose outcome is then not known beforehand.
-      joints: where the arm is [rad]; `home` if left out.
+      joints: where the arm is, seven angles [rad]; `home` if left out.
       home: where it is to go afterwards [rad]; `kinematics.HOME` if left out.
       width: distance between the fingers at the beginning [m]; ignored on the way home of a closed grip.
       speed: share of the joints' limits that velocities may reach, above 0 and at most 1; accelerations reach its
