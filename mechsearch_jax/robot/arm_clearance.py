@@ -99,7 +99,8 @@ class Obstacles:
     @classmethod
     def of(cls, shelf: Shelf, scenes: tuple[Superquadrics, ...] = (), floor: float = 0.0) -> Obstacles:
         """The shelf and the valid objects of some scenes, fields (N, ...)."""
-        sizes, poses = [np.zeros((0, 3))], [np.zeros((0, 4, 4))]
+        sizes: list[np.ndarray] = [np.zeros((0, 3))]
+        poses: list[np.ndarray] = [np.zeros((0, 4, 4))]
         for scene in scenes:
             valid = np.asarray(scene.valid)
             pose = np.tile(np.eye(4), (int(valid.sum()), 1, 1))
@@ -221,8 +222,8 @@ def _own_capsules() -> tuple[tuple[int, np.ndarray, np.ndarray, float], ...]:
     for frame in (0, 1):
         for capsule in LINKS[frame]:
             T, (radius, half) = capsule.T_frame_primitive, capsule.size
-            ends = (T[:3, 3] + sign * half * T[:3, 2] for sign in (-1.0, 1.0))
-            capsules.append((frame, *(e.astype(np.float32) for e in ends), radius))
+            low, high = (np.asarray(T[:3, 3] + sign * half * T[:3, 2], np.float32) for sign in (-1.0, 1.0))
+            capsules.append((frame, low, high, radius))
     return tuple(capsules)
 
 
