@@ -37,6 +37,9 @@ INSCRIBED = 0.7
 class DoubtConfig:
     """When recognition is too doubtful to move.
 
+    The defaults come from 24 published scenes, recognised with 1 mm and time-of-flight noise, with masks and without:
+    there the shares were at most 0.04, but for one object that was recognised wrongly.
+
     Attributes:
       tolerance: how far a point may be from a recognised surface, and how deep a ray may pass through an object [m].
       missing: share of the shelf's part of the image without a measured depth.
@@ -46,8 +49,8 @@ class DoubtConfig:
 
     tolerance: float = 0.012
     missing: float = 0.5
-    unexplained: float = 0.25
-    passed: float = 0.3
+    unexplained: float = 0.08
+    passed: float = 0.15
 
     def __post_init__(self):
         if not (self.tolerance > 0 and math.isfinite(self.tolerance)):
