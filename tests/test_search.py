@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stage import HIDDEN, OPEN, grab, idle
 
 from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import from_scenario
@@ -21,7 +22,6 @@ from mechsearch_jax.search.searcher import Searcher
 from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
-from tests.stage import HIDDEN, OPEN, grab, idle
 
 IMAGES = example_images()
 CAMERA, SHELF = IMAGES.camera, Shelf()

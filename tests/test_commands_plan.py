@@ -1,0 +1,91 @@
+"""`mechsearch plan`: from image files to a step, from call to call."""
+
+import csv
+import functools
+import json
+
+import pytest
+from stage import HIDDEN, OPEN, grab
+from test_mutated_files import program
+from test_search import IMAGES, TRUSTING, seen
+
+from mechsearch_jax.perception.image_files import load_camera, load_colour, load_depth, load_mask
+from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.search import searcher as searchers
+
+WRITTEN = {"step.json", "step.png", "trajectory.csv", "trajectory.json"}
+FILES = {"depth.png", "color.png", "mask.png", "camera.json"}
+
+
+@pytest.fixture
+def see(problem, monkeypatch):
+    """Let the command's searcher see a scenario, whatever the images show, and keep nothing on disk."""
+    monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
+    monkeypatch.setattr(Workcell, "problem", lambda self, target=None, config=None: problem)
+    whole = searchers.Searcher
+
+    def seeing(scenario):
+        given = {"policy": grab, "trajectories": TRUSTING, "recogniser": lambda problem: lambda *images: seen(scenario)}
+        monkeypatch.setattr(searchers, "Searcher", functools.partial(whole, **given))
+
+    return seeing
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "either --depth IMAGE or --example"),
+        (("--depth", "d.png", "--example"), "either --depth IMAGE or --example"),
+        (("--example", "--mask", "m.png"), "leave --color, --mask and --camera out"),
+        (("--depth", "d.png", "--target-id", "3"), "give --mask, too"),
+        (("--depth", "missing.png"), "missing.png: cannot be read"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(arguments, words, tmp_path, monkeypatch):
+    status, told = program(monkeypatch, "plan", *arguments, "--out", str(tmp_path / "out"))
+    assert status == 2
+    assert words in told
+    assert len(told.splitlines()) == 1
+
+
+def test_the_example_is_planned_on_and_written_as_files_like_a_users(see, tmp_path, monkeypatch):
+    see(OPEN)
+    out = tmp_path / "out"
+    assert program(monkeypatch, "plan", "--example", "--out", str(out))[0] == 0
+    assert {file.name for file in out.iterdir()} == WRITTEN | FILES
+    assert load_camera(out / "camera.json") == IMAGES.camera
+    assert load_depth(out / "depth.png").shape == load_colour(out / "color.png").shape[:2]
+    assert len(load_mask(out / "mask.png", 255)[1]) > 0
+    step = json.loads((out / "step.json").read_text())
+    assert step["kind"] == "retrieve"
+    assert step["motion"]["duration"] > 0
+    with open(out / "trajectory.csv", newline="") as file:
+        header, *rows = csv.reader(file)
+    points = json.loads((out / "trajectory.json").read_text())["arm"]["points"]
+    assert len(header) == len(rows[0]) == 17
+    assert len(rows) == len(points)
+
+    again = tmp_path / "again"
+    files = ("--depth", str(out / "depth.png"), "--color", str(out / "color.png"), "--mask", str(out / "mask.png"))
+    asked = (*files, "--target-id", "200", "--camera", str(out / "camera.json"), "--out", str(again))
+    assert program(monkeypatch, "plan", *asked)[0] == 0
+    assert json.loads((again / "step.json").read_text()) == step
+
+
+def test_a_search_goes_on_from_call_to_call(see, tmp_path, monkeypatch, capsys):
+    see(OPEN)
+    out, state = tmp_path / "out", tmp_path / "search.npz"
+    asked = ("plan", "--example", "--state", str(state), "--out", str(out))
+    assert program(monkeypatch, *asked)[0] == 0
+    assert program(monkeypatch, *asked, "--failed")[0] == 0
+    assert json.loads((out / "step.json").read_text())["index"] == 1
+    # Nothing is to be followed that is of another step.
+    see(HIDDEN)
+    assert program(monkeypatch, *asked, "--failed")[0] == 0
+    assert json.loads((out / "step.json").read_text())["motion"] is None
+    assert not (out / "trajectory.csv").exists()
+    see(OPEN)
+    assert program(monkeypatch, *asked)[0] == 0
+    before = (out / "step.json").read_bytes()
+    assert program(monkeypatch, *asked)[0] == 0
+    assert (out / "step.json").read_bytes() == before
