@@ -159,10 +159,10 @@ def test_a_few_that_fail_are_rows_even_if_nothing_else_is_run(problem, tmp_path,
 def test_what_fails_before_any_episode_ends_the_run(problem, tmp_path, files, monkeypatch):
     Stand(problem, monkeypatch)
 
-    def cached_problem(target, config):
+    def problem_of(self, target, config):
         raise ValueError("no problem")
 
-    monkeypatch.setattr(batches, "cached_problem", cached_problem)
+    monkeypatch.setattr(batches.Workcell, "problem", problem_of)
     with pytest.raises(ValueError, match="no problem"):
         evaluate(jobs_of(files), tmp_path / "rows", Batches(worlds=2))
     assert read_rows(tmp_path / "rows") == []

@@ -39,7 +39,7 @@ def test_workers_are_told_their_share(monkeypatch):
     tells = (sys.executable, "-c", f"import os, sys; sys.exit('share ' + os.environ['{VARIABLE}'])")
     jobs = make_jobs([example_scenarios()["first-light"]], [Method()], (0, 1))
     rows = []
-    Processes(4, tells)(jobs, rows.extend)
+    Processes(4, command=tells)(jobs, rows.extend, lambda job: True)
     assert [row.failure.endswith("share 3") for row in rows] == [True, True]
 
 

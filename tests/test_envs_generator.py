@@ -9,17 +9,18 @@ from scipy.spatial.transform import Rotation
 from stage import stays_put
 
 from mechsearch_jax.envs import generator, simulated_camera, world
-from mechsearch_jax.envs.generator import BOXES, CYLINDERS, GeneratorConfig, ScenarioGenerator, outline, separation
+from mechsearch_jax.envs.generator import GeneratorConfig, ScenarioGenerator, outline, separation
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.scenario import Body, format_scenario, parse_scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 SHELF = Shelf()
-SIZES = {tuple(round(s / 2, 6) for s in box) for box in BOXES}
+SIZES = {tuple(round(s / 2, 6) for s in box) for box in ObjectSizes().boxes}
 SIZES |= {(b, a, c) for a, b, c in SIZES}
-SIZES |= {(r, r, round(h / 2, 6)) for r, h in CYLINDERS}
+SIZES |= {(r, r, round(h / 2, 6)) for r, h in ObjectSizes().cylinders}
 
 
 @pytest.fixture(scope="module", params=["cylinder", "box"])

@@ -30,7 +30,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 SHELF = Shelf()
 # Nothing is within reach of these walls.
-OPEN = Shelf(front=-50.0, back=50.0, right=-50.0, left=50.0)
+OPEN = Shelf(front=-10.0, back=10.0, right=-10.0, left=10.0)
 CONFIG = PushConfig(width=16, layers=2)
 BOX, ROUND = shape_of("box").exponents, shape_of("cylinder").exponents
 
