@@ -103,6 +103,7 @@ def _images(
 ) -> dict[str, Any]:
     """The arguments of `Searcher.next` from files."""
     from mechsearch_jax.perception import image_files
+    from mechsearch_jax.perception.labels import INSTANCES
 
     images: dict[str, Any] = {"depth": image_files.load_depth(depth)}
     if color is not None:
@@ -112,8 +113,10 @@ def _images(
         if target_id is not None:
             # A number that the mask does not show: the target is not seen.
             images["target_id"] = numbers.get(target_id, -1)
-        elif color is None and len(numbers) == 9:
-            raise InputError(f"{mask}: names nine objects; say with --target-id which is the target, or leave one out")
+        elif color is None and len(numbers) == INSTANCES:
+            raise InputError(
+                f"{mask}: names {INSTANCES} objects; say with --target-id which is the target, or leave one out"
+            )
     return images
 
 

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.perception.planes import PlaneConfig, find_plane
 from mechsearch_jax.workspace.camera import Camera, back_project, project
@@ -123,13 +122,3 @@ def _floor_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
         f"depth image: the board appears up to {100 * abs(worst):.1f} cm too {'high' if worst > 0 else 'low'}; check "
         "the pose of the camera and the height of the board"
     )
-
-
-def check_camera(camera: Camera, shelf: Shelf) -> None:
-    """Refuse a camera that cannot be meant.
-
-    Raises:
-      InputError: its pose has a fault.
-    """
-    for fault in camera_faults(camera, shelf):
-        raise InputError(fault)

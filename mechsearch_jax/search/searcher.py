@@ -134,7 +134,7 @@ class Searcher:
         """Whether the arm can work in this shelf, and the camera sees it."""
         poses = self.problem.poses.shape[0]
         reach = len(np.unique(np.asarray(self.problem.grasps.pair_pose))) / poses
-        warnings = list(camera_faults(self.workcell.camera, self.workcell.shelf))
+        warnings = list(self._camera_faults)
         if reach == 0.0:
             warnings.insert(0, "shelf: the arm reaches the target nowhere; check the shelf's place before the robot")
         elif reach < LEAST_REACH:
@@ -212,7 +212,7 @@ class Searcher:
             joints = np.asarray(joints, float)
             check_joints("joints", joints)
         observation = self.recogniser(seeing, depth, colour, mask, target_id)
-        warnings = [*camera_faults(problem.camera, problem.shelf)]
+        warnings = [*self._camera_faults]
         warnings += image_faults(problem.camera, problem.shelf, depth, None if mask is None else np.asarray(mask))
         warnings += crowd_faults(observation)
         last = (now.observation, now.action) if now.acted else (None, None)
@@ -272,6 +272,11 @@ class Searcher:
           InputError: the file cannot be read, is none of `save`, or is of another workcell or configuration.
         """
         self._state = load_state(self.problem, self._digest, path)
+
+    @functools.cached_property
+    def _camera_faults(self) -> tuple[str, ...]:
+        """What is wrong with the camera's pose, which does not change."""
+        return camera_faults(self.workcell.camera, self.workcell.shelf)
 
     @functools.cached_property
     def _digest(self) -> str:

@@ -17,6 +17,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception import recogniser
 from mechsearch_jax.perception.doubt import DoubtConfig, check_recognition
 from mechsearch_jax.robot.arm_clearance import ArmBody, Held, Obstacles, clearance, tip_positions
 from mechsearch_jax.robot.free_motion import SPARE, FreeMotion, FreeMotionConfig, check_joints, free_motion
@@ -32,9 +33,6 @@ from mechsearch_jax.robot.robot_trajectory import (
     places_when_slowed,
     slowed,
 )
-from mechsearch_jax.workspace.camera import Camera
-from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.target import Target
 
 # How fast the fingers open and close on the ways through free space: how fast the distance between them changes [m/s].
 FINGER_SPEED = 0.1
@@ -42,20 +40,11 @@ FINGER_SPEED = 0.1
 OUTSIDE = 2e-3
 
 
-class Setting(Protocol):
+class Setting(recogniser.Setting, Protocol):
     """What a trajectory has to know of a problem; a planner's `Problem` is one."""
 
     @property
-    def camera(self) -> Camera: ...
-
-    @property
-    def shelf(self) -> Shelf: ...
-
-    @property
     def gripper(self) -> Gripper: ...
-
-    @property
-    def target(self) -> Target: ...
 
 
 @dataclasses.dataclass(frozen=True)
