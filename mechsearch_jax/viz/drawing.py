@@ -16,6 +16,7 @@ from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
+from matplotlib.text import Text
 from scipy.spatial import ConvexHull
 
 from mechsearch_jax.files import PathLike, replacing
@@ -179,9 +180,13 @@ def draw_objects(axes: Axes, scene: Superquadrics) -> None:
         number(axes, (y, x), i)
 
 
-def number(axes: Axes, place: tuple[float, float], index: int) -> None:
-    text = axes.text(place[0], place[1], str(index), color=INK, fontsize=LETTER, ha="center", va="center", zorder=10)
+def number(axes: Axes, place: tuple[float, float], index: int, animated: bool = False) -> Text:
+    """The number of an object, legible on anything."""
+    text = axes.text(
+        *place, str(index), color=INK, fontsize=LETTER, ha="center", va="center", zorder=10, animated=animated
+    )
     text.set_path_effects([Stroke(linewidth=2.2, foreground=PAPER, alpha=0.75), Normal()])
+    return text
 
 
 def draw_target(axes: Axes, pose: Float[np.ndarray, " 3"], target: Target, certain: bool) -> None:
@@ -318,13 +323,13 @@ def draw_numbers_in_view(axes: Axes, owner: Int[np.ndarray, "h w"], count: int) 
             number(axes, (float(np.median(columns)), float(np.median(rows))), i)
 
 
-def draw_legend(figure: Figure, capacity: int, y: float) -> None:
-    """What the colours of the map mean, in one line at the height `y` of the figure (0 to 1)."""
+def draw_legend(figure: Figure, capacity: int, y: float, size: float = LETTER) -> None:
+    """What the colours of the map mean, in one line at the height `y` of the figure (0 to 1), in type of a size."""
     marks = [patches.Patch(facecolor=(*rgb(b.colour), 0.95), label=b.label) for b in bands(capacity)]
     marks.append(patches.Patch(facecolor=TARGET, label="target, found"))
     marks.append(patches.Patch(facecolor="none", edgecolor=TARGET, linestyle=(0, (2, 1.5)), label="target, hidden"))
     title = "Where the target can be, and what a grasp there would meet"
-    legend = figure.legend(handles=marks, **_legend_style(len(marks), y), title=title, title_fontsize=LETTER)
+    legend = figure.legend(handles=marks, **_legend_style(len(marks), y, size), title=title, title_fontsize=size)
     legend.get_title().set_color(MUTED)
 
 
@@ -336,12 +341,12 @@ def draw_action_legend(figure: Figure, y: float) -> None:
         patches.Patch(facecolor=(*rgb(HAND), 0.05), edgecolor=(*rgb(HAND), 0.4), label="as it ends"),
         patches.Patch(**ghost, label="where objects are expected to go"),
     ]
-    figure.legend(handles=marks, **_legend_style(len(marks), y))
+    figure.legend(handles=marks, **_legend_style(len(marks), y, LETTER))
 
 
-def _legend_style(columns: int, y: float) -> dict[str, Any]:
+def _legend_style(columns: int, y: float, size: float) -> dict[str, Any]:
     return {
-        "loc": "center", "bbox_to_anchor": (0.5, y), "ncols": columns, "frameon": False, "fontsize": LETTER,
+        "loc": "center", "bbox_to_anchor": (0.5, y), "ncols": columns, "frameon": False, "fontsize": size,
         "handlelength": 1.1, "handleheight": 1.1, "columnspacing": 1.3, "labelcolor": INK, "borderpad": 0,
     }  # fmt: skip
 

@@ -156,17 +156,44 @@ def _write(figure: Figure, x: float, y: float, lines: Sequence[tuple[str, float,
 
 
 def _draw(view: Axes, above: Axes, frame: Frame, camera: Camera, shelf: Shelf, target: Target, room: float) -> None:
-    drawing.draw_view(view, frame.image, camera, shelf, room)
-    drawing.draw_numbers_in_view(view, frame.owner, frame.scene.capacity)
-    drawing.draw_shelf(above, shelf)
-    image = drawing.map_image(frame.existence, frame.graspability, target, frame.scene.capacity)
-    drawing.draw_map(above, image, shelf, target)
+    draw_seen(view, frame, camera, shelf, target, room)
+    draw_believed(above, frame, shelf, target)
     drawing.draw_objects(above, frame.scene)
     if frame.target_pose is not None:
         drawing.draw_target(above, frame.target_pose, target, frame.found)
-        if not frame.found:
-            drawing.draw_hidden_target_in_view(view, frame.target_pose, target, camera, shelf)
-    for axes, flat in ((view, sketches.in_view(camera)), (above, sketches.from_above)):
-        sketches.draw_action(axes, flat, frame.sketch, frame.scene, frame.after, shelf)
-        if frame.target_pose is not None:
-            sketches.draw_taken_target(axes, flat, frame.sketch, frame.target_pose, target, shelf)
+
+
+def draw_seen(axes: Axes, frame: Frame, camera: Camera, shelf: Shelf, target: Target, room: float) -> None:
+    """What the camera sees at a step, and the action.
+
+    Args:
+      axes: for nothing else.
+      frame: the step.
+      camera, shelf, target: of the problem.
+      room: how far above the board it is shown [m].
+    """
+    drawing.draw_view(axes, frame.image, camera, shelf, room)
+    drawing.draw_numbers_in_view(axes, frame.owner, frame.scene.capacity)
+    if frame.target_pose is not None and not frame.found:
+        drawing.draw_hidden_target_in_view(axes, frame.target_pose, target, camera, shelf)
+    _act(axes, sketches.in_view(camera), frame, shelf, target)
+
+
+def draw_believed(axes: Axes, frame: Frame, shelf: Shelf, target: Target) -> None:
+    """The empty shelf from above with f and g at a step, and the action.
+
+    Args:
+      axes: for nothing else.
+      frame: the step.
+      shelf, target: of the problem.
+    """
+    drawing.draw_shelf(axes, shelf)
+    image = drawing.map_image(frame.existence, frame.graspability, target, frame.scene.capacity)
+    drawing.draw_map(axes, image, shelf, target)
+    _act(axes, sketches.from_above, frame, shelf, target)
+
+
+def _act(axes: Axes, flat: sketches.Flat, frame: Frame, shelf: Shelf, target: Target) -> None:
+    sketches.draw_action(axes, flat, frame.sketch, frame.scene, frame.after, shelf)
+    if frame.target_pose is not None:
+        sketches.draw_taken_target(axes, flat, frame.sketch, frame.target_pose, target, shelf)

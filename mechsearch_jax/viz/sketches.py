@@ -97,11 +97,16 @@ def hand_points(T: Float[np.ndarray, "4 4"], opening: float) -> list[Float[np.nd
       T: pose of the gripper.
       opening: distance between the fingers [m].
     """
-    both = fingers(opening)
-    half = len(both) // 2
     T_world_hand = np.array(T, float)
     T_world_hand[:3, 3] -= FINGER_TIPS * T_world_hand[:3, 2]
-    return [_corners(T_world_hand, parts) for parts in (both[:half], both[half:], HAND)]
+    return points_of_hand(T_world_hand, opening)
+
+
+def points_of_hand(T: Float[np.ndarray, "4 4"], opening: float) -> list[Float[np.ndarray, "points 3"]]:
+    """`hand_points` from the pose of the hand."""
+    both = fingers(opening)
+    half = len(both) // 2
+    return [_corners(T, parts) for parts in (both[:half], both[half:], HAND)]
 
 
 def _corners(T: np.ndarray, parts: Sequence[Primitive]) -> np.ndarray:
