@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +27,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 # From the middle of the opening's lower edge, where the bystander is, and where he looks [m]: he stands at the left,
 # and the boards between him and the objects are left out.
-STANDS, LOOKS_AT = np.array([-0.56, 1.25, 0.85]), np.array([-0.09, -0.04, -0.02])
+STANDS, LOOKS_AT = np.array([-0.56, 1.25, 0.85]), np.array([-0.09, -0.04, 0.03])
 LEFT_OUT = ("ceiling", "left")
 # Width of his view, in units of its distance.
 VIEW_ANGLE = 1.02
@@ -51,7 +50,9 @@ class Film:
         """
         self._recording = recording
         self._played = playback(recording, fps, speed)
-        self._room = drawing.height_of([s for step in recording.steps for s in (step.scene, step.after)], recording.shelf)
+        self._room = drawing.height_of(
+            [s for step in recording.steps for s in (step.scene, step.after)], recording.shelf
+        )
         self._layout = Layout.of(width, recording.camera, recording.shelf, self._room)
         self.size, self.count = self._layout.size, len(self._played.time)
 
@@ -71,8 +72,7 @@ class Film:
             for index, rows in itertools.groupby(range(self.count), lambda row: int(played.step[row])):
                 step = recording.steps[index]
                 frame = recorded_frame(step, recording.camera, recording.shelf)
-                told = dataclasses.replace(frame, title=f"{frame.title}")
-                page = Page(told, recording.camera, recording.shelf, recording.target, self._room, self._layout)
+                page = Page(frame, recording.camera, recording.shelf, recording.target, self._room, self._layout)
                 # So few at once that they do not pile up where drawing is slower.
                 for some in _in_lots(rows, 2 * cores()):
                     for row, picture in zip(some, pool.map(beside, some), strict=True):

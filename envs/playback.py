@@ -34,7 +34,7 @@ class Playback(NamedTuple):
 
     Attributes:
       step: index of the step that it belongs to.
-      time: since the beginning [s].
+      time: since the beginning, as long as it took [s].
       q: joint angles [rad], shape (rows, 7).
       opening: distance between the fingers [m].
       position: of the nine bodies [m], shape (rows, 9, 3).
@@ -80,7 +80,7 @@ def playback(recording: Recording, fps: float, speed: float = 1.0) -> Playback:
         inside = moments[(moments >= begin) & (moments < end)]
         found.append((np.full(len(inside), i), inside, *_sampled(piece, inside - begin)))
     step, time, *rest = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return Playback(step, time / speed, *rest)
+    return Playback(step, time, *rest)
 
 
 def _pieces(step: RecordedStep, shelf: Shelf) -> Iterator[_Piece]:

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.actions import Action, no_action
+from mechsearch_jax.arrays import read_arrays
 from mechsearch_jax.envs.episodes import Moment
-from mechsearch_jax.envs.native import NativeSimulator, Trace
+from mechsearch_jax.envs.native import Trace
 from mechsearch_jax.envs.simulator import ARM
 from mechsearch_jax.envs.world import BODIES, World
-from mechsearch_jax.arrays import read_arrays
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, read_bytes, replacing
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -87,10 +88,17 @@ class Recording:
     steps: tuple[RecordedStep, ...]
 
 
-class Recorder:
-    """Collects the steps of an episode that runs alone in a `NativeSimulator`."""
+class Traced(Protocol):
+    """A simulator that tells how everything moved in each world during the last action, as `NativeSimulator` does."""
 
-    def __init__(self, simulator: NativeSimulator):
+    @property
+    def traces(self) -> Sequence[Trace]: ...
+
+
+class Recorder:
+    """Collects the steps of an episode that runs alone."""
+
+    def __init__(self, simulator: Traced):
         self._simulator = simulator
         self._steps: list[RecordedStep] = []
 

@@ -27,6 +27,7 @@ from mechsearch_jax.commands.options import with_planner_options
 from mechsearch_jax.commands.plan import plan
 from mechsearch_jax.commands.report import report
 from mechsearch_jax.commands.search import search
+from mechsearch_jax.commands.video import video
 from mechsearch_jax.errors import InputError, nearest
 
 Commands = Mapping[str, Callable[..., None]]
@@ -45,6 +46,7 @@ COMMANDS: Commands = {
     "search": search,
     "plan": plan,
     "inspect": inspect_scenarios,
+    "video": video,
     "evaluate": evaluate,
     "report": report,
     "config": print_config,

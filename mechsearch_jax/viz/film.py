@@ -102,6 +102,10 @@ class Page:
         frame = dataclasses.replace(frame, sketch=dataclasses.replace(frame.sketch, hands=None))
         draw_seen(view, frame, camera, shelf, target, room)
         draw_believed(self._above, frame, shelf, target)
+        view.text(
+            0.985, 0.03, "what the camera saw", transform=view.transAxes, color=drawing.MUTED, fontsize=7.5,
+            ha="right", va="bottom", zorder=9,
+        )  # fmt: skip
         self._write(frame)
         self._movers = _Movers(self._above, frame)
         self._clock = self._text(width - _GAP * width / WIDTH, 0.2, "", 8.5, drawing.MUTED, ha="right", animated=True)

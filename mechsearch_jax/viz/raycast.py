@@ -59,7 +59,7 @@ class Capsule:
         return nearest
 
     def normal(self, point, half_size, library):
-        half = (half_size[2] - half_size[0])
+        half = half_size[2] - half_size[0]
         height = point[..., 2:] - library.clip(point[..., 2:], -half, half)
         return library.concatenate([point[..., :2], height], axis=-1)
 
