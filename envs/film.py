@@ -41,7 +41,7 @@ class Film:
       size: their width and height.
     """
 
-    def __init__(self, recording: Recording, width: int, fps: float, speed: float = 1.0):
+    def __init__(self, recording: Recording, width: int, fps: int, speed: float = 1.0):
         """Args:
         recording: of the episode.
         width: of the pictures, in pixels.
@@ -119,7 +119,7 @@ def _body_solids(world: World, played: Playback, row: int) -> list[Solid]:
             played.position[row, i],
             _colour(i),
         )
-        for i in np.flatnonzero(world.valid)
+        for i in np.flatnonzero(world.valid).tolist()
     ]
 
 

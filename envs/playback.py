@@ -60,7 +60,7 @@ class _Piece(NamedTuple):
     ends: float
 
 
-def playback(recording: Recording, fps: float, speed: float = 1.0) -> Playback:
+def playback(recording: Recording, fps: int, speed: float = 1.0) -> Playback:
     """A recording as evenly spaced moments.
 
     Args:

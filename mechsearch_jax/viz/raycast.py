@@ -59,7 +59,7 @@ class Capsule:
         return nearest
 
     def normal(self, point, half_size, library):
-        half = half_size[2] - half_size[0]
+        half = half_size[..., 2:] - half_size[..., :1]
         height = point[..., 2:] - library.clip(point[..., 2:], -half, half)
         return library.concatenate([point[..., :2], height], axis=-1)
 
@@ -157,7 +157,7 @@ class Eye:
             return
         depth = depth[nearer]
         points = origin + depth[:, None] * np.stack([component[nearer] for component in local], axis=-1)
-        normal = solid.surface.normal(points, half, np)
+        normal = solid.surface.normal(points, np.broadcast_to(half, points.shape), np)
         normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
         shade = self._ambient + (1.0 - self._ambient) * np.maximum(normal @ (rotation.T @ self._light), 0.0)
         picture.depth[window][nearer] = depth
