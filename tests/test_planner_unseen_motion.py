@@ -112,7 +112,7 @@ def test_a_picked_object_may_have_touched_the_target_at_both_ends(problem, opene
 
 
 def test_what_moves_away_touches_nothing_where_it_stood(problem, opened):
-    """Behind the box, beyond the finger tips: the box does not drag the target along, and the hand does not reach it."""
+    """Behind the box and beyond the finger tips: the box does not drag the target along, the hand does not reach it."""
     grasp = make(FORWARD, jnp.float32([0.6, 0.0, 0.46]))
     there = jnp.float32([0.0, -0.2, 0.0])
     pick = no_action().replace(
