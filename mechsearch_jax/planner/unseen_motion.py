@@ -84,7 +84,8 @@ def _bodies(
 ) -> tuple[Float[Array, "n s p 3"], Bool[Array, "n s p"], Float[Array, ""]]:
     """Points that the objects passed [m], which of them count, and how far the target may have been taken [m]."""
     n, target, shelf = before.capacity, problem.target, problem.shelf
-    approach, share = problem.gripper.approach, jnp.linspace(0.0, 1.0, OBJECT_PLACES)[None, :, None, None]
+    # Where it began to move it touches only what it moves away from.
+    approach, share = problem.gripper.approach, jnp.linspace(0.0, 1.0, OBJECT_PLACES + 1)[None, 1:, None, None]
     size = jnp.where(before.valid[:, None], before.size, 1.0)
     clouds = jnp.swapaxes(object_clouds(before.replace(size=size), problem.config.actions.object_points), -1, -2)
     start = transform(make(before.rotation, before.position)[:, None], clouds)
@@ -101,10 +102,9 @@ def _bodies(
     holds = jnp.any(jnp.stack([action.kind == code for code, kind in KINDS.items() if kind.holds_object]))
     into = transform(compose(action.T_world_place, inverse(action.T_world_gripper)), start)
     # What is carried goes out along the gripper's z and in again.
-    half = OBJECT_PLACES // 2
-    back = approach * jnp.linspace(0.0, 1.0, half)[:, None]
-    ends = ((start, action.T_world_gripper), (into, action.T_world_place))
-    carried = [cloud[:, None] - (back * T[None, :3, 2])[None, :, None] for cloud, T in ends]
+    out = approach * jnp.linspace(0.0, 1.0, OBJECT_PLACES // 2 + 1)[:, None]
+    ends = ((start, action.T_world_gripper, out[1:]), (into, action.T_world_place, out[:-1]))
+    carried = [cloud[:, None] - (back * T[None, :3, 2])[None, :, None] for cloud, T, back in ends]
     held = own & holds
     points = jnp.where(held[:, None, None, None], jnp.concatenate(carried, axis=1), path)
     # What is carried may be dropped, however high it is.
