@@ -98,18 +98,19 @@ def surfaces(scene: Superquadrics) -> list[Float[np.ndarray, "points 3"] | None]
     return result
 
 
-def hull(points: Float[np.ndarray, "points 2"] | None) -> Float[np.ndarray, "corners 2"] | None:
-    return None if points is None else points[ConvexHull(points).vertices]
+def hull(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
+    """Corners of the convex hull, counter-clockwise."""
+    return points[ConvexHull(points).vertices]
 
 
 def outlines(scene: Superquadrics) -> list[Float[np.ndarray, "corners 2"] | None]:
     """Each object's outline seen from above in x and y [m], counter-clockwise; None for absent objects."""
-    return [hull(None if points is None else points[:, :2]) for points in surfaces(scene)]
+    return [None if points is None else hull(points[:, :2]) for points in surfaces(scene)]
 
 
 def outlines_in_view(scene: Superquadrics, camera: Camera) -> list[Float[np.ndarray, "corners 2"] | None]:
     """Each object's outline in the camera's image as columns and rows; None for absent objects."""
-    return [hull(None if points is None else pixels(camera, points)) for points in surfaces(scene)]
+    return [None if points is None else hull(pixels(camera, points)) for points in surfaces(scene)]
 
 
 def map_image(
@@ -304,7 +305,7 @@ def _name_front_in_view(axes: Axes, camera: Camera, shelf: Shelf) -> None:
     at, along = seen[len(seen) // 2], seen[-1] - seen[0]
     along = along if along[0] >= 0 else -along
     axes.text(
-        *at, "robot's side", color=MUTED, fontsize=LETTER, ha="center", va="top", rotation_mode="anchor",
+        float(at[0]), float(at[1]), "robot's side", color=MUTED, fontsize=LETTER, ha="center", va="top", rotation_mode="anchor",
         rotation=float(np.degrees(np.arctan2(-along[1], along[0]))), zorder=4,
     )  # fmt: skip
 

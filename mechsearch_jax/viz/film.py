@@ -112,7 +112,7 @@ class Page:
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
 
-    def image(self, beside: UInt8[np.ndarray, "h w 3"], moving: Moving) -> UInt8[np.ndarray, "h w 3"]:
+    def image(self, beside: UInt8[np.ndarray, "h w 3"], moving: Moving) -> UInt8[np.ndarray, "rows columns 3"]:
         """The whole picture at one moment.
 
         Args:

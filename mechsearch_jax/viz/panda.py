@@ -32,7 +32,8 @@ def panda_solids(poses: Float[np.ndarray, "8 4 4"], opening: float) -> list[Soli
 def _solid(T: np.ndarray, part: Primitive, colour: Colour) -> Solid:
     if part.kind == "box":
         return Solid(_BOX, np.array(part.size), T[:3, :3], T[:3, 3], colour)
-    return _capsule_solid(*part.size, T[:3, :3], T[:3, 3], colour)
+    radius, half = part.size
+    return _capsule_solid(radius, half, T[:3, :3], T[:3, 3], colour)
 
 
 def _capsule_solid(radius: float, half: float, rotation: np.ndarray, position: np.ndarray, colour: Colour) -> Solid:

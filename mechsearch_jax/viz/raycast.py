@@ -149,7 +149,8 @@ class Eye:
         rotation, half = np.asarray(solid.rotation, np.float32), np.asarray(solid.half_size, np.float32)
         rays = [component[window] for component in self._rays]
         origin = (self._position - np.asarray(solid.position, np.float32)) @ rotation
-        local = [sum(rotation[i, k] * rays[i] for i in range(3)) for k in range(3)]
+        x, y, z = rays
+        local = [rotation[0, k] * x + rotation[1, k] * y + rotation[2, k] * z for k in range(3)]
         with np.errstate(all="ignore"):
             depth = solid.surface.cut([np.float32(o) for o in origin], local, half, np)
         nearer = depth < picture.depth[window]
