@@ -305,8 +305,8 @@ def _name_front_in_view(axes: Axes, camera: Camera, shelf: Shelf) -> None:
     at, along = seen[len(seen) // 2], seen[-1] - seen[0]
     along = along if along[0] >= 0 else -along
     axes.text(
-        float(at[0]), float(at[1]), "robot's side", color=MUTED, fontsize=LETTER, ha="center", va="top", rotation_mode="anchor",
-        rotation=float(np.degrees(np.arctan2(-along[1], along[0]))), zorder=4,
+        float(at[0]), float(at[1]), "robot's side", color=MUTED, fontsize=LETTER, ha="center", va="top",
+        rotation=float(np.degrees(np.arctan2(-along[1], along[0]))), rotation_mode="anchor", zorder=4,
     )  # fmt: skip
 
 
