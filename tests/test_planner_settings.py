@@ -95,7 +95,7 @@ def test_a_robot_that_stands_elsewhere_sees_camera_and_shelf_from_there(tmp_path
 
 WRONG = {
     "[base]\nposition = [0, 11, 0]": ":2: [base] position y (11.0) must be from -10 to 10 m",
-    "[base]\nposition = [9.9, 0, 0]\n[camera]\nposition = [-5, 0, 0]": ":1: [base] position x (-14.9) must be from",
+    "[base]\nposition = [9.9, 0, 0]\n[camera]\nposition = [-5, 0, 0]": ":1: [base]: position x (-14.9) must be from",
     "[camera]\nwidth = 0": ":2: [camera] width (0) must be from 1 to",
     "[camera]\n\nwidth = 1.5": ":3: [camera] width must be a whole number, not 1.5",
     "[camera]\nwidth = true": ":2: [camera] width must be a whole number, not true",
