@@ -23,10 +23,13 @@ from mechsearch_jax.envs.simulator import ARM
 from mechsearch_jax.envs.world import BODIES, World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, read_bytes, replacing
+from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner import Problem
+from mechsearch_jax.shapes import in_order
 from mechsearch_jax.viz.filmstrip import Frame
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -178,9 +181,8 @@ def load_recording(path: PathLike) -> Recording:
         if (head["format"], head["version"]) != (FORMAT, VERSION):
             raise ValueError("of another kind or version")
         told, count = head["steps"], len(head["steps"])
-        if not count or any(len(arrays[name]) != count for name in ("rows", "acts", *_ARRAYS)):
-            raise ValueError("steps are missing")
         settings = {name: kind(**_tuples(head[name])) for name, kind in _SETTINGS.items()}
+        _check(arrays, count, len(settings["target"].candidate_poses(settings["shelf"])))
         ends = np.cumsum(arrays["rows"])
         steps = [_step(arrays, told[i], i, slice(ends[i] - arrays["rows"][i], ends[i])) for i in range(count)]
         return Recording(str(head["heading"]), **settings, steps=tuple(steps))
@@ -188,12 +190,41 @@ def load_recording(path: PathLike) -> Recording:
         raise InputError(f"{path}: is no recording of an episode ({' '.join(str(error).split())})") from error
 
 
+def _check(arrays: dict[str, np.ndarray], count: int, poses: int) -> None:
+    """Refuse arrays that are not those of so many steps and candidate poses."""
+    nothing = superquadric.empty(MAX_OBJECTS)
+    likes = {"world": _no_world(), "scene": nothing, "after": nothing, "action": no_action()}
+    like = {f"{name}.{f}": np.asarray(getattr(tree, f)) for name, tree in likes.items() for f in _fields(type(tree))}
+    like |= {"rows": np.array(0), "acts": np.array(True), "target_pose": np.zeros(3)}
+    like |= {"existence": np.zeros(poses, bool), "graspability": np.zeros(poses, int)}
+    if not count or any(arrays[name].shape != (count, *one.shape) for name, one in like.items()):
+        raise ValueError("steps are missing, or their arrays are of other shapes")
+    still = empty_trace()
+    like |= {f"trace.{name}": getattr(still, name) for name in _fields(Trace)}
+    if any(arrays[name].dtype.kind != one.dtype.kind for name, one in like.items()):
+        raise ValueError("an array is of another type")
+    rows = int(arrays["rows"].sum())
+    if arrays["rows"].min() < 0 or any(
+        arrays[name].shape != (rows, *one.shape[1:]) for name, one in like.items() if name.startswith("trace.")
+    ):
+        raise ValueError("rows are missing")
+    if not all(np.isfinite(arrays[name]).all() for name in like):
+        raise ValueError("there are numbers that are not finite")
+    kinds = arrays["world.kind"]
+    if kinds.min() < 0 or kinds.max() >= len(in_order()) or not (arrays["world.half_size"] > 0).all():
+        raise ValueError("a body is of no shape")
+
+
+def _no_world() -> World:
+    vectors = np.zeros((BODIES, 3), np.float32)
+    rotations, present = np.zeros((BODIES, 3, 3), np.float32), np.zeros(BODIES, bool)
+    return World(np.zeros(BODIES, np.int32), vectors, vectors, rotations, present)  # pyright: ignore[reportArgumentType]
+
+
 def _step(arrays: dict[str, np.ndarray], told: dict[str, Any], i: int, rows: slice) -> RecordedStep:
     trees = {name: kind(*(arrays[f"{name}.{f}"][i] for f in _fields(kind))) for name, kind in _TREES.items()}
     trees["action"] = trees["action"] if arrays["acts"][i] else None
     trace = Trace(*(arrays[f"trace.{name}"][rows] for name in _fields(Trace)))
-    if any(len(getattr(trace, name)) != rows.stop - rows.start for name in _fields(Trace)):
-        raise ValueError("rows are missing")
     return RecordedStep(**{n: told[n] for n in _TOLD}, **{n: arrays[n][i] for n in _ARRAYS}, **trees, trace=trace)
 
 

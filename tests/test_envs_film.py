@@ -129,7 +129,23 @@ def rename(arrays):
     arrays["head"] = np.array(str(arrays["head"]).replace("mechsearch recording", "something"))
 
 
-@pytest.mark.parametrize("spoil", [cut, forget, rename])
+def widen(arrays):
+    arrays["world.position"] = np.zeros((3, BODIES, 2), np.float32)
+
+
+def misname(arrays):
+    arrays["world.kind"] = arrays["world.kind"] + 7
+
+
+def lose(arrays):
+    arrays["trace.q"] = arrays["trace.q"] * np.nan
+
+
+def retype(arrays):
+    arrays["existence"] = arrays["existence"].astype("U1")
+
+
+@pytest.mark.parametrize("spoil", [cut, forget, rename, widen, misname, lose, retype])
 def test_what_is_no_recording_is_refused_in_one_line(spoil, tmp_path):
     save_recording(RECORDING, tmp_path / NAME)
     with np.load(tmp_path / NAME) as file:
