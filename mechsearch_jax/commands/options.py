@@ -148,8 +148,12 @@ def _usual(option: Option) -> str:
     values = {name: preset().options()[option.name] for name, preset in PRESETS.items()}
     said = {name: " ".join(map(_short, value)) if isinstance(value, list) else value for name, value in values.items()}
     usual = said.pop(DEFAULT_PRESET)
-    others = [f", in preset {name} {value}" for name, value in said.items() if value != usual]
-    return f"(default: {usual}{''.join(others)})"
+    others: dict[Any, list[str]] = {}
+    for name, value in said.items():
+        if value != usual:
+            others.setdefault(value, []).append(name)
+    told = [f", in preset {' and '.join(names)} {value}" for value, names in others.items()]
+    return f"(default: {usual}{''.join(told)})"
 
 
 def _short(value: Any) -> str:

@@ -26,7 +26,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.belief import Belief
 from mechsearch_jax.planner.config import PlannerConfig
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
-from mechsearch_jax.planner.prediction import Predict, PredictByKind
+from mechsearch_jax.planner.prediction import LaterPlacementsStay, Predict, PredictByKind
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import Propose, guided_draw
 from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at
@@ -168,10 +168,12 @@ def search(
       InputError: a setting is impossible, or weights are missing or damaged.
     """
     push_model = push_model or own_push_model("learned")
+    config = dataclasses.replace(_planner_config(config), **changes)
+    predict: Predict = PredictByKind(push_model, later_push_model or push_model)
     return Search(
-        config=dataclasses.replace(_planner_config(config), **changes),
+        config=config,
         propose=propose,
-        predict=PredictByKind(push_model, later_push_model or push_model),
+        predict=predict if config.later_placements else LaterPlacementsStay(predict),
         objective=objective,
     )
 
@@ -199,10 +201,30 @@ def random_action(config: PlannerConfig | None = None, **options: Any) -> Search
     return search(even, objective=Indifferent(), **options)
 
 
+def greedy(config: PlannerConfig | None = None, **options: Any) -> Search:
+    """A baseline: the one action that leaves the least of f, as lateral-access X-RAY reduces the area where the target
+    can be; once the target is found, the one that brings it nearest to a free grasp.
+
+    One step of the first term of J, and of the second at a found target: X-RAY's suction cup needs no free grasp. Draws
+    are even, and nothing but J counts: of `config`, the horizon, the guided fraction, the crowding weight and all
+    charges are not used.
+    """
+    plain = dataclasses.replace(
+        _planner_config(config),
+        horizon=1,
+        guided_fraction=0.0,
+        crowding_weight=0.0,
+        unseen_contact_penalty=0.0,
+        topple_charge=0.0,
+    )
+    return search_and_grasp(plain, **options)
+
+
 POLICIES: Mapping[str, PolicyFactory] = {
     "search-for-grasp": search_for_grasp,
     "search-and-grasp": search_and_grasp,
     "random": random_action,
+    "greedy": greedy,
 }
 
 
