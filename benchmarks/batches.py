@@ -122,7 +122,7 @@ class Batches:
 
         run_episodes(
             batch.starts(worlds),
-            method.workcell.problem(target, method.config.problem),
+            method.workcell.problem(target, method.problem_config),
             method.policy(),
             simulator,
             worlds,
@@ -132,6 +132,7 @@ class Batches:
             options=method.options(),
             at_once=AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE,
             busy=self.busy,
+            protocol=method.terms,
         )
 
 

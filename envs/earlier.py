@@ -17,6 +17,7 @@ RENAMED: Mapping[str, str] = {
 }
 # What options that files of earlier versions do not hold were then.
 EARLIER: Mapping[str, Any] = {
+    "protocol": "strict",
     "push_model": "quasi-static",
     "topple_charge": 0.0,
     "crowding_weight": 0.02,

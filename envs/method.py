@@ -8,9 +8,10 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
+from mechsearch_jax.envs.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
-from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, policy_factory
+from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
 from mechsearch_jax.planner.workcell import Workcell
 
 EngineName = Literal["NativeSimulator", "MjxSimulator"]
@@ -26,6 +27,7 @@ class Method:
       config: every setting of the problem and of the policy, one preset's worth.
       recognition: name of the recogniser.
       engine: name of the simulator.
+      protocol: name of how its episodes are run and judged, one of `protocols.PROTOCOLS`.
       workcell: what stands around the objects, and how finely a target is searched.
     """
 
@@ -34,6 +36,7 @@ class Method:
     recognition: RecognitionName = "oracle"
     engine: EngineName = "NativeSimulator"
     workcell: Workcell = dataclasses.field(default_factory=Workcell)
+    protocol: ProtocolName = "strict"
 
     def policy(self) -> Policy:
         """The policy, with the push models that the configuration names.
@@ -43,6 +46,16 @@ class Method:
         """
         first, later = push_models(self.config.push_model)
         return policy_factory(self.name)(self.config.planner, push_model=first, later_push_model=later)
+
+    @property
+    def terms(self) -> EpisodeProtocol:
+        """How its episodes are run and judged."""
+        return PROTOCOLS[self.protocol]
+
+    @property
+    def problem_config(self) -> ProblemConfig:
+        """How the problem is built that its episodes are run with."""
+        return self.terms.problem(self.config.problem)
 
     def check(self) -> None:
         """Fail before the first episode rather than in every one.
@@ -56,9 +69,9 @@ class Method:
         recogniser(self.recognition, self.workcell.target)
 
     def options(self) -> dict[str, Any]:
-        """What tells this method from others, flat and as JSON values: the policy, the recognition, every option of the
-        configuration by its name, and other settings that are not the preset `standard`'s, or not the usual workcell's,
-        by their path."""
+        """What tells this method from others, flat and as JSON values: policy, recognition, protocol, every option of
+        the configuration by its name, and other settings that are not the preset `standard`'s, or not the usual
+        workcell's, by their path."""
         named = {".".join(option.path) for option in OPTIONS}
         pairs = ((self.config, PRESETS["standard"](), ""), (self.workcell, Workcell(), "workcell."))
         unusual: dict[str, Any] = {}
@@ -66,7 +79,8 @@ class Method:
             usual = dict(_settings(standard, prefix))
             settings = _settings(config, prefix)
             unusual |= {path: value for path, value in settings if value != usual[path] and path not in named}
-        return {"policy": self.name, "recognition": self.recognition, **self.config.options(), **unusual}
+        told = {"policy": self.name, "recognition": self.recognition, "protocol": self.protocol}
+        return {**told, **self.config.options(), **unusual}
 
     def to_json(self) -> dict[str, Any]:
         """All of it as JSON values, for another process."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import flax.struct
@@ -22,7 +22,7 @@ from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.episode_log import Choice, chosen
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
-from mechsearch_jax.envs.verdicts import Verdict, judge, judge_many
+from mechsearch_jax.envs.verdicts import Verdict, judge, judge_many, swept_free
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
@@ -65,6 +65,15 @@ class Slots(Protocol):
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """What the policy decides in some slots; `keys` are the planner's, one for each slot."""
+        ...
+
+    def took(self, actions: Mapping[int, Action]) -> None:
+        """Let some slots know that something else is done than they decided."""
+        ...
+
+    def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
+        """Whether in some slots the target is in sight, and what is swept at some grasp meets nothing; see
+        `verdicts.swept_free`."""
         ...
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
@@ -116,6 +125,16 @@ class OneSlot:
         self.decision = self._policy(keys[0], self._problem, self.belief, self.observation)
         self.action = self.decision.action
         return {0: jax.device_get(chosen(self.decision))}
+
+    def took(self, actions: Mapping[int, Action]) -> None:
+        """See `Slots`."""
+        self.action = actions.get(0, self.action)
+
+    def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
+        """See `Slots`."""
+        if not rows or self.observation is None:
+            return {}
+        return {0: bool(_swept_free(self._problem, self.observation, jnp.array(True)))}
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
         """See `Slots`."""
@@ -179,6 +198,20 @@ class ManySlots:
             self._state = _note(self._state, decided.action, padded)
             choice = jax.device_get(decided)
             found |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(some)}
+        return found
+
+    def took(self, actions: Mapping[int, Action]) -> None:
+        """See `Slots`."""
+        if actions:
+            done = jax.tree.map(lambda *leaves: jnp.stack(leaves), *actions.values())
+            self._state = _note(self._state, done, jnp.array(list(actions), jnp.int32))
+
+    def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
+        """See `Slots`."""
+        found: dict[int, bool] = {}
+        for some, padded in self._chunks(rows):
+            free = jax.device_get(_swept_free_many(self._problem, self._state, padded))
+            found |= dict(zip(some, map(bool, free), strict=False))
         return found
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
@@ -269,3 +302,16 @@ def _decide(policy: Policy, problem: Problem, state: PlannerState, keys: Array, 
     objects = objects.replace(valid=objects.valid & active[:, None])
     seen = mine.observation.replace(objects=objects)
     return jax.vmap(one)(_some(keys, rows), mine.replace(belief=belief, observation=seen))
+
+
+@kept()
+def _swept_free(problem: Problem, seen: Observation, active: Bool[Array, ""]) -> Bool[Array, ""]:
+    """See `Slots.swept_free`; False, and little is computed, where `active` is."""
+    return swept_free(problem.target_grasps, seen.objects, seen.target_pose, active & seen.target_visible)
+
+
+@jax.jit
+def _swept_free_many(problem: Problem, state: PlannerState, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
+    """The same in the slots `rows`; False for rows beyond the end."""
+    active = rows < state.belief.found.shape[0]
+    return jax.vmap(lambda mine, active: _swept_free(problem, mine.observation, active))(_some(state, rows), active)

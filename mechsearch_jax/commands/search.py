@@ -69,7 +69,7 @@ def search(
             f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
         )
         wanted = target_of(scene, workcell.target)
-        problem = workcell.problem(wanted, chosen.config.problem)
+        problem = workcell.problem(wanted, chosen.problem_config)
         policy_now = chosen.policy()
         with prepared(first_decision(problem, policy_now), lambda text: console.print(text, style="dim")):
             # These take long to import, and meanwhile what the first decision needs is read or compiled.
@@ -91,6 +91,7 @@ def search(
                 chosen.config.max_steps,
                 chosen.options(),
                 narrator,
+                chosen.terms,
             )
         status.update("writing")
         strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
