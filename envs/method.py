@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
+from mechsearch_jax.envs.policy_numbers import mould
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
 from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, policy_factory
@@ -43,6 +44,15 @@ class Method:
         """
         first, later = push_models(self.config.push_model)
         return policy_factory(self.name)(self.config.planner, push_model=first, later_push_model=later)
+
+    def mould(self) -> Hashable:
+        """What is compiled for episodes of one target: the same for methods that differ in numbers of their policies,
+        such as gamma, or in the number of steps alone.
+
+        Raises:
+          InputError: as `policy`.
+        """
+        return self.workcell, self.config.problem, self.recognition, self.engine, mould(self.policy())
 
     def check(self) -> None:
         """Fail before the first episode rather than in every one.
