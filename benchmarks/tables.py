@@ -44,6 +44,11 @@ def rates_table(rows: Sequence[Row]) -> Table:
     return table
 
 
+def print_rates(console: Console, rows: Sequence[Row]) -> None:
+    """Print the rates of rows."""
+    console.print(rates_table(rows))
+
+
 def events_table(rows: Sequence[Row]) -> Table | None:
     """What happened on the way, by method and number of objects; None where no row says it."""
     summary = summarise_events(rows)

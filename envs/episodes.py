@@ -72,10 +72,15 @@ class Start:
     Attributes:
       scenario: where everything stands at the start.
       seed: of the planner's and of the environment's random numbers, which are independent of each other.
+      policy, max_steps, options: where they are not None, instead of those of the run. With several slots the policies
+        of a run may differ in numbers alone; see `policy_numbers`.
     """
 
     scenario: Scenario
     seed: int
+    policy: Policy | None = None
+    max_steps: int | None = None
+    options: Mapping[str, Any] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,7 +194,8 @@ def run_episodes(
       protocol: how they are run and judged. Who gives another has built the problem by `protocol.problem`.
 
     Raises:
-      InputError: there is no slot, a watcher is given for several, or the policy decides on an unknown kind of action.
+      InputError: there is no slot, a watcher is given for several, the policy decides on an unknown kind of action, or
+        policies differ in more than numbers.
     """
     if slots < 1:
         raise InputError(f"run_episodes: {slots} slots run nothing; give at least 1")
@@ -300,10 +306,11 @@ class _EpisodePool:
         """Begin episodes, with their places among all, in slots that are free and whose worlds are theirs."""
         fresh = np.zeros(len(self._slots), bool)
         for row, (place, start) in starts.items():
-            self._slots[row] = _Slot(place, start, EpisodeLog(self._run.max_steps))
+            self._slots[row] = _Slot(place, start, EpisodeLog(start.max_steps or self._run.max_steps))
             self._keys[row] = jax.random.key_data(jax.random.split(jax.random.key(start.seed)))
             fresh[row] = True
         self._known.forget(fresh)
+        self._known.decide_by({row: start.policy for row, (_, start) in starts.items()})
 
     def round(self) -> list[tuple[int, tuple[int, Episode]]]:
         """Look, decide and act once in all slots; the slots whose episodes ended, with their places and records."""
@@ -379,7 +386,8 @@ class _EpisodePool:
     def _options(self, start: Start) -> dict[str, Any]:
         """The options of an episode, as its record keeps them."""
         engine, shape = self._simulator.engine, self._problem.target.shape
-        return {**self._run.options, "target": shape, "simulator": engine, "seed": start.seed}
+        told = self._run.options if start.options is None else start.options
+        return {**told, "target": shape, "simulator": engine, "seed": start.seed}
 
     def _moment(self, choices: Mapping[int, Choice]) -> Moment | None:
         """What is known in a single slot."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
+from mechsearch_jax.envs.policy_numbers import mould
 from mechsearch_jax.envs.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
@@ -27,8 +28,8 @@ class Method:
       config: every setting of the problem and of the policy, one preset's worth.
       recognition: name of the recogniser.
       engine: name of the simulator.
-      protocol: name of how its episodes are run and judged, one of `protocols.PROTOCOLS`.
       workcell: what stands around the objects, and how finely a target is searched.
+      protocol: name of how its episodes are run and judged, one of `protocols.PROTOCOLS`.
     """
 
     name: str = "search-for-grasp"
@@ -56,6 +57,15 @@ class Method:
     def problem_config(self) -> ProblemConfig:
         """How the problem is built that its episodes are run with."""
         return self.terms.problem(self.config.problem)
+
+    def mould(self) -> Hashable:
+        """What is compiled for episodes of one target: the same for methods that differ in numbers of their policies,
+        such as gamma, or in the number of steps alone.
+
+        Raises:
+          InputError: as `policy`.
+        """
+        return self.workcell, self.config.problem, self.recognition, self.engine, self.protocol, mould(self.policy())
 
     def check(self) -> None:
         """Fail before the first episode rather than in every one.

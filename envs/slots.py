@@ -21,9 +21,11 @@ from jaxtyping import Array, Bool, Int
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.episode_log import Choice, chosen
+from mechsearch_jax.envs.policy_numbers import as_pytree, mould, numbers, with_numbers
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
 from mechsearch_jax.envs.verdicts import Verdict, judge, judge_many, swept_free
 from mechsearch_jax.envs.world import World
+from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.moved_target import nearest_candidate
@@ -51,6 +53,14 @@ class Slots(Protocol):
 
     def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
         """Let the fresh slots know nothing."""
+        ...
+
+    def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
+        """Let slots decide by policies of their own from now on; None stands for the policy of all.
+
+        Raises:
+          InputError: a policy cannot decide together with the others: it differs from them in more than numbers.
+        """
         ...
 
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
@@ -98,13 +108,19 @@ class OneSlot:
         self.belief = initial_belief(problem)
         self.decision: Decision | None = None
         self.action: Action = no_action()
-        self._problem, self._policy, self._recogniser = problem, policy, recogniser
+        self._problem, self._usual, self._recogniser = problem, policy, recogniser
+        self._policy = policy
 
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
         """See `Slots`."""
         if fresh[0]:
             self.belief = initial_belief(self._problem)
             self.action, self.observation = no_action(), None
+
+    def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
+        """See `Slots`; any policy will do."""
+        for policy in policies.values():
+            self._policy = self._usual if policy is None else policy
 
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
         """See `Slots`."""
@@ -162,17 +178,20 @@ class ManySlots:
 
     def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, world: World, at_once: int) -> None:
         """Args:
-        problem, policy: of all episodes.
+        problem: of all episodes.
+        policy: of all slots that have none of their own.
         recogniser: must be traceable, as the policy.
         world: of all slots, for what recognisers make of it.
         at_once: how many slots are looked at or decided upon in one computation.
         """
         self._problem = problem
-        # A plain function is a pytree without leaves, too, if it is told so.
-        self._policy = jax.tree_util.Partial(policy) if jax.tree_util.all_leaves([policy]) else policy
+        self._policy, self._mould = as_pytree(policy), mould(policy)
         self._recogniser = recogniser
         self._at_once = at_once
         self._count = len(world.kind)
+        self._numbers = [numbers(self._policy)] * self._count
+        # Policies that were looked at, by what tells objects apart while they are kept.
+        self._known: dict[int, tuple[Policy, tuple[np.ndarray, ...]]] = {}
         one = jax.tree.map(lambda a: a[0], world)
         seen = jax.eval_shape(
             lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), one
@@ -184,6 +203,18 @@ class ManySlots:
         """See `Slots`."""
         self._state = _forget(self._problem, self._state, jnp.asarray(fresh))
 
+    def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
+        """See `Slots`."""
+        for row, policy in policies.items():
+            self._numbers[row] = numbers(self._policy) if policy is None else self._numbers_of(policy)
+
+    def _numbers_of(self, policy: Policy) -> tuple[np.ndarray, ...]:
+        if id(policy) not in self._known:
+            if mould(policy) != self._mould:
+                raise InputError("run_episodes: policies of one run that differ in more than numbers need runs each")
+            self._known[id(policy)] = policy, numbers(as_pytree(policy))
+        return self._known[id(policy)][1]
+
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
         """See `Slots`."""
         for _, padded in self._chunks(rows):
@@ -194,7 +225,10 @@ class ManySlots:
         """See `Slots`."""
         found: dict[int, Choice] = {}
         for some, padded in self._chunks(rows):
-            decided = _decide(self._policy, self._problem, self._state, keys, padded)
+            # Rows beyond the end decide by anything.
+            told = [self._numbers[r] for r in some] + [self._numbers[some[0]]] * (self._at_once - len(some))
+            own = tuple(np.stack(values) for values in zip(*told, strict=True))
+            decided = _decide(self._policy, own, self._problem, self._state, keys, padded)
             self._state = _note(self._state, decided.action, padded)
             choice = jax.device_get(decided)
             found |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(some)}
@@ -289,11 +323,18 @@ def _look(
 
 
 @jax.jit
-def _decide(policy: Policy, problem: Problem, state: PlannerState, keys: Array, rows: Int[Array, " n"]) -> Choice:
-    """What the policy decides in the slots `rows`."""
+def _decide(
+    policy: Policy,
+    own: tuple[Array, ...],
+    problem: Problem,
+    state: PlannerState,
+    keys: Array,
+    rows: Int[Array, " n"],
+) -> Choice:
+    """What the policy decides in the slots `rows`, with the numbers in `own`, shape (n,) each, in place of its own."""
 
-    def one(key, mine):
-        return chosen(policy(key, problem, mine.belief, mine.observation))
+    def one(values, key, mine):
+        return chosen(with_numbers(policy, values)(key, problem, mine.belief, mine.observation))
 
     mine, active = _some(state, rows), rows < keys.shape[0]
     # Where the target is not found and can be nowhere, and nothing stands, a decision costs next to nothing.
@@ -301,7 +342,7 @@ def _decide(policy: Policy, problem: Problem, state: PlannerState, keys: Array, 
     objects = mine.observation.objects
     objects = objects.replace(valid=objects.valid & active[:, None])
     seen = mine.observation.replace(objects=objects)
-    return jax.vmap(one)(_some(keys, rows), mine.replace(belief=belief, observation=seen))
+    return jax.vmap(one)(own, _some(keys, rows), mine.replace(belief=belief, observation=seen))
 
 
 @kept()

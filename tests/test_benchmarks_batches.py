@@ -48,15 +48,15 @@ class Stand:
         monkeypatch.setattr(batches, "run_episodes", self)
         monkeypatch.setattr(batches.Workcell, "problem", lambda workcell, target, config: problem)
 
-    def __call__(self, starts, problem, policy, simulator, slots, ended, *, max_steps, options, **rest):
-        assert max_steps == METHOD.config.max_steps
+    def __call__(self, starts, problem, policy, simulator, slots, ended, **rest):
         self.slots.append(slots)
         for place, start in enumerate(starts):
             error = self._fail(start.scenario.name, slots)
             if error:
                 raise error
             scene = start.scenario
-            config = {**options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
+            assert start.max_steps == start.options["max_steps"]
+            config = {**start.options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
             facts = (scene.name, len(scene.objects), config, {}, (), 0, 0, False, "not found", scene.content_hash)
             ended([(place, Episode(*facts))])
 
