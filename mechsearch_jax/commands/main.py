@@ -26,6 +26,7 @@ from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
 from mechsearch_jax.commands.options import EpisodeOptions, with_planner_options
 from mechsearch_jax.commands.plan import plan
 from mechsearch_jax.commands.report import report
+from mechsearch_jax.commands.reproduce import reproduce
 from mechsearch_jax.commands.search import search
 from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
 from mechsearch_jax.errors import InputError, nearest
@@ -48,6 +49,7 @@ COMMANDS: Commands = {
     "inspect": inspect_scenarios,
     "evaluate": evaluate,
     "sweep": sweep,
+    "reproduce": reproduce,
     "report": report,
     "config": print_config,
     "doctor": doctor,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +16,11 @@ from mechsearch_jax.cores import cores
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from mechsearch_jax.benchmarks.evaluate import Job
+    from mechsearch_jax.benchmarks.rows import Row
+    from mechsearch_jax.envs.method import EngineName
 
 
 def _count(metavar: str) -> Any:
@@ -64,6 +68,15 @@ class RunOptions:
             raise InputError(f"{command}: --time-limit {self.time_limit:g} must be a number of seconds above 0")
         return found
 
+    def engine(self, command: str, options: EpisodeOptions) -> EngineName:
+        """The simulator that the episodes run in.
+
+        Raises:
+          InputError: as `in_processes`, the part of the episodes is none, or the simulator is not installed.
+        """
+        parsed_shard(command, self.shard)
+        return "NativeSimulator" if self.in_processes(command, options.simulator) else options.engine()
+
 
 # As the commands run them where nothing is given.
 USUAL_RUN = RunOptions()
@@ -104,31 +117,65 @@ def run_episodes_of(
     Raises:
       InputError: something that is given cannot be used.
     """
-    from mechsearch_jax.benchmarks.evaluate import make_jobs, shard_of
+    from mechsearch_jax.benchmarks.evaluate import make_jobs
+    from mechsearch_jax.benchmarks.tables import print_rates
 
-    parts = parsed_shard(command, run.shard)
-    in_processes = run.in_processes(command, points[0].simulator)
-    engine = "NativeSimulator" if in_processes else points[0].engine()
+    engine = run.engine(command, points[0])
     # The same settings may come from several points.
     methods = dict.fromkeys(method for point in points for method in point.methods(policies, engine))
-    jobs = shard_of(make_jobs(find_scenarios(scenarios), list(methods), list(dict.fromkeys(seeds))), *parts)
+    jobs = make_jobs(find_scenarios(scenarios), list(methods), list(dict.fromkeys(seeds)))
+    run_jobs(command, jobs, out, run, points[0].simulator, print_rates)
+
+
+def run_jobs(
+    command: str,
+    jobs: Sequence[Job],
+    out: Path,
+    run: RunOptions,
+    simulator: str,
+    told: Callable[[Console, Sequence[Row]], None],
+) -> None:
+    """Run this machine's part of jobs, or only say what that would take.
+
+    Args:
+      command: its name, for complaints.
+      jobs: the episodes of all machines; their engine is `run.engine`'s.
+      out: folder of the results.
+      run: how they are run.
+      simulator: as `EpisodeOptions` has it.
+      told: prints what they came to, where there are any.
+
+    Raises:
+      InputError: something that is given cannot be used.
+    """
+    from mechsearch_jax.benchmarks.evaluate import shard_of
+
+    jobs = shard_of(jobs, *parsed_shard(command, run.shard))
+    in_processes = run.in_processes(command, simulator)
     workers = run.workers or cores()
     if run.dry_run:
         from mechsearch_jax.benchmarks.estimate import estimate
 
         print(estimate(jobs, out, workers if in_processes else 1, run.retry_errors))
         return
-    _run(command, jobs, out, run, workers if in_processes else None)
+    _run(command, jobs, out, run, workers if in_processes else None, told)
 
 
-def _run(command: str, jobs: Sequence[Job], out: Path, run: RunOptions, workers: int | None) -> None:
+def _run(
+    command: str,
+    jobs: Sequence[Job],
+    out: Path,
+    run: RunOptions,
+    workers: int | None,
+    told: Callable[[Console, Sequence[Row]], None],
+) -> None:
     """Run jobs in so many worker processes, in batches if None."""
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.batches import Batches
     from mechsearch_jax.benchmarks.evaluate import evaluate
     from mechsearch_jax.benchmarks.processes import TIME_LIMIT, Processes
-    from mechsearch_jax.benchmarks.tables import EpisodeProgress, print_rates
+    from mechsearch_jax.benchmarks.tables import EpisodeProgress
     from mechsearch_jax.planner.cache import keep_compilations
 
     console = Console(highlight=False)
@@ -140,7 +187,7 @@ def _run(command: str, jobs: Sequence[Job], out: Path, run: RunOptions, workers:
             runner = Batches(run.batch, progress.busy)
         rows = evaluate(jobs, out, runner, progress.ended, progress.waiting, run.retry_errors)
     if rows:
-        print_rates(console, rows)
+        told(console, rows)
     if errors := sum(row.is_error for row in rows):
         print(
             f"{command}: {errors} of {len(rows)} episodes ended in an error; --retry-errors runs them again",
