@@ -280,9 +280,9 @@ def markdown(results: Results, command: str) -> str:
         "",
         f"{results.table.about}. The paper's figures are of scenes of its own, in PyBullet. `{command}`",
         "",
-        "Shares with Wilson's 95% interval, of all episodes; steps are the mean number of actions in the episodes that got",
-        "there, with a 95% interval from resampling scenes. The paper's R stands beside `masks`, its own setting, and",
-        "`full`.",
+        "Shares with Wilson's 95% interval, of all episodes; steps are the mean number of actions in the episodes that",
+        "got there, with a 95% interval from resampling scenes. The paper's R stands beside `masks`, its own setting,",
+        "and `full`.",
     ]
     for (preset, protocol), cells in _parts(results.cells()).items():
         text += ["", f"## Preset {preset}, protocol {protocol}", "", *_markdown_table(COLUMNS, list(map(_line, cells)))]
