@@ -213,10 +213,6 @@ def results_of(table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], rows: M
     return Results(table, {setting: own for setting, own in found.items() if own})
 
 
-def _share(mean: Mean) -> str:
-    return _told(mean, "{:.3f}")
-
-
 def _told(mean: Mean, form: str) -> str:
     if mean.value is None:
         return "-"
@@ -256,17 +252,36 @@ def _parts(cells: Sequence[Cell]) -> dict[tuple[str, str], list[Cell]]:
 
 
 def screen(results: Results) -> Group:
-    """The tables as they are printed: one for each preset and protocol."""
+    """The tables as they are printed, ours and the paper's figures without intervals: one for each preset, protocol and
+    set of actions."""
+    parts: dict[tuple[str, str, str], list[Cell]] = {}
+    for cell in results.cells():
+        parts.setdefault((cell.setting.preset, cell.setting.protocol, _actions(cell.setting)), []).append(cell)
     tables = []
-    for (preset, protocol), cells in _parts(results.cells()).items():
-        title = f"{results.table.name}, preset {preset}, protocol {protocol}"
-        table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title)
-        for name in COLUMNS:
-            table.add_column(name, justify="right", no_wrap=name != "steps to grasp" and name != "steps to find")
+    for (preset, protocol, actions), cells in parts.items():
+        only = "" if len(results.table.actions) == 1 else f", actions {actions}"
+        title = f"\n{results.table.name}, preset {preset}, protocol {protocol}{only}: here/in the paper"
+        table = Table(
+            box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left"
+        )
+        table.add_column("", no_wrap=True)
+        for name in ("objects", "runs", "find", "grasp", "to find", "to grasp"):
+            table.add_column(name, justify="right", no_wrap=True)
         for cell in cells:
-            table.add_row(*_line(cell))
+            name = f"{cell.setting.recognition} {cell.setting.method}"
+            table.add_row(name, _objects(cell.objects), str(cell.episodes), *_beside(cell))
         tables.append(table)
     return Group(*tables)
+
+
+def _beside(cell: Cell) -> list[str]:
+    """Ours and the paper's figures."""
+
+    def told(value: float | None) -> str:
+        return "-" if value is None else f"{value:.2f}"
+
+    paper = cell.paper or Figures(None, None, None, None)
+    return [f"{told(getattr(cell, name).value)}/{told(getattr(paper, name))}" for name in Figures._fields]
 
 
 def _markdown_table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
