@@ -126,9 +126,10 @@ def _run(command: str, jobs: Sequence[Job], out: Path, run: RunOptions, workers:
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.batches import Batches
+    from mechsearch_jax.benchmarks.episode_tables import print_rates
     from mechsearch_jax.benchmarks.evaluate import evaluate
     from mechsearch_jax.benchmarks.processes import TIME_LIMIT, Processes
-    from mechsearch_jax.benchmarks.tables import EpisodeProgress, print_rates
+    from mechsearch_jax.benchmarks.tables import EpisodeProgress
     from mechsearch_jax.planner.cache import keep_compilations
 
     console = Console(highlight=False)
