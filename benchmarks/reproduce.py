@@ -15,7 +15,7 @@ from rich.table import Table
 
 from mechsearch_jax.benchmarks.evaluate import Job
 from mechsearch_jax.benchmarks.paper_tables import BOTH, Figures, PaperTable, paper_figures
-from mechsearch_jax.benchmarks.rates import wilson
+from mechsearch_jax.benchmarks.rates import step_of, wilson
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.files import PathLike, check_writable, replacing
 
@@ -28,7 +28,8 @@ FACTORS = {
     "preset": "preset",
     "protocol": "protocol",
 }
-GOALS = ("find", "grasp")
+# What the paper calls the goals, and what rows do.
+GOALS = {"find": "found", "grasp": "graspable"}
 Interval = tuple[float, float]
 
 
@@ -99,11 +100,6 @@ class Difference:
     grasp_steps: Mean
 
 
-def steps_of(row: Row, goal: str) -> int | None:
-    """Number of actions until a goal was reached; None where it was not."""
-    return row.found_step if goal == "find" else row.graspable_step
-
-
 def bootstrap(total: Float[np.ndarray, " n"], count: Float[np.ndarray, " n"]) -> Mean:
     """A mean over clusters, and its 95% interval from resampling whole clusters (percentiles; the same every time).
 
@@ -131,8 +127,8 @@ def _by_scene(values: Sequence[tuple[str, float]]) -> Mean:
 
 def _cell(setting: Setting, objects: int | None, rows: Sequence[Row], paper: Figures | None) -> Cell:
     n, told = len(rows), {}
-    for goal in GOALS:
-        steps = [(row.scenario, float(s)) for row in rows if (s := steps_of(row, goal)) is not None]
+    for goal, said in GOALS.items():
+        steps = [(row.scenario, float(s)) for row in rows if (s := step_of(row, said)) is not None]
         told[goal] = Mean(len(steps) / n, wilson(len(steps), n), n)
         told[f"{goal}_steps"] = _by_scene(steps)
     return Cell(setting, objects, n, sum(row.is_error for row in rows), **told, paper=paper)
@@ -192,8 +188,8 @@ def _difference(
     factor: str, setting: Setting, base: Setting, objects: int | None, pairs: Sequence[tuple[Row, Row]]
 ) -> Difference:
     told = {}
-    for goal in GOALS:
-        steps = [(row.scenario, steps_of(row, goal), steps_of(other, goal)) for row, other in pairs]
+    for goal, said in GOALS.items():
+        steps = [(row.scenario, step_of(row, said), step_of(other, said)) for row, other in pairs]
         told[goal] = _by_scene([(scene, float(a is not None) - float(b is not None)) for scene, a, b in steps])
         told[f"{goal}_steps"] = _by_scene(
             [(scene, float(a - b)) for scene, a, b in steps if a is not None and b is not None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Hashable, Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
@@ -12,6 +12,7 @@ from mechsearch_jax.envs.policy_numbers import mould
 from mechsearch_jax.envs.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
+from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
 from mechsearch_jax.planner.workcell import Workcell
 
@@ -92,6 +93,25 @@ class Method:
         told = {"policy": self.name, "recognition": self.recognition, "protocol": self.protocol}
         return {**told, **self.config.options(), **unusual}
 
+    @classmethod
+    def of_options(cls, options: Mapping[str, Any]) -> Method:
+        """The method whose `options` these are; what they do not hold is as in the preset `standard`. It runs natively.
+
+        Raises:
+          InputError: a setting is impossible, or there is none of a path.
+        """
+        known = {option.name for option in OPTIONS}
+        config = PRESETS["standard"](**{name: value for name, value in options.items() if name in known})
+        parts: dict[str, Any] = {"config": config, "workcell": Workcell()}
+        for path, value in options.items():
+            first, *rest = path.split(".")
+            if rest and first == "workcell":
+                parts["workcell"] = _with_setting(parts["workcell"], rest, value)
+            elif rest:
+                parts["config"] = _with_setting(parts["config"], path.split("."), value)
+        protocol = options.get("protocol", "strict")
+        return cls(options["policy"], recognition=options["recognition"], protocol=protocol, **parts)
+
     def to_json(self) -> dict[str, Any]:
         """All of it as JSON values, for another process."""
         return dataclasses.asdict(self)
@@ -117,6 +137,20 @@ def _settings(config: Config | Workcell, prefix: str) -> Iterator[tuple[str, Any
                 yield f"{path}{name}", part
 
     return inside(json.loads(json.dumps(dataclasses.asdict(config))), prefix)
+
+
+def _with_setting(settings: Any, path: Sequence[str], value: Any) -> Any:
+    """Settings with another value, as JSON has it, at a path.
+
+    Raises:
+      InputError: it is impossible, or there is no such path.
+    """
+    first, *rest = path
+    if not hasattr(settings, first):
+        raise InputError(f"setting {'.'.join(path)} is unknown to this version")
+    here = getattr(settings, first)
+    new = _with_setting(here, rest, value) if rest else _restored(here, value)
+    return dataclasses.replace(settings, **{first: new})
 
 
 def _restored(like: Any, value: Any) -> Any:

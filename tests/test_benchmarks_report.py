@@ -10,9 +10,9 @@ from matplotlib import image
 from rich.console import Console
 
 from mechsearch_jax.benchmarks import report
+from mechsearch_jax.benchmarks.episode_tables import events_table, rates_table
 from mechsearch_jax.benchmarks.rates import summarise, wilson
 from mechsearch_jax.benchmarks.rows import EVENTS, Row, write_rows
-from mechsearch_jax.benchmarks.tables import events_table, rates_table
 from mechsearch_jax.errors import InputError
 
 WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)

@@ -143,7 +143,7 @@ def test_what_is_wrong_in_a_file_is_named_with_its_place(folder, jobs_of, text, 
 
 
 def test_a_list_in_a_flag_has_commas(jobs_of):
-    with pytest.raises(InputError, match="--push-distances 0.1;0.2 is no list of numbers"):
+    with pytest.raises(InputError, match=r"--push-distances 0\.1;0\.2 is no list of numbers"):
         jobs_of("sweep", "one.json", "--push-distances", "0.1;0.2")
 
 

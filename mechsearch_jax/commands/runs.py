@@ -117,8 +117,8 @@ def run_episodes_of(
     Raises:
       InputError: something that is given cannot be used.
     """
+    from mechsearch_jax.benchmarks.episode_tables import print_rates
     from mechsearch_jax.benchmarks.evaluate import make_jobs
-    from mechsearch_jax.benchmarks.tables import print_rates
 
     engine = run.engine(command, points[0])
     # The same settings may come from several points.

@@ -25,18 +25,20 @@ if TYPE_CHECKING:
     from mechsearch_jax.planner import Option
 
 Recognition = Literal["oracle", "masks", "full"]
+ProtocolName = Literal["strict", "published-code"]
 SimulatorName = Literal["auto", "native", "mjx"]
 # Keys of a sweep's file that are no options of the planner, with what they hold; lists of it, but for the last two.
 _KEYS: Mapping[str, Any] = {
     **dict.fromkeys(("scenarios", "policy", "method"), str),
     "seed": int,
     "recognition": Recognition,
+    "protocol": ProtocolName,
     "simulator": SimulatorName,
     "config": str,
 }
 _SINGLE = ("simulator", "config")
 # Those that `SweptOptions` has, and their names there.
-_FIELDS = {"recognition": "recognition", "simulator": "simulator", "config": "config_file"}
+_FIELDS = {"recognition": "recognition", "protocol": "protocol", "simulator": "simulator", "config": "config_file"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,6 +50,7 @@ class SweptOptions:
         before it. One for all.
       recognition: "oracle" knows true shapes and poses; the others see a noisy depth image, "masks" with the true
         segmentation, "full" without.
+      protocol: how episodes are run and judged: strictly, or as the authors' published code does.
       simulator: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for batches where there is a GPU.
         One for all.
     """
@@ -56,6 +59,10 @@ class SweptOptions:
     recognition: Annotated[
         tuple[Recognition, ...],
         tyro.conf.arg(metavar="{oracle,masks,full} ...", help_behavior_hint="(default: oracle)"),
+    ] = ()
+    protocol: Annotated[
+        tuple[ProtocolName, ...],
+        tyro.conf.arg(metavar="{strict,published-code} ...", help_behavior_hint="(default: strict)"),
     ] = ()
     simulator: Annotated[
         SimulatorName | None, tyro.conf.arg(metavar="{auto,native,mjx}", help_behavior_hint="(default: auto)")
@@ -71,7 +78,8 @@ class SweptOptions:
 
         kind = with_planner_options()
         lists = {option.name: option.type for option in OPTIONS if get_origin(option.type) is tuple}
-        swept = {"recognition": self.recognition, **{n: getattr(self, n, ()) for n in ("preset", *_options())}}
+        listed = {"recognition": self.recognition, "protocol": self.protocol}
+        swept = {**listed, **{n: getattr(self, n, ()) for n in ("preset", *_options())}}
         given = {
             name: [_listed(name, value, lists[name]) if name in lists else value for value in values]
             for name, values in swept.items()
