@@ -38,7 +38,7 @@ def search(
       objects: instead of a scenario, generate one with so many objects.
       target: shape of a generated target; a cylinder, or what the configuration file says, if not given.
       method: "search-for-grasp", the default, minds the grasp while it searches, "search-and-grasp" only afterwards.
-      policy: instead of a method, the name of a policy ("random", "greedy" and "mctx" are three more), or the import path of another.
+      policy: instead of a method, the name of a policy (also random, greedy, mctx), or the import path of another.
       seed: of the planner, of the environment, and of a generated scenario.
       out: folder for episode.json, filmstrip.png and the scenario.
       options: how the planner decides.
