@@ -365,7 +365,8 @@ class _EpisodePool:
         with clock("simulate", acting):
             if acting:
                 executed = self._run.protocol.execute(self._simulator, {r: choices[r] for r in acting})
-                others = {r: choice for r, choice in executed.choices.items() if choice is not choices[r]}
+                taken = executed.choices
+                others = {r: choice for r, choice in taken.items() if choice is not choices[r]}
                 self._known.took({r: choice.action for r, choice in others.items()})
                 for r, choice in others.items():
                     running[r].log.took(choice)
