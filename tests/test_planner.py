@@ -495,7 +495,7 @@ def test_impossible_options_are_refused_with_what_would_do(changes, message):
     [
         (
             "guess",
-            'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, greedy, or an import path',
+            'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, greedy, mctx, or an import path',
         ),
         ("no_such_lab.policies:Mine", "cannot be imported .*no_such_lab"),
         ("mechsearch_jax.planner:Nobody", "cannot be imported .*Nobody"),
@@ -510,7 +510,8 @@ def test_policies_that_are_not_there_are_named(name, message):
 def test_policies_are_found_by_name_and_by_import_path():
     assert planner.policy_factory("search-and-grasp") is planner.search_and_grasp
     assert planner.policy_factory("mechsearch_jax.planner.policies:random_action") is planner.random_action
-    for factory in planner.POLICIES.values():
+    # One needs a library that not everybody has.
+    for factory in (factory for name, factory in planner.POLICIES.items() if name != "mctx"):
         assert factory(CONFIG, push_model=QuasiStatic()).predict.push_model == QuasiStatic()
 
 
