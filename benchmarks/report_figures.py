@@ -130,10 +130,9 @@ def rates_figure(summary: Sequence[Rates], key: Key) -> Figure:
         _plain(axes)
         axes.set_ylabel(f"share {title}", fontsize=9, color=INK)
     labels = [key.short[str(rates.method)] for rates in ranked]
+    turned = {"rotation": 25, "ha": "right", "fontsize": 8} if few else {"rotation": 90, "fontsize": 6}
     for axes in grid[-1]:
-        axes.set_xticks(
-            x, labels, rotation=25 if few else 90, ha="right" if few else "center", fontsize=8 if few else 6
-        )
+        axes.set_xticks(x, labels, **turned)
         axes.set_xlim(-0.6, len(ranked) - 0.4)
     return figure
 
