@@ -9,6 +9,7 @@ import pytest
 
 from mechsearch_jax import actions, planner
 from mechsearch_jax.actions import SAMPLED_KINDS, ActionConfig, ActionKind
+from mechsearch_jax.actions.sampler import _shares
 from mechsearch_jax.dynamics import quasi_static, rigid
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import footprints, superquadric, transforms
@@ -197,6 +198,14 @@ def test_objects_are_drawn_by_their_weights(sampled, draw):
     assert share > even_share + 0.1
 
 
+def test_ways_of_an_object_are_drawn_by_their_weights_the_clean_ones_first():
+    clean = jnp.array([[True, True, False], [False, False, False], [False, False, False]])
+    usable = jnp.array([[True, True, True], [True, False, True], [False, False, False]])
+    weight = jnp.float32([[1.0, 0.25, 1.0], [0.25, 1.0, 0.25], [1.0, 1.0, 1.0]])
+    shares = np.asarray(_shares(clean, usable, weight))
+    np.testing.assert_allclose(shares, [[0.8, 0.2, 0.0], [0.5, 0.0, 0.5], [0.0, 0.0, 0.0]])
+
+
 def test_both_kinds_of_action_are_offered(sampled):
     kinds = sampled[2].action.kind
     assert np.mean(kinds == ActionKind.PUSH) > 0.05
@@ -263,6 +272,9 @@ def test_settings_that_make_no_sense_are_refused():
     for postures in ((), ((0.0, 3),)):
         with pytest.raises(InputError, match=r"push_postures .* pairs of a yaw and an index"):
             ActionConfig(push_postures=postures)
+    for share in (-0.1, 1.5, float("nan")):
+        with pytest.raises(InputError, match="high_pushes"):
+            ActionConfig(high_pushes=share)
     with pytest.raises(InputError, match="contact_tolerance"):
         ActionConfig(contact_tolerance=-0.001)
     with pytest.raises(InputError, match="give as many each"):

@@ -21,7 +21,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner.prediction import PredictByKind
 from mechsearch_jax.planner.proposal import ALONE, blame, sampling_weights
-from mechsearch_jax.planner.rollout import Rollout, prefix_values
+from mechsearch_jax.planner.rollout import Rollout, prefix_values, sequence_values
 from mechsearch_jax.workspace import scenario
 
 CONFIG = PlannerConfig()
@@ -85,6 +85,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "actions": ["push", "pick-and-place"],
         "push_directions": pytest.approx(np.radians([90, -90, 0, 35, -35, 65, -65]).tolist()),
         "push_distances": [0.05, 0.1, 0.15],
+        "high_pushes": 0.25,
         "avoid_unseen": True,
         "object_grasp_tilts": pytest.approx([np.radians(20), np.radians(30)]),
         "criterion": "detector",
@@ -118,7 +119,7 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     assert (config.problem.existence.erosion, config.problem.existence.reopen) == (0.0, False)
     assert (config.problem.existence.criterion, actions.avoid_unseen) == ("depth-mse", False)
     assert (actions.push_distances, set(actions.actions)) == ((0.05, 0.10, 0.15), {"push", "pick-and-place"})
-    assert actions.push_directions == (np.pi / 2, -np.pi / 2)
+    assert (actions.push_directions, actions.high_pushes) == ((np.pi / 2, -np.pi / 2), 0.0)
     assert config.problem.grasps.tilts == config.problem.retrieval.tilts == (np.radians(20),)
     assert actions.grasps.tilts == (np.radians(20),)
     # Where the paper is silent.
@@ -346,6 +347,17 @@ def test_what_is_dear_is_not_chosen():
         charge = jnp.float32([[price * 20.0], [0.0]])
         value = [prefix_values(c, h, jnp.array([True]), 0.9)[0] for c, h in zip(cost, charge, strict=True)]
         assert int(np.argmin(value)) == best
+
+
+def test_a_risk_is_taken_only_where_nothing_else_gains():
+    acted = jnp.ones((2, 1), bool)
+    risky = jnp.float32([[19.0], [0.0]])
+    # The first sequence gains 10 at a risk of 19; the second 0.1 or 4 at none.
+    for safe, best, value in ((19.9, 0, -9.0), (16.0, 1, -3.6)):
+        values, length = sequence_values(jnp.float32([[20.0, 10.0], [20.0, safe]]), risky, acted, 0.9)
+        assert int(jnp.argmin(values)) == best
+        assert float(values[best]) == pytest.approx(value)
+        assert length.tolist() == [1, 1]
 
 
 @pytest.mark.slow

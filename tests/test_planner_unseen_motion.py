@@ -111,6 +111,20 @@ def test_a_picked_object_may_have_touched_the_target_at_both_ends(problem, opene
         assert not where[np.asarray(at(problem, (0.6, 0.25)))].any()
 
 
+def test_what_moves_away_touches_nothing_where_it_stood(problem, opened):
+    """Behind the box and beyond the finger tips: the box does not drag the target along, the hand does not reach it."""
+    grasp = make(FORWARD, jnp.float32([0.6, 0.0, 0.46]))
+    there = jnp.float32([0.0, -0.2, 0.0])
+    pick = no_action().replace(
+        kind=jnp.int32(ActionKind.PICK_AND_PLACE),
+        opening=jnp.float32(0.08),
+        T_world_gripper=grasp,
+        T_world_place=translate(grasp, there),
+    )
+    behind = at(problem, (0.67, 0.0))
+    assert not opened(behind, BEFORE, boxes((0.6, -0.2), (0.6, 0.3)), pick).any()
+
+
 def test_it_works_in_a_batch(problem, opened):
     everywhere = jnp.ones(problem.poses.shape[0], bool)
     ways = jnp.stack([LEFT, 0.5 * LEFT])

@@ -26,6 +26,7 @@ def no_candidates(space: ActionSpace, capacity: int) -> Candidates:
         n, v, d = capacity, len(kind.wrists(space)), kind.distances(space)
         return Ways(
             T_world_gripper=jnp.zeros((n, v, 4, 4)),
+            weight=jnp.zeros((n, v)),
             reached=jnp.zeros((n, v, d), bool),
             hits=jnp.zeros((n, v, n), bool),
             enters=jnp.zeros((n, v, d), bool),
@@ -65,12 +66,13 @@ def candidates(
     others = concerns & scene.valid[:, None] & scene.valid[None, :]
     prints = footprints(scene)
 
-    poses, wanted, wrists, openings, owners, parts = [], [], [], [], [], []
+    poses, weights, wanted, wrists, openings, owners, parts = [], [], [], [], [], [], []
     first = 0
     for kind, before in zip(SAMPLED_KINDS, previous, strict=True):
-        T, plausible = kind.propose(space, tables, scene, prints, fresh)
+        T, weight = kind.propose(space, tables, scene, prints, fresh)
         poses.append(jnp.where(fresh[:, None, None, None], T, before.T_world_gripper))
-        wanted.append((plausible & (kind.name in space.config.actions) & fresh[:, None]).reshape(-1))
+        weights.append(jnp.where(fresh[:, None], weight, before.weight))
+        wanted.append(((weight > 0.0) & (kind.name in space.config.actions) & fresh[:, None]).reshape(-1))
         count = n * T.shape[1]
         wrists.append(np.tile(kind.wrists(space), n))
         openings.append(np.full(count, kind.opening))
@@ -92,13 +94,13 @@ def candidates(
 
     able = jnp.broadcast_to(True if available is None else available, (len(SAMPLED_KINDS), n))
     found = []
-    for i, (kind, before, T, part, arrives) in enumerate(
-        zip(SAMPLED_KINDS, previous, poses, parts, reached, strict=True)
+    for i, (kind, before, T, weight, part, arrives) in enumerate(
+        zip(SAMPLED_KINDS, previous, poses, weights, parts, reached, strict=True)
     ):
         hits = by_hand[part]
         hits |= kind.swept_hits(space, scene, flat[part], mask[part] & ~hits)
         hits = jnp.where(concerns[:, None, :], hits.reshape(*T.shape[:2], n), before.hits)
-        ways = Ways(T, arrives, hits, before.enters)
+        ways = Ways(T, weight, arrives, hits, before.enters)
         looked_at = ways.replace(reached=arrives & able[i][:, None, None])
         found.append(ways.replace(enters=kind.entering(space, tables, scene, possible, looked_at)))
     return tuple(found)

@@ -117,8 +117,8 @@ class SampledKind(Kind, Protocol):
         scene: Superquadrics,
         prints: Footprints,
         fresh: Bool[Array, " n"],
-    ) -> tuple[Float[Array, "n v 4 4"], Bool[Array, "n v"]]:
-        """Gripper poses of all ways, and which are worth a look; of objects that are not `fresh`, anything."""
+    ) -> tuple[Float[Array, "n v 4 4"], Float[Array, "n v"]]:
+        """Gripper poses of all ways, and their `Ways.weight`; of objects that are not `fresh`, anything."""
         ...
 
     def travels(

@@ -248,7 +248,10 @@ class PickAndPlace:
 
     def propose(self, space, tables, scene, prints, fresh):
         """See `object_grasps`."""
-        return object_grasps(space.shelf, space.gripper, prints, space.config.grasps, space.max_yaw, space.wrists)
+        T, plausible = object_grasps(
+            space.shelf, space.gripper, prints, space.config.grasps, space.max_yaw, space.wrists
+        )
+        return T, plausible.astype(jnp.float32)
 
     def travels(self, space, tables, T, near) -> Bool[Array, "k d"]:
         """The way out is the way in."""

@@ -118,10 +118,11 @@ def _half_extents(scene: Superquadrics, vectors: Float[np.ndarray, "v 2"]) -> Fl
 
 def object_pushes(
     space: ActionSpace, tables: ActionTables, scene: Superquadrics, prints: Footprints, fresh: Bool[Array, " n"]
-) -> tuple[Float[Array, "n v 4 4"], Bool[Array, "n v"]]:
-    """Gripper poses where pushes start, at `push_gap` from each object, and whether it would stay upright.
+) -> tuple[Float[Array, "n v 4 4"], Float[Array, "n v"]]:
+    """Gripper poses where pushes start, at `push_gap` from each object, and their sampling weights.
 
-    Only for `fresh` objects; in the order of `push_starts`.
+    1 where the push begins so low that leverage cannot topple the object, else `ActionConfig.high_pushes`. Only for
+    `fresh` objects; in the order of `push_starts`.
     """
     shelf, config = space.shelf, space.config
     starts = push_starts(config, space.wrists)
@@ -160,4 +161,4 @@ def object_pushes(
     distance, contact = (a.reshape(n, len(first))[:, alike.reshape(-1)] for a in found)
     stable = contact <= jnp.maximum(leverage, LOW_CONTACT)
     back = -distance[..., None] * starts.heading[None]
-    return T.at[..., :2, 3].add(back), stable
+    return T.at[..., :2, 3].add(back), jnp.where(stable, 1.0, config.high_pushes)

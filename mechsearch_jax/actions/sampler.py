@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from mechsearch_jax.actions.candidates import Candidates, free_ways
 from mechsearch_jax.actions.config import ActionSpace, ActionTables
@@ -24,13 +24,14 @@ def _choose(key, weight):
     return jnp.argmax(logits + jax.random.gumbel(key, weight.shape)), jnp.any(weight > 0)
 
 
-def _shares(clean, dirty):
-    """One for every object that has an action, shared evenly among its clean ones, or the others in need."""
-    usable = jnp.where(jnp.any(clean, axis=-1, keepdims=True), clean, dirty)
-    return usable / jnp.maximum(jnp.sum(usable, axis=-1, keepdims=True), 1)
+def _shares(clean, dirty, weight):
+    """One for every object that has an action, shared by weight among its clean ones, or the others in need."""
+    usable = jnp.where(jnp.any(clean, axis=-1, keepdims=True), clean, dirty) * weight
+    total = jnp.sum(usable, axis=-1, keepdims=True)
+    return usable / jnp.where(total > 0.0, total, 1.0)
 
 
-def _stacked(rows: Sequence[Bool[Array, "n _ _"]]) -> Bool[Array, "rows width"]:
+def _stacked(rows: Sequence[Shaped[Array, "n _ _"]]) -> Shaped[Array, "rows width"]:
     """The ways of all objects by all kinds, padded to the same number."""
     width = max(a.shape[1] * a.shape[2] for a in rows)
     flat = [a.reshape(a.shape[0], -1) for a in rows]
@@ -47,7 +48,7 @@ def sample_action(
     available: Bool[Array, "*kinds n"],
     weights: Float[Array, " n"] | None = None,
 ) -> Sample:
-    """Draw an action: an object and a kind (the multi-set of B.5) by the object's weight, then one of its ways evenly.
+    """Draw an action: an object and a kind (the multi-set of B.5) by the object's weight, then a way by its own.
 
     Args:
       key: PRNG key.
@@ -64,8 +65,9 @@ def sample_action(
     able = jnp.broadcast_to(available, (len(SAMPLED_KINDS), n))
     ways = _stacked([free_ways(w) & a[:, None, None] for w, a in zip(options, able, strict=True)])
     enters = _stacked([w.enters for w in options])
+    beside = _stacked([jnp.broadcast_to(w.weight[..., None], w.reached.shape) for w in options])
     weights = jnp.ones(n) if weights is None else weights
-    weight = jnp.tile(weights, len(SAMPLED_KINDS))[:, None] * _shares(ways & ~enters, ways)
+    weight = jnp.tile(weights, len(SAMPLED_KINDS))[:, None] * _shares(ways & ~enters, ways, beside)
     choice, possible_at_all = _choose(key_choice, weight.reshape(-1))
     row, way = choice // ways.shape[1], choice % ways.shape[1]
     chosen, index = row // n, row % n

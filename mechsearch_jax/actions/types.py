@@ -82,12 +82,14 @@ class Ways(flax.struct.PyTreeNode):
 
     Attributes:
       T_world_gripper: where the gripper goes, shape (N, V, 4, 4).
+      weight: sampling weight of each beside the others of its object, shape (N, V); 0 where it is not worth a look.
       reached: whether arm, hand and shelf allow it, by distance, shape (N, V, D).
       hits: which objects are run into, shape (N, V, N).
       enters: whether gripper or object would enter space where the target may be, by distance, shape (N, V, D).
     """
 
     T_world_gripper: jax.Array
+    weight: jax.Array
     reached: jax.Array
     hits: jax.Array
     enters: jax.Array

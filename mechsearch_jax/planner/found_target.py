@@ -18,18 +18,20 @@ from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
 from mechsearch_jax.graspability import FoundGrasps, GraspTables, boxes_overlap, feasible_grasps, grasp_hits
 from mechsearch_jax.planner.problem import TargetGrasps
 from mechsearch_jax.robot.arm_hits import arm_hits
-from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, arm_path, crossing_length, crossing_poses, way_in
+from mechsearch_jax.robot.entry import arm_path, crossing_length, crossing_poses, way_in
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import JOINTS
 
 # Of the poses where the arm's way in is followed, every so many is tested against objects: 5 cm apart at most.
-ARM_EVERY = 2
+ARM_EVERY = 3
+# Poses on the way along x of each grasp: at fewer the arm may pass a singularity unnoticed.
+CROSSINGS = 15
 
 
 def no_grasps(grasps: TargetGrasps) -> FoundGrasps:
     """Those of a target that has not been found."""
     count = grasps.tables.found_grasp.shape[0]
-    poses = len(range(0, CLOSE_CROSSINGS + CLOSE_WAYPOINTS, ARM_EVERY))
+    poses = len(range(0, CROSSINGS + CLOSE_WAYPOINTS, ARM_EVERY))
     return FoundGrasps(jnp.eye(4), jnp.zeros(count, bool), jnp.zeros((count, poses, len(JOINTS))))
 
 
@@ -47,7 +49,7 @@ def found_grasps(
     feasible = feasible_grasps(tables, shelf, gripper, grasps.config, T_world_target[None], active)[0]
 
     def enters(_, row, i):
-        path = way_in(row[0][i], gripper.nearest_outside, gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS)
+        path = way_in(row[0][i], gripper.nearest_outside, gripper, CROSSINGS, CLOSE_WAYPOINTS)
         q, follows = arm_path(path, row[1][i], shelf)
         return follows, q[::ARM_EVERY]
 

@@ -1,10 +1,10 @@
 """Where a hidden target may be now that an action may have moved it.
 
 A target slides only while something that moves touches it, and comes to rest at once. So if it was moved, it stood
-beside the space that hand and objects swept, and stands beside that space now, no farther away than they travelled.
-What swept it is known: the hand's way from the action, and the objects' ways from where they were seen before and after
-it. Whether the action succeeded does not matter: one that failed swept no more than it was meant to, and what it moved
-is seen.
+beside the space that hand and objects swept, and stands beside that space now, no farther away than they travelled, and
+not behind where it stood, as seen along a straight way in or out. What swept it is known: the hand's way from the
+action, and the objects' ways from where they were seen before and after it. Whether the action succeeded does not
+matter: one that failed swept no more than it was meant to, and what it moved is seen.
 
 Only what the camera allows now stays open: the belief folds the new observation in afterwards.
 """
@@ -12,6 +12,7 @@ Only what the camera allows now stays open: the belief folds the new observation
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -31,6 +32,8 @@ STILL = 0.003
 REACH = 0.01
 # A hand that pushes travels no farther than this between the places where it is looked at [m].
 STRIDE = 0.03
+# What is carried and ends farther than this from its place was dropped or pushed on the way [m].
+DROPPED = 0.03
 # Places on the way of an object.
 OBJECT_PLACES = 12
 # By how much two objects must differ in place and size to be taken for one another rather than keep their numbers [m].
@@ -48,26 +51,93 @@ def reopened(
       before, after: the objects as they were seen before and after it, in any order.
       action: a single action, whether or not it was carried out to its end.
     """
-    target, shelf = problem.target, problem.shelf
-    hand = _hand(problem, action)
-    bodies, passed, travel = _bodies(problem, before, after, action)
-    points = jnp.concatenate([hand, bodies.reshape(-1, 3)])
-    counts = jnp.concatenate([hand[:, 2] < shelf.board + 2 * target.half_size[2], passed.reshape(-1)])
-    # What does not count is far away.
-    swept = jnp.where((counts & (action.kind != ActionKind.NONE))[:, None], points[:, :2], jnp.inf)
-
+    target = problem.target
     places = problem.poses.reshape(-1, target.yaws, 3)[:, 0, :2]
-    gap2 = jnp.min(jnp.sum((places[:, None] - swept[None]) ** 2, axis=-1), axis=1)
     radius = target.half_size[0] if target.yaws == 1 else math.hypot(*target.half_size[:2])
-    beside = gap2 < (radius + REACH) ** 2
-    possible = jnp.any(exists.reshape(-1, target.yaws), axis=1) & beside
+    now = jnp.any(exists.reshape(-1, target.yaws), axis=1)
     away2 = jnp.sum((places[:, None] - places[None]) ** 2, axis=-1)
-    within = away2 < (travel + 2 * REACH) ** 2
-    return jnp.repeat(beside & jnp.any(within & possible[None], axis=1), target.yaws)
+    opened = jnp.zeros_like(now)
+    for sweep in _sweeps(problem, before, after, action):
+        # What does not count is far away.
+        swept = jnp.where((sweep.counts & (action.kind != ActionKind.NONE))[:, None], sweep.points[:, :2], jnp.inf)
+        gap2 = jnp.min(jnp.sum((places[:, None] - swept[None]) ** 2, axis=-1), axis=1)
+        beside = gap2 < (radius + REACH) ** 2
+        within = away2 < (sweep.travel + 2 * REACH) ** 2
+        # What is pushed gives way forwards or sideways.
+        ahead = jnp.sum(places * sweep.heading[None], axis=-1)
+        within &= ahead[:, None] - ahead[None] > -2 * REACH
+        opened |= beside & jnp.any(within & (now & beside)[None], axis=1)
+    return jnp.repeat(opened, target.yaws)
 
 
-def _hand(problem: Problem, action: Action) -> Float[Array, "p 3"]:
-    """Points that the gripper passed, on its ways in and out and in between if it pushed [m]."""
+class _Sweep(NamedTuple):
+    """What one stretch of an action passed.
+
+    Attributes:
+      points: that hand or objects passed, shape (P, 3) [m].
+      counts: which of them passed so low that they may have touched the target, shape (P,).
+      heading: which way they went, seen from above, shape (2,); 0 if it may have been any.
+      travel: how far they can have taken the target [m].
+    """
+
+    points: Float[Array, "p 3"]
+    counts: Bool[Array, " p"]
+    heading: Float[Array, "2"]
+    travel: Array | float
+
+
+def _sweeps(problem: Problem, before: Superquadrics, after: Superquadrics, action: Action) -> tuple[_Sweep, ...]:
+    """The stretches of an action: the way in, the push with what it moved, the way out, and the way in to a new place.
+
+    Where something began to move is left out: it only moved away from what is there.
+    """
+    n, shelf, approach = before.capacity, problem.shelf, problem.gripper.approach
+    holds = jnp.any(jnp.stack([action.kind == code for code, kind in KINDS.items() if kind.holds_object]))
+    start, end, same, known = _bodies(problem, before, after, action)
+    own = (jnp.arange(n) == action.object) & before.valid
+    # What is held arrives at its place, or was dropped or pushed on the way there.
+    into = transform(compose(action.T_world_place, inverse(action.T_world_gripper)), start)
+    arrived = jnp.sum((jnp.mean(end, axis=1) - jnp.mean(into, axis=1)) ** 2, axis=-1) < DROPPED**2
+    carried = own & holds & arrived
+    apart = jnp.sqrt(jnp.sum((after.position[same] - before.position)[:, :2] ** 2, axis=-1))
+    moved = (known & (apart > STILL)) | own
+
+    share = (jnp.arange(OBJECT_PLACES) + 1.0) / OBJECT_PLACES
+    path = start[:, None] + share[None, :, None, None] * (end - start)[:, None]
+    passed = jnp.broadcast_to((moved & ~carried)[:, None, None], path.shape[:-1])
+    turned = jnp.sqrt(jnp.max(jnp.sum((end - start) ** 2, axis=-1), axis=-1))
+    farthest = jnp.max(jnp.where(moved & ~carried, turned, 0.0), initial=0.0)
+    farthest = jnp.maximum(farthest, jnp.sqrt(jnp.sum(action.displacement**2)))
+    # An approximation: on its ways in and out, a hand that pushes takes the target no farther than the push does.
+    ways = jnp.where(holds, approach, farthest)
+
+    # What is carried goes out along the gripper's z and in again.
+    back = approach * jnp.linspace(0.0, 1.0, OBJECT_PLACES // 2 + 1)
+
+    def behind(points, T, along):
+        return points[:, None] - (along[:, None] * T[None, :3, 2])[None, :, None]
+
+    out, new = behind(start, action.T_world_gripper, back[1:]), behind(into, action.T_world_place, back[:-1])
+    with_it = jnp.broadcast_to((own & holds)[:, None, None], out.shape[:-1])
+    hand_in, hand_between, hand_at_end = _hand(problem, action)
+    forward, backward = action.T_world_gripper[:2, 2], -action.T_world_place[:2, 2]
+
+    def sweep(parts, heading, travel):
+        points = jnp.concatenate([points.reshape(-1, 3) for points, _ in parts])
+        counts = jnp.concatenate([jnp.broadcast_to(c, p.shape[:-1]).reshape(-1) for p, c in parts])
+        return _Sweep(points, counts & (points[:, 2] < shelf.board + 2 * problem.target.half_size[2]), heading, travel)
+
+    return (
+        sweep([(hand_in, True)], forward, ways),
+        sweep([(hand_between, ~holds), (path, passed)], jnp.zeros(2), farthest),
+        sweep([(hand_at_end, ~holds)], backward, ways),
+        sweep([(out, with_it)], -forward, approach),
+        sweep([(hand_at_end, holds), (new, with_it)], -backward, approach),
+    )
+
+
+def _hand(problem: Problem, action: Action) -> tuple[Float[Array, "p 3"], Float[Array, "q 3"], Float[Array, "p 3"]]:
+    """Points that the gripper passed on the way in, in between if it pushed, and on the way to or from its end [m]."""
     tables = problem.actions
     opening = jnp.where(action.opening > 0.0, OPEN, CLOSED)
     wrist = jnp.argmin(jnp.abs(tables.q7[opening] - action.q7))
@@ -75,46 +145,23 @@ def _hand(problem: Problem, action: Action) -> Float[Array, "p 3"]:
     places = math.ceil(max(problem.config.actions.push_distances) / STRIDE) + 1
     way = action.displacement[None] * jnp.linspace(0.0, 1.0, places)[:, None]
     between = transform(action.T_world_gripper, still)[None] + way[:, None]
-    ends = [transform(T, cloud) for T in (action.T_world_gripper, action.T_world_place)]
-    return jnp.concatenate([*ends, between.reshape(-1, 3)])
+    first, last = (transform(T, cloud) for T in (action.T_world_gripper, action.T_world_place))
+    return first, between.reshape(-1, 3), last
 
 
 def _bodies(
     problem: Problem, before: Superquadrics, after: Superquadrics, action: Action
-) -> tuple[Float[Array, "n s p 3"], Bool[Array, "n s p"], Float[Array, ""]]:
-    """Points that the objects passed [m], which of them count, and how far the target may have been taken [m]."""
-    n, target, shelf = before.capacity, problem.target, problem.shelf
-    approach, share = problem.gripper.approach, jnp.linspace(0.0, 1.0, OBJECT_PLACES)[None, :, None, None]
+) -> tuple[Float[Array, "n p 3"], Float[Array, "n p 3"], Int[Array, " n"], Bool[Array, " n"]]:
+    """Points of the objects before and after the action [m], which each is afterwards, and whether that is known."""
     size = jnp.where(before.valid[:, None], before.size, 1.0)
     clouds = jnp.swapaxes(object_clouds(before.replace(size=size), problem.config.actions.object_points), -1, -2)
     start = transform(make(before.rotation, before.position)[:, None], clouds)
-
     same, known = _same(before, after)
     end = transform(make(after.rotation[same], after.position[same])[:, None], clouds)
-    shift = jnp.sqrt(jnp.sum((after.position[same] - before.position)[:, :2] ** 2, axis=-1))
-    own = (jnp.arange(n) == action.object) & before.valid
+    own = (jnp.arange(before.capacity) == action.object) & before.valid
     # What is pushed is known to move even where it is not seen afterwards.
     end = jnp.where((own & ~known)[:, None, None], start + action.displacement[None, None], end)
-    path = start[:, None] + share * (end - start)[:, None]
-    moved = known & (shift > STILL)
-
-    holds = jnp.any(jnp.stack([action.kind == code for code, kind in KINDS.items() if kind.holds_object]))
-    into = transform(compose(action.T_world_place, inverse(action.T_world_gripper)), start)
-    # What is carried goes out along the gripper's z and in again.
-    half = OBJECT_PLACES // 2
-    back = approach * jnp.linspace(0.0, 1.0, half)[:, None]
-    ends = ((start, action.T_world_gripper), (into, action.T_world_place))
-    carried = [cloud[:, None] - (back * T[None, :3, 2])[None, :, None] for cloud, T in ends]
-    held = own & holds
-    points = jnp.where(held[:, None, None, None], jnp.concatenate(carried, axis=1), path)
-    # What is carried may be dropped, however high it is.
-    low = (points[..., 2] < shelf.board + 2 * target.half_size[2]) | held[:, None, None]
-    passed = low & (moved | own)[:, None, None]
-
-    turned = jnp.sqrt(jnp.max(jnp.sum((end - start) ** 2, axis=-1), axis=-1))
-    farthest = jnp.max(jnp.where(moved & ~held, turned, 0.0), initial=0.0)
-    pushed = jnp.sqrt(jnp.sum(action.displacement**2))
-    return points, passed, jnp.maximum(jnp.maximum(farthest, pushed), jnp.where(holds, approach, 0.0))
+    return start, end, same, known
 
 
 def _same(before: Superquadrics, after: Superquadrics) -> tuple[Int[Array, " n"], Bool[Array, " n"]]:
