@@ -131,7 +131,7 @@ def apply(document: Document, table: str, given: Mapping[str, Any], make: Callab
     key = next((key for key in given if _complaint(make, given, key) != said), "")
     said = _CLASS.sub("", said)
     place = document.where(table, key)
-    raise InputError(f"{place.removesuffix(key) if said.startswith(key) else f'{place}: '}{said}")
+    raise InputError(f"{place.removesuffix(key) if key and said.startswith(key) else f'{place}: '}{said}")
 
 
 def _complaint(make: Callable[[Mapping[str, Any]], Any], given: Mapping[str, Any], without: str) -> str | None:

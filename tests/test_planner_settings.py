@@ -4,6 +4,7 @@ import dataclasses
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mechsearch_jax import errors, tables
@@ -81,7 +82,20 @@ push_distances = [0.1]
     assert isinstance(found.config.planner.gamma, float)
 
 
+def test_a_robot_that_stands_elsewhere_sees_camera_and_shelf_from_there(tmp_path):
+    where = "[base]\nposition = [0.5, -0.25, 0.125]\n[shelf]\nfront = 1.0\nback = 1.5\n"
+    found = load(tmp_path, where).workcell
+    assert (found.shelf.front, found.shelf.back) == (0.5, 1.0)
+    assert found.shelf.board == Shelf().board - 0.125
+    assert (found.shelf.left, found.shelf.spawn_y[1]) == (Shelf().left + 0.25, Shelf().spawn_y[1] + 0.25)
+    np.testing.assert_allclose(np.subtract(found.camera.position, Camera().position), (-0.5, 0.25, -0.125), atol=1e-12)
+    assert found.camera.rotation == Camera().rotation
+    assert load(tmp_path, "[base]\nposition = [0, 0, 0]").workcell == Workcell()
+
+
 WRONG = {
+    "[base]\nposition = [0, 11, 0]": ":2: [base] position y (11.0) must be from -10 to 10 m",
+    "[base]\nposition = [9.9, 0, 0]\n[camera]\nposition = [-5, 0, 0]": ":1: [base]: position x (-14.9) must be from",
     "[camera]\nwidth = 0": ":2: [camera] width (0) must be from 1 to",
     "[camera]\n\nwidth = 1.5": ":3: [camera] width must be a whole number, not 1.5",
     "[camera]\nwidth = true": ":2: [camera] width must be a whole number, not true",
@@ -143,7 +157,9 @@ def options_of(tmp_path, text, *arguments):
 
 def test_the_command_line_goes_before_the_file(tmp_path):
     text = '[planner]\npreset = "paper"\ngamma = 0.5\nactions = ["standard"]\n[shelf]\nback = 0.8\n'
-    standard = {name: PRESETS["standard"]().options()[name] for name in ("push_directions", "object_grasp_tilts")}
+    standard = {
+        name: PRESETS["standard"]().options()[name] for name in ("push_directions", "high_pushes", "object_grasp_tilts")
+    }
     given = options_of(tmp_path, text)
     assert given.settings().config == PRESETS["paper"](gamma=0.5, **standard)
     assert given.settings().workcell.shelf.back == 0.8

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
-from mechsearch_jax.errors import InputError, nearest
+from mechsearch_jax.errors import InputError, check_range, nearest
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.planner.config import OPTIONS, Config, Option
 from mechsearch_jax.planner.presets import DEFAULT_PRESET, PRESETS, expanded
@@ -18,8 +18,25 @@ from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.target import Target
 
 PLANNER = "planner"
+# The base is no farther than this from the origin of a file's frame [m].
+FARTHEST = 10.0
 # The example in the folder `data` of the package.
 EXAMPLE = "example-config.toml"
+
+
+@dataclasses.dataclass(frozen=True)
+class Base:
+    """Where the robot's base stands in the frame that a file gives camera and shelf in.
+
+    Attributes:
+      position: of the base; its axes are those of the frame [m].
+    """
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        for axis, value in zip("xyz", self.position, strict=True):
+            check_range(f"Base: position {axis}", value, -FARTHEST, FARTHEST, "m")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +75,7 @@ class Settings:
 # The tables of a file beside the planner's, and what they are without it.
 _PARTS: Mapping[str, Any] = {
     **{field.name: getattr(Workcell(), field.name) for field in dataclasses.fields(Workcell)},
+    "base": Base(),
     "objects": ObjectSizes(),
 }
 
@@ -74,7 +92,7 @@ def tables() -> dict[str, dict[str, Any]]:
 def load_settings(path: PathLike) -> Settings:
     """Read a configuration file (TOML); what it does not give takes its default.
 
-    Lengths in metres, angles in radians, poses in the robot's base frame.
+    Lengths in metres, angles in radians, poses in the robot's base frame, or in one in which `[base]` gives its place.
 
     Raises:
       InputError: the file cannot be read or is not TOML; a table or key is unknown; a value is of the wrong type or
@@ -89,7 +107,10 @@ def load_settings(path: PathLike) -> Settings:
         begin = ", ".join(f"[{table}]" for table in known)
         raise InputError(f"{document.where('', key)} stands in no table; begin one of {begin}")
     parts = {name: with_table(document, name, usual) for name, usual in _PARTS.items() if name != "target"}
-    objects = parts.pop("objects")
+    objects, base = parts.pop("objects"), parts.pop("base")
+    x, y, z = base.position
+    around = lambda _: {name: parts[name].moved((-x, -y, -z)) for name in ("camera", "shelf")}  # noqa: E731
+    parts |= apply(document, "base", {}, around)
     target = _target(document)
     workcell = apply(
         document,

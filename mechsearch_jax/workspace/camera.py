@@ -57,6 +57,11 @@ class Camera:
         for axis, value in zip("xyz", self.position, strict=True):
             check_range(f"Camera: position {axis}", value, -FARTHEST, FARTHEST, "m")
 
+    def moved(self, shift: tuple[float, float, float]) -> Camera:
+        """The same camera elsewhere, by a translation in the world [m]."""
+        x, y, z = (a + b for a, b in zip(self.position, shift, strict=True))
+        return dataclasses.replace(self, position=(x, y, z))
+
     def scaled(self, factor: int) -> Camera:
         """The same view at `1/factor` of the resolution, its size rounded down."""
         return dataclasses.replace(

@@ -57,6 +57,21 @@ class Shelf:
             if not -FARTHEST <= low < high <= FARTHEST:
                 raise InputError(f"Shelf: {name} ({low}, {high}) must be two places in metres, the smaller first")
 
+    def moved(self, shift: tuple[float, float, float]) -> Shelf:
+        """The same shelf elsewhere, by a translation in the world [m]."""
+        x, y, z = shift
+        return dataclasses.replace(
+            self,
+            front=self.front + x,
+            back=self.back + x,
+            right=self.right + y,
+            left=self.left + y,
+            board=self.board + z,
+            ceiling=self.ceiling + z,
+            spawn_x=(self.spawn_x[0] + x, self.spawn_x[1] + x),
+            spawn_y=(self.spawn_y[0] + y, self.spawn_y[1] + y),
+        )
+
 
 def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
     """Whether world points are in the shelf, whose sides and ceiling are taken closer by their margins.
