@@ -26,6 +26,7 @@ def print_rates(console: Console, rows: Sequence[Row]) -> None:
 def print_summary(console: Console, summary: Sequence[Rates], key: Key) -> None:
     """Print rates, and what the labels of variants stand for."""
     console.print(summary_table(summary, key))
+    console.print("plan, act: seconds per action", style="dim")
     if key.numbered:
         console.print()
         for label, short in key.short.items():
@@ -61,7 +62,6 @@ def summary_table(summary: Sequence[Rates], key: Key) -> Table:
             f"{rates.simulation_seconds:.2f}",
             style="bold" if None in rates.group.values() else None,
         )
-    table.caption = "plan, act: seconds per action"
     return table
 
 

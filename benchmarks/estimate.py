@@ -35,7 +35,7 @@ class Estimate:
       there: of how many of them the folder holds the row.
       compilations: in how many ways those that are left differ in more than continuous settings and max_steps.
       episode_seconds, compile_seconds: what one takes [s].
-      at_once: how many processes share the episodes.
+      workers: how many processes share the episodes; None for batches.
       measured: how many rows of the folder say so; where none do, the seconds are assumed.
     """
 
@@ -45,13 +45,13 @@ class Estimate:
     compilations: int
     episode_seconds: float
     compile_seconds: float
-    at_once: int
+    workers: int | None
     measured: int
 
     @property
     def hours(self) -> float:
         """How long it would take, if nothing was compiled before."""
-        running = (self.episodes - self.there) * self.episode_seconds / self.at_once
+        running = (self.episodes - self.there) * self.episode_seconds / (self.workers or 1)
         return (running + self.compilations * self.compile_seconds) / 3600.0
 
     def __str__(self) -> str:
@@ -61,7 +61,7 @@ class Estimate:
             if self.measured
             else "assumed: the folder holds no rows of this kind of device"
         )
-        where = "in batches" if self.at_once == 1 else f"in {self.at_once} processes"
+        where = "in batches" if self.workers is None else f"in {_counted(self.workers, 'process')}"
         return (
             f"{_counted(self.variants, 'variant')}, {_counted(self.episodes, 'episode')}, "
             f"{self.there} of them there already, {left} left\n"
@@ -73,16 +73,16 @@ class Estimate:
 
 
 def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+    return f"{count} {what}{'' if count == 1 else 'es' if what.endswith('s') else 's'}"
 
 
-def estimate(jobs: Sequence[Job], out: PathLike, at_once: int, retry_errors: bool = False) -> Estimate:
+def estimate(jobs: Sequence[Job], out: PathLike, workers: int | None, retry_errors: bool = False) -> Estimate:
     """What `evaluate` would take for jobs.
 
     Args:
       jobs: what is wanted.
       out: the folder of the results, which need not be there.
-      at_once: number of worker processes; 1 for batches.
+      workers: number of worker processes; None for batches.
       retry_errors: as `evaluate` has it.
 
     Raises:
@@ -97,7 +97,9 @@ def estimate(jobs: Sequence[Job], out: PathLike, at_once: int, retry_errors: boo
     moulds = {(target_of(job.scenario, job.method.workcell.target), mould(job.method)) for job in left}
     device = versions()["device"]
     rows = [row for row in results.rows.values() if row.device == device and not row.is_error]
-    episode, compiling = _measured(rows, at_once) if rows else ASSUMED["cpu" if device.startswith("cpu") else "gpu"]
+    episode, compiling = (
+        _measured(rows, workers or 1) if rows else ASSUMED["cpu" if device.startswith("cpu") else "gpu"]
+    )
     return Estimate(
         variants=len({job.method for job in jobs}),
         episodes=len(wanted),
@@ -105,7 +107,7 @@ def estimate(jobs: Sequence[Job], out: PathLike, at_once: int, retry_errors: boo
         compilations=len(moulds),
         episode_seconds=episode,
         compile_seconds=compiling,
-        at_once=at_once,
+        workers=workers,
         measured=len(rows),
     )
 

@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Hashable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import scipy.stats
@@ -162,17 +163,20 @@ def _rates(group: Mapping[str, Hashable], rows: Sequence[Row]) -> Rates:
     said = [row.paper_graspable for row in rows if row.paper_graspable is not None]
     steps = {goal: [step for row in rows if (step := step_of(row, goal)) is not None] for goal in GOALS}
     reached = {goal: len(steps[goal]) for goal in GOALS}
+    told: dict[str, Any] = {
+        **{goal: reached[goal] / count for goal in GOALS},
+        **{f"{goal}_interval": wilson(reached[goal], count) for goal in GOALS},
+        **{f"{goal}_steps": sum(steps[goal]) / reached[goal] if reached[goal] else None for goal in GOALS},
+        **{f"{goal}_steps_interval": bootstrap(steps[goal]) for goal in GOALS},
+    }
     return Rates(
         group=group,
         episodes=count,
         errors=sum(row.is_error for row in rows),
-        **{goal: reached[goal] / count for goal in GOALS},
-        **{f"{goal}_interval": wilson(reached[goal], count) for goal in GOALS},
+        **told,
         paper_episodes=len(said),
         paper_graspable=sum(said) / len(said) if said else None,
         paper_graspable_interval=wilson(sum(said), len(said)),
-        **{f"{goal}_steps": sum(steps[goal]) / reached[goal] if reached[goal] else None for goal in GOALS},
-        **{f"{goal}_steps_interval": bootstrap(steps[goal]) for goal in GOALS},
         steps=sum(row.steps for row in rows) / count,
         planning_seconds=sum(row.planning_seconds for row in rows) / actions,
         simulation_seconds=sum(row.simulation_seconds for row in rows) / actions,

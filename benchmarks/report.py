@@ -258,7 +258,7 @@ def _pictures(report: Report) -> dict[str, Callable[[], Figure]]:
         "rates.png": lambda: rates_figure(report.variants, report.key),
     }
     if report.curve:
-        draws["curve.png"] = lambda: curve_figure(report.curve, report.curve_columns, dict(report.key.short))
+        draws["curve.png"] = lambda: curve_figure(report.curve, report.curve_columns, report.key.short)
     return draws
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -130,10 +131,9 @@ def rates_figure(summary: Sequence[Rates], key: Key) -> Figure:
         _plain(axes)
         axes.set_ylabel(f"share {title}", fontsize=9, color=INK)
     labels = [key.short[str(rates.method)] for rates in ranked]
+    turned = {"rotation": 25, "ha": "right", "fontsize": 8} if few else {"rotation": 90, "fontsize": 6}
     for axes in grid[-1]:
-        axes.set_xticks(
-            x, labels, rotation=25 if few else 90, ha="right" if few else "center", fontsize=8 if few else 6
-        )
+        axes.set_xticks(x, labels, **turned)
         axes.set_xlim(-0.6, len(ranked) - 0.4)
     return figure
 
@@ -154,7 +154,7 @@ def curve_rates(rows: Sequence[Row], columns: Sequence[str]) -> list[Rates]:
     return found
 
 
-def curve_figure(found: Sequence[Rates], columns: Sequence[str], short: Mapping[Hashable, str]) -> Figure:
+def curve_figure(found: Sequence[Rates], columns: Sequence[str], short: Mapping[str, str]) -> Figure:
     """Rates over a column, with their intervals: a panel for each goal, a line for each value of the second column.
 
     Args:
@@ -172,7 +172,7 @@ def curve_figure(found: Sequence[Rates], columns: Sequence[str], short: Mapping[
     colours = COLOURS
     if len(lines) > len(COLOURS):
         scale = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.95, len(lines)))
-        colours = tuple(matplotlib.colors.to_hex(colour) for colour in scale)
+        colours = tuple(to_hex(colour) for colour in scale)
     width = float(np.clip(0.35 * len(values), 3.4, 6.0))
     legend = 0.25 * -(-len(lines) // 4) + 0.3 if second else 0.0
     figure = Figure(figsize=(width * len(GOALS), 3.4 + legend), layout="constrained")
@@ -183,14 +183,14 @@ def curve_figure(found: Sequence[Rates], columns: Sequence[str], short: Mapping[
             low, high = np.array([getattr(rates, f"{goal}_interval") for rates in members]).T
             axes.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
             share = [getattr(rates, goal) for rates in members]
-            axes.plot(x, share, color=colour, marker="o", markersize=3, label=short.get(line, str(line)))
+            axes.plot(x, share, color=colour, marker="o", markersize=3, label=short.get(str(line), str(line)))
         _plain(axes)
         axes.set_title(title, fontsize=10, color=INK)
         axes.set_xlabel(first.replace("_", " "), fontsize=9, color=INK)
         if not numeric:
-            told = [short.get(value, str(value)) for value in values]
+            told = [short.get(str(value), str(value)) for value in values]
             axes.set_xticks([places[value] for value in values], told, rotation=30 if len(told) > 3 else 0)
     grid[0][0].set_ylabel("share", fontsize=9, color=INK)
     if second:
-        _legend(figure, grid, [short.get(line, str(line)) for line in lines], second[0].replace("_", " "))
+        _legend(figure, grid, [short.get(str(line), str(line)) for line in lines], second[0].replace("_", " "))
     return figure

@@ -6,7 +6,7 @@ import collections
 from collections.abc import Hashable, Sequence
 
 from mechsearch_jax.benchmarks.pages import Block, Heading, Paragraph, Picture, Table
-from mechsearch_jax.benchmarks.paired import by_variant
+from mechsearch_jax.benchmarks.paired import Difference, by_variant
 from mechsearch_jax.benchmarks.rates import EVENTS, GOALS, Events, Rates
 from mechsearch_jax.benchmarks.report import Report, reason_of, told_of_changes
 from mechsearch_jax.benchmarks.variants import MOST_IN_FULL, VARIANT, Key
@@ -76,9 +76,12 @@ def _steps(value: float | None, interval: tuple[float, float] | None) -> str:
     return "-" if value is None or interval is None else f"{value:.1f} ({interval[0]:.1f} to {interval[1]:.1f})"
 
 
-def _rates_table(rates: Sequence[Rates], key: Key) -> Table:
+def _rates_table(rates: Sequence[Rates], key: Key, spelt: bool = False) -> Table:
+    """A line for each group; where `spelt`, with what a variant's options are that differ."""
     columns = list(rates[0].group)
+    options = list(next(iter(key.options.values()))) if spelt else []
     header = (
+        *options,
         *(column.replace("_", " ") for column in columns),
         *("episodes", "errors", *SHARES.values()),
         *(f"actions until {goal}" for goal in GOALS),
@@ -86,6 +89,7 @@ def _rates_table(rates: Sequence[Rates], key: Key) -> Table:
     )
     lines = [
         (
+            *(key.options[str(one.method)][name] for name in options),
             *(said(one.group[column], key) for column in columns),
             *(str(one.episodes), str(one.errors)),
             *(_share(getattr(one, goal), getattr(one, f"{goal}_interval")) for goal in SHARES),
@@ -94,14 +98,15 @@ def _rates_table(rates: Sequence[Rates], key: Key) -> Table:
         )
         for one in rates
     ]
-    return Table(header, lines, texts=len(columns))
+    return Table(header, lines, texts=len(columns) + len(options))
 
 
 def _rates(report: Report) -> list[Block]:
     table = _rates_table(report.rates, report.key)
     if not (_many(report) and list(report.rates[0].group) == [VARIANT, "objects"]):
         return [Heading("Rates"), table]
-    whole = _rates_table([rates for rates in report.rates if rates.objects is None], report.key)
+    everything = [rates for rates in report.rates if rates.objects is None]
+    whole = _rates_table(everything, report.key, spelt=report.key.numbered)
     instead = "By number of objects too: see rates.csv."
     folded = Table(table.header, table.lines, table.texts, True, "by number of objects", instead)
     return [Heading("Rates"), whole, folded]
@@ -123,7 +128,7 @@ def _differences(report: Report) -> list[Block]:
         return []
     short = report.key.short
 
-    def cell(one, scale: float, digits: int) -> str:
+    def cell(one: Difference, scale: float, digits: int) -> str:
         if one.difference is None:
             return "-"
         error = "" if one.standard_error is None else f" ± {scale * one.standard_error:.{digits}f}"
@@ -132,9 +137,9 @@ def _differences(report: Report) -> list[Block]:
     lines = [
         (
             *(short[label], str(goals["found"].pairs)),
-            *(cell(goals[goal], 100, 1) for goal in GOALS),
+            *(cell(goals[goal], 100.0, 1) for goal in GOALS),
             f"{goals['retrieved'].gains}, {goals['retrieved'].losses}",
-            *(cell(goals[f"{goal}_steps"], 1, 2) for goal in GOALS),
+            *(cell(goals[f"{goal}_steps"], 1.0, 2) for goal in GOALS),
         )
         for label, goals in by_variant(report.differences).items()
     ]

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import subprocess
 import sys
 
 import pytest
@@ -361,3 +362,17 @@ def test_a_policy_of_another_module_reaches_the_worker(tmp_path, files, monkeypa
     (row,) = evaluate(make_jobs(files[:1], [method], (0,)), tmp_path / "rows", Processes(1))
     assert (row.policy, row.gamma) == ("their_lab:Mine", 0.25)
     assert row.failure == "error: RuntimeError: gamma 0.25 arrived"
+
+
+def test_a_worker_ends_with_its_input_whatever_it_is_doing():
+    program = (
+        "import sys, time; from mechsearch_jax.benchmarks.worker import until_closed; "
+        "next(until_closed(sys.stdin)); print('busy', flush=True); time.sleep(100)"
+    )
+    pipe, command = subprocess.PIPE, [sys.executable, "-c", program]
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+        process.stdin.write("a job\n")
+        process.stdin.flush()
+        assert process.stdout.readline() == "busy\n"
+        process.stdin.close()
+        assert process.wait(60) == 0

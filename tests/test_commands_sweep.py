@@ -164,6 +164,7 @@ def test_what_a_run_would_take_is_told_and_nothing_is_run(folder, capsys):
     )()
     said = capsys.readouterr().out
     assert said.startswith("96 variants, 192 episodes, 0 of them there already, 192 left\n1 compilation of the planner")
+    assert "192 x 8 s in 2 processes" in said
     assert "assumed" in said
     cli.parse(["sweep", *common, "--gamma", "0.5", "1", "--horizon", "2", "3", "--max-steps", "5", "10"])()
     assert "8 variants, 16 episodes, 0 of them there already, 16 left\n2 compilations" in capsys.readouterr().out

@@ -156,7 +156,7 @@ def run_jobs(
     if run.dry_run:
         from mechsearch_jax.benchmarks.estimate import estimate
 
-        print(estimate(jobs, out, workers if in_processes else 1, run.retry_errors))
+        print(estimate(jobs, out, workers if in_processes else None, run.retry_errors))
         return
     _run(command, jobs, out, run, workers if in_processes else None, told)
 

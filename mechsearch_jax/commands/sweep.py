@@ -76,7 +76,7 @@ class SweptOptions:
         """
         from mechsearch_jax.planner import OPTIONS
 
-        kind = with_planner_options()
+        kind: Any = with_planner_options()
         lists = {option.name: option.type for option in OPTIONS if get_origin(option.type) is tuple}
         listed = {"recognition": self.recognition, "protocol": self.protocol}
         swept = {**listed, **{n: getattr(self, n, ()) for n in ("preset", *_options())}}
@@ -131,7 +131,7 @@ def with_swept_options() -> type[SweptOptions]:
         elif option.choices:
             kind, metavar = Literal[option.choices], f"{{{','.join(option.choices)}}}"
         else:
-            kind, metavar = option.type, {bool: "{True,False}"}.get(option.type, option.type.__name__.upper())
+            kind, metavar = option.type, "{True,False}" if option.type is bool else str(option.type.__name__).upper()
         fields.append((option.name, several(kind, metavar, f"{option.help}."), ()))
     return dataclasses.make_dataclass("Swept", fields, bases=(SweptOptions,), frozen=True, kw_only=True)
 
