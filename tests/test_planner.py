@@ -495,7 +495,7 @@ def test_impossible_options_are_refused_with_what_would_do(changes, message):
     [
         (
             "guess",
-            'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, greedy, mctx, or an import path',
+            'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, greedy, mctx, or an import',
         ),
         ("no_such_lab.policies:Mine", "cannot be imported .*no_such_lab"),
         ("mechsearch_jax.planner:Nobody", "cannot be imported .*Nobody"),
