@@ -46,12 +46,13 @@ class Worker:
         episode = run_episode(
             seed,
             scenario,
-            self._problem(workcell, target, method.config.problem),
+            self._problem(workcell, target, method.problem_config),
             self._policy(method),
             self._simulator(workcell),
             recogniser(method.recognition, target),
             method.config.max_steps,
             method.options(),
+            protocol=method.terms,
         )
         return Row.of_episode(episode, present_code())
 

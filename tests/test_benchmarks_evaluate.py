@@ -12,6 +12,7 @@ from rich.console import Console
 from mechsearch_jax import versions
 from mechsearch_jax.benchmarks import evaluate as benchmark
 from mechsearch_jax.benchmarks import tables
+from mechsearch_jax.benchmarks.episode_tables import rates_table
 from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs, present_code, shard_of
 from mechsearch_jax.benchmarks.processes import Processes
 from mechsearch_jax.benchmarks.rates import summarise
@@ -338,7 +339,7 @@ def test_progress_and_rates_are_shown(tmp_path, files, command):
     with tables.EpisodeProgress(console, 3) as progress:
         jobs = make_jobs([files[0], files[1], files[3]], [Method()], (0,))
         rows = evaluate(jobs, tmp_path / "rows", Processes(1, command=command), ended=progress.ended)
-    console.print(tables.rates_table(rows))
+    console.print(rates_table(rows))
     text = screen.getvalue()
     assert "3/3 raise: error: ValueError: no" in text
     everything = next(line for line in text.splitlines() if " all " in line)

@@ -41,7 +41,7 @@ def search(
       objects: instead of a scenario, generate one with so many objects.
       target: shape of a generated target; a cylinder, or what the configuration file says, if not given.
       method: "search-for-grasp", the default, minds the grasp while it searches, "search-and-grasp" only afterwards.
-      policy: instead of a method, the name of a policy ("random" is one more), or the import path of another.
+      policy: instead of a method, the name of a policy (also random, greedy, mctx), or the import path of another.
       seed: of the planner, of the environment, and of a generated scenario.
       out: folder for episode.json, filmstrip.png and the scenario.
       record: also write recording.npz, what moved and what was believed, of which `mechsearch video` makes a film.
@@ -79,7 +79,7 @@ def search(
             f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
         )
         wanted = target_of(scene, workcell.target)
-        problem = workcell.problem(wanted, chosen.config.problem)
+        problem = workcell.problem(wanted, chosen.problem_config)
         policy_now = chosen.policy()
         with prepared(first_decision(problem, policy_now), lambda text: console.print(text, style="dim")):
             # These take long to import, and meanwhile what the first decision needs is read or compiled.
@@ -106,6 +106,7 @@ def search(
                 chosen.config.max_steps,
                 chosen.options(),
                 narrator,
+                chosen.terms,
             )
         status.update("writing")
         strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
