@@ -224,7 +224,7 @@ def load_weights(path: PathLike, name: str) -> Weights:
             raise InputError(f"{path}: {shown(key)} holds NaN or infinite numbers; train anew")
     # Numbers, also where the caller is traced.
     with jax.ensure_compile_time_eval():
-        parameters = {key: jnp.asarray(a) for key, a in arrays.items()}
+        parameters = {key: jax.device_put(a) for key, a in arrays.items()}
     return Weights(ARCHITECTURES[name].network(config), unflatten_dict(parameters, sep="/"), card)
 
 
