@@ -179,7 +179,7 @@ class Bench:
         return jax.jit(label)
 
     def _label(self, label: Callable[..., Any], index: int, noise: str) -> tuple[Look, np.ndarray, float]:
-        key, image = image_of(self.scenes, index, noise, self.seed, self.shelf)
+        key, image = image_of(self.scenes, index, noise, self.seed, shelf_view(shelf=self.shelf), self.shelf)
         seen = jax.block_until_ready((image, is_found(Camera(), self.scenes[index].world)))[1]
         start = time.perf_counter()
         found = jax.block_until_ready(label(key, image, seen))

@@ -158,7 +158,7 @@ def test_the_picture_shows_the_worst_answers(bench, measured, tmp_path):
     assert rows[0].outcome == "not finite"
     ious = [row.iou for row in measured.rows if row.method == "nan"]
     assert [row.iou for row in rows] == sorted(ious)[:3]
-    figure = recognition_figure.worst_figure(bench, rows)
+    figure = recognition_figure.worst_figure([bench], rows)
     lines = [len(axes.lines) for axes in figure.axes]
     # Both views of each: the truth alone where the answer cannot be drawn.
     assert lines == [1, 1, 1, 1, 2, 2]

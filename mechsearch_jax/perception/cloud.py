@@ -95,6 +95,15 @@ def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride:
     return view(camera, (int(low[0]), int(high[0])), (int(low[1]), int(high[1])), stride)
 
 
+def thinned_view(camera: Camera, shelf: Shelf) -> View:
+    """The shelf's part of a camera's image as the networks are shown it, about as fine as that of the default camera.
+
+    Raises:
+      InputError: the camera does not see the shelf.
+    """
+    return shelf_view(camera, shelf, max(1, round(camera.fx * STRIDE / Camera().fx)))
+
+
 class PointCloud(flax.struct.PyTreeNode):
     """Points in the world, a fixed number of them, some of which may be absent.
 

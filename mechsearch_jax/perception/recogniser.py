@@ -20,7 +20,7 @@ from mechsearch_jax.compiled import kept
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.cloud import MARGIN, OVERHANG, STRIDE, View, above_board, shelf_view
+from mechsearch_jax.perception.cloud import MARGIN, OVERHANG, above_board, thinned_view
 from mechsearch_jax.perception.colour import TargetColour
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
@@ -32,8 +32,6 @@ from mechsearch_jax.workspace.target import Target
 
 # Pixels of a 1280 x 720 image that make the target visible.
 VISIBLE_PIXELS = 100
-# The focal length, in pixels, of the images that the networks were trained on.
-_TRAINED_FOCAL = Camera().fx / STRIDE
 
 # Which pixels are the target's, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
 TargetDetector = Callable[[Array], Array]
@@ -105,7 +103,7 @@ class Recogniser:
           InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
         """
         camera = camera or problem.camera
-        _view(camera, problem.shelf)
+        thinned_view(camera, problem.shelf)
         fields = {
             "camera": camera,
             "shelf": problem.shelf,
@@ -165,7 +163,7 @@ class Recogniser:
         _check(self.camera, depth, colour, mask, target_id)
         keys = jax.random.split(key, 3)
         image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
-        camera = _view(self.camera, self.shelf).camera
+        camera = thinned_view(self.camera, self.shelf).camera
         # Compiled on its own, whatever the images that the labels come from.
         found = recognise_image(keys[1:], image, self.shapes, camera, self.shelf, self.target, self.refinement)
         return Observation(found[0], visible, found[1])
@@ -176,17 +174,13 @@ def _as_pytree(slot: Any) -> Any:
     return jax.tree_util.Partial(slot) if jax.tree_util.all_leaves([slot]) else slot
 
 
-def _view(camera: Camera, shelf: Shelf) -> View:
-    return shelf_view(camera, shelf, max(1, round(camera.fx / _TRAINED_FOCAL)))
-
-
 @kept()
 def _labelled(
     recogniser: Recogniser, key: Array, depth: Any, colour: Any, mask: Any, target_id: Any
 ) -> tuple[LabelledImage, Bool[Array, ""]]:
     """The shelf's part of the image with labels, and whether the target is visible in it."""
     camera, shelf = recogniser.camera, recogniser.shelf
-    view = _view(camera, shelf)
+    view = thinned_view(camera, shelf)
     seen = view.of(jnp.asarray(depth, jnp.float32))
     seen = jnp.where(seen > 0.0, seen, jnp.nan)
     points = back_project(view.camera, seen)
