@@ -145,10 +145,10 @@ def bench_recognition(
             total = len(bench.scenes) * len(bench.noises)
             status.update(f"{name}: compiling")
             parts[name] = bench.run(lambda done, name=name, total=total: status.update(f"{name}: {done}/{total}"))
-            measured = recognition.joined(parts, places)
-            # Places take minutes each: what is done is kept.
+            # A place takes minutes: what is done is kept.
             if out is not None:
-                recognition.save_recognition(measured, out)
+                recognition.save_recognition(recognition.joined(parts, places), out)
+        measured = recognition.joined(parts, places)
         if picture is not None:
             status.update("drawing")
             rows = recognition_figure.worst(measured.rows, worst_of, worst)

@@ -26,6 +26,7 @@ from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
+from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -115,6 +116,14 @@ class Recogniser:
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
+
+    @property
+    def trained(self) -> dict[str, TrainedView]:
+        """Which camera and shelf the networks were trained on, by their names, where that is known."""
+        views = {"recognition": self.shapes.view}
+        if isinstance(self.segmenter, NetworkSegmenter):
+            views["segmentation"] = self.segmenter.view
+        return {name: view for name, view in views.items() if view is not None}
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         return (self.segmenter, self.shapes, self.detector), (self.camera, self.shelf, self.target, self.refinement)

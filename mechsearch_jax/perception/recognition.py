@@ -19,6 +19,7 @@ from mechsearch_jax.perception.cloud import draw
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
 from mechsearch_jax.perception.target_pose import target_pose
+from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -81,16 +82,18 @@ class ShapeNetwork(flax.struct.PyTreeNode):
     Attributes:
       parameters: of the network.
       network: static.
+      view: which camera and shelf it was trained on, if that is known; static.
     """
 
     parameters: Any
     network: RecognitionNetwork = flax.struct.field(pytree_node=False)
+    view: TrainedView | None = flax.struct.field(pytree_node=False, default=None)
 
     @classmethod
     def of(cls, weights: Weights | None = None) -> ShapeNetwork:
         """The network with the given weights; with those that ship with the package if None."""
         weights = weights or shipped_weights("recognition")
-        return cls(weights.parameters, cast(RecognitionNetwork, weights.network))
+        return cls(weights.parameters, cast(RecognitionNetwork, weights.network), weights.view)
 
 
 class LabelledImage(flax.struct.PyTreeNode):
