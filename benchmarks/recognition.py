@@ -433,21 +433,19 @@ def shipped_bench(
 def joined(parts: Mapping[str, Measured], places: Mapping[str, Workcell]) -> Measured:
     """Comparisons in several places as one; the rows tell the place as their source.
 
+    Images of different places differ in size: how long they take is told of one place alone.
+
     Args:
       parts: what was measured, by place; at least one, all with the same methods, noises and seed.
       places: whose camera and shelf each is.
     """
-    some, every = next(iter(parts.values())), list(parts.values())
-    times = {
-        name: Time(statistics.median(seconds), tuple(second for part in every for second in part.times[name].seconds))
-        for name in some.times
-        if (seconds := [part.times[name].compile_seconds for part in every])
-    }
+    some = next(iter(parts.values()))
     views = {
         name: {"camera": dataclasses.asdict(places[name].camera), "shelf": dataclasses.asdict(places[name].shelf)}
         for name in parts
     }
-    rows = tuple(row for part in every for row in part.rows)
+    rows = tuple(row for part in parts.values() for row in part.rows)
+    times = some.times if len(parts) == 1 else {}
     return Measured(rows, some.after, times, some.settings | {"places": views}, some.versions)
 
 

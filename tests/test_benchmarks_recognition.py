@@ -263,7 +263,7 @@ def test_every_configuration_is_a_place_of_its_own(monkeypatch, tmp_path, capsys
     assert list(dict.fromkeys(row.source for row in rows)) == list(places)
     assert {name: place["shelf"]["left"] for name, place in value["settings"]["places"].items()} == places
     assert value["settings"]["held_out_scenes"] == 1
-    assert value["seconds_per_object"]["network"]["calls"] == 2
+    assert value["seconds_per_object"] == {}
     assert picture.read_bytes().startswith(b"\x89PNG")
     printed = capsys.readouterr().out
     assert all(f"{name} scenes, clean" in printed for name in places)

@@ -154,7 +154,8 @@ def bench_recognition(
             rows = recognition_figure.worst(measured.rows, worst_of, worst)
             save_figure(recognition_figure.worst_figure(list(benches.values()), rows), picture)
     console.print(recognition_tables(measured))
-    console.print(recognition_times_table(measured))
+    if measured.times:
+        console.print(recognition_times_table(measured))
 
 
 def _places(command: str, files: Sequence[Path], scenarios: Sequence[str]) -> dict[str, Workcell]:

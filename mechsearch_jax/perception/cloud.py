@@ -95,13 +95,24 @@ def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride:
     return view(camera, (int(low[0]), int(high[0])), (int(low[1]), int(high[1])), stride)
 
 
+def middle(shelf: Shelf) -> tuple[float, float, float]:
+    """The middle of the board's top [m]."""
+    return (shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board
+
+
+def density(camera: Camera, shelf: Shelf) -> float:
+    """How many of a camera's pixels there are to a metre across its view at the middle of the board."""
+    return camera.fx / max(float(np.linalg.norm(np.subtract(camera.position, middle(shelf)))), 1e-9)
+
+
 def thinned_view(camera: Camera, shelf: Shelf) -> View:
-    """The shelf's part of a camera's image as the networks are shown it, about as fine as that of the default camera.
+    """The shelf's part of a camera's image as networks are shown it: thinned to about the density of their training.
 
     Raises:
       InputError: the camera does not see the shelf.
     """
-    return shelf_view(camera, shelf, max(1, round(camera.fx * STRIDE / Camera().fx)))
+    finer = density(camera, shelf) / density(Camera(), Shelf())
+    return shelf_view(camera, shelf, max(1, round(STRIDE * finer)))
 
 
 class PointCloud(flax.struct.PyTreeNode):

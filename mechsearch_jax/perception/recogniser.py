@@ -59,8 +59,8 @@ class Recogniser:
     A callable `(key, depth, colour=None, mask=None, target_id=None) -> Observation` for `jit` and `vmap`, and a pytree,
     so that it can be an argument of either. Networks' weights are its leaves, all else is static.
 
-    The image is looked at with the angular resolution that the networks were trained on, about 0.19 degrees a pixel:
-    of a larger image every second pixel, or third, and so on, of the part in which the shelf's space appears.
+    The image is looked at about as densely as in the networks' training, with 400 pixels to a metre at the middle of
+    the board: of a finer one every second pixel, or third, and so on, of the part in which the shelf's space appears.
 
     Attributes:
       camera: what took the images; depth and colour are registered to it.

@@ -16,7 +16,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.networks.segmentation import SegmentationNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import above_board, cloud_of, resample
+from mechsearch_jax.perception.cloud import above_board, cloud_of, middle, resample
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.shelf import Shelf
@@ -190,5 +190,5 @@ class NetworkSegmenter(flax.struct.PyTreeNode):
         """Points where they would be if the shelf stood where it stood in training: the network knows no other."""
         if self.view is None or self.view.shelf == shelf:
             return points
-        shift = np.subtract(self.view.middle, TrainedView(self.view.camera, shelf).middle)
+        shift = np.subtract(middle(self.view.shelf), middle(shelf))
         return points + jnp.asarray(shift, points.dtype).reshape(1, 3)

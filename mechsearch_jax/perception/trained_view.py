@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mechsearch_jax.errors import InputError, shown
-from mechsearch_jax.perception.cloud import thinned_view
+from mechsearch_jax.perception.cloud import density, middle, thinned_view
 from mechsearch_jax.tables import checked
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -32,22 +32,16 @@ class TrainedView:
     camera: Camera = dataclasses.field(default_factory=lambda: thinned_view(Camera(), Shelf()).camera)
     shelf: Shelf = dataclasses.field(default_factory=Shelf)
 
-    @property
-    def middle(self) -> tuple[float, float, float]:
-        """The middle of the board's top [m]."""
-        shelf = self.shelf
-        return (shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board
-
     def numbers(self) -> dict[str, float]:
         """What `TOLERANCES` compares; lengths in metres, angles in degrees, pixels per metre."""
-        x, y, z = np.subtract(self.camera.position, self.middle).tolist()
+        x, y, z = np.subtract(self.camera.position, middle(self.shelf)).tolist()
         distance = float(np.linalg.norm((x, y, z)))
         shelf = self.shelf
         return {
             "distance": distance,
             "azimuth": float(np.degrees(np.arctan2(y, -x))),
             "elevation": float(np.degrees(np.arcsin(z / max(distance, 1e-9)))),
-            "density": self.camera.fx / max(distance, 1e-9),
+            "density": density(self.camera, shelf),
             "depth": shelf.back - shelf.front,
             "width": shelf.left - shelf.right,
             "height": shelf.ceiling - shelf.board,
