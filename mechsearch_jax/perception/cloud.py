@@ -100,9 +100,14 @@ def middle(shelf: Shelf) -> tuple[float, float, float]:
     return (shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board
 
 
+def distance(camera: Camera, shelf: Shelf) -> float:
+    """From the camera to the middle of the board's top [m]; at least a nanometre."""
+    return max(float(np.linalg.norm(np.subtract(camera.position, middle(shelf)))), 1e-9)
+
+
 def density(camera: Camera, shelf: Shelf) -> float:
     """How many of a camera's pixels there are to a metre across its view at the middle of the board."""
-    return camera.fx / max(float(np.linalg.norm(np.subtract(camera.position, middle(shelf)))), 1e-9)
+    return camera.fx / distance(camera, shelf)
 
 
 def thinned_view(camera: Camera, shelf: Shelf) -> View:

@@ -15,7 +15,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import matmul, transform
 from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import draw
+from mechsearch_jax.perception.cloud import distance, draw
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
 from mechsearch_jax.perception.target_pose import target_pose
@@ -45,6 +45,15 @@ def best_hypothesis(hypotheses: Hypotheses, segments: Segments) -> Superquadrics
     )
 
 
+def nearness(camera: Camera, shelf: Shelf) -> float:
+    """The share of its distance from an object at which a camera is told to the network.
+
+    The network makes little of a camera farther away than that of its training. It is told of one that is not, on the
+    same line, from which the points look all but the same.
+    """
+    return min(1.0, distance(Camera(), Shelf()) / distance(camera, shelf))
+
+
 @functools.partial(jax.jit, static_argnames=("network", "camera", "shelf", "count", "config"))
 def recognise(
     key: Key[Array, ""],
@@ -72,7 +81,8 @@ def recognise(
       config: how segments' clouds are drawn; static.
     """
     segments = segment_clouds(key, camera, points, labels, shelf, count, config)
-    hypotheses = apply_network(network, parameters, segments.points, segments.mark, segments.camera)
+    eyes = nearness(camera, shelf or Shelf()) * segments.camera
+    hypotheses = apply_network(network, parameters, segments.points, segments.mark, eyes)
     return best_hypothesis(hypotheses, segments)
 
 
