@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from typing import get_args
 
 import jax
@@ -76,7 +77,8 @@ class Batches:
             not suffice for a single world.
         """
         failures = _Failures(ended)
-        for (target, method), group in _groups(jobs):
+        for target, group in _groups(jobs):
+            method = group[0].method
             simulator = new_simulator(method.engine, method.workcell)
             worlds = min(self.worlds or fitting_worlds(simulator), len(group))
             # Those that take longest come first, so that none of them begins when all others are over.
@@ -114,6 +116,11 @@ class Batches:
         worlds: int,
     ) -> None:
         code = present_code()
+        policy_of, options_of = functools.cache(Method.policy), functools.cache(Method.options)
+
+        def start(job: Job) -> Start:
+            own = job.method
+            return Start(job.scenario, job.seed, policy_of(own), own.config.max_steps, options_of(own))
 
         def take(episodes: Sequence[tuple[int, Episode]]) -> None:
             own = batch.take(episodes)
@@ -121,17 +128,16 @@ class Batches:
                 ended([Row.of_episode(episode, code) for episode in own])
 
         run_episodes(
-            batch.starts(worlds),
-            method.workcell.problem(target, method.config.problem),
-            method.policy(),
+            map(start, batch.jobs(worlds)),
+            method.workcell.problem(target, method.problem_config),
+            policy_of(method),
             simulator,
             worlds,
             take,
             recogniser=recogniser(method.recognition, target),
-            max_steps=method.config.max_steps,
-            options=method.options(),
             at_once=AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE,
             busy=self.busy,
+            protocol=method.terms,
         )
 
 
@@ -151,8 +157,8 @@ class _Batch:
         self._begun: list[Job] = []
         self._over: set[int] = set()
 
-    def starts(self, worlds: int) -> Iterator[Start]:
-        """The jobs as episodes to begin.
+    def jobs(self, worlds: int) -> Iterator[Job]:
+        """The jobs, as their episodes are begun.
 
         Where jobs are run again and are fewer than the worlds, they come several times, since another number of worlds
         would have to be compiled; what the copies come to does not count.
@@ -161,10 +167,9 @@ class _Batch:
             job, begun = self._todo.popleft()
             if begun or self._begin(job):
                 self._begun.append(job)
-                yield Start(job.scenario, job.seed)
+                yield job
         for place in range(worlds - len(self._begun) if self._fill else 0):
-            job = self._begun[place % len(self._begun)]
-            yield Start(job.scenario, job.seed)
+            yield self._begun[place % len(self._begun)]
 
     def take(self, episodes: Sequence[tuple[int, Episode]]) -> list[Episode]:
         """Take note of episodes that ended, by their places; those that count."""
@@ -224,12 +229,13 @@ class _Failures:
             self._ended(rows)
 
 
-def _groups(jobs: Sequence[Job]) -> list[tuple[tuple[Target, Method], list[Job]]]:
-    """The jobs by what is compiled for them."""
-    groups: dict[tuple[Target, Method], list[Job]] = {}
+def _groups(jobs: Sequence[Job]) -> list[tuple[Target, list[Job]]]:
+    """The jobs by what is compiled for them, with their target."""
+    mould = functools.cache(Method.mould)
+    groups: dict[tuple[Target, Hashable], list[Job]] = {}
     for job in jobs:
-        groups.setdefault((target_of(job.scenario, job.method.workcell.target), job.method), []).append(job)
-    return list(groups.items())
+        groups.setdefault((target_of(job.scenario, job.method.workcell.target), mould(job.method)), []).append(job)
+    return [(target, group) for (target, _), group in groups.items()]
 
 
 def fitting_worlds(simulator: Simulator) -> int:

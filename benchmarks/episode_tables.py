@@ -1,14 +1,130 @@
-"""Results of whole episodes on the screen: what share of scenes can be solved, and what a suite lost."""
+"""Results of whole episodes on the screen: rates by variant, what share of scenes can be solved, what a suite lost."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
 
-from rich.console import Group
+from rich.console import Console, Group
+from rich.markup import escape
+from rich.table import Table
 from rich.text import Text
 
 from mechsearch_jax.benchmarks import guard, solvability
+from mechsearch_jax.benchmarks.paired import Difference, by_variant
+from mechsearch_jax.benchmarks.rates import EVENTS, GOALS, Events, Rates, summarise, summarise_events
+from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.benchmarks.tables import plain_table
+from mechsearch_jax.benchmarks.variants import MOST_IN_FULL, VARIANT, Key
+
+
+def print_rates(console: Console, rows: Sequence[Row]) -> None:
+    """Print the rates of rows by variant and number of objects, with what the labels stand for."""
+    print_summary(console, summarise(rows), Key.of(rows))
+
+
+def print_summary(console: Console, summary: Sequence[Rates], key: Key) -> None:
+    """Print rates, and what the labels of variants stand for."""
+    console.print(summary_table(summary, key))
+    console.print("plan, act: seconds per action", style="dim")
+    if key.numbered:
+        console.print()
+        for label, short in key.short.items():
+            console.print(f"{short}  {label}", soft_wrap=True)
+    elif key.common:
+        console.print(f"all {key.common}", style="dim", soft_wrap=True)
+
+
+def rates_table(rows: Sequence[Row]) -> Table:
+    """Rates of success by variant and number of objects; see `summary_table`."""
+    return summary_table(summarise(rows), Key.of(rows))
+
+
+def summary_table(summary: Sequence[Rates], key: Key) -> Table:
+    """Rates of success by group, and mean times per action.
+
+    "paper's" is the share that is graspable with the paper's grasps alone, of the episodes that say so.
+    """
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    columns = list(summary[0].group)
+    for name in columns:
+        _add_group_column(table, name)
+    for name in ("runs", "found", "graspable", "paper's", "retrieved", "actions", "plan", "act"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for rates in _told(summary, key):
+        shares = rates.found, rates.graspable, rates.paper_graspable, rates.retrieved
+        table.add_row(
+            *_group(rates.group, key),
+            str(rates.episodes),
+            *("-" if share is None else f"{share:.2f}" for share in shares),
+            f"{rates.steps:.1f}",
+            f"{rates.planning_seconds:.2f}",
+            f"{rates.simulation_seconds:.2f}",
+            style="bold" if None in rates.group.values() else None,
+        )
+    return table
+
+
+def _add_group_column(table: Table, name: str) -> None:
+    """A column that says what a group has in common; others give way before labels do."""
+    text = name in (VARIANT, "scenario", "policy")
+    header = {"objects": "objs"}.get(name, name.replace("_", " "))
+    table.add_column(header, justify="left" if text else "right", no_wrap=name == VARIANT, overflow="fold")
+
+
+def _group(group: Mapping[str, Hashable], key: Key) -> list[str]:
+    """What a group has in common, as cells; what a cell says is no markup."""
+    found = []
+    for value in group.values():
+        told = f"{value:g}" if isinstance(value, float) else key.short.get(str(value), str(value))
+        found.append("all" if value is None else escape(told))
+    return found
+
+
+def _told(summary: Sequence[Any], key: Key) -> Sequence[Any]:
+    """What is printed: all, or where there are many variants, what is over all numbers of objects."""
+    if len(key.short) <= MOST_IN_FULL or list(summary[0].group) != [VARIANT, "objects"]:
+        return summary
+    return [each for each in summary if each.objects is None]
+
+
+def differences_table(differences: Sequence[Difference], key: Key, baseline: str) -> Table:
+    """How variants differ from one of them over pairs of episodes, in percentage points, each ± a standard error."""
+    table = plain_table(f"points more than {key.short[baseline]}, same episodes")
+    table.add_column("variant", overflow="fold")
+    for name in ("pairs", *GOALS):
+        table.add_column(name, justify="right", no_wrap=True)
+    for label, goals in by_variant(differences).items():
+        cells = []
+        for goal in GOALS:
+            one = goals[goal]
+            error = "" if one.standard_error is None else f" ± {100 * one.standard_error:.1f}"
+            cells.append("-" if one.difference is None else f"{100 * one.difference:+.1f}{error}")
+        table.add_row(escape(key.short[label]), str(goals["found"].pairs), *cells)
+    return table
+
+
+def events_table(rows: Sequence[Row]) -> Table | None:
+    """What happened on the way, by variant and number of objects; None where no row says it."""
+    summary = summarise_events(rows)
+    return events_summary_table(summary, Key.of(rows)) if summary else None
+
+
+def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
+    """What happened on the way, of at least one group."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    for name in summary[0].group:
+        _add_group_column(table, name)
+    for name in ("runs", *EVENTS.values()):
+        table.add_column(name, justify="right")
+    for events in _told(summary, key):
+        table.add_row(
+            *_group(events.group, key),
+            str(events.episodes),
+            *(f"{getattr(events, name):.3f}" for name in EVENTS),
+            style="bold" if events.objects is None else None,
+        )
+    return table
 
 
 def ceiling_table(rows: Sequence[solvability.Row]) -> Group:

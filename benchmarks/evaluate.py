@@ -210,6 +210,26 @@ def evaluate(
         return work.rows
 
 
+def check_code(results: Results, fresh: Sequence[str]) -> None:
+    """Refuse rows of other code than the present one.
+
+    Args:
+      results: of a folder.
+      fresh: the keys of the rows that are to be looked at.
+
+    Raises:
+      InputError: other code ran one of them.
+    """
+    code = present_code()
+    for key in fresh:
+        if (row := results.rows[key]).code != code:
+            other = row.code or "other code, it does not say which"
+            raise InputError(
+                f"{results.folder}: its episodes were run by {other}, this is {code}; give another folder, "
+                "or delete this one to run all of them again"
+            )
+
+
 class _Work:
     """The jobs of this process, and what has become of them."""
 
@@ -304,12 +324,6 @@ class _Work:
         Raises:
           InputError: other code ran some of it.
         """
-        fresh, code = self._results.refresh(), present_code()
+        fresh = self._results.refresh()
         self._fresh += fresh
-        for key in fresh:
-            if (row := self._results.rows[key]).code != code:
-                other = row.code or "other code, it does not say which"
-                raise InputError(
-                    f"{self._results.folder}: its episodes were run by {other}, this is {code}; give another folder, "
-                    "or delete this one to run all of them again"
-                )
+        check_code(self._results, fresh)

@@ -1,4 +1,4 @@
-"""What results say: tables with confidence intervals, failure reasons, and success over the number of actions."""
+"""What results say: rates with confidence intervals, paired differences, failure reasons, and pictures of all that."""
 
 from __future__ import annotations
 
@@ -6,38 +6,34 @@ import collections
 import csv
 import dataclasses
 import io
-import itertools
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
-from mechsearch_jax.benchmarks.rates import EVENTS, Events, Rates, summarise, summarise_events, wilson
-from mechsearch_jax.benchmarks.rows import Row, identity, label_variants
+from mechsearch_jax.benchmarks.films import Film
+from mechsearch_jax.benchmarks.pages import as_html, as_latex, as_markdown
+from mechsearch_jax.benchmarks.paired import PAIRED, Difference, paired
+from mechsearch_jax.benchmarks.rates import Events, Rates, summarise, summarise_events
+from mechsearch_jax.benchmarks.report_figures import curve_figure, curve_rates, rates_figure, success_figure
+from mechsearch_jax.benchmarks.rows import Row, identity, options_of
 from mechsearch_jax.benchmarks.shards import result_tables
+from mechsearch_jax.benchmarks.variants import VARIANT, Key, canonical, label_variants, natural
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, check_writable, replacing
-from mechsearch_jax.viz.drawing import INK, MUTED, save_figure
+from mechsearch_jax.viz.drawing import save_figure
 
-# What a report consists of.
-FILES = ("report.md", "rates.csv", "rates.json", "failures.csv", "events.csv", "success.png")
+# What every report consists of, and what one has that was asked for more; the folder `films.FOLDER` holds pictures.
+FILES = (
+    *("report.md", "report.tex", "report.html", "rates.csv", "rates.json", "failures.csv", "events.csv", "key.csv"),
+    *("success.png", "rates.png"),
+)
+ASKED_FILES = ("curve.csv", "curve.png", "paired.csv")
 # Which action it was is no reason of its own.
 _WHICH_ACTION = re.compile(r" at action \d+$")
-GOALS = {"found": "found", "graspable": "found and graspable", "retrieved": "retrieved"}
-# The shares in `Rates` that a report lists, in its words.
-SHARES = {
-    "found": "found",
-    "graspable": "graspable",
-    "paper_graspable": "with the paper's grasps",
-    "retrieved": "retrieved",
-}
-# Told apart without colour vision too (Okabe and Ito).
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 
 
 def read_tables(paths: Sequence[PathLike]) -> list[Row]:
@@ -60,19 +56,6 @@ def read_tables(paths: Sequence[PathLike]) -> list[Row]:
     if not rows:
         raise InputError("report: there are no episodes in these tables")
     return rows
-
-
-def step_of(row: Row, goal: str) -> int | None:
-    """Number of actions after which an episode reached "found", "graspable" or "retrieved"; None if it never did."""
-    if goal == "retrieved":
-        return row.steps if row.retrieved else None
-    return row.found_step if goal == "found" else row.graspable_step
-
-
-def reached(rows: Sequence[Row], goal: str, actions: int) -> list[int]:
-    """How many episodes had reached a goal after 0, 1, ..., `actions` actions."""
-    after = collections.Counter(step_of(row, goal) for row in rows)
-    return list(itertools.accumulate(after[k] for k in range(actions + 1)))
 
 
 def changed_scenarios(rows: Sequence[Row]) -> list[str]:
@@ -98,7 +81,7 @@ class Failures:
     """How often episodes ended for a reason.
 
     Attributes:
-      method: with the options that differ, as in `Rates`.
+      method: with the options that differ, as `label_variants` has it.
       reason: why there was no retrieval.
       episodes: how many ended so.
       share: of the method's episodes.
@@ -110,96 +93,109 @@ class Failures:
     share: float
 
 
+def reason_of(row: Row) -> str:
+    """Why an episode ended without a retrieval, whichever action it was."""
+    return _WHICH_ACTION.sub("", row.failure or "unknown")
+
+
 def failures(rows: Sequence[Row]) -> list[Failures]:
     """Why episodes ended without a retrieval, the most frequent reason first."""
     groups: dict[str, list[Row]] = {}
     for row, label in zip(rows, label_variants(rows), strict=True):
         groups.setdefault(label, []).append(row)
     result = []
-    for method, group in sorted(groups.items()):
-        told = [row.failure or "unknown" for row in group if not row.retrieved]
-        reasons = collections.Counter(_WHICH_ACTION.sub("", reason) for reason in told)
+    for method in sorted(groups, key=natural):
+        group = groups[method]
+        reasons = collections.Counter(reason_of(row) for row in group if not row.retrieved)
         result += [Failures(method, reason, n, n / len(group)) for reason, n in reasons.most_common()]
     return result
 
 
-def _share(value: float | None, interval: tuple[float, float]) -> str:
-    return "-" if value is None else f"{value:.2f} ({interval[0]:.2f} to {interval[1]:.2f})"
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """What a report is to say beside what every report does.
+
+    Attributes:
+      rows: columns that rates are told by, instead of the variant and the number of objects.
+      curve: one column or two: rates over the first, with a line for each value of the second.
+      baseline: a variant, as `Key.named` takes it, that all others are compared with.
+      paired: columns that make two episodes a pair.
+    """
+
+    rows: Sequence[str] = ()
+    curve: Sequence[str] = ()
+    baseline: str | None = None
+    paired: Sequence[str] = PAIRED
 
 
-def _objects(rates: Rates | Events) -> str:
-    return "all" if rates.objects is None else str(rates.objects)
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What rows say.
+
+    Attributes:
+      episodes: the rows.
+      key: of their variants.
+      rates: by the columns that were asked for, by default the variant and the number of objects.
+      variants: by variant and number of objects.
+      events: likewise.
+      reasons: why episodes failed.
+      curve_columns, curve: rates over a column; empty if not asked for.
+      baseline, differences: paired differences from that variant, its label; None and empty if not asked for.
+      films: pictures of single episodes.
+    """
+
+    episodes: Sequence[Row]
+    key: Key
+    rates: Sequence[Rates]
+    variants: Sequence[Rates]
+    events: Sequence[Events]
+    reasons: Sequence[Failures]
+    curve_columns: Sequence[str]
+    curve: Sequence[Rates]
+    baseline: str | None
+    differences: Sequence[Difference]
+    films: Sequence[Film] = ()
+
+    @classmethod
+    def of(cls, rows: Sequence[Row], asked: Asked | None = None) -> Report:
+        """The report of at least one row.
+
+        Raises:
+          InputError: there is no such column or variant, or nothing to compare the baseline with.
+        """
+        asked, key = asked or Asked(), Key.of(rows)
+        baseline = None if asked.baseline is None else key.named(asked.baseline)
+        by_variant = summarise(rows)
+        return cls(
+            episodes=rows,
+            key=key,
+            rates=summarise(rows, asked.rows) if asked.rows else by_variant,
+            variants=by_variant,
+            events=summarise_events(rows),
+            reasons=failures(rows),
+            curve_columns=[canonical(name) for name in asked.curve],
+            curve=curve_rates(rows, asked.curve) if asked.curve else [],
+            baseline=baseline,
+            differences=[] if baseline is None else paired(rows, baseline, asked.paired),
+        )
 
 
-def _row(cells: Sequence[str]) -> str:
-    # A bar would end the cell.
-    return "| " + " | ".join(" ".join(cell.replace("|", "\\|").split()) for cell in cells) + " |"
-
-
-def markdown(
-    rows: Sequence[Row], summary: Sequence[Rates], reasons: Sequence[Failures], events: Sequence[Events]
-) -> str:
-    """The report as text, of the rows and what `summarise`, `failures` and `summarise_events` make of them."""
-    names = ("method", "objects", "episodes", "errors", *SHARES.values(), "actions", "planning [s]", "simulation [s]")
-    lines = [
-        "# Results",
-        "",
-        f"{len(rows)} episodes. Shares with Wilson's 95% confidence interval; actions are the mean number per episode, "
-        "attempts to take the target out among them; times are means per action. An episode that ended in an error of "
-        "the program counts as a failure. *With the paper's grasps*: graspable with those alone before the episode "
-        "ended, of the episodes that say so.",
-        "",
-        *([told_of_changes(rows), ""] if changed_scenarios(rows) else []),
-        _row(names),
-        _row(["---"] * len(names)),
-    ]
-    for rates in summary:
-        cells = [rates.method, _objects(rates), str(rates.episodes), str(rates.errors)]
-        cells += [_share(getattr(rates, goal), getattr(rates, f"{goal}_interval")) for goal in SHARES]
-        cells += [f"{v:.2f}" for v in (rates.steps, rates.planning_seconds, rates.simulation_seconds)]
-        lines.append(_row(cells))
-    lines += ["", "## Why episodes failed", ""]
-    if reasons:
-        lines += [_row(("method", "reason", "episodes", "share")), _row(["---"] * 4)]
-        lines += [_row((f.method, f.reason, str(f.episodes), f"{f.share:.2f}")) for f in reasons]
-    else:
-        lines.append("None did.")
-    lines += ["", "## What happened on the way", "", *_events(events)]
-    lines += ["", "## Success over the number of actions", "", "![Success over the number of actions](success.png)", ""]
-    return "\n".join(lines)
-
-
-def _events(summary: Sequence[Events]) -> list[str]:
-    """What happened on the way, as lines of the report."""
-    if not summary:
-        return ["These episodes do not say: an earlier version ran them, or they ended in errors."]
-    names = ("method", "objects", "episodes", *EVENTS.values())
-    lines = [
-        "Shares of the episodes that say so; *of all looks* is the share of the steps before the target was found at "
-        "which f ruled out its true pose.",
-        "",
-        _row(names),
-        _row(["---"] * len(names)),
-    ]
-    for events in summary:
-        shares = [f"{getattr(events, name):.3f}" for name in EVENTS]
-        lines.append(_row([events.method, _objects(events), str(events.episodes), *shares]))
-    return lines
-
-
-def _flat(rates: Rates | Events) -> dict[str, object]:
+def _flat(value: Any) -> dict[str, Any]:
     """Rates or events with one value a column."""
-    flat: dict[str, object] = {}
-    for name, value in dataclasses.asdict(rates).items():
-        if isinstance(value, tuple):
-            goal = name.removesuffix("_interval")
-            flat |= {f"{goal}_low": value[0], f"{goal}_high": value[1]}
+    flat: dict[str, Any] = {name: "all" if part is None else part for name, part in value.group.items()}
+    for field in dataclasses.fields(value):
+        part = getattr(value, field.name)
+        if field.name == "group":
+            continue
+        if field.name.endswith("_interval"):
+            goal, (low, high) = field.name.removesuffix("_interval"), part or (None, None)
+            flat |= {f"{goal}_low": low, f"{goal}_high": high}
         else:
-            flat[name] = "all" if name == "objects" and value is None else value
+            flat[field.name] = part
     return flat
 
 
-def _csv(lines: Sequence[dict[str, object]], names: Sequence[str]) -> str:
+def _csv(lines: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, names, lineterminator="\n")
     writer.writeheader()
@@ -207,73 +203,97 @@ def _csv(lines: Sequence[dict[str, object]], names: Sequence[str]) -> str:
     return text.getvalue()
 
 
-def _curve(axes: Axes, rows: Sequence[Row], goal: str, actions: int, colour: str, label: str) -> None:
-    counts = reached(rows, goal, actions)
-    x = np.arange(actions + 1)
-    low, high = np.array([wilson(n, len(rows)) for n in counts]).T
-    axes.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
-    axes.plot(x, np.array(counts) / len(rows), color=colour, marker="o", markersize=3, label=label)
+def _names(kind: type, columns: Sequence[str]) -> list[str]:
+    """The columns of a table of rates or events."""
+    names: list[str] = []
+    for field in dataclasses.fields(kind):
+        goal = field.name.removesuffix("_interval")
+        names += [f"{goal}_low", f"{goal}_high"] if goal != field.name else [field.name]
+    return [*columns, *(name for name in names if name != "group")]
 
 
-def success_figure(rows: Sequence[Row]) -> Figure:
-    """Share of episodes that reached each goal over the number of actions: a column for each number of objects."""
-    groups: dict[tuple[str, int], list[Row]] = {}
-    for row, label in zip(rows, label_variants(rows), strict=True):
-        groups.setdefault((label, row.objects), []).append(row)
-    variants, objects = (sorted(set(values)) for values in zip(*groups, strict=True))
-    actions = max(max(row.steps for row in rows), 1)
-    size = (2.6 * len(objects) + 1.2, 2.2 * len(GOALS) + 0.9 + 0.2 * len(variants))
-    figure = Figure(figsize=(max(size[0], 5.0), size[1]), layout="constrained")
-    grid = figure.subplots(len(GOALS), len(objects), sharex=True, sharey=True, squeeze=False)
-    for i, (goal, title) in enumerate(GOALS.items()):
-        for j, count in enumerate(objects):
-            axes: Axes = grid[i][j]
-            # Not found out anew for every one of a hundred curves.
-            axes.set(xlim=(-0.05 * actions, 1.05 * actions), ylim=(-0.03, 1.03))
-            for k, variant in enumerate(variants):
-                if group := groups.get((variant, count)):
-                    _curve(axes, group, goal, actions, COLOURS[k % len(COLOURS)], variant)
-            axes.grid(color=MUTED, alpha=0.2)
-            axes.spines[["top", "right"]].set_visible(False)
-            axes.tick_params(colors=INK, labelsize=8)
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-            if i == 0:
-                axes.set_title(f"{count} object{'' if count == 1 else 's'}", fontsize=10, color=INK)
-            if i == len(GOALS) - 1:
-                axes.set_xlabel("actions", fontsize=9, color=INK)
-            if j == 0:
-                axes.set_ylabel(f"share {title}", fontsize=9, color=INK)
-    handles = {line.get_label(): line for axes in grid.flat for line in axes.get_lines()}
-    shown = [handles[variant] for variant in variants]
-    figure.legend(shown, variants, loc="outside lower center", ncols=1, frameon=False, fontsize=8)
-    return figure
+def _key_csv(report: Report) -> str:
+    """A line for each variant: its labels, and every option."""
+    known: dict[str, dict[str, Any]] = {}
+    for label, row in zip(label_variants(report.episodes), report.episodes, strict=True):
+        if label not in known:
+            known[label] = {name: _cell(value) for name, value in options_of(row).items()}
+    names = list(dict.fromkeys(name for options in known.values() for name in options))
+    lines = [{"label": short, VARIANT: label, **known[label]} for label, short in report.key.short.items()]
+    return _csv(lines, ["label", VARIANT, *names])
 
 
-def write_report(rows: Sequence[Row], out: PathLike) -> None:
-    """Write a report, the files `FILES`, into a folder.
+def _cell(value: Any) -> Hashable:
+    return " ".join(map(str, value)) if isinstance(value, list) else value
+
+
+def _texts(report: Report) -> dict[str, str]:
+    """The files that hold figures, by their names."""
+    flat, events = [_flat(rates) for rates in report.rates], [_flat(each) for each in report.events]
+    reasons = [dataclasses.asdict(each) for each in report.reasons]
+    curve = [_flat(each) for each in report.curve]
+    differences = [dataclasses.asdict(each) for each in report.differences]
+    value = {"rates": flat, "failures": reasons, "events": events, "key": dict(report.key.short)}
+    value |= {"curve": curve} if curve else {}
+    value |= {"baseline": report.baseline, "paired": differences} if differences else {}
+    usual = list(report.variants[0].group)
+    files = {
+        "rates.csv": _csv(flat, _names(Rates, list(report.rates[0].group))),
+        "rates.json": json.dumps(value, indent=1, allow_nan=False) + "\n",
+        "failures.csv": _csv(reasons, [field.name for field in dataclasses.fields(Failures)]),
+        "events.csv": _csv(events, _names(Events, usual)),
+        "key.csv": _key_csv(report),
+    }
+    if curve:
+        files["curve.csv"] = _csv(curve, _names(Rates, list(report.curve[0].group)))
+    if differences:
+        files["paired.csv"] = _csv(differences, [field.name for field in dataclasses.fields(Difference)])
+    return files
+
+
+def _pictures(report: Report) -> dict[str, Callable[[], Figure]]:
+    """What draws the files that are pictures, by their names."""
+    draws: dict[str, Callable[[], Figure]] = {
+        "success.png": lambda: success_figure(report.episodes, report.baseline),
+        "rates.png": lambda: rates_figure(report.variants, report.key),
+    }
+    if report.curve:
+        draws["curve.png"] = lambda: curve_figure(report.curve, report.curve_columns, report.key.short)
+    return draws
+
+
+def write_report(rows: Sequence[Row] | Report, out: PathLike, told: Callable[[str], None] = lambda file: None) -> None:
+    """Write a report, the files `FILES` and of `ASKED_FILES` what was asked for, into a folder.
 
     Args:
-      rows: at least one.
-      out: the folder; files of these names are replaced.
+      rows: at least one; or what they say.
+      out: the folder; files of these names are replaced or removed.
+      told: of each file that is begun.
 
     Raises:
       InputError: the folder cannot be written to.
     """
+    from mechsearch_jax.benchmarks.report_page import blocks
+
     check_writable(out)
     folder = Path(out)
-    figure = success_figure(rows)
-    summary, why, happened = summarise(rows), failures(rows), summarise_events(rows)
-    flat, events = [_flat(rates) for rates in summary], [_flat(each) for each in happened]
-    reasons = [dataclasses.asdict(f) for f in why]
-    texts = (
-        markdown(rows, summary, why, happened),
-        _csv(flat, list(flat[0])),
-        json.dumps({"rates": flat, "failures": reasons, "events": events}, indent=1, allow_nan=False) + "\n",
-        _csv(reasons, [field.name for field in dataclasses.fields(Failures)]),
-        _csv(events, [field.name for field in dataclasses.fields(Events)]),
-    )
-    *written, picture = (folder / name for name in FILES)
-    for path, text in zip(written, texts, strict=True):
-        with replacing(path) as file:
+    report = rows if isinstance(rows, Report) else Report.of(rows)
+    images: dict[str, bytes] = {}
+    for name, draw in _pictures(report).items():
+        told(name)
+        save_figure(draw(), folder / name)
+        images[name] = (folder / name).read_bytes()
+    for film in report.films:
+        if film.drawn:
+            images[film.file] = (folder / film.file).read_bytes()
+    page = blocks(report)
+    texts = _texts(report)
+    texts |= {"report.md": as_markdown(page), "report.tex": as_latex(page)}
+    texts["report.html"] = as_html(page, "Results", images)
+    for name, text in texts.items():
+        told(name)
+        with replacing(folder / name) as file:
             file.write(text.encode())
-    save_figure(figure, picture)
+    for name in ASKED_FILES:
+        if name not in texts and name not in images:
+            (folder / name).unlink(missing_ok=True)

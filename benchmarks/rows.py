@@ -218,6 +218,7 @@ EPISODE = "episode"
 _MORE = {
     **{option.name: _column(option.type) for option in PLANNER_OPTIONS if option.name not in _FIELDS},
     "simulator": pyarrow.string(),
+    "protocol": pyarrow.string(),
     EPISODE: pyarrow.string(),
 }
 SCHEMA = pyarrow.schema([*_FIELDS.items(), *_MORE.items()])
@@ -272,38 +273,11 @@ def _digest(known: str) -> str:
     return hashlib.sha256(known.encode()).hexdigest()
 
 
-def _options(row: Row) -> dict[str, Any]:
+def options_of(row: Row) -> dict[str, Any]:
     """Every option of a row that is known."""
     known = {name: getattr(row, name) for name in OPTIONS}
     actions = row.actions.split(ACTIONS_BETWEEN)
     return {**present_options(json.loads(row.configuration or "{}")), **known, "actions": actions}
-
-
-_variant = operator.attrgetter("configuration", *OPTIONS)
-
-
-def label_variants(rows: Sequence[Row]) -> list[str]:
-    """For each row the policy and those options that are not the same in all rows: "search-for-grasp, gamma 0.5".
-
-    Rows that ran under different options never share a label.
-    """
-    variants = list(map(_variant, rows))
-    # Thousands of rows have the same few options.
-    each = {variant: _options(row) for variant, row in dict(zip(variants, rows, strict=True)).items()}
-    names = sorted({name for options in each.values() for name in options} - {"policy"})
-    differing = [name for name in names if len({json.dumps(options.get(name)) for options in each.values()}) > 1]
-
-    def said(options: dict[str, Any], name: str) -> str:
-        value = options.get(name, "unknown")
-        values = value if isinstance(value, list) else [value]
-        shown = "/".join(f"{v:g}" if isinstance(v, float) else str(v) for v in values)
-        return f"{name.replace('_', ' ')} {shown}"
-
-    labels = {
-        variant: ", ".join([str(options["policy"]), *(said(options, name) for name in differing)])
-        for variant, options in each.items()
-    }
-    return [labels[variant] for variant in variants]
 
 
 def read_rows(path: PathLike) -> list[Row]:

@@ -1,4 +1,4 @@
-"""Results on the screen: rates of success, timings, and the progress of many episodes."""
+"""Results on the screen: timings, scores, and the progress of many episodes."""
 
 from __future__ import annotations
 
@@ -14,54 +14,9 @@ from mechsearch_jax.benchmarks import push, scenes, segmentation
 from mechsearch_jax.benchmarks.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.bench import Timing
 from mechsearch_jax.benchmarks.evaluate import Tally
-from mechsearch_jax.benchmarks.rates import EVENTS, summarise, summarise_events
 from mechsearch_jax.benchmarks.recognition import SHARES, Measured
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.envs import scene_sets
-
-
-def rates_table(rows: Sequence[Row]) -> Table:
-    """Rates of success by method and number of objects, and mean times per action.
-
-    "paper's" is the share that is graspable with the paper's grasps alone, of the episodes that say so.
-    """
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    table.add_column("method", no_wrap=True)
-    for name in ("objects", "runs", "found", "graspable", "paper's", "retrieved", "actions", "plan s", "act s"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for rates in summarise(rows):
-        shares = rates.found, rates.graspable, rates.paper_graspable, rates.retrieved
-        table.add_row(
-            rates.method,
-            "all" if rates.objects is None else str(rates.objects),
-            str(rates.episodes),
-            *("-" if share is None else f"{share:.2f}" for share in shares),
-            f"{rates.steps:.1f}",
-            f"{rates.planning_seconds:.2f}",
-            f"{rates.simulation_seconds:.2f}",
-            style="bold" if rates.objects is None else None,
-        )
-    return table
-
-
-def events_table(rows: Sequence[Row]) -> Table | None:
-    """What happened on the way, by method and number of objects; None where no row says it."""
-    summary = summarise_events(rows)
-    if not summary:
-        return None
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    table.add_column("method", no_wrap=True)
-    for name in ("objects", "runs", *EVENTS.values()):
-        table.add_column(name, justify="right", no_wrap=True)
-    for events in summary:
-        table.add_row(
-            events.method,
-            "all" if events.objects is None else str(events.objects),
-            str(events.episodes),
-            *(f"{getattr(events, name):.3f}" for name in EVENTS),
-            style="bold" if events.objects is None else None,
-        )
-    return table
 
 
 def timing_table(timing: Timing) -> Table:

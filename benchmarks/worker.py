@@ -1,6 +1,7 @@
 """One worker process of `evaluate`: reads jobs from its input, one JSON line each, and answers with one line each.
 
-It is started as `python -m mechsearch_jax.benchmarks.worker` and ends when its input does.
+It is started as `python -m mechsearch_jax.benchmarks.worker` and ends when its input does, such as when what started it
+was killed.
 """
 
 from __future__ import annotations
@@ -8,7 +9,10 @@ from __future__ import annotations
 import functools
 import json
 import os
+import queue
 import sys
+import threading
+from collections.abc import Iterable, Iterator
 from typing import TextIO
 
 from mechsearch_jax.benchmarks.evaluate import present_code
@@ -42,12 +46,13 @@ class Worker:
         episode = run_episode(
             seed,
             scenario,
-            self._problem(workcell, target, method.config.problem),
+            self._problem(workcell, target, method.problem_config),
             self._policy(method),
             self._simulator(workcell),
             recogniser(method.recognition, target),
             method.config.max_steps,
             method.options(),
+            protocol=method.terms,
         )
         return Row.of_episode(episode, present_code())
 
@@ -56,7 +61,21 @@ def _simulator(workcell: Workcell) -> NativeSimulator:
     return NativeSimulator(shelf=workcell.shelf, camera=workcell.camera)
 
 
-def serve(jobs: TextIO, answers: TextIO) -> None:
+def until_closed(stream: TextIO) -> Iterator[str]:
+    """The lines of a stream, read ahead. When it ends the process does, whatever it is doing: nobody waits for it."""
+    waiting: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def read() -> None:
+        for line in stream:
+            waiting.put(line)
+        os._exit(0)
+
+    threading.Thread(target=read, daemon=True).start()
+    while True:
+        yield waiting.get()
+
+
+def serve(jobs: Iterable[str], answers: TextIO) -> None:
     """Answer every job with its row, or with the reason why there is none."""
     worker = Worker()
     for line in jobs:
@@ -76,7 +95,7 @@ def main() -> None:
     keep_compilations()
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
-    serve(sys.stdin, answers)
+    serve(until_closed(sys.stdin), answers)
 
 
 if __name__ == "__main__":

@@ -17,13 +17,17 @@ RENAMED: Mapping[str, str] = {
 }
 # What options that files of earlier versions do not hold were then.
 EARLIER: Mapping[str, Any] = {
+    "protocol": "strict",
     "push_model": "quasi-static",
     "topple_charge": 0.0,
     "crowding_weight": 0.02,
+    "hindrance_weight": 1.0,
     "draws": 1,
     "move_again": False,
     "move_target": False,
     "predicted_collisions": False,
+    "later_draws": "predicted",
+    "later_placements": True,
     "avoid_unseen": True,
     "cell_reach": [0.5],
     "closer_look": 0,

@@ -32,18 +32,21 @@ class Choice(flax.struct.PyTreeNode):
     Attributes:
       action, cost, predicted_cost: of the `Decision`.
       sequences: how many sequences it was chosen from.
+      others: the first actions of all of these, the best first, of kind NONE after the last; None where not known.
     """
 
     action: Action
     cost: jax.Array
     predicted_cost: jax.Array
     sequences: jax.Array
+    others: Action | None = None
 
 
 def chosen(decision: Decision) -> Choice:
     """What a decision comes down to."""
     count = jnp.sum(jnp.isfinite(decision.sequences.value))
-    return Choice(decision.action, decision.cost, decision.predicted_cost, count)
+    others = jax.tree.map(lambda a: a[:, 0], decision.sequences.actions)
+    return Choice(decision.action, decision.cost, decision.predicted_cost, count, others)
 
 
 def takes_target(choice: Choice) -> bool:
@@ -143,8 +146,7 @@ def record(
     if choice is not None:
         action, cost = record_action(choice.action), float(choice.cost)
         if not takes_target(choice):
-            # A policy need not say what it expects.
-            predicted = float(choice.predicted_cost) if np.isfinite(choice.predicted_cost) else None
+            predicted = _expected(choice)
             sequences = int(choice.sequences)
     return Step(
         belief_size=belief_size,
@@ -161,6 +163,11 @@ def record(
         restarts=restarts,
         paper_graspable=verdict.paper_graspable,
     )
+
+
+def _expected(choice: Choice) -> float | None:
+    """The cost that is expected after a choice, if any is: a policy need not say."""
+    return float(choice.predicted_cost) if np.isfinite(choice.predicted_cost) else None
 
 
 class EpisodeLog:
@@ -212,6 +219,12 @@ class EpisodeLog:
             self._paper_graspable_step = self._index
         self.steps.append(step)
         return step
+
+    def took(self, choice: Choice) -> None:
+        """Note that another action was executed than the one that was decided upon."""
+        self.steps[-1] = dataclasses.replace(
+            self.steps[-1], action=record_action(choice.action), predicted_cost=_expected(choice)
+        )
 
     def act(self, result: Result | None, trouble: str | None, timings: dict[str, float]) -> bool:
         """Note what came of the decision; whether the episode ends with it.

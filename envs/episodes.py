@@ -25,12 +25,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, UInt
 
-from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.compile_clock import CompileClock
 from mechsearch_jax.envs.episode_log import (
     Choice,
     EpisodeLog,
+    Result,
     distrust,
     overflow_trouble,
     record,
@@ -39,6 +39,7 @@ from mechsearch_jax.envs.episode_log import (
     target_trouble,
 )
 from mechsearch_jax.envs.outcome import Outcome
+from mechsearch_jax.envs.protocols import ALL_FAILED, EpisodeProtocol, Execution, Strict
 from mechsearch_jax.envs.records import Episode, Step
 from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.envs.slots import ManySlots, OneSlot, Slots
@@ -50,6 +51,8 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.target import Target
+
+STRICT = Strict()
 
 
 def target_of(scenario: Scenario, usual: Target | None = None) -> Target:
@@ -69,10 +72,15 @@ class Start:
     Attributes:
       scenario: where everything stands at the start.
       seed: of the planner's and of the environment's random numbers, which are independent of each other.
+      policy, max_steps, options: where they are not None, instead of those of the run. With several slots the policies
+        of a run may differ in numbers alone; see `policy_numbers`.
     """
 
     scenario: Scenario
     seed: int
+    policy: Policy | None = None
+    max_steps: int | None = None
+    options: Mapping[str, Any] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,18 +133,31 @@ def run_episode(
     max_steps: int = 10,
     options: Mapping[str, Any] | None = None,
     watcher: Watcher | None = None,
+    protocol: EpisodeProtocol = STRICT,
 ) -> Episode:
     """Run one episode to its end, whatever that is.
 
     Args:
       seed: see `Start`.
       scenario: where everything stands at the start.
-      problem, policy, simulator, recogniser, max_steps, options, watcher: see `run_episodes`. Neither the policy nor
-        the recogniser need be traceable.
+      problem, policy, simulator, recogniser, max_steps, options, watcher, protocol: see `run_episodes`. Neither the
+        policy nor the recogniser need be traceable.
     """
     found: list[tuple[int, Episode]] = []
     start = Start(scenario, seed)
-    run_episodes([start], problem, policy, simulator, 1, found.extend, recogniser, max_steps, options, watcher=watcher)
+    run_episodes(
+        [start],
+        problem,
+        policy,
+        simulator,
+        1,
+        found.extend,
+        recogniser,
+        max_steps,
+        options,
+        watcher=watcher,
+        protocol=protocol,
+    )
     return found[0][1]
 
 
@@ -153,6 +174,7 @@ def run_episodes(
     at_once: int = 64,
     busy: Callable[[str, int], None] = lambda stage, episodes: None,
     watcher: Watcher | None = None,
+    protocol: EpisodeProtocol = STRICT,
 ) -> None:
     """Run episodes to their ends, many at a time.
 
@@ -169,9 +191,11 @@ def run_episodes(
       at_once: how many slots look or decide in one computation.
       busy: told of every stage ("recognise", "plan", "judge", "simulate"), with the number of slots in it.
       watcher: told of every step; for one slot only.
+      protocol: how they are run and judged. Who gives another has built the problem by `protocol.problem`.
 
     Raises:
-      InputError: there is no slot, a watcher is given for several, or the policy decides on an unknown kind of action.
+      InputError: there is no slot, a watcher is given for several, the policy decides on an unknown kind of action, or
+        policies differ in more than numbers.
     """
     if slots < 1:
         raise InputError(f"run_episodes: {slots} slots run nothing; give at least 1")
@@ -181,14 +205,16 @@ def run_episodes(
         return
     if watcher is not None and len(first) > 1:
         raise InputError(f"run_episodes: a watcher looks on at one slot, not at {len(first)}")
-    count = len(first)
+    count, recogniser = len(first), protocol.recogniser(recogniser)
     world = simulator.reset([start.scenario for _, start in first])
     if count == 1:
         known: Slots = OneSlot(problem, policy, recogniser)
     else:
         known = ManySlots(problem, policy, recogniser, world, min(at_once, count))
     with CompileClock() as compiling:
-        pool = _EpisodePool(simulator, problem, known, count, _Run(max_steps, options or {}, busy, watcher, compiling))
+        pool = _EpisodePool(
+            simulator, problem, known, count, _Run(max_steps, options or {}, busy, watcher, compiling, protocol)
+        )
         pool.begin(dict(enumerate(first)))
         while pool.running:
             done = pool.round()
@@ -209,6 +235,7 @@ class _Run:
     told: Callable[[str, int], None]
     watcher: Watcher | None
     compiling: CompileClock
+    protocol: EpisodeProtocol
 
     def busy(self, stage: str, episodes: int) -> None:
         """Say that a stage begins."""
@@ -279,10 +306,11 @@ class _EpisodePool:
         """Begin episodes, with their places among all, in slots that are free and whose worlds are theirs."""
         fresh = np.zeros(len(self._slots), bool)
         for row, (place, start) in starts.items():
-            self._slots[row] = _Slot(place, start, EpisodeLog(self._run.max_steps))
+            self._slots[row] = _Slot(place, start, EpisodeLog(start.max_steps or self._run.max_steps))
             self._keys[row] = jax.random.key_data(jax.random.split(jax.random.key(start.seed)))
             fresh[row] = True
         self._known.forget(fresh)
+        self._known.decide_by({row: start.policy for row, (_, start) in starts.items()})
 
     def round(self) -> list[tuple[int, tuple[int, Episode]]]:
         """Look, decide and act once in all slots; the slots whose episodes ended, with their places and records."""
@@ -303,9 +331,10 @@ class _EpisodePool:
             choices = self._known.decide(planner_keys, asked)
         choices = {r: choice for r, choice in choices.items() if not logs[r].last or takes_target(choice)}
         with clock("judge", sought):
-            verdicts = self._known.judge(world, sought)
+            verdicts = self._run.protocol.judge(self._known, world, sought)
 
         trouble |= {r: reason for r, choice in choices.items() if (reason := distrust(choice))}
+        trouble |= self._run.protocol.ends(self._problem.shelf, world, list(logs), verdicts, choices)
         for r, log in logs.items():
             # Where an object has left the board, an episode goes on for what else is to be known of it, no further.
             verdict = verdicts.get(r, Verdict())
@@ -332,30 +361,34 @@ class _EpisodePool:
         moment = self._moment(choices)
         if self._run.watcher is not None and moment is not None and acting:
             self._run.watcher.decided(moment)
-        outcome: Outcome | None = None
+        executed: Execution | None = None
         with clock("simulate", acting):
             if acting:
-                active = np.isin(np.arange(len(self._slots)), acting)
-                actions = _actions(len(self._slots), {r: choices[r].action for r in acting})
-                outcome = jax.device_get(self._simulator.execute(actions, jnp.asarray(active)))
+                executed = self._run.protocol.execute(self._simulator, {r: choices[r] for r in acting})
+                taken = executed.choices
+                others = {r: choice for r, choice in taken.items() if choice is not choices[r]}
+                self._known.took({r: choice.action for r, choice in others.items()})
+                for r, choice in others.items():
+                    running[r].log.took(choice)
 
         done: list[tuple[int, tuple[int, Episode]]] = []
         for r, slot in running.items():
             result, why = None, trouble.get(r)
-            if outcome is not None and r in acting:
-                result, why = result_of(choices[r], outcome, r), overflow_trouble(outcome, r)
+            if executed is not None and r in acting:
+                result, why = _result(executed, r)
             if slot.log.act(result, why, clock.timings(r)):
                 done.append((r, (slot.place, slot.log.episode(slot.start.scenario, self._options(slot.start)))))
                 self._slots[r] = None
         if self._run.watcher is not None and moment is not None:
-            told = None if outcome is None else jax.tree.map(lambda a: a[0], outcome)
+            told = None if executed is None else jax.tree.map(lambda a: a[0], executed.outcome)
             self._run.watcher.acted(dataclasses.replace(moment, record=running[0].log.steps[-1], outcome=told))
         return done
 
     def _options(self, start: Start) -> dict[str, Any]:
         """The options of an episode, as its record keeps them."""
         engine, shape = self._simulator.engine, self._problem.target.shape
-        return {**self._run.options, "target": shape, "simulator": engine, "seed": start.seed}
+        told = self._run.options if start.options is None else start.options
+        return {**told, "target": shape, "simulator": engine, "seed": start.seed}
 
     def _moment(self, choices: Mapping[int, Choice]) -> Moment | None:
         """What is known in a single slot."""
@@ -374,10 +407,8 @@ def _keys_at(data: UInt[Array, "slots 2 *words"], steps: Int[Array, " slots"]) -
     return fold(keys[:, 0], steps), fold(keys[:, 1], steps)
 
 
-def _actions(count: int, chosen: Mapping[int, Action]) -> Action:
-    """What every slot does; nothing where nothing was decided."""
-    actions = jax.tree.map(lambda a: np.broadcast_to(a, (count, *np.shape(a))).copy(), jax.device_get(no_action()))
-    for row, action in chosen.items():
-        for name in Action.__dataclass_fields__:
-            getattr(actions, name)[row] = getattr(action, name)
-    return jax.tree.map(jnp.asarray, actions)
+def _result(executed: Execution, row: int) -> tuple[Result | None, str | None]:
+    """What came of what was executed in a slot, and why its episode cannot go on, if so."""
+    if row in executed.stuck:
+        return None, ALL_FAILED
+    return result_of(executed.choices[row], executed.outcome, row), overflow_trouble(executed.outcome, row)

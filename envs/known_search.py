@@ -249,7 +249,7 @@ class _Running:
 
     def _judge_one(self, world: World, active: Bool[Array, ""]) -> Judgement:
         search = self._search
-        return judge(self._problem, search.objective, search.config.crowding_weight, world, active)
+        return judge(self._problem, search.objective, search.config.weights, world, active)
 
     def _judged(self, worlds: Sequence[World]) -> list[Judgement]:
         """Judge worlds, so many at once as are simulated at once."""

@@ -15,6 +15,7 @@ from mechsearch_jax.envs.world import World
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import no_hits, pairs
 from mechsearch_jax.planner import Belief, Problem, Search, Sequences, initial_belief
+from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.found_target import found_grasps, found_hits
 from mechsearch_jax.planner.objective import Objective, SearchForGrasp
 from mechsearch_jax.planner.retrieval import GraspChoice, best_grasps
@@ -25,9 +26,9 @@ from mechsearch_jax.planner.rollout import Rollout, plan
 class InFullView(SearchForGrasp):
     """How far the target is from graspable where it is known to be: it may stand hidden."""
 
-    def cost(self, problem, belief, exists, target_at, hits, crowding_weight) -> Float[Array, ""]:
+    def cost(self, problem, belief, exists, target_at, hits, weights) -> Float[Array, ""]:
         nowhere_hidden = jnp.zeros_like(exists)
-        return super().cost(problem, belief, nowhere_hidden, target_at, hits, crowding_weight)
+        return super().cost(problem, belief, nowhere_hidden, target_at, hits, weights)
 
 
 class Judgement(flax.struct.PyTreeNode):
@@ -50,15 +51,13 @@ class Judgement(flax.struct.PyTreeNode):
 
 
 @functools.partial(jax.jit, static_argnames=("objective",))
-def judge(
-    problem: Problem, objective: Objective, weight: Array | float, world: World, active: Bool[Array, ""]
-) -> Judgement:
+def judge(problem: Problem, objective: Objective, weights: Weights, world: World, active: Bool[Array, ""]) -> Judgement:
     """How far the target of a world is from graspable.
 
     Args:
       problem: built for the target.
       objective: whose cost it is; static.
-      weight: of crowding, see `PlannerConfig`.
+      weights: of what is in the way of the grasp.
       world: the true state, fields without leading axes.
       active: where false, little is computed, and what is told means nothing.
     """
@@ -67,7 +66,7 @@ def judge(
     hits = found_hits(problem.target_grasps, belief.grasps, objects_on_the_board(here), active)
     nowhere = jnp.zeros_like(belief.exists)
     rows = jnp.concatenate([no_hits(pairs(problem.grasps), hits.shape[1]), hits])
-    cost = objective.cost(problem, belief, nowhere, nowhere, rows, weight)
+    cost = objective.cost(problem, belief, nowhere, nowhere, rows, weights)
     return Judgement(cost, belief.grasps.feasible, hits & belief.grasps.feasible[:, None])
 
 

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
+from mechsearch_jax.envs.policy_numbers import mould
+from mechsearch_jax.envs.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
-from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, policy_factory
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
 from mechsearch_jax.planner.workcell import Workcell
 
 EngineName = Literal["NativeSimulator", "MjxSimulator"]
@@ -27,6 +30,7 @@ class Method:
       recognition: name of the recogniser.
       engine: name of the simulator.
       workcell: what stands around the objects, and how finely a target is searched.
+      protocol: name of how its episodes are run and judged, one of `protocols.PROTOCOLS`.
     """
 
     name: str = "search-for-grasp"
@@ -34,6 +38,7 @@ class Method:
     recognition: RecognitionName = "oracle"
     engine: EngineName = "NativeSimulator"
     workcell: Workcell = dataclasses.field(default_factory=Workcell)
+    protocol: ProtocolName = "strict"
 
     def policy(self) -> Policy:
         """The policy, with the push models that the configuration names.
@@ -43,6 +48,25 @@ class Method:
         """
         first, later = push_models(self.config.push_model)
         return policy_factory(self.name)(self.config.planner, push_model=first, later_push_model=later)
+
+    @property
+    def terms(self) -> EpisodeProtocol:
+        """How its episodes are run and judged."""
+        return PROTOCOLS[self.protocol]
+
+    @property
+    def problem_config(self) -> ProblemConfig:
+        """How the problem is built that its episodes are run with."""
+        return self.terms.problem(self.config.problem)
+
+    def mould(self) -> Hashable:
+        """What is compiled for episodes of one target: the same for methods that differ in numbers of their policies,
+        such as gamma, or in the number of steps alone.
+
+        Raises:
+          InputError: as `policy`.
+        """
+        return self.workcell, self.config.problem, self.recognition, self.engine, self.protocol, mould(self.policy())
 
     def check(self) -> None:
         """Fail before the first episode rather than in every one.
@@ -56,9 +80,9 @@ class Method:
         recogniser(self.recognition, self.workcell.target)
 
     def options(self) -> dict[str, Any]:
-        """What tells this method from others, flat and as JSON values: the policy, the recognition, every option of the
-        configuration by its name, and other settings that are not the preset `standard`'s, or not the usual workcell's,
-        by their path."""
+        """What tells this method from others, flat and as JSON values: policy, recognition, protocol, every option of
+        the configuration by its name, and other settings that are not the preset `standard`'s, or not the usual
+        workcell's, by their path."""
         named = {".".join(option.path) for option in OPTIONS}
         pairs = ((self.config, PRESETS["standard"](), ""), (self.workcell, Workcell(), "workcell."))
         unusual: dict[str, Any] = {}
@@ -66,7 +90,27 @@ class Method:
             usual = dict(_settings(standard, prefix))
             settings = _settings(config, prefix)
             unusual |= {path: value for path, value in settings if value != usual[path] and path not in named}
-        return {"policy": self.name, "recognition": self.recognition, **self.config.options(), **unusual}
+        told = {"policy": self.name, "recognition": self.recognition, "protocol": self.protocol}
+        return {**told, **self.config.options(), **unusual}
+
+    @classmethod
+    def of_options(cls, options: Mapping[str, Any]) -> Method:
+        """The method whose `options` these are; what they do not hold is as in the preset `standard`. It runs natively.
+
+        Raises:
+          InputError: a setting is impossible, or there is none of a path.
+        """
+        known = {option.name for option in OPTIONS}
+        config = PRESETS["standard"](**{name: value for name, value in options.items() if name in known})
+        parts: dict[str, Any] = {"config": config, "workcell": Workcell()}
+        for path, value in options.items():
+            first, *rest = path.split(".")
+            if rest and first == "workcell":
+                parts["workcell"] = _with_setting(parts["workcell"], rest, value)
+            elif rest:
+                parts["config"] = _with_setting(parts["config"], path.split("."), value)
+        protocol = options.get("protocol", "strict")
+        return cls(options["policy"], recognition=options["recognition"], protocol=protocol, **parts)
 
     def to_json(self) -> dict[str, Any]:
         """All of it as JSON values, for another process."""
@@ -93,6 +137,20 @@ def _settings(config: Config | Workcell, prefix: str) -> Iterator[tuple[str, Any
                 yield f"{path}{name}", part
 
     return inside(json.loads(json.dumps(dataclasses.asdict(config))), prefix)
+
+
+def _with_setting(settings: Any, path: Sequence[str], value: Any) -> Any:
+    """Settings with another value, as JSON has it, at a path.
+
+    Raises:
+      InputError: it is impossible, or there is no such path.
+    """
+    first, *rest = path
+    if not hasattr(settings, first):
+        raise InputError(f"setting {'.'.join(path)} is unknown to this version")
+    here = getattr(settings, first)
+    new = _with_setting(here, rest, value) if rest else _restored(here, value)
+    return dataclasses.replace(settings, **{first: new})
 
 
 def _restored(like: Any, value: Any) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
@@ -29,7 +31,19 @@ class Narrator:
       frames: of the steps so far.
     """
 
-    def __init__(self, console: Console, status: Status, problem: Problem):
+    def __init__(
+        self,
+        console: Console,
+        status: Status,
+        problem: Problem,
+        drawn: Callable[[Moment, Frame], None] = lambda moment, frame: None,
+    ):
+        """Args:
+        console, status: where it is told.
+        problem: of the episode.
+        drawn: told of every step that is over, with its frame.
+        """
+        self._drawn = drawn
         self.frames: list[Frame] = []
         self._restarts = 0
         self._console = console
@@ -69,6 +83,7 @@ class Narrator:
         self._line("time", stages, "dim")
         self._status.update("drawing")
         self.frames.append(pictures.frame(moment, self._problem))
+        self._drawn(moment, self.frames[-1])
 
     def ended(self, episode: Episode) -> None:
         """Say how it ended."""

@@ -12,13 +12,16 @@ from mechsearch_jax import planner
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.envs.episodes import Moment
+from mechsearch_jax.envs.recording import RecordedStep
 from mechsearch_jax.envs.simulated_camera import Image
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle, true_target_pose
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.viz.filmstrip import Frame
 from mechsearch_jax.viz.maps import Maps, maps_figure
+from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 
 def colour_image(image: Image) -> UInt8[np.ndarray, "h w 3"]:
@@ -54,6 +57,27 @@ def frame(moment: Moment, problem: Problem) -> Frame:
         target_pose=np.asarray(true_target_pose(moment.snapshot.world)),
         found=record.found,
         after=after,
+        sketch=sketch,
+    )
+
+
+def recorded_frame(step: RecordedStep, camera: Camera, shelf: Shelf) -> Frame:
+    """A step of a recording, ready to be drawn; what the camera saw is cast once more."""
+    image = Snapshot(camera, shelf, jax.tree.map(jnp.asarray, step.world)).image
+    sketch = Sketch()
+    if step.action is not None:
+        sketch = kind_of(int(step.action.kind)).sketch(step.scene, step.after, step.action)
+    return Frame(
+        title=step.title,
+        caption=step.caption,
+        image=colour_image(image),
+        owner=np.asarray(image.segmentation),
+        scene=step.scene,
+        existence=step.existence,
+        graspability=step.graspability,
+        target_pose=step.target_pose,
+        found=step.found,
+        after=step.after,
         sketch=sketch,
     )
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import flax.struct
@@ -21,9 +21,11 @@ from jaxtyping import Array, Bool, Int
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.episode_log import Choice, chosen
+from mechsearch_jax.envs.policy_numbers import as_pytree, mould, numbers, with_numbers
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
-from mechsearch_jax.envs.verdicts import Verdict, judge, judge_many
+from mechsearch_jax.envs.verdicts import Verdict, judge, judge_many, swept_free
 from mechsearch_jax.envs.world import World
+from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.moved_target import nearest_candidate
@@ -53,6 +55,14 @@ class Slots(Protocol):
         """Let the fresh slots know nothing."""
         ...
 
+    def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
+        """Let slots decide by policies of their own from now on; None stands for the policy of all.
+
+        Raises:
+          InputError: a policy cannot decide together with the others: it differs from them in more than numbers.
+        """
+        ...
+
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
         """Recognise and update the belief in some slots; what is known then in all of them.
 
@@ -65,6 +75,15 @@ class Slots(Protocol):
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """What the policy decides in some slots; `keys` are the planner's, one for each slot."""
+        ...
+
+    def took(self, actions: Mapping[int, Action]) -> None:
+        """Let some slots know that something else is done than they decided."""
+        ...
+
+    def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
+        """Whether in some slots the target is in sight, and what is swept at some grasp meets nothing; see
+        `verdicts.swept_free`."""
         ...
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
@@ -89,13 +108,19 @@ class OneSlot:
         self.belief = initial_belief(problem)
         self.decision: Decision | None = None
         self.action: Action = no_action()
-        self._problem, self._policy, self._recogniser = problem, policy, recogniser
+        self._problem, self._usual, self._recogniser = problem, policy, recogniser
+        self._policy = policy
 
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
         """See `Slots`."""
         if fresh[0]:
             self.belief = initial_belief(self._problem)
             self.action, self.observation = no_action(), None
+
+    def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
+        """See `Slots`; any policy will do."""
+        for policy in policies.values():
+            self._policy = self._usual if policy is None else policy
 
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
         """See `Slots`."""
@@ -116,6 +141,16 @@ class OneSlot:
         self.decision = self._policy(keys[0], self._problem, self.belief, self.observation)
         self.action = self.decision.action
         return {0: jax.device_get(chosen(self.decision))}
+
+    def took(self, actions: Mapping[int, Action]) -> None:
+        """See `Slots`."""
+        self.action = actions.get(0, self.action)
+
+    def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
+        """See `Slots`."""
+        if not rows or self.observation is None:
+            return {}
+        return {0: bool(_swept_free(self._problem, self.observation, jnp.array(True)))}
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
         """See `Slots`."""
@@ -143,17 +178,20 @@ class ManySlots:
 
     def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, world: World, at_once: int) -> None:
         """Args:
-        problem, policy: of all episodes.
+        problem: of all episodes.
+        policy: of all slots that have none of their own.
         recogniser: must be traceable, as the policy.
         world: of all slots, for what recognisers make of it.
         at_once: how many slots are looked at or decided upon in one computation.
         """
         self._problem = problem
-        # A plain function is a pytree without leaves, too, if it is told so.
-        self._policy = jax.tree_util.Partial(policy) if jax.tree_util.all_leaves([policy]) else policy
+        self._policy, self._mould = as_pytree(policy), mould(policy)
         self._recogniser = recogniser
         self._at_once = at_once
         self._count = len(world.kind)
+        self._numbers = [numbers(self._policy)] * self._count
+        # Policies that were looked at, by what tells objects apart while they are kept.
+        self._known: dict[int, tuple[Policy, tuple[np.ndarray, ...]]] = {}
         one = jax.tree.map(lambda a: a[0], world)
         seen = jax.eval_shape(
             lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), one
@@ -165,6 +203,18 @@ class ManySlots:
         """See `Slots`."""
         self._state = _forget(self._problem, self._state, jnp.asarray(fresh))
 
+    def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
+        """See `Slots`."""
+        for row, policy in policies.items():
+            self._numbers[row] = numbers(self._policy) if policy is None else self._numbers_of(policy)
+
+    def _numbers_of(self, policy: Policy) -> tuple[np.ndarray, ...]:
+        if id(policy) not in self._known:
+            if mould(policy) != self._mould:
+                raise InputError("run_episodes: policies of one run that differ in more than numbers need runs each")
+            self._known[id(policy)] = policy, numbers(as_pytree(policy))
+        return self._known[id(policy)][1]
+
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
         """See `Slots`."""
         for _, padded in self._chunks(rows):
@@ -175,10 +225,27 @@ class ManySlots:
         """See `Slots`."""
         found: dict[int, Choice] = {}
         for some, padded in self._chunks(rows):
-            decided = _decide(self._policy, self._problem, self._state, keys, padded)
+            # Rows beyond the end decide by anything.
+            told = [self._numbers[r] for r in some] + [self._numbers[some[0]]] * (self._at_once - len(some))
+            own = tuple(np.stack(values) for values in zip(*told, strict=True))
+            decided = _decide(self._policy, own, self._problem, self._state, keys, padded)
             self._state = _note(self._state, decided.action, padded)
             choice = jax.device_get(decided)
             found |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(some)}
+        return found
+
+    def took(self, actions: Mapping[int, Action]) -> None:
+        """See `Slots`."""
+        if actions:
+            done = jax.tree.map(lambda *leaves: jnp.stack(leaves), *actions.values())
+            self._state = _note(self._state, done, jnp.array(list(actions), jnp.int32))
+
+    def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
+        """See `Slots`."""
+        found: dict[int, bool] = {}
+        for some, padded in self._chunks(rows):
+            free = jax.device_get(_swept_free_many(self._problem, self._state, padded))
+            found |= dict(zip(some, map(bool, free), strict=False))
         return found
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
@@ -256,11 +323,18 @@ def _look(
 
 
 @jax.jit
-def _decide(policy: Policy, problem: Problem, state: PlannerState, keys: Array, rows: Int[Array, " n"]) -> Choice:
-    """What the policy decides in the slots `rows`."""
+def _decide(
+    policy: Policy,
+    own: tuple[Array, ...],
+    problem: Problem,
+    state: PlannerState,
+    keys: Array,
+    rows: Int[Array, " n"],
+) -> Choice:
+    """What the policy decides in the slots `rows`, with the numbers in `own`, shape (n,) each, in place of its own."""
 
-    def one(key, mine):
-        return chosen(policy(key, problem, mine.belief, mine.observation))
+    def one(values, key, mine):
+        return chosen(with_numbers(policy, values)(key, problem, mine.belief, mine.observation))
 
     mine, active = _some(state, rows), rows < keys.shape[0]
     # Where the target is not found and can be nowhere, and nothing stands, a decision costs next to nothing.
@@ -268,4 +342,17 @@ def _decide(policy: Policy, problem: Problem, state: PlannerState, keys: Array, 
     objects = mine.observation.objects
     objects = objects.replace(valid=objects.valid & active[:, None])
     seen = mine.observation.replace(objects=objects)
-    return jax.vmap(one)(_some(keys, rows), mine.replace(belief=belief, observation=seen))
+    return jax.vmap(one)(own, _some(keys, rows), mine.replace(belief=belief, observation=seen))
+
+
+@kept()
+def _swept_free(problem: Problem, seen: Observation, active: Bool[Array, ""]) -> Bool[Array, ""]:
+    """See `Slots.swept_free`; False, and little is computed, where `active` is."""
+    return swept_free(problem.target_grasps, seen.objects, seen.target_pose, active & seen.target_visible)
+
+
+@jax.jit
+def _swept_free_many(problem: Problem, state: PlannerState, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
+    """The same in the slots `rows`; False for rows beyond the end."""
+    active = rows < state.belief.found.shape[0]
+    return jax.vmap(lambda mine, active: _swept_free(problem, mine.observation, active))(_some(state, rows), active)

@@ -7,18 +7,23 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world import World
+from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import transform, upright_pose
+from mechsearch_jax.graspability import grasp_hits
 from mechsearch_jax.planner import Problem, paper
+from mechsearch_jax.planner.found_target import no_grasps
 from mechsearch_jax.planner.problem import TargetGrasps, target_grasps
 from mechsearch_jax.planner.retrieval import best_grasp, graspable_at
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.workspace.camera import Camera
-from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 from mechsearch_jax.workspace.target import Target
 
 
@@ -64,6 +69,32 @@ def judge_many(problem: Problem, worlds: World, active: Bool[Array, " n"]) -> li
     sets = problem.target_grasps, paper_grasps(problem.shelf, problem.gripper, problem.target)
     found = jax.device_get(_graspable_many(sets, problem.camera, worlds, active))
     return [Verdict(*map(bool, each)) for each in zip(*found, strict=True)]
+
+
+def swept_free(
+    grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, " 3"], active: Bool[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether at some grasp what gripper and target sweep, on the straight approach and out again, meets nothing.
+
+    Neither the objects nor the shelf; the arm is not looked at, nor whether it gets there.
+
+    Args:
+      grasps: those to choose from.
+      scene: the objects, without the target.
+      pose: of the target as x, y [m], yaw [rad].
+      active: where false, the answer is no, and little is computed.
+    """
+    tables, shelf = grasps.tables, grasps.shelf
+    T_world_target = upright_pose(pose, grasps.target.height(shelf))
+
+    def touches(tables, T, i):
+        return jnp.any(hits_shelf(shelf, transform(T[...], tables.clouds[i].T)))
+
+    wanted = jnp.broadcast_to(active, tables.q7.shape)
+    free = wanted & ~masked_vmap(touches, wanted, tables, T_world_target)
+    found = no_grasps(grasps).replace(T_world_target=T_world_target, feasible=free)
+    hits = grasp_hits(tables, found, scene, jnp.asarray(active)[None])
+    return jnp.any(free & ~jnp.any(hits, axis=1))
 
 
 @kept()

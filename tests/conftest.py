@@ -41,6 +41,7 @@ GROUPS = {
         "test_planner_moved_target",
         "test_envs_episode",
         "test_envs_batch_episode",
+        "test_envs_protocols",
         "test_envs_verdicts",
         "test_envs_warm_up",
         "test_readme",

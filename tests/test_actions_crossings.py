@@ -212,3 +212,16 @@ def test_a_retrieval_past_a_post_that_only_its_crossing_touches_hits_it(grasps):
         found = FoundGrasps(T_world_target, feasible, jnp.zeros((len(grasps.q7), 1, 7)))
         z = grasp_hits(grasps, found, scene, jnp.ones(1, bool))
         assert not z.any()
+
+
+def test_the_arm_is_followed_closely_to_where_the_fingers_close():
+    poses, last = found_target.ARM_POSES, found_target.CROSSINGS + approach.CLOSE_WAYPOINTS - 1
+    assert poses[-1] == last
+    # The longest way along x is 17 cm; the approach begins at row CROSSINGS.
+    along = np.concatenate(
+        [
+            0.17 * np.arange(found_target.CROSSINGS) / found_target.CROSSINGS,
+            0.17 + GRIPPER.approach * np.linspace(0.0, 1.0, approach.CLOSE_WAYPOINTS),
+        ]
+    )
+    assert np.diff(along[poses]).max() <= 0.055

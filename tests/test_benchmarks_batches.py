@@ -1,21 +1,24 @@
 """Batches of jobs: rows for all of them, whatever fails, and the same after a kill."""
 
 import dataclasses
+import functools
+import itertools
 
 import jax
 import pytest
-from stage import HIDDEN, OPEN
+from stage import HIDDEN, OPEN, Stage
 
 from mechsearch_jax.benchmarks import batches
 from mechsearch_jax.benchmarks.batches import Batches, fitting_worlds
 from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
 from mechsearch_jax.benchmarks.rows import identity
 from mechsearch_jax.benchmarks.shards import Results
+from mechsearch_jax.benchmarks.worker import Worker
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.records import Episode
-from mechsearch_jax.planner import PRESETS
+from mechsearch_jax.planner import PRESETS, policies
 from mechsearch_jax.workspace.scenario import save_scenario
 
 METHOD = Method(config=PRESETS["standard"](max_steps=2))
@@ -48,15 +51,15 @@ class Stand:
         monkeypatch.setattr(batches, "run_episodes", self)
         monkeypatch.setattr(batches.Workcell, "problem", lambda workcell, target, config: problem)
 
-    def __call__(self, starts, problem, policy, simulator, slots, ended, *, max_steps, options, **rest):
-        assert max_steps == METHOD.config.max_steps
+    def __call__(self, starts, problem, policy, simulator, slots, ended, **rest):
         self.slots.append(slots)
         for place, start in enumerate(starts):
             error = self._fail(start.scenario.name, slots)
             if error:
                 raise error
             scene = start.scenario
-            config = {**options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
+            assert start.max_steps == start.options["max_steps"]
+            config = {**start.options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
             facts = (scene.name, len(scene.objects), config, {}, (), 0, 0, False, "not found", scene.content_hash)
             ended([(place, Episode(*facts))])
 
@@ -188,6 +191,60 @@ def test_a_run_that_was_killed_goes_on_to_the_same_rows(tmp_path, files):
     assert facts(rows) == facts(whole)
     assert len(read_rows(out)) == len(jobs)
     assert [row for row in read_rows(out) if row in kept] == kept
+
+
+def test_what_differs_in_numbers_alone_is_one_batch(problem, tmp_path, files, monkeypatch):
+    changes = [{"gamma": 0.5}, {"unseen_contact_penalty": 0.0}, {"guided_fraction": 0.0}, {"max_steps": 5}, {}]
+    methods = [Method(config=PRESETS["standard"](**change)) for change in changes]
+    stand = Stand(problem, monkeypatch)
+    rows = evaluate(make_jobs(files, methods, (0,)), tmp_path / "rows", Batches(worlds=30))
+    assert stand.slots == [len(files) * len(methods)]
+    assert {identity(r) for r in rows} == {identity(j.failed("")) for j in make_jobs(files, methods, (0,))}
+    others = [
+        *(Method(config=PRESETS["standard"](**change)) for change in ({"horizon": 2}, {"push_distances": (0.1,)})),
+        *(Method("search-and-grasp"), Method(recognition="masks"), Method()),
+    ]
+    assert len({method.mould() for method in others}) == len(others)
+    stand.slots.clear()
+    evaluate(make_jobs(files, others, (0,)), tmp_path / "others", Batches(worlds=30))
+    assert stand.slots == [len(files)] * len(others)
+
+
+class QuickStage(Stage):
+    """Nothing happens, under the name of a real simulator."""
+
+    engine = "NativeSimulator"
+
+    def __init__(self, *workcell):
+        super().__init__()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["batch", "worker"])
+def test_96_settings_trace_the_plan_once(tmp_path, files, monkeypatch, how):
+    """The real policy, with all that is continuous; in worker processes as in batches."""
+    traced, real = [], policies.plan
+
+    def plan(rollout, key, scene):
+        traced.append(rollout.config.sequences)
+        return real(rollout, key, scene)
+
+    monkeypatch.setattr(policies, "plan", plan)
+    monkeypatch.setattr(batches, "new_simulator", QuickStage)
+    names = ("gamma", "guided_fraction", "unseen_contact_penalty", "topple_charge", "crowding_weight")
+    values = list(itertools.product((0.5, 0.6, 0.7, 0.8, 0.9, 1.0), (0.0, 0.7), (0.0, 1.0), (0.0, 0.5), (0.0, 0.02)))
+    small = {"max_steps": 1, "horizon": 2, "sequences": 7 if how == "batch" else 6}
+    methods = [Method(config=PRESETS["standard"](**dict(zip(names, value, strict=True)), **small)) for value in values]
+    jobs = make_jobs(files[:1], methods, (0,))
+    if how == "batch":
+        rows = evaluate(jobs, tmp_path / "rows", Batches(worlds=2))
+    else:
+        worker = Worker()
+        worker._simulator = functools.cache(QuickStage)
+        rows = [worker.run(job.path, job.method, job.seed) for job in jobs]
+    assert len({identity(row) for row in rows}) == 96
+    assert not any(row.is_error for row in rows)
+    assert traced == [small["sequences"]]
 
 
 def test_the_memory_of_the_device_bounds_the_worlds(monkeypatch):

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import json
+import subprocess
 import sys
 
 import pytest
@@ -11,6 +12,7 @@ from rich.console import Console
 from mechsearch_jax import versions
 from mechsearch_jax.benchmarks import evaluate as benchmark
 from mechsearch_jax.benchmarks import tables
+from mechsearch_jax.benchmarks.episode_tables import rates_table
 from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs, present_code, shard_of
 from mechsearch_jax.benchmarks.processes import Processes
 from mechsearch_jax.benchmarks.rates import summarise
@@ -337,7 +339,7 @@ def test_progress_and_rates_are_shown(tmp_path, files, command):
     with tables.EpisodeProgress(console, 3) as progress:
         jobs = make_jobs([files[0], files[1], files[3]], [Method()], (0,))
         rows = evaluate(jobs, tmp_path / "rows", Processes(1, command=command), ended=progress.ended)
-    console.print(tables.rates_table(rows))
+    console.print(rates_table(rows))
     text = screen.getvalue()
     assert "3/3 raise: error: ValueError: no" in text
     everything = next(line for line in text.splitlines() if " all " in line)
@@ -360,3 +362,17 @@ def test_a_policy_of_another_module_reaches_the_worker(tmp_path, files, monkeypa
     (row,) = evaluate(make_jobs(files[:1], [method], (0,)), tmp_path / "rows", Processes(1))
     assert (row.policy, row.gamma) == ("their_lab:Mine", 0.25)
     assert row.failure == "error: RuntimeError: gamma 0.25 arrived"
+
+
+def test_a_worker_ends_with_its_input_whatever_it_is_doing():
+    program = (
+        "import sys, time; from mechsearch_jax.benchmarks.worker import until_closed; "
+        "next(until_closed(sys.stdin)); print('busy', flush=True); time.sleep(100)"
+    )
+    pipe, command = subprocess.PIPE, [sys.executable, "-c", program]
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+        process.stdin.write("a job\n")
+        process.stdin.flush()
+        assert process.stdout.readline() == "busy\n"
+        process.stdin.close()
+        assert process.wait(60) == 0

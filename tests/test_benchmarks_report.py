@@ -10,9 +10,10 @@ from matplotlib import image
 from rich.console import Console
 
 from mechsearch_jax.benchmarks import report
+from mechsearch_jax.benchmarks.episode_tables import events_table, rates_table
 from mechsearch_jax.benchmarks.rates import summarise, wilson
+from mechsearch_jax.benchmarks.report_figures import reached, success_figure
 from mechsearch_jax.benchmarks.rows import EVENTS, Row, write_rows
-from mechsearch_jax.benchmarks.tables import events_table, rates_table
 from mechsearch_jax.errors import InputError
 
 WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)
@@ -28,9 +29,9 @@ ROWS = [WON, LOST, BROKEN, OTHER]
 
 
 def test_goals_are_reached_once_and_for_all():
-    assert report.reached(ROWS, "found", 4) == [0, 3, 3, 3, 3]
-    assert report.reached(ROWS, "graspable", 4) == [0, 0, 2, 2, 2]
-    assert report.reached(ROWS, "retrieved", 4) == [0, 0, 0, 2, 2]
+    assert reached(ROWS, "found", 4) == [0, 3, 3, 3, 3]
+    assert reached(ROWS, "graspable", 4) == [0, 0, 2, 2, 2]
+    assert reached(ROWS, "retrieved", 4) == [0, 0, 0, 2, 2]
 
 
 def test_failures_are_counted_by_reason():
@@ -129,8 +130,8 @@ def test_configurations_do_not_mix():
         ("search-for-grasp, gamma 0.5", 0.0),
         ("search-for-grasp, gamma 0.9", 1.0),
     ]
-    assert [line.get_text() for line in report.success_figure(rows).legends[0].get_texts()] == [
-        "search-for-grasp, gamma 0.5", "search-for-grasp, gamma 0.9",
+    assert [line.get_text() for line in success_figure(rows).legends[0].get_texts()] == [
+        "gamma 0.5", "gamma 0.9",
     ]  # fmt: skip
 
 

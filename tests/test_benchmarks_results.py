@@ -20,10 +20,10 @@ from mechsearch_jax.benchmarks.rows import (
     configuration,
     episode_key,
     identity,
-    label_variants,
     read_rows,
     write_rows,
 )
+from mechsearch_jax.benchmarks.variants import label_variants
 from mechsearch_jax.envs.earlier import EARLIER, RENAMED
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.records import Episode, Step, load_episode, record_action, save_episode

@@ -74,7 +74,7 @@ def folder(tmp_path):
 
 WRONG = {
     "no command": ([], "Expected one of"),
-    "unknown command": (["sweep"], 'there is no command "mechsearch sweep"; known are search, plan, inspect'),
+    "unknown command": (["frobnicate"], 'there is no command "mechsearch frobnicate"; known are search, plan, inspect'),
     "mistyped command": (["serch"], "did you mean search? (mechsearch --help tells more)"),
     "mistyped command of a group": (["bench", "plam"], "did you mean plan? (mechsearch bench --help tells more)"),
     "mistyped option": (
@@ -344,8 +344,8 @@ def test_help_names_options_with_their_defaults(capsys):
     assert not end.value.code
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "--gamma FLOAT" in shown
-    assert "(default: 0.7, in preset paper 0.0)" in shown
-    assert "(default: 1, in preset paper 8, in preset best 4)" in shown
+    assert "(default: 0.7, in preset paper and published-code 0.0)" in shown
+    assert "(default: 1, in preset paper and published-code 8, in preset best 4)" in shown
     assert "(default: 30)" in shown
     assert "the paper's is 0" not in shown
     assert all(f"--{option.name.replace('_', '-')} " in shown for option in OPTIONS)

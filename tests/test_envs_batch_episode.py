@@ -2,11 +2,12 @@
 
 import dataclasses
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, push_off, reveal, topple
+from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, idle, push_off, reveal, topple
 
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.envs.episode_log import Choice, EpisodeLog, Result, distrust, record
@@ -14,6 +15,7 @@ from mechsearch_jax.envs.episodes import Start, run_episode, run_episodes
 from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.outcome import Failure, Overflow
+from mechsearch_jax.envs.policy_numbers import mould
 from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.envs.verdicts import Verdict
 from mechsearch_jax.envs.world import TARGET
@@ -72,6 +74,50 @@ def test_episodes_are_the_same_alone_and_in_a_batch_whatever_their_slot(problem,
     assert [without_times(e) for e in episodes] == [without_times(e) for e in alone]
     assert {e.scenario for e in episodes if e.retrieved} >= {"open"}
     assert all(step.timings["recognise"] > 0 for e in episodes for step in e.steps)
+
+
+class Counting(Grab):
+    """The same, and counts how often it is traced; `tilt` is an array, `far` is static."""
+
+    tilt: jax.Array | None = None
+    far: bool = flax.struct.field(pytree_node=False, default=False)
+    traced = 0
+
+    def __call__(self, *args):
+        type(self).traced += 1
+        return super().__call__(*args)
+
+
+def test_policies_that_differ_in_numbers_share_a_batch_and_what_is_compiled(problem):
+    """Several episodes a slot; every episode is what its policy makes of it alone."""
+    Counting.traced, count = 0, 6
+    policies = [Counting(charge=float(charge)) for charge in range(count)]
+    starts = [Start(HIDDEN, 0, policy, 1 + i % 2, {"charge": policy.charge}) for i, policy in enumerate(policies)]
+    found = {}
+    run_episodes(starts, problem, policies[0], Stage(), 2, found.update, max_steps=9, at_once=AT_ONCE)
+    assert Counting.traced == 1
+    sizes = {found[i].steps[0].belief_size for i in range(count)}
+    assert len(sizes) == 1
+    assert [found[i].steps[0].cost for i in range(count)] == [sizes.copy().pop() + charge for charge in range(count)]
+    assert [len(found[i].steps) for i in range(count)] == [2 + i % 2 for i in range(count)]
+    assert [found[i].config["charge"] for i in range(count)] == list(range(count))
+    for i in (0, 5):
+        alone = run_episode(0, HIDDEN, problem, policies[i], Stage(), max_steps=1 + i % 2, options={"charge": i})
+        assert without_times(alone) == without_times(found[i])
+
+
+def test_policies_that_differ_in_more_than_numbers_do_not_share_a_batch(problem):
+    first = Counting(tilt=jnp.zeros(3))
+    assert mould(first) == mould(first.replace(charge=0.5, tilt=jnp.zeros(3)))
+    assert mould(grab) != mould(first) != mould(Counting())
+    for other in (first.replace(far=True), first.replace(tilt=jnp.ones(3)), grab):
+        starts = [Start(OPEN, 0, first), Start(OPEN, 0, other)]
+        with pytest.raises(InputError, match="differ in more than numbers"):
+            run_episodes(starts, problem, first, Stage(), 2, print)
+    # One after the other they may be anything.
+    found = {}
+    run_episodes([Start(OPEN, 0), Start(OPEN, 0, idle)], problem, grab, Stage(), 1, found.update)
+    assert [found[i].retrieved for i in (0, 1)] == [True, False]
 
 
 def test_a_slot_is_free_for_the_next_as_soon_as_its_episode_ends(problem):

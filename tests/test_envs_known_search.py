@@ -22,6 +22,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.graspability import no_hits, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import GraspChoice, Sequences, graspable_at
+from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.retrieval import best_grasps
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -228,9 +229,9 @@ def test_a_target_that_may_stand_hidden_costs_no_more_for_it(problem):
     belief = planner.initial_belief(problem).replace(found=jnp.array(True))
     at = jnp.arange(problem.poses.shape[0]) == 400
     hits = no_hits(pairs(problem.grasps, belief.grasps), 8)
-    seen, hidden = (InFullView().cost(problem, belief, e, at, hits, 0.0) for e in (jnp.zeros_like(at), at))
+    seen, hidden = (InFullView().cost(problem, belief, e, at, hits, Weights()) for e in (jnp.zeros_like(at), at))
     assert seen == hidden == 1.0
-    assert planner.search_for_grasp().objective.cost(problem, belief, at, at, hits, 0.0) > 1.0
+    assert planner.search_for_grasp().objective.cost(problem, belief, at, at, hits, Weights()) > 1.0
 
 
 @pytest.mark.slow

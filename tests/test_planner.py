@@ -10,18 +10,20 @@ import pytest
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionConfig, ActionKind
+from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import masked, superquadric
-from mechsearch_jax.graspability import GraspConfig
+from mechsearch_jax.graspability import GraspConfig, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
-from mechsearch_jax.planner.prediction import PredictByKind
+from mechsearch_jax.planner.config import Weights
+from mechsearch_jax.planner.prediction import LaterPlacementsStay, PredictByKind
 from mechsearch_jax.planner.proposal import ALONE, blame, sampling_weights
-from mechsearch_jax.planner.rollout import Rollout, prefix_values, sequence_values
+from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, sequence_values
 from mechsearch_jax.workspace import scenario
 
 CONFIG = PlannerConfig()
@@ -78,10 +80,13 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "topple_charge": 0.0,
         "guided_fraction": 0.7,
         "crowding_weight": 0.02,
+        "hindrance_weight": 1.0,
         "draws": 1,
         "move_again": False,
         "move_target": True,
         "predicted_collisions": False,
+        "later_draws": "predicted",
+        "later_placements": True,
         "actions": ["push", "pick-and-place"],
         "push_directions": pytest.approx(np.radians([90, -90, 0, 35, -35, 65, -65]).tolist()),
         "push_distances": [0.05, 0.1, 0.15],
@@ -130,6 +135,91 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
 def test_the_best_preset_is_the_standard_with_more_draws_and_actions():
     assert planner.best() == planner.standard(draws=4, max_steps=20)
     assert planner.best(max_steps=10, gamma=0.8) == planner.standard(draws=4, gamma=0.8)
+
+
+def test_the_preset_of_the_published_code_is_the_papers_but_for_four_settings():
+    changed = {"push_distances": (0.1,), "later_draws": "present", "later_placements": False, "hindrance_weight": 0.1}
+    assert planner.published_code() == planner.paper(**changed)
+    assert all(planner.paper().options()[name] != value for name, value in changed.items())
+
+
+def test_what_is_in_the_way_of_a_grasp_weighs_as_much_as_is_said(problem):
+    belief = planner.initial_belief(problem)
+    rows = pairs(problem.grasps, belief.grasps)
+    hits = jnp.zeros((rows.pose.shape[0], 9), bool).at[:, :2].set(True)
+    exists = jnp.arange(problem.poses.shape[0]) % 7 == 0
+    nowhere = jnp.zeros_like(exists)
+
+    def cost(policy, known, weights):
+        return float(policy.objective.cost(problem, known, exists, nowhere, hits, weights))
+
+    plain, light, none = (cost(POLICY, belief, Weights(hindrance=h)) for h in (1.0, 0.1, 0.0))
+    assert none == exists.sum()
+    assert light - none == pytest.approx(0.1 * (plain - none), rel=1e-5)
+    both = planner.search_and_grasp()
+    assert cost(both, belief, Weights()) == exists.sum()
+    found = belief.replace(found=jnp.array(True))
+    assert cost(both, found, Weights(hindrance=0.5)) == pytest.approx(0.5 * cost(both, found, Weights()))
+
+
+def test_what_is_picked_later_stays_where_it_is_in_the_published_code(problem):
+    _, objects = load("first-light")
+    state = rollout_of(problem, planner.initial_belief(problem)).root(objects)
+    ahead = jnp.float32([0.1, 0.0, 0.0])
+
+    def shifts(problem, state, sample, first):
+        scene = state.scene
+        return Prediction(scene.replace(position=scene.position + ahead[None]), jnp.array(True), jnp.float32(0.5))
+
+    def shift(kind, first):
+        action = no_action().replace(kind=jnp.int32(kind))
+        sample = Sample(action, jnp.int32(0), jnp.float32(0.0))
+        told = LaterPlacementsStay(shifts)(problem, state, sample, jnp.array(first))
+        assert bool(told.possible)
+        return float(told.scene.position[0, 0] - state.scene.position[0, 0])
+
+    assert shift(ActionKind.PICK_AND_PLACE, False) == 0
+    for kind, first in ((ActionKind.PICK_AND_PLACE, True), (ActionKind.PUSH, True), (ActionKind.PUSH, False)):
+        assert shift(kind, first) == pytest.approx(0.1, abs=1e-6)
+    assert isinstance(planner.search_for_grasp(planner.published_code().planner).predict, LaterPlacementsStay)
+    assert isinstance(POLICY.predict, PredictByKind)
+
+
+def test_later_actions_are_drawn_in_the_present_scene_if_asked_for(problem):
+    _, objects = load("first-light")
+    belief, shift = planner.initial_belief(problem), jnp.float32([0.0, 0.05, 0.0])
+
+    def draws_where_it_stands(key, problem, belief, objective, guided_fraction, state):
+        T = jnp.eye(4).at[:3, 3].set(state.scene.position[0])
+        action = no_action().replace(kind=jnp.int32(ActionKind.PUSH), T_world_gripper=T)
+        return Sample(action, jnp.int32(0), jnp.float32(0.0))
+
+    def moves(problem, state, sample, first):
+        scene = state.scene
+        return Prediction(scene.replace(position=scene.position + shift[None]), jnp.array(True), jnp.float32(0.0))
+
+    @dataclasses.dataclass(frozen=True)
+    class Drawn(Rollout):
+        """What is drawn and predicted, and nothing computed of it."""
+
+        def update(self, state, moved):
+            return state
+
+        def options(self, state, moved):
+            return state.options
+
+        def cost(self, state):
+            return jnp.sum(state.scene.position[0])
+
+    def starts(later_draws):
+        config = dataclasses.replace(CONFIG, later_draws=later_draws, horizon=3, sequences=2)
+        rollout = Drawn(problem, belief, config, draws_where_it_stands, moves, POLICY.objective)
+        told = jax.jit(lambda key, objects: plan(rollout, key, objects))(jax.random.key(0), objects)
+        np.testing.assert_allclose(np.diff(told.sequences.cost[0]), 0.05, atol=1e-6)
+        return np.asarray(told.sequences.actions.T_world_gripper)[0, :, 1, 3] - float(objects.position[0, 1])
+
+    np.testing.assert_allclose(starts("predicted"), [0.0, 0.05, 0.1], atol=1e-6)
+    np.testing.assert_allclose(starts("present"), 0.0, atol=1e-6)
 
 
 def test_options_are_changed_by_name_and_survive_json():
@@ -386,6 +476,8 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"topple_charge": -0.5}, "topple_charge -0.5 must be a number that is not negative"),
         ({"topple_charge": float("nan")}, "topple_charge nan"),
         ({"unseen_contact_penalty": -1.0}, "unseen_contact_penalty -1.0"),
+        ({"hindrance_weight": -0.1}, "hindrance_weight -0.1 must be a number that is not negative"),
+        ({"later_draws": "past"}, 'later_draws "past" is unknown; use predicted, present'),
         ({"draws": 0}, "draws 0 must be at least 1"),
         ({"max_steps": 0}, "max_steps 0 must be at least 1"),
         ({"push_model": "guess"}, 'push model "guess" is unknown; use quasi-static, learned, physics'),
@@ -401,7 +493,10 @@ def test_impossible_options_are_refused_with_what_would_do(changes, message):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("guess", 'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, or an import path'),
+        (
+            "guess",
+            'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, greedy, mctx, or an import',
+        ),
         ("no_such_lab.policies:Mine", "cannot be imported .*no_such_lab"),
         ("mechsearch_jax.planner:Nobody", "cannot be imported .*Nobody"),
         ("mechsearch_jax.planner:OPTIONS", "is not callable"),
@@ -415,7 +510,8 @@ def test_policies_that_are_not_there_are_named(name, message):
 def test_policies_are_found_by_name_and_by_import_path():
     assert planner.policy_factory("search-and-grasp") is planner.search_and_grasp
     assert planner.policy_factory("mechsearch_jax.planner.policies:random_action") is planner.random_action
-    for factory in planner.POLICIES.values():
+    # One needs a library that not everybody has.
+    for factory in (factory for name, factory in planner.POLICIES.items() if name != "mctx"):
         assert factory(CONFIG, push_model=QuasiStatic()).predict.push_model == QuasiStatic()
 
 
@@ -426,6 +522,7 @@ def test_a_found_target_that_nothing_blocks_is_taken_out(problem):
         (planner.search_for_grasp, 1.0),
         (planner.search_and_grasp, 0.0),
         (planner.random_action, 0.0),
+        (planner.greedy, 0.0),
     ):
         decision = factory()(jax.random.key(0), problem, belief, seen(nothing, True, pose))
         assert int(decision.action.kind) == ActionKind.RETRIEVE
@@ -442,6 +539,42 @@ def test_a_random_policy_is_indifferent_and_its_actions_are_possible(decision, p
     assert {float(one.cost) for one in chosen} == {0.0}
     assert all(int(one.action.kind) != ActionKind.NONE for one in chosen)
     assert len({(int(one.action.kind), int(one.action.object)) for one in chosen}) > 3
+
+
+def test_a_greedy_policy_looks_one_action_ahead_and_minds_nothing_but_the_area():
+    policy = planner.greedy(planner.standard(horizon=3, sequences=40).planner)
+    assert isinstance(policy.objective, type(planner.search_and_grasp().objective))
+    config = policy.config
+    assert (config.horizon, config.sequences, config.guided_fraction, config.topple_charge) == (1, 40, 0.0, 0.0)
+    assert (config.crowding_weight, config.unseen_contact_penalty) == (0.0, 0.0)
+    assert planner.policy_factory("greedy") is planner.greedy
+
+
+@pytest.mark.slow
+def test_a_greedy_policy_leaves_the_least_of_f(decision, problem):
+    objects, belief, _ = decision
+    told = planner.greedy()(jax.random.key(0), problem, belief, seen(objects))
+    left = np.asarray(told.sequences.cost)[:, 0]
+    acted = np.asarray(told.sequences.actions.kind)[:, 0] != ActionKind.NONE
+    assert float(told.cost) == float(belief.exists.sum())
+    assert float(told.predicted_cost) == left[acted].min() < float(told.cost)
+    assert len(set(left[acted])) > 1
+
+
+@pytest.mark.slow
+def test_a_decision_with_the_settings_of_the_published_code_is_one_too(decision):
+    objects = decision[0]
+    config = planner.published_code(sequences=10)
+    problem = planner.build_problem(config=config.problem)
+    belief = planner.update_belief(problem, planner.initial_belief(problem), seen(objects))
+    told = planner.search_for_grasp(config.planner)(jax.random.key(0), problem, belief, seen(objects))
+    kinds, cost = np.asarray(told.sequences.actions.kind), np.asarray(told.sequences.cost)
+    later = kinds[:, 1:] == ActionKind.PICK_AND_PLACE
+    assert later.any()
+    np.testing.assert_array_equal(np.diff(cost, axis=1)[later], 0.0)
+    pushes = kinds == ActionKind.PUSH
+    distance = np.linalg.norm(np.asarray(told.sequences.actions.displacement), axis=-1)
+    np.testing.assert_allclose(distance[pushes], 0.1, rtol=1e-5)
 
 
 @pytest.mark.slow

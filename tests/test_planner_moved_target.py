@@ -17,6 +17,7 @@ from mechsearch_jax.graspability import crowding, grasp_hits, graspability, pair
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import prediction
 from mechsearch_jax.planner.belief import possible_poses, with_target
+from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.moved_target import BEYOND, beyond_candidates, candidate_of
 from mechsearch_jax.planner.rollout import Rollout
 from mechsearch_jax.workspace import scenario
@@ -125,7 +126,7 @@ def test_the_cost_of_a_pushed_target_is_that_of_its_candidate(problem, objects, 
 def test_where_a_pushed_target_could_be_hidden_no_grasp_counts(problem, belief, states, objective):
     _, after, _ = states
     at, hits = jnp.asarray(after.target_at), jnp.zeros(after.hits.shape, bool)
-    cost = lambda exists: float(objective.cost(problem, belief, exists, at, hits, 0.02))  # noqa: E731
+    cost = lambda exists: float(objective.cost(problem, belief, exists, at, hits, Weights(crowding=0.02)))  # noqa: E731
     assert cost(jnp.zeros_like(at)) == objective.reached
     assert cost(at) == objective.reached + 1.0 + hits.shape[1]
 

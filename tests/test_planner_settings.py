@@ -41,7 +41,7 @@ def test_the_example_holds_every_key_with_its_default(tmp_path):
 
 def test_the_example_of_the_guide_is_read(tmp_path):
     guide = (Path(__file__).parents[1] / "docs" / "commands.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"^```toml\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
+    block, _ = re.findall(r"^```toml\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
     assert load(tmp_path, block).config == PRESETS["best"](gamma=0.8)
     assert all(f"| `[{name}]` |" in guide for name in settings.tables())
 

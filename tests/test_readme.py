@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from mechsearch_jax.commands import main as cli
 from mechsearch_jax.workspace.scenario import example_scenarios
 
 ROOT = Path(__file__).parents[1]
@@ -26,9 +28,23 @@ def test_there_are_two_commands():
     assert install_and_test.endswith("pytest")
 
 
-def test_the_first_screen_has_the_picture():
-    (picture,) = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", README)
-    assert (ROOT / picture).read_bytes().startswith(b"\x89PNG")
+def test_the_first_screen_moves_and_the_filmstrip_is_there():
+    moving, still = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", README)
+    assert (ROOT / still).read_bytes().startswith(b"\x89PNG")
+    assert README[: README.index(moving)].count("\n") < 10
+    assert (ROOT / moving).stat().st_size < 5_000_000
+    with Image.open(ROOT / moving) as picture:
+        assert picture.n_frames > 50
+
+
+def test_the_command_that_made_the_animation_is_beside_it():
+    (command,) = re.findall(r"`mechsearch (video [^`]*)`", README)
+    (moving, *_) = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", README)
+    arguments = command.split()
+    assert arguments[arguments.index("--out") + 1] == moving
+    assert callable(cli.parse(arguments))
+    with Image.open(ROOT / moving) as picture:
+        assert str(picture.size[0]) == arguments[arguments.index("--width") + 1]
 
 
 @pytest.mark.slow

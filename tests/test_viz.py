@@ -39,6 +39,7 @@ PUSH = no_action().replace(
     T_world_gripper=jnp.asarray(RIGHT),
     displacement=jnp.array([0.0, 0.1, 0.0]),
 )
+PUSH_BY = np.array([[0, 0, 0, 0], [0, 0, 0, 0.1], [0, 0, 0, 0], [0, 0, 0, 0]], np.float32)
 PICK = no_action().replace(
     kind=jnp.int32(ActionKind.PICK_AND_PLACE),
     object=jnp.int32(1),
@@ -107,13 +108,115 @@ def test_outlines_in_the_view_reach_as_far_as_the_projected_corners():
     np.testing.assert_allclose(outline.max(axis=0), pixels.max(axis=0), atol=1.5)
 
 
+def filmed(*frames, target=None):
+    return filmstrip(frames, CAMERA, SHELF, target or Target.cylinder(), "one")
+
+
+def ghosts(axes, colour=drawing.ACTION):
+    dashed = [p for p in axes.patches if isinstance(p, Polygon) and p.get_linestyle() != "solid"]
+    return [p.get_xy()[:-1] for p in dashed if mpl.colors.same_color(p.get_edgecolor(), colour)]
+
+
+def arrow(axes):
+    (one,) = [p for p in axes.patches if isinstance(p, FancyArrowPatch)]
+    return one._path_original.vertices
+
+
+def hands(axes):
+    colour = mpl.colors.to_rgb(drawing.HAND)
+    polygons = [p for p in axes.patches if isinstance(p, Polygon)]
+    return [p.get_xy()[:-1] for p in polygons if mpl.colors.to_rgb(p.get_edgecolor()) == pytest.approx(colour)]
+
+
 def test_the_picture_shows_the_planners_own_prediction():
-    figure = filmstrip([frame(Target.cylinder(), **shown(PICK))], CAMERA, SHELF, Target.cylinder(), "one")
-    (ghost,) = [p for p in figure.axes[1].patches if isinstance(p, Polygon) and p.get_linestyle() != "solid"]
-    expected = drawing.outlines(moved_on(PICK))[1]
-    np.testing.assert_allclose(ghost.get_xy()[:-1], expected[:, ::-1], atol=1e-6)
-    (arrow,) = [p for p in figure.axes[1].patches if isinstance(p, FancyArrowPatch)]
-    np.testing.assert_allclose(arrow._path_original.vertices[0], np.array(BODIES[1].position)[1::-1], atol=1e-6)
+    view, above = filmed(frame(Target.cylinder(), **shown(PICK))).axes
+    (ghost,) = ghosts(above)
+    expected = drawing.outlines(moved_on(PICK))[1][:, ::-1]
+    assert len(ghost) == len(expected)
+    assert {tuple(corner) for corner in ghost.round(6)} == {tuple(corner) for corner in expected.round(6)}
+    (ghost,) = ghosts(view)
+    np.testing.assert_allclose(ghost, drawing.outlines_in_view(moved_on(PICK), CAMERA)[1], atol=1e-6)
+
+
+def test_an_arrow_leads_from_where_an_object_is_to_where_it_goes():
+    view, above = filmed(frame(Target.cylinder(), **shown(PICK))).axes
+    begin, end = (np.asarray(scene.position)[1] for scene in (SCENE, moved_on(PICK)))
+    np.testing.assert_allclose(arrow(above)[[0, -1]], [begin[1::-1], end[1::-1]], atol=1e-6)
+    # In the camera's image, too, it never turns back towards where it comes from.
+    way = arrow(view)
+    assert (np.diff(way @ (way[-1] - way[0])) > 0).all()
+
+
+def test_everything_that_a_push_moves_is_drawn_where_it_ends():
+    after = SCENE.replace(position=SCENE.position.at[:2, 1].add(0.05).at[2, 1].add(1e-3))
+    sketch = kind_of(ActionKind.PUSH).sketch(SCENE, after, PUSH)
+    view, above = filmed(frame(Target.cylinder(), after=after, sketch=sketch)).axes
+    assert len(ghosts(view)) == len(ghosts(above)) == 2
+
+
+@pytest.mark.parametrize(("action", "places"), [(PUSH, 2), (PICK, 2), (RETRIEVAL, 1), (no_action(), 0)])
+def test_the_hand_is_drawn_where_it_acts(action, places):
+    view, above = filmed(frame(Target.cylinder(), **shown(action))).axes
+    for axes in (view, above):
+        assert len(hands(axes)) == 3 * places
+    for i, T in enumerate([action.T_world_gripper, action.T_world_gripper + PUSH_BY, action.T_world_place][:places]):
+        if i == 1 and int(action.kind) == ActionKind.PICK_AND_PLACE:
+            T = action.T_world_place
+        left, right, hand = hands(above)[3 * i : 3 * i + 3]
+        tip = np.asarray(T)[[1, 0], 3]
+        assert left[:, 1].max() == pytest.approx(tip[1], abs=0.01)
+        assert hand[:, 1].max() < tip[1]
+        assert (left.mean(axis=0) + right.mean(axis=0))[0] / 2 == pytest.approx(tip[0], abs=2e-3)
+
+
+@pytest.mark.parametrize("target", [Target.cylinder(), Target.box()], ids=["cylinder", "box"])
+def test_a_target_that_is_taken_out_is_drawn_in_front_of_the_shelf(target):
+    view, above = filmed(frame(target, found=True, **shown(RETRIEVAL)), target=target).axes
+    (ghost,) = ghosts(above, drawing.TARGET)
+    assert ghost[:, 1].max() < SHELF.front
+    assert arrow(above)[-1, 1] < SHELF.front < arrow(above)[0, 1]
+    # In the camera's image it goes towards the board's front edge, which is further down.
+    assert arrow(view)[-1, 1] > arrow(view)[0, 1]
+    assert len(ghosts(view, drawing.TARGET)) == 1
+
+
+def test_a_hidden_target_is_outlined_in_the_view_and_a_found_one_is_seen():
+    hidden, found = (filmed(frame(Target.cylinder(), found=f)).axes[0] for f in (False, True))
+    (outline,) = ghosts(hidden, drawing.TARGET)
+    middle = np.asarray(project(CAMERA, jnp.array([0.7, 0.1, SHELF.board + 0.05]))[0])[::-1]
+    np.testing.assert_allclose((outline.min(axis=0) + outline.max(axis=0)) / 2, middle, atol=3)
+    assert ghosts(found, drawing.TARGET) == []
+
+
+def test_the_view_is_cut_to_what_stands_there():
+    low, high = (drawing.view_window(CAMERA, SHELF, height) for height in (drawing.height_of([SCENE], SHELF), None))
+    assert low[3] - low[2] < 0.7 * (high[3] - high[2])
+    for outline in drawing.outlines_in_view(SCENE, CAMERA)[:3]:
+        assert (outline > (low[0], low[2])).all()
+        assert (outline < (low[1], low[3])).all()
+    tall = SCENE.replace(size=SCENE.size.at[0, 2].set(0.2))
+    assert drawing.height_of([SCENE, tall], SHELF) > drawing.height_of([SCENE], SHELF)
+
+
+def test_both_pictures_say_which_side_is_the_robots():
+    for axes in filmed(frame(Target.cylinder())).axes:
+        assert [text.get_text() for text in axes.texts].count("robot's side") == 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 6])
+def test_all_type_is_large_enough_at_a_thousand_pixels(count):
+    long = {"title": "10  push the target by 15 cm forward and to the right", "caption": "a reason " * 12}
+    figure = filmed(*[frame(Target.cylinder(), **long)] * count)
+    assert figure.get_figwidth() == 10.0
+    figure.draw_without_rendering()
+    texts = [*figure.texts, *(text for axes in figure.axes for text in axes.texts)]
+    assert min(text.get_fontsize() for text in texts) >= 8
+    # Nothing that is written lies over a picture or beyond its step.
+    boxes = [text.get_window_extent() for text in figure.texts]
+    pictures = [axes.get_window_extent() for axes in figure.axes]
+    assert not any(box.overlaps(picture) for box in boxes for picture in pictures)
+    assert all(box.x0 >= 0 and box.x1 <= figure.bbox.width for box in boxes)
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
 
 
 @pytest.mark.parametrize("target", [Target.cylinder(), Target.box()], ids=["cylinder", "box"])
@@ -154,7 +257,7 @@ def test_the_window_holds_the_shelf():
 
 @pytest.mark.parametrize(("action", "arrows"), [(PUSH, 1), (PICK, 1), (RETRIEVAL, 1), (no_action(), 0)])
 def test_an_action_is_drawn_into_both_pictures(action, arrows):
-    figure = filmstrip([frame(Target.cylinder(), **shown(action))], CAMERA, SHELF, Target.cylinder(), "one")
+    figure = filmed(frame(Target.cylinder(), **shown(action)))
     for axes in figure.axes:
         assert sum(isinstance(p, FancyArrowPatch) for p in axes.patches) == arrows
 
@@ -170,12 +273,11 @@ def test_a_push_points_where_the_gripper_goes():
 
 
 def test_objects_and_target_are_outlined():
-    hidden = filmstrip([frame(Target.cylinder())], CAMERA, SHELF, Target.cylinder(), "one").axes[1]
+    hidden, found = (filmed(frame(Target.cylinder(), found=f, **shown(no_action()))).axes[1] for f in (False, True))
     assert sum(isinstance(p, Polygon) for p in hidden.patches) == 3
     circle = next(p for p in hidden.patches if isinstance(p, Circle))
     assert circle.center == (pytest.approx(0.1), pytest.approx(0.7))
     assert circle.get_facecolor()[3] == 0
-    found = filmstrip([frame(Target.cylinder(), found=True)], CAMERA, SHELF, Target.cylinder(), "one").axes[1]
     assert next(p for p in found.patches if isinstance(p, Circle)).get_facecolor()[3] == 1
 
 

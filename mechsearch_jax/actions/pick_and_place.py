@@ -313,12 +313,14 @@ class PickAndPlace:
         return pick_and_place_reference(action.T_world_gripper, action.T_world_place, action.q7, action.opening, config)
 
     def sketch(self, scene: Superquadrics, after: Superquadrics, action: Action) -> Sketch:
-        """The object's way in an arch out of the shelf and back, and where it is predicted to stand."""
+        """The hand at both ends, and the object's way, as an arch above the others from its top to its top."""
         i = int(action.object)
         begin, end = (np.asarray(s.position, float)[i] for s in (scene, after))
+        top = np.array([0.0, 0.0, float(np.abs(np.asarray(scene.rotation)[i, 2]) @ np.asarray(scene.size)[i])])
         share = np.linspace(0.0, 1.0, 40)[:, None]
-        arch = 4 * share * (1 - share) * np.array([-0.12, 0.0, 0.06])
-        return Sketch(path=begin + share * (end - begin) + arch, ghost=i)
+        arch = 4 * share * (1 - share) * np.array([0.0, 0.0, 0.25 * np.linalg.norm(end - begin)])
+        hands = np.stack([np.asarray(T, float) for T in (action.T_world_gripper, action.T_world_place)])
+        return Sketch(hands, float(action.opening), path=begin + top + share * (end - begin) + arch)
 
     def describe(self, action: Action, target: int | None = None) -> str:
         shift = np.asarray(action.T_world_place - action.T_world_gripper)[:2, 3]

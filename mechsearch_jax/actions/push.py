@@ -42,8 +42,6 @@ PUSH_PLACES = 3
 EDGE = 0.01
 # As the hand goes back, objects that the push moved are tested smaller by this on every side: many touch the hand [m].
 TOUCHING = 0.008
-# Length of the way in that a picture shows [m].
-SHOWN_WAY_IN = 0.12
 
 
 def _displacements(config: ActionConfig, heading: Float[np.ndarray, "*batch 2"]) -> Float[Array, "*batch d 3"]:
@@ -313,14 +311,12 @@ class Push:
         return push_reference(action.T_world_gripper, action.displacement, action.q7, config)
 
     def sketch(self, scene: Superquadrics, after: Superquadrics, action: Action) -> Sketch:
-        """The hand's way in, and how far it pushes."""
-        T = np.asarray(action.T_world_gripper, float)
-        start, share = T[:3, 3], np.linspace(0.0, 1.0, 40)[:, None]
-        return Sketch(
-            way_in=start - (1 - share) * SHOWN_WAY_IN * T[:3, 2],
-            path=start + share * np.asarray(action.displacement, float),
-            start=start,
-        )
+        """The hand where it begins and where it ends, and its way between them."""
+        start, way = np.asarray(action.T_world_gripper, float), np.asarray(action.displacement, float)
+        end = start.copy()
+        end[:3, 3] += way
+        share = np.linspace(0.0, 1.0, 40)[:, None]
+        return Sketch(np.stack([start, end]), float(action.opening), path=start[:3, 3] + share * way)
 
     def describe(self, action: Action, target: int | None = None) -> str:
         d = np.asarray(action.displacement)

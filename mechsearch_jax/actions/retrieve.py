@@ -13,8 +13,8 @@ from mechsearch_jax.actions.types import Action, Prediction
 from mechsearch_jax.robot.motion import MotionConfig, Reference, retrieve_reference
 
 CODE = 3
-# Length of the way out that a picture shows [m].
-SHOWN_WAY_OUT = 0.25
+# Length of the way out that a picture shows, as far as it reaches [m].
+SHOWN_WAY_OUT = 0.5
 
 
 def retrieve_action(
@@ -60,9 +60,12 @@ class Retrieve:
         return retrieve_reference(action.T_world_gripper, action.q7, action.opening, config)
 
     def sketch(self, scene, after, action: Action) -> Sketch:
-        """The hand's way out with the target."""
+        """The hand at the target, and their way out, drawn level: where it leads is then seen from everywhere."""
         T = np.asarray(action.T_world_gripper, float)
-        return Sketch(path=T[:3, 3] - np.linspace(0.0, SHOWN_WAY_OUT, 40)[:, None] * T[:3, 2])
+        level = np.array([T[0, 2], T[1, 2], 0.0])
+        way = -SHOWN_WAY_OUT * level / max(float(np.linalg.norm(level)), 1e-9)
+        share = np.linspace(0.0, 1.0, 40)[:, None]
+        return Sketch(T[None], float(action.opening), path=T[:3, 3] + share * way, takes_target=True)
 
     def describe(self, action: Action, target: int | None = None) -> str:
         return "take the target out"

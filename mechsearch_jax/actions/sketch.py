@@ -1,4 +1,7 @@
-"""What a picture shows of an action, in the world and without any knowledge of how it is drawn."""
+"""What a picture shows of an action, in the world and without any knowledge of how it is drawn.
+
+Objects that are predicted to move are drawn where they end, whatever the kind of action.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,13 @@ class Sketch:
     """Lines in the world; every part may be missing.
 
     Attributes:
-      way_in: the way of the gripper before it acts, drawn dotted, shape (points, 3) [m].
+      hands: poses of the gripper, where it begins to act and then where else it acts, shape (k, 4, 4) [m].
+      opening: distance between its fingers [m].
       path: what moves while it acts, drawn as an arrow, shape (points, 3) [m].
-      start: where it begins to act, drawn as a dot, shape (3,) [m].
-      ghost: index of the object that is also drawn where it is predicted to end.
+      takes_target: whether it is the target that moves along the path.
     """
 
-    way_in: Float[np.ndarray, "points 3"] | None = None
+    hands: Float[np.ndarray, "k 4 4"] | None = None
+    opening: float = 0.0
     path: Float[np.ndarray, "points 3"] | None = None
-    start: Float[np.ndarray, " 3"] | None = None
-    ghost: int | None = None
+    takes_target: bool = False

@@ -92,7 +92,7 @@ def bench_plan(
 
     Args:
       method: how it is decided; "search-for-grasp" by default.
-      policy: instead of a method, the name of a policy ("random" is one more), or the import path of another.
+      policy: instead of a method, the name of a policy (also random, greedy, mctx), or the import path of another.
       objects: number of objects in a scene.
       batch: how many scenes at once.
       repeats: number of timed calls.

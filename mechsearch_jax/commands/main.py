@@ -23,10 +23,13 @@ from mechsearch_jax.commands import bench, bench_episodes, bench_quality, scenar
 from mechsearch_jax.commands.doctor import doctor, print_config
 from mechsearch_jax.commands.evaluate import evaluate
 from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
-from mechsearch_jax.commands.options import with_planner_options
+from mechsearch_jax.commands.options import EpisodeOptions, with_planner_options
 from mechsearch_jax.commands.plan import plan
 from mechsearch_jax.commands.report import report
+from mechsearch_jax.commands.reproduce import reproduce
 from mechsearch_jax.commands.search import search
+from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
+from mechsearch_jax.commands.video import video
 from mechsearch_jax.errors import InputError, nearest
 
 Commands = Mapping[str, Callable[..., None]]
@@ -45,7 +48,10 @@ COMMANDS: Commands = {
     "search": search,
     "plan": plan,
     "inspect": inspect_scenarios,
+    "video": video,
     "evaluate": evaluate,
+    "sweep": sweep,
+    "reproduce": reproduce,
     "report": report,
     "config": print_config,
     "doctor": doctor,
@@ -62,6 +68,13 @@ GROUPS: Mapping[str, Commands] = {
 }
 
 
+# What takes a second to be found out, by what a command is declared with.
+_OPTIONS: Mapping[type, Callable[[], type]] = {
+    EpisodeOptions: with_planner_options,
+    SweptOptions: with_swept_options,
+}
+
+
 def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
     """A function that takes the command's arguments, with all options if it takes any, and only returns what is to be
     run."""
@@ -72,7 +85,7 @@ def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]
     hints, signature = get_type_hints(plain, include_extras=True), inspect.signature(plain)
     parameters = dict(signature.parameters)
     if "options" in hints:
-        options = with_planner_options()
+        options = _OPTIONS[hints["options"]]()
         hints["options"] = Annotated[options, tyro.conf.arg(name="")]
         parameters["options"] = parameters["options"].replace(default=options())
     for name, parameter in parameters.items():

@@ -41,11 +41,13 @@ class EpisodeOptions:
         a noisy depth image, "masks" with the true segmentation, "full" without.
       simulator: what executes the actions: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for
         batches where there is a GPU.
+      protocol: how episodes are run and judged: strictly, or as the authors' published code does.
     """
 
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
     recognition: Literal["oracle", "masks", "full"] = "oracle"
     simulator: Literal["auto", "native", "mjx"] = "auto"
+    protocol: Literal["strict", "published-code"] = "strict"
 
     def settings(self) -> Settings:
         """The configuration file's settings, with what is given in their place.
@@ -72,7 +74,10 @@ class EpisodeOptions:
             # As Python itself does for a program that is not installed.
             sys.path.append("")
         settings = self.settings()
-        methods = [Method(name, settings.config, self.recognition, engine, settings.workcell) for name in policies]
+        methods = [
+            Method(name, settings.config, self.recognition, engine, settings.workcell, self.protocol)
+            for name in policies
+        ]
         for method in methods:
             method.check()
         return methods
@@ -148,8 +153,12 @@ def _usual(option: Option) -> str:
     values = {name: preset().options()[option.name] for name, preset in PRESETS.items()}
     said = {name: " ".join(map(_short, value)) if isinstance(value, list) else value for name, value in values.items()}
     usual = said.pop(DEFAULT_PRESET)
-    others = [f", in preset {name} {value}" for name, value in said.items() if value != usual]
-    return f"(default: {usual}{''.join(others)})"
+    others: dict[Any, list[str]] = {}
+    for name, value in said.items():
+        if value != usual:
+            others.setdefault(value, []).append(name)
+    told = [f", in preset {' and '.join(names)} {value}" for value, names in others.items()]
+    return f"(default: {usual}{''.join(told)})"
 
 
 def _short(value: Any) -> str:

@@ -1,12 +1,26 @@
-"""`mechsearch report`: what results of `evaluate` say."""
+"""`mechsearch report`: what results of `evaluate` and `sweep` say."""
 
 from __future__ import annotations
 
+import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from mechsearch_jax.commands.options import find_scenario, find_scenarios
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.benchmarks.films import Draw
+    from mechsearch_jax.benchmarks.rows import Row
+
+
+def _columns(texts: Sequence[str]) -> tuple[str, ...]:
+    """Names of columns, which may stand one after the other or have commas between them."""
+    return tuple(name for text in texts for name in text.split(",") if name)
 
 
 def report(
@@ -14,30 +28,78 @@ def report(
     /,
     *,
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None,
+    rows: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN ...")] = (),
+    curve: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN [COLUMN]")] = (),
+    baseline: Annotated[str | None, tyro.conf.arg(metavar="VARIANT")] = None,
+    paired: Annotated[tuple[str, ...], tyro.conf.arg(metavar="COLUMN ...")] = (),
+    films: bool = False,
+    scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SCENARIO|FOLDER|SET ...")] = (),
 ) -> None:
-    """Print rates by method and number of objects from results of `evaluate`, and write them with plots.
+    """Print rates by variant and number of objects from results of evaluate or sweep, and write them with plots.
 
     What happened on the way is told too: the truth ruled out, objects fallen, the arm held up, bodies never at rest.
+    Columns are those of the results: fields of rows, options, and "method" for the variant.
 
     Args:
-      results: folders of `evaluate`, folders of those, and Parquet files of earlier versions.
-      out: folder for report.md, rates.csv, rates.json, failures.csv, events.csv and success.png; only prints if not
-        given.
+      results: folders of evaluate, folders of those, and Parquet files of earlier versions.
+      out: folder for report.html, which holds everything, report.md, report.tex, CSV and JSON files and pictures; only
+        prints if not given.
+      rows: columns to tell rates by, instead of method and objects; rates over all values of the last one are told too.
+      curve: rates over this column; of two, with a line for each value of the second.
+      baseline: a variant by its label, or what tells it from others, as gamma=0.5; paired differences from it are told.
+      paired: what two episodes of a pair have in common; scenario and seed if not given.
+      films: draw three typical episodes, three lost and the slowest, by running them again.
+      scenes: where the scenarios of these are, if they are neither shipped nor in a scene set.
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.report import read_tables, told_of_changes, write_report
-    from mechsearch_jax.benchmarks.tables import events_table, rates_table
+    from mechsearch_jax.benchmarks import films as single
+    from mechsearch_jax.benchmarks.episode_tables import differences_table, events_summary_table, print_summary
+    from mechsearch_jax.benchmarks.paired import PAIRED
+    from mechsearch_jax.benchmarks.report import Asked, Report, read_tables, told_of_changes, write_report
 
-    rows = read_tables(results)
-    if out is not None:
-        write_report(rows, out)
+    if films and out is None:
+        raise InputError("report: --films are drawn into a folder; give --out")
+    if paired and baseline is None:
+        raise InputError("report: --paired says what is compared with a baseline; give --baseline")
+    found = read_tables(results)
+    told = Report.of(found, Asked(_columns(rows), _columns(curve), baseline, _columns(paired) or PAIRED))
     console = Console(highlight=False)
-    console.print(rates_table(rows))
-    if (events := events_table(rows)) is not None:
-        console.print()
-        console.print(events)
-    if told_of_changes(rows):
-        print(f"report: {told_of_changes(rows)}", file=sys.stderr)
     if out is not None:
-        console.print(str(out / "report.md"), soft_wrap=True)
+        with Console(stderr=True).status("writing") as status:
+            draw = _drawer(scenes, status.update) if films else None
+            told = dataclasses.replace(told, films=single.films(found, out, draw))
+            write_report(told, out, lambda file: status.update(f"writing {file}"))
+    print_summary(console, told.rates, told.key)
+    if told.curve:
+        console.print()
+        print_summary(console, told.curve, dataclasses.replace(told.key, common=""))
+    if told.differences:
+        console.print()
+        console.print(differences_table(told.differences, told.key, str(told.baseline)))
+    if told.events and not rows:
+        console.print()
+        console.print(events_summary_table(told.events, told.key))
+    if told_of_changes(found):
+        print(f"report: {told_of_changes(found)}", file=sys.stderr)
+    if out is not None:
+        console.print(f"{out / 'report.html'}\n{out / 'report.md'}", soft_wrap=True)
+
+
+def _drawer(scenes: Sequence[str], status) -> Draw:
+    """What draws an episode's filmstrip, its scenario found among these, the shipped ones or those of scene sets."""
+    from mechsearch_jax.benchmarks.films import replay
+    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.workspace.scenario import Scenario, load_scenario
+
+    keep_compilations()
+    given: dict[str, Scenario] = {}
+    for file in find_scenarios(scenes) if scenes else ():
+        scenario = load_scenario(file)
+        given[scenario.name] = scenario
+
+    def draw(row: Row, file: Path) -> str:
+        status(f"running {row.scenario} again, seed {row.seed}")
+        return replay(row, given.get(row.scenario) or load_scenario(find_scenario(row.scenario)), file)
+
+    return draw

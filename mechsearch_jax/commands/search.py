@@ -16,6 +16,7 @@ from mechsearch_jax.commands.options import (
     chosen_policies,
     find_scenario,
 )
+from mechsearch_jax.commands.video import make_film
 from mechsearch_jax.errors import InputError
 
 
@@ -29,6 +30,8 @@ def search(
     policy: OnePolicy = None,
     seed: int = 0,
     out: Path,
+    record: bool = False,
+    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE.mp4|FILE.webp")] = None,
     options: EpisodeOptions = DEFAULTS,
 ) -> None:
     """Run one episode: look, decide, act, until the target is found, graspable and taken out.
@@ -38,18 +41,22 @@ def search(
       objects: instead of a scenario, generate one with so many objects.
       target: shape of a generated target; a cylinder, or what the configuration file says, if not given.
       method: "search-for-grasp", the default, minds the grasp while it searches, "search-and-grasp" only afterwards.
-      policy: instead of a method, the name of a policy ("random" is one more), or the import path of another.
+      policy: instead of a method, the name of a policy (also random, greedy, mctx), or the import path of another.
       seed: of the planner, of the environment, and of a generated scenario.
       out: folder for episode.json, filmstrip.png and the scenario.
+      record: also write recording.npz, what moved and what was believed, of which `mechsearch video` makes a film.
+      video: make the film at once, too; it is recorded then.
       options: how the planner decides.
     """
     from rich.console import Console
 
     from mechsearch_jax.envs.episodes import run_episode, target_of
     from mechsearch_jax.envs.generator import ScenarioGenerator
+    from mechsearch_jax.envs.simulator import SimulatorConfig
     from mechsearch_jax.envs.warm_up import first_decision, prepared
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.viz.movie import check_movie_path
     from mechsearch_jax.workspace.scenario import load_scenario, save_scenario
 
     if (scenario is None) == (objects is None):
@@ -60,6 +67,9 @@ def search(
     (chosen,) = options.methods(chosen_policies("search", method and (method,), policy and (policy,)))
     settings, workcell = options.settings(), chosen.workcell
     known = load_scenario(find_scenario(scenario), workcell.shelf) if scenario is not None else None
+    if video is not None:
+        check_movie_path(video)
+        check_writable(video.parent)
     check_writable(out)
     keep_compilations()
     console = Console(highlight=False)
@@ -69,33 +79,44 @@ def search(
             f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
         )
         wanted = target_of(scene, workcell.target)
-        problem = workcell.problem(wanted, chosen.config.problem)
+        problem = workcell.problem(wanted, chosen.problem_config)
         policy_now = chosen.policy()
         with prepared(first_decision(problem, policy_now), lambda text: console.print(text, style="dim")):
             # These take long to import, and meanwhile what the first decision needs is read or compiled.
             from mechsearch_jax.envs.narration import Narrator, verdict
             from mechsearch_jax.envs.native import NativeSimulator
             from mechsearch_jax.envs.recognisers import recogniser
+            from mechsearch_jax.envs.recording import NAME, TRACE_EVERY, Recorder, save_recording
             from mechsearch_jax.envs.records import save_episode
             from mechsearch_jax.viz.drawing import save_figure
             from mechsearch_jax.viz.filmstrip import filmstrip
 
-            narrator = Narrator(console, status, problem)
+            simulator = NativeSimulator(
+                config=SimulatorConfig(trace_every=TRACE_EVERY), shelf=workcell.shelf, camera=workcell.camera
+            )
+            recorder = Recorder(simulator)
+            narrator = Narrator(console, status, problem, recorder.note)
             episode = run_episode(
                 seed,
                 scene,
                 problem,
                 policy_now,
-                NativeSimulator(shelf=workcell.shelf, camera=workcell.camera),
+                simulator,
                 recogniser(chosen.recognition, wanted),
                 chosen.config.max_steps,
                 chosen.options(),
                 narrator,
+                chosen.terms,
             )
         status.update("writing")
         strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
         save_figure(strip, out / "filmstrip.png")
         save_scenario(scene, out / "scenario.json")
         save_episode(episode, out / "episode.json")
+        recording = recorder.recording(problem, verdict(episode))
+        if record or video is not None:
+            save_recording(recording, out / NAME)
     narrator.ended(episode)
     console.print(f"{out / 'episode.json'}\n{out / 'filmstrip.png'}", soft_wrap=True)
+    if video is not None:
+        make_film(recording, video, console)

@@ -7,13 +7,23 @@ from mechsearch_jax.planner.policies import (
     Policy,
     PolicyFactory,
     Search,
+    greedy,
     policy_factory,
     random_action,
     search,
     search_and_grasp,
     search_for_grasp,
 )
-from mechsearch_jax.planner.presets import DEFAULT_PRESET, PRESETS, action_set, best, expanded, paper, standard
+from mechsearch_jax.planner.presets import (
+    DEFAULT_PRESET,
+    PRESETS,
+    action_set,
+    best,
+    expanded,
+    paper,
+    published_code,
+    standard,
+)
 from mechsearch_jax.planner.problem import Problem, build_problem
 from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at
 from mechsearch_jax.planner.state import Decision, Sequences
@@ -41,9 +51,11 @@ __all__ = [
     "expanded",
     "graspability_map",
     "graspable_at",
+    "greedy",
     "initial_belief",
     "paper",
     "policy_factory",
+    "published_code",
     "random_action",
     "search",
     "search_and_grasp",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, CROSSING_PLACES
@@ -22,17 +23,16 @@ from mechsearch_jax.robot.entry import arm_path, crossing_length, crossing_poses
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import JOINTS
 
-# Of the poses where the arm's way in is followed, every so many is tested against objects: 5 cm apart at most.
-ARM_EVERY = 3
 # Poses on the way along x of each grasp: at fewer the arm may pass a singularity unnoticed.
 CROSSINGS = 15
+# At which poses of the way in the arm is tested against objects: 5.5 cm apart at most, and where the fingers close.
+ARM_POSES = np.array([*range(2, CROSSINGS, 4), *range(CROSSINGS + 1, CROSSINGS + CLOSE_WAYPOINTS, 2)])
 
 
 def no_grasps(grasps: TargetGrasps) -> FoundGrasps:
     """Those of a target that has not been found."""
     count = grasps.tables.found_grasp.shape[0]
-    poses = len(range(0, CROSSINGS + CLOSE_WAYPOINTS, ARM_EVERY))
-    return FoundGrasps(jnp.eye(4), jnp.zeros(count, bool), jnp.zeros((count, poses, len(JOINTS))))
+    return FoundGrasps(jnp.eye(4), jnp.zeros(count, bool), jnp.zeros((count, len(ARM_POSES), len(JOINTS))))
 
 
 def found_grasps(
@@ -51,7 +51,7 @@ def found_grasps(
     def enters(_, row, i):
         path = way_in(row[0][i], gripper.nearest_outside, gripper, CROSSINGS, CLOSE_WAYPOINTS)
         q, follows = arm_path(path, row[1][i], shelf)
-        return follows, q[::ARM_EVERY]
+        return follows, q[ARM_POSES]
 
     T = compose(T_world_target[None], tables.T_target_gripper)
     able, q = masked_vmap(enters, feasible, None, (T, tables.q7), block=64)

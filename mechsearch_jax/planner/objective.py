@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.graspability import crowding, graspability, pairs
 from mechsearch_jax.planner.belief import Belief, possible_poses
+from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.problem import Problem
 
 
@@ -30,7 +31,7 @@ class Objective(Protocol):
         exists: Bool[Array, " x"],
         target_at: Bool[Array, " x"],
         hits: Bool[Array, "k n"],
-        crowding_weight: Array | float,
+        weights: Weights,
     ) -> Float[Array, ""]:
         """J of a state.
 
@@ -40,7 +41,7 @@ class Objective(Protocol):
           exists: f of the state; see `State`, as of the next.
           target_at: the candidate pose that stands for where a found target was pushed to.
           hits: H of the state, with the rows of `graspability.pairs`.
-          crowding_weight: see `PlannerConfig`.
+          weights: of what is in the way of a grasp.
         """
         ...
 
@@ -51,8 +52,9 @@ class Objective(Protocol):
         ...
 
 
-def _where_and_how_graspable(problem, belief, exists, target_at, hits, crowding_weight):
-    """f, how far each pose is from graspable with g extended below zero (B.4), and how crowded its grasps are.
+def _where_and_how_graspable(problem, belief, exists, target_at, hits, weights):
+    """f, how far each pose is from graspable with g extended below zero (B.4), and how crowded its grasps are; the last
+    two as J weighs them.
 
     g only sees the best grasp of a pose; while nothing changes that one, clearing the way for others is progress too.
     A found target that is pushed to where it could be hidden counts as if no grasp were feasible: once it is not seen,
@@ -62,7 +64,7 @@ def _where_and_how_graspable(problem, belief, exists, target_at, hits, crowding_
     rows = pairs(problem.grasps, belief.grasps)
     hidden = jnp.append(exists & belief.found, False)
     g = jnp.minimum(graspability(rows, hits), jnp.where(hidden, -hits.shape[1], 1)).astype(jnp.float32)
-    return f, g, crowding_weight * crowding(rows, hits)
+    return f, weights.hindrance * (1.0 - g), weights.crowding * crowding(rows, hits)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,9 +73,9 @@ class SearchForGrasp:
 
     reached: float = 1.0
 
-    def cost(self, problem, belief, exists, target_at, hits, crowding_weight) -> Float[Array, ""]:
-        f, g, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits, crowding_weight)
-        return jnp.sum(f * (1.0 + (1.0 - g) + crowded))
+    def cost(self, problem, belief, exists, target_at, hits, weights) -> Float[Array, ""]:
+        f, hindered, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits, weights)
+        return jnp.sum(f * (1.0 + hindered + crowded))
 
     def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:
         return possible_poses(belief, exists, target_at)
@@ -85,9 +87,9 @@ class SearchAndGrasp:
 
     reached: float = 0.0
 
-    def cost(self, problem, belief, exists, target_at, hits, crowding_weight) -> Float[Array, ""]:
-        f, g, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits, crowding_weight)
-        return jnp.where(belief.found, jnp.sum(f * (1.0 - g + crowded)), jnp.sum(f))
+    def cost(self, problem, belief, exists, target_at, hits, weights) -> Float[Array, ""]:
+        f, hindered, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits, weights)
+        return jnp.where(belief.found, jnp.sum(f * (hindered + crowded)), jnp.sum(f))
 
     def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:
         return possible_poses(belief, exists, target_at) & belief.found
@@ -99,7 +101,7 @@ class Indifferent:
 
     reached: float = 0.0
 
-    def cost(self, problem, belief, exists, target_at, hits, crowding_weight) -> Float[Array, ""]:
+    def cost(self, problem, belief, exists, target_at, hits, weights) -> Float[Array, ""]:
         return jnp.float32(0.0)
 
     def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:

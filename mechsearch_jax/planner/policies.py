@@ -22,11 +22,12 @@ from mechsearch_jax.compiled import kept
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.belief import Belief
 from mechsearch_jax.planner.config import PlannerConfig
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
-from mechsearch_jax.planner.prediction import Predict, PredictByKind
+from mechsearch_jax.planner.prediction import LaterPlacementsStay, Predict, PredictByKind
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import Propose, guided_draw
 from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at
@@ -69,18 +70,28 @@ class PolicyFactory(Protocol):
         ...
 
 
+class Plan(Protocol):
+    """Plans with the engine's slots; static under jit."""
+
+    def __call__(self, rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
+        """The next action, as `rollout.plan` tells it."""
+        ...
+
+
 class Search(flax.struct.PyTreeNode):
     """The engine as a `Policy`: takes a found target out as soon as a grasp hits nothing, and else plans.
 
     Attributes:
       config: how it decides.
       propose, predict, objective: the slots; static.
+      plan: how it plans with them; static.
     """
 
     config: PlannerConfig
     propose: Propose = flax.struct.field(pytree_node=False)
     predict: Predict = flax.struct.field(pytree_node=False)
     objective: Objective = flax.struct.field(pytree_node=False)
+    plan: Plan = flax.struct.field(pytree_node=False, default=plan)
 
     def prepare(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> None:
         """Load or compile what a plan with such arguments needs, without planning; see `compiled.Kept.prepare`."""
@@ -120,7 +131,7 @@ class Search(flax.struct.PyTreeNode):
 @kept()
 def _plan(search: Search, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
     rollout = Rollout(problem, belief, search.config, search.propose, search.predict, search.objective)
-    return plan(rollout, key, observation.objects)
+    return search.plan(rollout, key, observation.objects)
 
 
 @kept()
@@ -168,10 +179,12 @@ def search(
       InputError: a setting is impossible, or weights are missing or damaged.
     """
     push_model = push_model or own_push_model("learned")
+    config = dataclasses.replace(_planner_config(config), **changes)
+    predict: Predict = PredictByKind(push_model, later_push_model or push_model)
     return Search(
-        config=dataclasses.replace(_planner_config(config), **changes),
+        config=config,
         propose=propose,
-        predict=PredictByKind(push_model, later_push_model or push_model),
+        predict=predict if config.later_placements else LaterPlacementsStay(predict),
         objective=objective,
     )
 
@@ -199,10 +212,44 @@ def random_action(config: PlannerConfig | None = None, **options: Any) -> Search
     return search(even, objective=Indifferent(), **options)
 
 
+def greedy(config: PlannerConfig | None = None, **options: Any) -> Search:
+    """A baseline: the one action that leaves the least of f, as lateral-access X-RAY reduces the area where the target
+    can be; once the target is found, the one that brings it nearest to a free grasp.
+
+    One step of the first term of J, and of the second at a found target: X-RAY's suction cup needs no free grasp. Draws
+    are even, and nothing but J counts: of `config`, the horizon, the guided fraction, the crowding weight and all
+    charges are not used.
+    """
+    plain = dataclasses.replace(
+        _planner_config(config),
+        horizon=1,
+        guided_fraction=0.0,
+        crowding_weight=0.0,
+        unseen_contact_penalty=0.0,
+        topple_charge=0.0,
+    )
+    return search_and_grasp(plain, **options)
+
+
+def mctx(config: PlannerConfig | None = None, **options: Any) -> Search:
+    """A baseline: Monte-Carlo tree search with the library `mctx` on the cost of `search_for_grasp`; see `tree_search`.
+
+    Raises:
+      InputError: `mctx` is not installed.
+    """
+    # Not everybody has it, and it takes time to import.
+    from mechsearch_jax.planner.tree_search import import_mctx, tree_plan
+
+    import_mctx()
+    return search_for_grasp(config, **options).replace(plan=tree_plan)
+
+
 POLICIES: Mapping[str, PolicyFactory] = {
     "search-for-grasp": search_for_grasp,
     "search-and-grasp": search_and_grasp,
     "random": random_action,
+    "greedy": greedy,
+    "mctx": mctx,
 }
 
 

@@ -71,6 +71,7 @@ class Rollout:
       problem, belief: what does not change, and what is known.
       config: how the planner decides.
       propose, predict, objective: the slots.
+      present: the scene in which later actions are drawn, too; None where each is drawn in the state before it.
     """
 
     problem: Problem
@@ -79,6 +80,7 @@ class Rollout:
     propose: Propose
     predict: Predict
     objective: Objective
+    present: Superquadrics | None = None
 
     def root(self, objects: Superquadrics) -> State:
         """The present state, of which nothing is computed yet: as if every object had just moved."""
@@ -117,6 +119,12 @@ class Rollout:
         of_found = found_hits(problem.target_grasps, grasps, objects, found, state.hits[known:], moved)
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, of_found]))
 
+    def drawn_in(self, state: State) -> State:
+        """The state as it is taken for where an action is drawn."""
+        if self.present is None:
+            return state
+        return state.replace(scene=self.present.replace(valid=self.present.valid & state.scene.valid))
+
     def options(self, state: State, moved: Bool[Array, " n"]):
         """What can be done in a state after some objects moved."""
         possible = possible_space(self.problem, self.belief, state.exists)
@@ -126,10 +134,12 @@ class Rollout:
     def cost(self, state: State) -> Float[Array, ""]:
         """J of a state that is up to date."""
         known = (state.exists, state.target_at, state.hits)
-        return self.objective.cost(self.problem, self.belief, *known, self.config.crowding_weight)
+        return self.objective.cost(self.problem, self.belief, *known, self.config.weights)
 
     def _attempt(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
-        sample = self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, state)
+        sample = self.propose(
+            key, self.problem, self.belief, self.objective, self.config.guided_fraction, self.drawn_in(state)
+        )
         return sample, self.predict(self.problem, state, sample, first)
 
     def _draw(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
@@ -186,7 +196,9 @@ class Rollout:
         states = shared(jax.vmap(self.update)(states.replace(exists=states.exists & computes), moved))
 
         def go_on():
-            options = shared(jax.vmap(self.options)(states, moved))
+            # What can be done in the present scene is known from the first action on.
+            changed = moved if self.present is None else moved & first
+            options = shared(jax.vmap(self.options)(jax.vmap(self.drawn_in)(states), changed))
             act = jax.vmap(functools.partial(self.act, first))
             changes, actions, price = act(states.replace(options=options), keys)
             return changes | {"options": options}, actions, price
@@ -219,7 +231,10 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     """
     config = rollout.config
     count, horizon = config.sequences, config.horizon
-    states = repeated(rollout.root(objects), count)
+    root = rollout.root(objects)
+    if config.later_draws == "present":
+        rollout = dataclasses.replace(rollout, present=root.scene)
+    states = repeated(root, count)
     keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
     _, (actions, cost, price, scenes) = jax.lax.scan(
         lambda states, now: rollout.step(states, *now), states, (keys, jnp.arange(horizon + 1))

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot import kinematics
-from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
+from mechsearch_jax.robot.gripper import HAND, LINKS, Primitive, fingers
 from mechsearch_jax.workspace.shelf import Shelf
 
 # Edge of the cells of which boxes are made up [m]: each has a sphere around it. Coarse ones serve against the arm
@@ -76,7 +76,7 @@ class ArmBody:
     def of(cls, opening: float, held: Held | None = None) -> ArmBody:
         """The arm with `opening` m between the fingers."""
         extra = ((HAND_FRAME, _in_hand(held)),) if held else ()
-        bodies = (*((i, LINKS[i]) for i in range(7)), (HAND_FRAME, HAND), (HAND_FRAME, _fingers(opening)), *extra)
+        bodies = (*((i, LINKS[i]) for i in range(7)), (HAND_FRAME, HAND), (HAND_FRAME, fingers(opening)), *extra)
         return cls(_spheres(bodies, CELL), _spheres(bodies[5:], COARSE_CELL))
 
 
@@ -225,19 +225,6 @@ def _own_capsules() -> tuple[tuple[int, np.ndarray, np.ndarray, float], ...]:
             first, last = ((T[:3, 3] + sign * half * T[:3, 2]).astype(np.float32) for sign in (-1.0, 1.0))
             capsules.append((frame, first, last, radius))
     return tuple(capsules)
-
-
-def _fingers(opening: float) -> tuple[Primitive, ...]:
-    """Both fingers in the hand frame."""
-    left = np.eye(4)
-    left[:3, 3] = (0.0, opening / 2, FINGER_BASE)
-    right = np.diag([-1.0, -1.0, 1.0, 1.0])
-    right[:3, 3] = (0.0, -opening / 2, FINGER_BASE)
-    return tuple(
-        dataclasses.replace(part, T_frame_primitive=T @ part.T_frame_primitive)
-        for T in (left, right)
-        for part in FINGER
-    )
 
 
 def _in_hand(held: Held) -> tuple[Primitive, ...]:

@@ -168,6 +168,19 @@ LINKS = (
 )
 
 
+def fingers(opening: float) -> tuple[Primitive, ...]:
+    """Both fingers, `opening` m apart, in the hand frame."""
+    left = np.eye(4)
+    left[:3, 3] = (0.0, opening / 2, FINGER_BASE)
+    right = np.diag([-1.0, -1.0, 1.0, 1.0])
+    right[:3, 3] = (0.0, -opening / 2, FINGER_BASE)
+    return tuple(
+        dataclasses.replace(part, T_frame_primitive=T @ part.T_frame_primitive)
+        for T in (left, right)
+        for part in FINGER
+    )
+
+
 def primitives_in_gripper(gripper: Gripper, opening: float, q7: float) -> tuple[Primitive, ...]:
     """The primitives of the hand, both fingers, link 7 and link 6, with their poses in the gripper frame.
 

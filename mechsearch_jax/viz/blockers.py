@@ -56,9 +56,10 @@ def blockers_figure(
       heading: one line above everything.
       text: why the target cannot be taken out; it is broken into lines below everything.
     """
-    left, right, top, bottom = drawing.view_window(camera, shelf)
+    room = drawing.height_of([moment.scene for moment in moments], shelf)
+    left, right, top, bottom = drawing.view_window(camera, shelf, room)
     view_height = _WIDTH * (bottom - top) / (right - left)
-    map_height = _WIDTH * (shelf.back - shelf.front + 0.087) / (shelf.left - shelf.right + 0.024)
+    map_height = _WIDTH * drawing.map_share(shelf)
     width = len(moments) * (_WIDTH + _GAP) + _GAP
     lines = textwrap.wrap(text, int(_LETTERS * width))
     low = _GAP + _LINE * len(lines) + 0.1
@@ -72,15 +73,15 @@ def blockers_figure(
         figure.text(x / width, middle, moment.title, fontsize=10, color=drawing.INK, va="center")
         view = figure.add_axes((x / width, upper / height, _WIDTH / width, view_height / height))
         above = figure.add_axes((x / width, low / height, _WIDTH / width, map_height / height))
-        _draw(view, above, moment, camera, shelf, target)
+        _draw(view, above, moment, camera, shelf, target, room)
     for i, line in enumerate(lines):
         y = (low - 0.1 - _LINE * (i + 0.5)) / height
         figure.text(_GAP / width, y, line, fontsize=9, color=drawing.INK, va="center")
     return figure
 
 
-def _draw(view: Axes, above: Axes, moment: Moment, camera: Camera, shelf: Shelf, target: Target) -> None:
-    drawing.draw_view(view, moment.image, camera, shelf)
+def _draw(view: Axes, above: Axes, moment: Moment, camera: Camera, shelf: Shelf, target: Target, room: float) -> None:
+    drawing.draw_view(view, moment.image, camera, shelf, room)
     drawing.draw_numbers_in_view(view, moment.owner, moment.scene.capacity)
     drawing.draw_shelf(above, shelf)
     drawing.draw_objects(above, moment.scene)

@@ -6,6 +6,8 @@ From above, the picture is oriented as the robot sees the shelf: its open front 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,11 +15,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib import patches
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.path import Path
 from matplotlib.patheffects import Normal, Stroke
+from matplotlib.text import Text
 from scipy.spatial import ConvexHull
 
-from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.shapes import shape_of
@@ -36,6 +37,14 @@ TARGET = "#d1344b"
 GRASPABLE = "#2a9d78"
 BLOCKED = ("#f2c14e", "#ee9b3a", "#d9622b", "#9c3d2e")
 NO_GRASP = "#8d7b9c"
+HAND = INK
+
+# In pictures from above: what is shown in front of the shelf, and beside and behind it [m].
+ROBOT_STRIP, RIM = 0.1, 0.012
+# The camera's view reaches at least so far above the board, and so far above what stands there [m].
+LOWEST, ROOM = 0.15, 0.03
+# Size of the type within pictures.
+LETTER = 8.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +74,7 @@ def rgb(colour: str) -> np.ndarray:
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
 
 
-def _surfaces(scene: Superquadrics) -> list[Float[np.ndarray, "points 3"] | None]:
+def surfaces(scene: Superquadrics) -> list[Float[np.ndarray, "points 3"] | None]:
     """Points of each object's surface [m]; None for absent objects."""
     elevation = np.linspace(-np.pi / 2, np.pi / 2, 33)[:, None]
     azimuth = np.linspace(-np.pi, np.pi, 97)[None, :]
@@ -89,18 +98,19 @@ def _surfaces(scene: Superquadrics) -> list[Float[np.ndarray, "points 3"] | None
     return result
 
 
-def _hull(points: Float[np.ndarray, "points 2"] | None) -> Float[np.ndarray, "corners 2"] | None:
-    return None if points is None else points[ConvexHull(points).vertices]
+def hull(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"]:
+    """Corners of the convex hull, counter-clockwise."""
+    return points[ConvexHull(points).vertices]
 
 
 def outlines(scene: Superquadrics) -> list[Float[np.ndarray, "corners 2"] | None]:
     """Each object's outline seen from above in x and y [m], counter-clockwise; None for absent objects."""
-    return [_hull(None if points is None else points[:, :2]) for points in _surfaces(scene)]
+    return [None if points is None else hull(points[:, :2]) for points in surfaces(scene)]
 
 
 def outlines_in_view(scene: Superquadrics, camera: Camera) -> list[Float[np.ndarray, "corners 2"] | None]:
     """Each object's outline in the camera's image as columns and rows; None for absent objects."""
-    return [_hull(None if points is None else _pixels(camera, points)) for points in _surfaces(scene)]
+    return [None if points is None else hull(pixels(camera, points)) for points in surfaces(scene)]
 
 
 def map_image(
@@ -135,8 +145,11 @@ def draw_shelf(axes: Axes, shelf: Shelf) -> None:
         [left, left, right, right], [front, back, back, front], color=WALL, linewidth=3.5, solid_joinstyle="miter"
     )
     axes.plot([left, right], [front, front], color=WALL, linewidth=1, linestyle=(0, (4, 3)))
-    axes.set_xlim(left + 0.012, right - 0.012)
-    axes.set_ylim(front - 0.075, back + 0.012)
+    axes.text(
+        left - 0.01, front - 0.75 * ROBOT_STRIP, "robot's side", color=MUTED, fontsize=LETTER, ha="left", va="center"
+    )
+    axes.set_xlim(left + RIM, right - RIM)
+    axes.set_ylim(front - ROBOT_STRIP, back + RIM)
     axes.set_aspect("equal")
     axes.axis("off")
 
@@ -165,12 +178,16 @@ def draw_objects(axes: Axes, scene: Superquadrics) -> None:
             )
         )
         x, y, _ = np.asarray(scene.position)[i].tolist()
-        _number(axes, (y, x), i)
+        number(axes, (y, x), i)
 
 
-def _number(axes: Axes, place: tuple[float, float], index: int) -> None:
-    text = axes.text(place[0], place[1], str(index), color=INK, fontsize=8.5, ha="center", va="center", zorder=10)
+def number(axes: Axes, place: tuple[float, float], index: int, animated: bool = False) -> Text:
+    """The number of an object, legible on anything."""
+    text = axes.text(
+        *place, str(index), color=INK, fontsize=LETTER, ha="center", va="center", zorder=10, animated=animated
+    )
     text.set_path_effects([Stroke(linewidth=2.2, foreground=PAPER, alpha=0.75), Normal()])
+    return text
 
 
 def draw_target(axes: Axes, pose: Float[np.ndarray, " 3"], target: Target, certain: bool) -> None:
@@ -186,91 +203,85 @@ def draw_target(axes: Axes, pose: Float[np.ndarray, " 3"], target: Target, certa
         c, s = np.cos(yaw), np.sin(yaw)
         corners = shape.rim(target.half_size) @ np.array([[c, s], [-s, c]]) + (x, y)
         outline = patches.Polygon(corners[:, ::-1], closed=True, **style)
-    outline.set_path_effects(_halo(1.6))
+    outline.set_path_effects(halo(1.6))
     axes.add_patch(outline)
 
 
-def _halo(width: float) -> list:
+def target_points(pose: Float[np.ndarray, " 3"], target: Target, shelf: Shelf) -> Float[np.ndarray, "points 3"]:
+    """Points whose hull is the target, upright on the board [m].
+
+    Args:
+      pose: x, y [m] and yaw [rad].
+      target: what it looks like.
+      shelf: where it stands.
+    """
+    x, y, yaw = (float(v) for v in pose)
+    c, s = np.cos(yaw), np.sin(yaw)
+    level = shape_of(target.shape).rim(target.half_size) @ np.array([[c, s], [-s, c]]) + (x, y)
+    ends = (shelf.board, shelf.board + 2 * target.half_size[2])
+    return np.concatenate([np.column_stack([level, np.full(len(level), z)]) for z in ends])
+
+
+def draw_hidden_target_in_view(
+    axes: Axes, pose: Float[np.ndarray, " 3"], target: Target, camera: Camera, shelf: Shelf
+) -> None:
+    """An open outline where only the picture knows that the target is."""
+    outline = hull(pixels(camera, target_points(pose, target, shelf)))
+    hidden = patches.Polygon(
+        outline, closed=True, facecolor="none", edgecolor=TARGET, linewidth=1.3, linestyle=(0, (2, 1.5)), zorder=5
+    )
+    hidden.set_path_effects(halo(1.3))
+    axes.add_patch(hidden)
+
+
+def halo(width: float) -> list:
     return [Stroke(linewidth=width + 2.6, foreground=PAPER), Normal()]
 
 
-def _arrow(axes: Axes, points: Float[np.ndarray, "points 2"]) -> None:
-    codes = [Path.MOVETO, *[Path.LINETO] * (len(points) - 1)]
-    arrow = patches.FancyArrowPatch(
-        path=Path(points, codes),
-        arrowstyle="-|>",
-        mutation_scale=13,
-        color=ACTION,
-        linewidth=2.4,
-        fill=False,
-        joinstyle="miter",
-        zorder=8,
-        clip_on=False,
-    )
-    arrow.set_path_effects(_halo(2.4))
-    axes.add_patch(arrow)
-
-
-def draw_sketch(axes: Axes, sketch: Sketch, after: Superquadrics) -> None:
-    """An action from above.
-
-    Args:
-      axes: where the shelf is drawn.
-      sketch: what there is to show.
-      after: the objects as they are predicted after the action.
-    """
-    if sketch.way_in is not None:
-        axes.plot(*sketch.way_in[:, 1::-1].T, color=ACTION, lw=1.6, linestyle=(0, (1, 1.2)), zorder=7)
-    if sketch.start is not None:
-        axes.plot(sketch.start[1], sketch.start[0], "o", color=ACTION, markersize=4, zorder=9)
-    if sketch.ghost is not None:
-        outline = outlines(after)[sketch.ghost]
-        if outline is not None:
-            axes.add_patch(
-                patches.Polygon(
-                    outline[:, ::-1], closed=True, facecolor=(*rgb(ACTION), 0.12), edgecolor=ACTION, lw=1.4,
-                    linestyle=(0, (3, 2)), zorder=6,
-                )
-            )  # fmt: skip
-    if sketch.path is not None:
-        _arrow(axes, sketch.path[:, 1::-1])
-
-
-def draw_sketch_in_view(axes: Axes, sketch: Sketch, camera: Camera) -> None:
-    """An action in the camera's image."""
-    if sketch.way_in is not None:
-        axes.plot(*_pixels(camera, sketch.way_in).T, color=ACTION, lw=1.6, linestyle=(0, (1, 1.2)), zorder=7)
-    if sketch.start is not None:
-        axes.plot(*_pixels(camera, sketch.start), "o", color=ACTION, markersize=4, zorder=9)
-    if sketch.path is not None:
-        _arrow(axes, _pixels(camera, sketch.path))
-
-
-def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
+def pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
     """(column, row) of world points."""
     pixels, _ = project(camera, jnp.asarray(points, jnp.float32))
     return np.asarray(pixels)[..., ::-1]
 
 
-def view_window(camera: Camera, shelf: Shelf) -> tuple[int, int, int, int]:
-    """The part of the camera's image that shows the shelf: first and last column, first and last row."""
+def view_window(camera: Camera, shelf: Shelf, height: float | None = None) -> tuple[int, int, int, int]:
+    """The part of the camera's image that shows the shelf: first and last column, first and last row.
+
+    Args:
+      camera, shelf: of the problem.
+      height: how far above its board it is shown [m]; up to the upper board if None.
+    """
+    top = shelf.ceiling if height is None else min(shelf.board + height, shelf.ceiling)
     corners = np.array(
         [
             (x, y, z)
             for x in (shelf.front, shelf.back)
             for y in (shelf.right, shelf.left)
-            for z in (shelf.board, shelf.ceiling)
+            for z in (shelf.board - shelf.thickness, top)
         ]
     )
-    pixels = _pixels(camera, corners)
-    low = np.clip(np.floor(pixels.min(axis=0)) - 10, 0, None)
-    high = np.clip(np.ceil(pixels.max(axis=0)) + 10, None, (camera.width, camera.height))
+    corner = pixels(camera, corners)
+    low = np.clip(np.floor(corner.min(axis=0)) - 10, 0, None)
+    high = np.clip(np.ceil(corner.max(axis=0)) + 10, None, (camera.width, camera.height))
     return int(low[0]), int(high[0]), int(low[1]), int(high[1])
 
 
-def draw_view(axes: Axes, image: UInt8[np.ndarray, "h w 3"], camera: Camera, shelf: Shelf) -> None:
-    """The camera's image, cut to the shelf."""
-    left, right, top, bottom = view_window(camera, shelf)
+def height_of(scenes: Iterable[Superquadrics], shelf: Shelf) -> float:
+    """How far above the board everything in some scenes can be shown, with a little room [m]."""
+    tops = [points[:, 2].max() for scene in scenes for points in surfaces(scene) if points is not None]
+    return max(LOWEST, *(top - shelf.board + ROOM for top in tops)) if tops else LOWEST
+
+
+def map_share(shelf: Shelf) -> float:
+    """Height of the picture from above for each unit of its width."""
+    return (shelf.back - shelf.front + ROBOT_STRIP + RIM) / (shelf.left - shelf.right + 2 * RIM)
+
+
+def draw_view(
+    axes: Axes, image: UInt8[np.ndarray, "h w 3"], camera: Camera, shelf: Shelf, height: float | None = None
+) -> None:
+    """The camera's image, cut to the shelf: see `view_window`."""
+    left, right, top, bottom = view_window(camera, shelf, height)
     axes.imshow(image[top:bottom, left:right], extent=(left, right, bottom, top), interpolation="antialiased")
     axes.set_xlim(left, right)
     axes.set_ylim(bottom, top)
@@ -278,6 +289,25 @@ def draw_view(axes: Axes, image: UInt8[np.ndarray, "h w 3"], camera: Camera, she
     axes.set_yticks([])
     for spine in axes.spines.values():
         spine.set_color(WALL)
+    _name_front_in_view(axes, camera, shelf)
+
+
+def _name_front_in_view(axes: Axes, camera: Camera, shelf: Shelf) -> None:
+    """Say which side is the robot's, along the board's front edge where that is in the picture."""
+    y = np.linspace(shelf.left, shelf.right, 201)
+    edge = np.column_stack([np.full_like(y, shelf.front), y, np.full_like(y, shelf.board - shelf.thickness)])
+    edge = pixels(camera, edge)
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    inside = (edge[:, 0] > left) & (edge[:, 0] < right) & (edge[:, 1] > top) & (edge[:, 1] < bottom)
+    seen = edge[inside]
+    if len(seen) < 20:
+        return
+    at, along = seen[len(seen) // 2], seen[-1] - seen[0]
+    along = along if along[0] >= 0 else -along
+    axes.text(
+        float(at[0]), float(at[1]), "robot's side", color=MUTED, fontsize=LETTER, ha="center", va="top",
+        rotation=float(np.degrees(np.arctan2(-along[1], along[0]))), rotation_mode="anchor", zorder=4,
+    )  # fmt: skip
 
 
 def draw_numbers_in_view(axes: Axes, owner: Int[np.ndarray, "h w"], count: int) -> None:
@@ -291,20 +321,35 @@ def draw_numbers_in_view(axes: Axes, owner: Int[np.ndarray, "h w"], count: int) 
     for i in range(count):
         rows, columns = np.nonzero(owner == i)
         if len(rows) > 200:
-            _number(axes, (float(np.median(columns)), float(np.median(rows))), i)
+            number(axes, (float(np.median(columns)), float(np.median(rows))), i)
 
 
-def draw_legend(figure: Figure, capacity: int, y: float) -> None:
-    """What the colours mean, in one line at the height `y` of the figure (0 to 1)."""
+def draw_legend(figure: Figure, capacity: int, y: float, size: float = LETTER) -> None:
+    """What the colours of the map mean, in one line at the height `y` of the figure (0 to 1), in type of a size."""
     marks = [patches.Patch(facecolor=(*rgb(b.colour), 0.95), label=b.label) for b in bands(capacity)]
     marks.append(patches.Patch(facecolor=TARGET, label="target, found"))
     marks.append(patches.Patch(facecolor="none", edgecolor=TARGET, linestyle=(0, (2, 1.5)), label="target, hidden"))
-    legend = figure.legend(
-        handles=marks, loc="center", bbox_to_anchor=(0.5, y), ncols=len(marks), frameon=False, fontsize=8.5,
-        handlelength=1.1, handleheight=1.1, columnspacing=1.3, labelcolor=INK, borderpad=0,
-        title="Where the target can be, and what a grasp there would meet", title_fontsize=8.5,
-    )  # fmt: skip
+    title = "Where the target can be, and what a grasp there would meet"
+    legend = figure.legend(handles=marks, **_legend_style(len(marks), y, size), title=title, title_fontsize=size)
     legend.get_title().set_color(MUTED)
+
+
+def draw_action_legend(figure: Figure, y: float) -> None:
+    """How actions are drawn, in one line at the height `y` of the figure (0 to 1)."""
+    ghost = {"facecolor": (*rgb(ACTION), 0.14), "edgecolor": ACTION, "linestyle": (0, (3, 1.6))}
+    marks = [
+        patches.Patch(facecolor=(*rgb(HAND), 0.22), edgecolor=HAND, label="the hand as it begins"),
+        patches.Patch(facecolor=(*rgb(HAND), 0.05), edgecolor=(*rgb(HAND), 0.4), label="as it ends"),
+        patches.Patch(**ghost, label="where objects are expected to go"),
+    ]
+    figure.legend(handles=marks, **_legend_style(len(marks), y, LETTER))
+
+
+def _legend_style(columns: int, y: float, size: float) -> dict[str, Any]:
+    return {
+        "loc": "center", "bbox_to_anchor": (0.5, y), "ncols": columns, "frameon": False, "fontsize": size,
+        "handlelength": 1.1, "handleheight": 1.1, "columnspacing": 1.3, "labelcolor": INK, "borderpad": 0,
+    }  # fmt: skip
 
 
 def save_figure(figure: Figure, path: PathLike, dpi: int = 110) -> None:

@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import textwrap
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.viz import drawing
+from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-_WIDTH = 4.6
-_CAPTION, _GAP, _LEGEND = 0.52, 0.16, 0.55
-# Width of a letter of the heading, in units of the size of its type.
-_LETTER = 0.6
+# Of the figure [inches]: at 100 dots an inch all of its type can be read.
+WIDTH = 10.0
+_HEADING, _GAP, _BETWEEN, _LEGEND = 0.42, 0.14, 0.06, 0.8
+# Distance of lines of type, in units of its size.
+_LEADING = 1.4
+# Width of a letter, in units of the size of its type.
+_LETTER, _BOLD_LETTER = 0.54, 0.575
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,63 +61,139 @@ class Frame:
 
 
 def filmstrip(
-    frames: Sequence[Frame], camera: Camera, shelf: Shelf, target: Target, heading: str, columns: int = 4
+    frames: Sequence[Frame], camera: Camera, shelf: Shelf, target: Target, heading: str, columns: int = 3
 ) -> Figure:
     """Draw an episode: per step the camera's view and the shelf from above, with f and g as colours and the action.
 
     Args:
-      frames: the steps, at least one.
+      frames: the steps, at least one; a single one has its two pictures side by side.
       camera, shelf, target: of the problem.
       heading: one line above everything.
       columns: at most so many steps side by side; lines are filled evenly.
 
     Returns:
-      The figure; nothing is kept anywhere else.
+      The figure, `WIDTH` wide; nothing is kept anywhere else.
     """
     lines = math.ceil(len(frames) / columns)
     columns = math.ceil(len(frames) / lines)
-    left, right, top, bottom = drawing.view_window(camera, shelf)
-    view_height = _WIDTH * (bottom - top) / (right - left)
-    map_height = _WIDTH * (shelf.back - shelf.front + 0.087) / (shelf.left - shelf.right + 0.024)
-    cell = _CAPTION + view_height + 0.08 + map_height + _GAP
-    width = columns * _WIDTH + (columns + 1) * _GAP
-    height = 0.5 + lines * cell + _LEGEND
-    figure = Figure(figsize=(max(width, 9.6), height), facecolor=drawing.PAPER)
-    width, offset = figure.get_figwidth(), (figure.get_figwidth() - width) / 2
+    scenes = [scene for frame in frames for scene in (frame.scene, frame.after)]
+    room = drawing.height_of(scenes, shelf)
+    width = (WIDTH - (columns + 1) * _GAP) / columns
+    lines_of = [_lines(frame, width) for frame in frames]
+    caption = _BETWEEN + max(sum(_LEADING * size / 72 for _, size, *_ in told) for told in lines_of)
+    layout = _layout(columns, width, caption, drawing.view_window(camera, shelf, room), drawing.map_share(shelf))
+    height = _HEADING + lines * layout.height + _LEGEND
+    figure = Figure(figsize=(WIDTH, height), facecolor=drawing.PAPER)
+    fits = 72.0 * (WIDTH - 2 * _GAP) / (_BOLD_LETTER * max(len(heading), 1))
     figure.text(
-        _GAP / width + offset / width,
-        1 - 0.3 / height,
+        _GAP / WIDTH,
+        1 - 0.22 / height,
         heading,
-        fontsize=min(13.0, 72.0 * (width - offset - 2 * _GAP) / (_LETTER * max(len(heading), 1))),
+        fontsize=min(13.0, fits),
         color=drawing.INK,
         weight="bold",
         va="center",
     )
-
     for i, frame in enumerate(frames):
-        x = offset + _GAP + (i % columns) * (_WIDTH + _GAP)
-        y = height - 0.5 - (i // columns) * cell
-        figure.text(
-            x / width, (y - 0.16) / height, frame.title, fontsize=10.5, color=drawing.INK, weight="bold", va="center"
+        x = _GAP + (i % columns) * (layout.width + _GAP)
+        y = height - _HEADING - (i // columns) * layout.height
+        _write(figure, x, y, lines_of[i])
+        view, above = (
+            figure.add_axes(((x + a) / WIDTH, (y - b) / height, w / WIDTH, h / height))
+            for a, b, w, h in (layout.view, layout.above)
         )
-        figure.text(x / width, (y - 0.37) / height, frame.caption, fontsize=8.5, color=drawing.MUTED, va="center")
-        y -= _CAPTION + view_height
-        view = figure.add_axes((x / width, y / height, _WIDTH / width, view_height / height))
-        y -= 0.08 + map_height
-        above = figure.add_axes((x / width, y / height, _WIDTH / width, map_height / height))
-        _draw(view, above, frame, camera, shelf, target)
-    drawing.draw_legend(figure, frames[0].scene.capacity, 0.5 * _LEGEND / height)
+        _draw(view, above, frame, camera, shelf, target, room)
+    drawing.draw_legend(figure, frames[0].scene.capacity, 0.62 * _LEGEND / height)
+    drawing.draw_action_legend(figure, 0.17 * _LEGEND / height)
     return figure
 
 
-def _draw(view, above, frame: Frame, camera: Camera, shelf: Shelf, target: Target) -> None:
-    drawing.draw_view(view, frame.image, camera, shelf)
-    drawing.draw_numbers_in_view(view, frame.owner, frame.scene.capacity)
-    drawing.draw_shelf(above, shelf)
-    image = drawing.map_image(frame.existence, frame.graspability, target, frame.scene.capacity)
-    drawing.draw_map(above, image, shelf, target)
+class _Layout(NamedTuple):
+    """Where the pictures of a step are [inches].
+
+    Attributes:
+      width, height: of all of it.
+      view, above: of each picture its left side, from the step's left side, its lower side, from the step's upper side
+        downwards, its width and its height.
+    """
+
+    width: float
+    height: float
+    view: tuple[float, float, float, float]
+    above: tuple[float, float, float, float]
+
+
+def _layout(columns: int, width: float, caption: float, window: tuple[int, int, int, int], map_share: float) -> _Layout:
+    """One above the other, or, of a single step, side by side with the same height."""
+    left, right, top, bottom = window
+    share = (bottom - top) / (right - left)
+    if columns > 1:
+        view, above = width * share, width * map_share
+        lower = caption + view + _BETWEEN + above
+        return _Layout(width, lower + _GAP, (0.0, caption + view, width, view), (0.0, lower, width, above))
+    high = (width - _GAP) / (1 / share + 1 / map_share)
+    lower, across = caption + high, high / share
+    return _Layout(width, lower + _GAP, (0.0, lower, across, high), (across + _GAP, lower, high / map_share, high))
+
+
+def _lines(frame: Frame, width: float) -> list[tuple[str, float, str, str]]:
+    """Title and caption of a step, broken into lines: each with its size, weight and colour."""
+    told = (
+        (frame.title, 9.5, "bold", drawing.INK, _BOLD_LETTER),
+        (frame.caption, drawing.LETTER, "normal", drawing.MUTED, _LETTER),
+    )
+    return [
+        (line, size, weight, colour)
+        for text, size, weight, colour, letter in told
+        for line in textwrap.wrap(text, int(72 * width / (letter * size)))
+    ]
+
+
+def _write(figure: Figure, x: float, y: float, lines: Sequence[tuple[str, float, str, str]]) -> None:
+    for text, size, weight, colour in lines:
+        y -= _LEADING * size / 72
+        figure.text(x / WIDTH, y / figure.get_figheight(), text, fontsize=size, color=colour, weight=weight)
+
+
+def _draw(view: Axes, above: Axes, frame: Frame, camera: Camera, shelf: Shelf, target: Target, room: float) -> None:
+    draw_seen(view, frame, camera, shelf, target, room)
+    draw_believed(above, frame, shelf, target)
     drawing.draw_objects(above, frame.scene)
     if frame.target_pose is not None:
         drawing.draw_target(above, frame.target_pose, target, frame.found)
-    drawing.draw_sketch_in_view(view, frame.sketch, camera)
-    drawing.draw_sketch(above, frame.sketch, frame.after)
+
+
+def draw_seen(axes: Axes, frame: Frame, camera: Camera, shelf: Shelf, target: Target, room: float) -> None:
+    """What the camera sees at a step, and the action.
+
+    Args:
+      axes: for nothing else.
+      frame: the step.
+      camera, shelf, target: of the problem.
+      room: how far above the board it is shown [m].
+    """
+    drawing.draw_view(axes, frame.image, camera, shelf, room)
+    drawing.draw_numbers_in_view(axes, frame.owner, frame.scene.capacity)
+    if frame.target_pose is not None and not frame.found:
+        drawing.draw_hidden_target_in_view(axes, frame.target_pose, target, camera, shelf)
+    _act(axes, sketches.in_view(camera), frame, shelf, target)
+
+
+def draw_believed(axes: Axes, frame: Frame, shelf: Shelf, target: Target) -> None:
+    """The empty shelf from above with f and g at a step, and the action.
+
+    Args:
+      axes: for nothing else.
+      frame: the step.
+      shelf, target: of the problem.
+    """
+    drawing.draw_shelf(axes, shelf)
+    image = drawing.map_image(frame.existence, frame.graspability, target, frame.scene.capacity)
+    drawing.draw_map(axes, image, shelf, target)
+    _act(axes, sketches.from_above, frame, shelf, target)
+
+
+def _act(axes: Axes, flat: sketches.Flat, frame: Frame, shelf: Shelf, target: Target) -> None:
+    sketches.draw_action(axes, flat, frame.sketch, frame.scene, frame.after, shelf)
+    if frame.target_pose is not None:
+        sketches.draw_taken_target(axes, flat, frame.sketch, frame.target_pose, target, shelf)

@@ -45,7 +45,7 @@ def maps_figure(
       The figure; nothing is kept anywhere else.
     """
     left, right, top, bottom = drawing.view_window(camera, shelf)
-    map_height = _WIDTH * (shelf.back - shelf.front + 0.087) / (shelf.left - shelf.right + 0.024)
+    map_height = _WIDTH * drawing.map_share(shelf)
     view_height = 2 * map_height + 0.4
     view_width = view_height * (right - left) / (bottom - top)
     width = view_width + 2 * _WIDTH + 4 * _GAP

@@ -1,0 +1,150 @@
+"""`mechsearch reproduce`: the paper's experiments, beside the paper's figures."""
+
+from __future__ import annotations
+
+import itertools
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from mechsearch_jax.commands.options import PaperMethod, at_least_one, files_of, with_planner_options
+from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, run_jobs
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.evaluate import Job
+    from mechsearch_jax.benchmarks.paper_tables import PaperTable
+    from mechsearch_jax.benchmarks.reproduce import Setting
+    from mechsearch_jax.benchmarks.rows import Row
+
+TableName = Literal["table1", "table3", "table4", "table5"]
+Recognition = Literal["oracle", "masks", "full"]
+ProtocolName = Literal["strict", "published-code"]
+
+
+def _settings(
+    table: PaperTable,
+    method: Sequence[str],
+    recognition: Sequence[str],
+    preset: Sequence[str],
+    protocol: Sequence[str],
+) -> list[Setting]:
+    """What the cells of a table run with."""
+    from mechsearch_jax.benchmarks.reproduce import Setting
+    from mechsearch_jax.planner import PRESETS
+
+    unknown = [name for name in preset if name not in PRESETS]
+    if unknown:
+        raise InputError(f"reproduce: preset {unknown[0]} is unknown; use {', '.join(PRESETS)}")
+    product = itertools.product(preset, protocol, recognition, method, table.actions)
+    return [Setting(m, r, actions, p, terms) for p, terms, r, m, actions in dict.fromkeys(product)]
+
+
+def _jobs(
+    settings: Sequence[Setting], scenarios: Sequence[Path], seeds: Sequence[int], simulator: str, run: RunOptions
+) -> dict[Setting, list[Job]]:
+    """The episodes of every setting.
+
+    Raises:
+      InputError: a setting cannot be used, or the simulator is not there.
+    """
+    from mechsearch_jax.benchmarks.evaluate import make_jobs
+
+    options: Any = with_planner_options()
+    engine = run.engine("reproduce", options(simulator=simulator))
+
+    def method_of(setting: Setting) -> Any:
+        point = options(
+            preset=setting.preset,
+            recognition=setting.recognition,
+            protocol=setting.protocol,
+            actions=setting.actions,
+            simulator=simulator,
+        )
+        return point.methods([setting.method], engine)[0]
+
+    methods = {setting: method_of(setting) for setting in settings}
+    jobs = make_jobs(scenarios, list(methods.values()), list(dict.fromkeys(seeds)))
+    found: dict[Any, list[Job]] = {}
+    for job in jobs:
+        found.setdefault(job.method, []).append(job)
+    return {setting: found[method] for setting, method in methods.items()}
+
+
+def reproduce(
+    table: Annotated[TableName, tyro.conf.Positional, tyro.conf.arg(metavar="table1|table3|table4|table5")],
+    /,
+    *,
+    out: Path,
+    method: Annotated[tuple[PaperMethod, ...], tyro.conf.arg(metavar="{search-and-grasp,search-for-grasp} ...")] = (),
+    recognition: Annotated[tuple[Recognition, ...], tyro.conf.arg(metavar="{oracle,masks,full} ...")] = (),
+    preset: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = (),
+    protocol: Annotated[tuple[ProtocolName, ...], tyro.conf.arg(metavar="{strict,published-code} ...")] = (),
+    objects: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (),
+    scenes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    seed: tuple[int, ...] = (0,),
+    simulator: Literal["auto", "native", "mjx"] = "auto",
+    run: Annotated[RunOptions, tyro.conf.arg(name="")] = USUAL_RUN,
+) -> None:
+    """Run an experiment of the paper in our simulator, and set what comes of it beside the paper's figures.
+
+    The rows are those of evaluate, in the same kind of folder: killed and started again, it goes on where it stopped.
+    The table is drawn from all that is in the folder by then, this machine's part or another's.
+
+    Args:
+      table: table1 is the main experiment, table3 two cylinders in a line, table4 one kind of action alone, table5 a
+        box as the target.
+      out: folder for the results, and for NAME.md and NAME.json.
+      method: one of them; both by default.
+      recognition: what the planner sees: true shapes, a noisy depth image with true masks (the paper's R), or the image
+        alone; all three by default.
+      preset: where the planner's settings come from, one or more; paper and standard by default.
+      protocol: how episodes are run and judged, one or both; strict by default.
+      objects: only the scenes with so many.
+      scenes: only the first so many of each number of objects, for a quick look.
+      seed: one or more.
+      simulator: as evaluate has it.
+      run: how the episodes are run.
+    """
+    from mechsearch_jax.benchmarks.paper_tables import METHODS, TABLES, table_scenes
+
+    at_least_one("reproduce", scenes=scenes)
+    chosen = TABLES[table]
+    files = files_of(table_scenes(chosen, objects, scenes))
+    settings = _settings(
+        chosen,
+        method or METHODS,
+        recognition or ("oracle", "masks", "full"),
+        preset or ("paper", "standard"),
+        protocol or ("strict",),
+    )
+    jobs = _jobs(settings, files, seed, simulator, run)
+    every = [job for own in jobs.values() for job in own]
+    if run.dry_run:
+        print(f"{chosen.name}: {chosen.about}; {len(files)} scenes")
+        for setting, own in jobs.items():
+            print(f"{len(own)} episodes: {', '.join(['+'.join(p) if isinstance(p, tuple) else p for p in setting])}")
+
+    def told(console: Console, rows: Sequence[Row]) -> None:
+        _draw(console, chosen, jobs, out)
+
+    run_jobs("reproduce", every, out, run, simulator, told)
+
+
+def _draw(console: Console, table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], out: Path) -> None:
+    """Print and write the table from what is in the folder."""
+    from mechsearch_jax.benchmarks.reproduce import results_of, screen, write_table
+    from mechsearch_jax.benchmarks.shards import Results
+
+    known = Results(out)
+    known.refresh()
+    results = results_of(table, jobs, known.rows)
+    page, _ = write_table(results, out, shlex.join(["mechsearch", *sys.argv[1:]]))
+    console.print(screen(results))
+    console.print(str(page), soft_wrap=True)

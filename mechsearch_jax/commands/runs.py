@@ -1,0 +1,196 @@
+"""What the commands share that run many episodes: how they are run, whatever they come to."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from mechsearch_jax.commands.options import EpisodeOptions, at_least_one, find_scenarios, has_gpu
+from mechsearch_jax.cores import cores
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.evaluate import Job
+    from mechsearch_jax.benchmarks.rows import Row
+    from mechsearch_jax.envs.method import EngineName
+
+
+def _count(metavar: str) -> Any:
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
+@dataclasses.dataclass(frozen=True)
+class RunOptions:
+    """How episodes are run; nothing of it decides what they come to.
+
+    Attributes:
+      workers: number of processes, which use the CPU; by default one for each core, where there is no GPU.
+      batch: number of episodes that run at the same time in this process; by default, on a GPU, what its memory holds.
+      shard: run only the K-th of N parts of the episodes, as on machines that share no folder.
+      retry_errors: run the episodes again whose row is an error.
+      time_limit: of an episode in a worker process; one that takes longer is killed, and its row is an error. 3600 by
+        default.
+      dry_run: only say how many episodes and compilations it would be, and about how many hours.
+    """
+
+    workers: Annotated[int | None, _count("N")] = None
+    batch: Annotated[int | None, _count("N")] = None
+    shard: Annotated[str | None, _count("K/N")] = None
+    retry_errors: bool = False
+    time_limit: Annotated[float | None, _count("SECONDS")] = None
+    dry_run: bool = False
+
+    def in_processes(self, command: str, simulator: str) -> bool:
+        """Whether worker processes run the episodes, with a simulator as `EpisodeOptions` has it.
+
+        Raises:
+          InputError: an option is impossible, or does not go with another.
+        """
+        at_least_one(command, workers=self.workers, batch=self.batch)
+        if self.workers is not None and self.batch is not None:
+            raise InputError(f"{command}: give either --workers or --batch, not both")
+        if self.workers is not None and simulator == "mjx":
+            raise InputError(f"{command}: --workers run the native simulator; leave --workers out, or --simulator mjx")
+        found = self.workers is not None or (self.batch is None and simulator != "mjx" and not has_gpu())
+        if self.time_limit is not None and not found:
+            raise InputError(
+                f"{command}: --time-limit is for worker processes, not for batches; leave it out, or --workers N"
+            )
+        if self.time_limit is not None and not 0 < self.time_limit < math.inf:
+            raise InputError(f"{command}: --time-limit {self.time_limit:g} must be a number of seconds above 0")
+        return found
+
+    def engine(self, command: str, options: EpisodeOptions) -> EngineName:
+        """The simulator that the episodes run in.
+
+        Raises:
+          InputError: as `in_processes`, the part of the episodes is none, or the simulator is not installed.
+        """
+        parsed_shard(command, self.shard)
+        return "NativeSimulator" if self.in_processes(command, options.simulator) else options.engine()
+
+
+# As the commands run them where nothing is given.
+USUAL_RUN = RunOptions()
+
+
+def parsed_shard(command: str, text: str | None) -> tuple[int, int]:
+    """The numbers K and N of "K/N"; 1 and 1 where nothing is given.
+
+    Raises:
+      InputError: it is something else.
+    """
+    parts = (text or "1/1").split("/")
+    if len(parts) != 2 or not all(part.isdecimal() for part in parts) or not 1 <= int(parts[0]) <= int(parts[1]):
+        raise InputError(f"{command}: --shard {text} is not K/N with K from 1 to N, as 2/8")
+    return int(parts[0]), int(parts[1])
+
+
+def run_episodes_of(
+    command: str,
+    scenarios: Sequence[str],
+    points: Sequence[EpisodeOptions],
+    policies: Sequence[str],
+    seeds: Sequence[int],
+    out: Path,
+    run: RunOptions,
+) -> None:
+    """Run every scenario with every policy at every point and with every seed, and print the rates.
+
+    Args:
+      command: its name, for complaints.
+      scenarios: as commands take them.
+      points: what episodes run with; one simulator and one configuration file for all.
+      policies: their names or import paths.
+      seeds: of the episodes.
+      out: folder of the results.
+      run: how they are run.
+
+    Raises:
+      InputError: something that is given cannot be used.
+    """
+    from mechsearch_jax.benchmarks.episode_tables import print_rates
+    from mechsearch_jax.benchmarks.evaluate import make_jobs
+
+    engine = run.engine(command, points[0])
+    # The same settings may come from several points.
+    methods = dict.fromkeys(method for point in points for method in point.methods(policies, engine))
+    jobs = make_jobs(find_scenarios(scenarios), list(methods), list(dict.fromkeys(seeds)))
+    run_jobs(command, jobs, out, run, points[0].simulator, print_rates)
+
+
+def run_jobs(
+    command: str,
+    jobs: Sequence[Job],
+    out: Path,
+    run: RunOptions,
+    simulator: str,
+    told: Callable[[Console, Sequence[Row]], None],
+) -> None:
+    """Run this machine's part of jobs, or only say what that would take.
+
+    Args:
+      command: its name, for complaints.
+      jobs: the episodes of all machines; their engine is `run.engine`'s.
+      out: folder of the results.
+      run: how they are run.
+      simulator: as `EpisodeOptions` has it.
+      told: prints what they came to, where there are any.
+
+    Raises:
+      InputError: something that is given cannot be used.
+    """
+    from mechsearch_jax.benchmarks.evaluate import shard_of
+
+    jobs = shard_of(jobs, *parsed_shard(command, run.shard))
+    in_processes = run.in_processes(command, simulator)
+    workers = run.workers or cores()
+    if run.dry_run:
+        from mechsearch_jax.benchmarks.estimate import estimate
+
+        print(estimate(jobs, out, workers if in_processes else None, run.retry_errors))
+        return
+    _run(command, jobs, out, run, workers if in_processes else None, told)
+
+
+def _run(
+    command: str,
+    jobs: Sequence[Job],
+    out: Path,
+    run: RunOptions,
+    workers: int | None,
+    told: Callable[[Console, Sequence[Row]], None],
+) -> None:
+    """Run jobs in so many worker processes, in batches if None."""
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.batches import Batches
+    from mechsearch_jax.benchmarks.evaluate import evaluate
+    from mechsearch_jax.benchmarks.processes import TIME_LIMIT, Processes
+    from mechsearch_jax.benchmarks.tables import EpisodeProgress
+    from mechsearch_jax.planner.cache import keep_compilations
+
+    console = Console(highlight=False)
+    with EpisodeProgress(console, len(jobs)) as progress:
+        if workers is not None:
+            runner = Processes(workers, run.time_limit or TIME_LIMIT)
+        else:
+            keep_compilations()
+            runner = Batches(run.batch, progress.busy)
+        rows = evaluate(jobs, out, runner, progress.ended, progress.waiting, run.retry_errors)
+    if rows:
+        told(console, rows)
+    if errors := sum(row.is_error for row in rows):
+        print(
+            f"{command}: {errors} of {len(rows)} episodes ended in an error; --retry-errors runs them again",
+            file=sys.stderr,
+        )
+    console.print(str(out), soft_wrap=True)

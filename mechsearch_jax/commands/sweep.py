@@ -1,0 +1,211 @@
+"""`mechsearch sweep`: many episodes, with several values of any option."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
+
+import tyro
+
+from mechsearch_jax.commands.options import (
+    EpisodeOptions,
+    PaperMethod,
+    SomeScenarios,
+    chosen_policies,
+    with_planner_options,
+)
+from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, run_episodes_of
+from mechsearch_jax.errors import InputError, nearest
+
+if TYPE_CHECKING:
+    from mechsearch_jax.planner import Option
+
+Recognition = Literal["oracle", "masks", "full"]
+ProtocolName = Literal["strict", "published-code"]
+SimulatorName = Literal["auto", "native", "mjx"]
+# Keys of a sweep's file that are no options of the planner, with what they hold; lists of it, but for the last two.
+_KEYS: Mapping[str, Any] = {
+    **dict.fromkeys(("scenarios", "policy", "method"), str),
+    "seed": int,
+    "recognition": Recognition,
+    "protocol": ProtocolName,
+    "simulator": SimulatorName,
+    "config": str,
+}
+_SINGLE = ("simulator", "config")
+# Those that `SweptOptions` has, and their names there.
+_FIELDS = {"recognition": "recognition", "protocol": "protocol", "simulator": "simulator", "config": "config_file"}
+
+
+@dataclasses.dataclass(frozen=True)
+class SweptOptions:
+    """What episodes run with, any number of values of each; `with_swept_options` adds the preset and the planner's.
+
+    Attributes:
+      config_file: a file of settings of camera, shelf, gripper, target, objects and planner; what else is given goes
+        before it. One for all.
+      recognition: "oracle" knows true shapes and poses; the others see a noisy depth image, "masks" with the true
+        segmentation, "full" without.
+      protocol: how episodes are run and judged: strictly, or as the authors' published code does.
+      simulator: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for batches where there is a GPU.
+        One for all.
+    """
+
+    config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
+    recognition: Annotated[
+        tuple[Recognition, ...],
+        tyro.conf.arg(metavar="{oracle,masks,full} ...", help_behavior_hint="(default: oracle)"),
+    ] = ()
+    protocol: Annotated[
+        tuple[ProtocolName, ...],
+        tyro.conf.arg(metavar="{strict,published-code} ...", help_behavior_hint="(default: strict)"),
+    ] = ()
+    simulator: Annotated[
+        SimulatorName | None, tyro.conf.arg(metavar="{auto,native,mjx}", help_behavior_hint="(default: auto)")
+    ] = None
+
+    def points(self) -> list[EpisodeOptions]:
+        """All combinations of the values, in the order of the options.
+
+        Raises:
+          InputError: a value that is a list holds something else.
+        """
+        from mechsearch_jax.planner import OPTIONS
+
+        kind: Any = with_planner_options()
+        lists = {option.name: option.type for option in OPTIONS if get_origin(option.type) is tuple}
+        listed = {"recognition": self.recognition, "protocol": self.protocol}
+        swept = {**listed, **{n: getattr(self, n, ()) for n in ("preset", *_options())}}
+        given = {
+            name: [_listed(name, value, lists[name]) if name in lists else value for value in values]
+            for name, values in swept.items()
+            if values
+        }
+        file = None if self.config_file is None else Path(self.config_file)
+        once: dict[str, Any] = {"config_file": file, "simulator": self.simulator or "auto"}
+        return [kind(**once, **dict(zip(given, point, strict=True))) for point in itertools.product(*given.values())]
+
+
+SWEPT_DEFAULTS = SweptOptions()
+
+
+def _options() -> dict[str, Option]:
+    from mechsearch_jax.planner import OPTIONS
+
+    return {option.name: option for option in OPTIONS}
+
+
+def _listed(name: str, value: Any, kind: Any) -> tuple[Any, ...]:
+    """A value that is a list, which the command line has with commas."""
+    if not isinstance(value, str):
+        return tuple(value)
+    try:
+        return tuple(get_args(kind)[0](part.strip()) for part in value.split(","))
+    except ValueError:
+        raise InputError(
+            f"sweep: --{name.replace('_', '-')} {value} is no list of numbers; give each value as 0.05,0.1, and one "
+            "after the other to sweep over them"
+        ) from None
+
+
+@functools.cache
+def with_swept_options() -> type[SweptOptions]:
+    """`SweptOptions` with one more field for the preset and for each of the planner's options, empty if not given."""
+    from mechsearch_jax.planner import OPTIONS, PRESETS
+
+    def several(kind: Any, metavar: str, about: str) -> Any:
+        shown = tyro.conf.arg(metavar=f"{metavar} ...", help=about, help_behavior_hint="")
+        return Annotated[tuple[kind, ...], shown]
+
+    names = ",".join(PRESETS)
+    preset = several(Literal[tuple(PRESETS)], f"{{{names}}}", "where settings come from that are not given.")
+    fields: list[tuple[str, Any, Any]] = [("preset", preset, ())]
+    for option in OPTIONS:
+        if get_origin(option.type) is tuple:
+            part = "NAME" if get_args(option.type)[0] is str else "FLOAT"
+            kind, metavar = str, f"{part},..."
+        elif option.choices:
+            kind, metavar = Literal[option.choices], f"{{{','.join(option.choices)}}}"
+        else:
+            kind, metavar = option.type, "{True,False}" if option.type is bool else str(option.type.__name__).upper()
+        fields.append((option.name, several(kind, metavar, f"{option.help}."), ()))
+    return dataclasses.make_dataclass("Swept", fields, bases=(SweptOptions,), frozen=True, kw_only=True)
+
+
+def read_sweep(path: Path) -> dict[str, Any]:
+    """The values that a sweep's file gives, by key, as tuples but for those of which there is one for all.
+
+    Raises:
+      InputError: the file cannot be read, a key is unknown, or a value is of another type. The message names file, line
+        and key.
+    """
+    from mechsearch_jax.planner import PRESETS
+    from mechsearch_jax.tables import checked, read_document
+
+    document = read_document(path)
+    for table in document.tables:
+        if table:
+            raise InputError(
+                f"{document.where(table)} is a table, of which a sweep has none; give its settings by config"
+            )
+    types = {name: Literal[option.choices] if option.choices else option.type for name, option in _options().items()}
+    known = {**_KEYS, "preset": Literal[tuple(PRESETS)], **types}
+    found: dict[str, Any] = {}
+    for key, value in document.tables[""].items():
+        where = document.where("", key)
+        if key not in known:
+            raise InputError(f"{where} is unknown; {nearest(key, known)}")
+        if key in _SINGLE:
+            found[key] = checked(value, known[key], where)
+            continue
+        is_list = get_origin(known[key]) is tuple
+        several = isinstance(value, list) and (not is_list or any(isinstance(part, list) for part in value))
+        values = value if several else [value]
+        found[key] = tuple(
+            checked(one, known[key], f"{where}[{i}]" if several else where) for i, one in enumerate(values)
+        )
+    return found
+
+
+def sweep(
+    scenarios: SomeScenarios = (),
+    /,
+    *,
+    out: Path,
+    file: Annotated[Path | None, tyro.conf.arg(metavar="SWEEP.toml")] = None,
+    method: tuple[PaperMethod, ...] = (),
+    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE ...")] = (),
+    seed: tuple[int, ...] = (),
+    run: Annotated[RunOptions, tyro.conf.arg(name="")] = USUAL_RUN,
+    options: SweptOptions = SWEPT_DEFAULTS,
+) -> None:
+    """Run many episodes with all combinations of several values of any option; otherwise as evaluate.
+
+    The rows are those of evaluate, in the same kind of folder. Settings that are continuous (gamma, charges, guidance)
+    share one compilation, and in batches one batch.
+
+    Args:
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
+      out: folder for the results, one row for each episode; those of which it holds a row are not run again.
+      file: a file with scenarios, policy, seed and options by their names with underscores, a value or a list of values
+        each; what is given here goes before it.
+      method: one or more; search-for-grasp if neither this nor a policy is given.
+      policy: instead of methods, names of policies, or import paths of others, one or more.
+      seed: one or more; 0 if not given.
+      run: how the episodes are run.
+      options: how the planner decides.
+    """
+    told = {} if file is None else read_sweep(file)
+    if method or policy:
+        told = {key: value for key, value in told.items() if key not in ("method", "policy")}
+    policies = chosen_policies("sweep", method or told.get("method"), policy or told.get("policy"))
+    named = {name: told[key] for key, name in _FIELDS.items() if key in told}
+    named |= {key: value for key, value in told.items() if key not in _KEYS}
+    fresh = {key: value for key, value in named.items() if not getattr(options, key)}
+    points = dataclasses.replace(options, **fresh).points()
+    chosen = scenarios or told.get("scenarios", ())
+    run_episodes_of("sweep", chosen, points, policies, seed or told.get("seed") or (0,), out, run)

@@ -1,0 +1,78 @@
+"""`mechsearch video`: the film of a recorded episode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mechsearch_jax.envs.recording import Recording
+
+WIDTH, FPS = 960, 15
+# A wider or faster film nobody watches.
+WIDEST, FASTEST = 3840, 60
+
+
+def video(
+    episode: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    /,
+    *,
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE.mp4|FILE.webp")],
+    width: int = WIDTH,
+    fps: int = FPS,
+    speed: float = 1.0,
+) -> None:
+    """Make the film of an episode from its recording: the robot acting, the map of f and g, what the camera saw.
+
+    Args:
+      episode: folder of `search --record` or `search --video`.
+      out: the film; its ending says what it is, H.264 or an animated WebP for a page.
+      width: of the film [pixels].
+      fps: pictures in a second.
+      speed: how many times as fast as it was everything goes.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.envs.recording import NAME, load_recording
+    from mechsearch_jax.files import check_writable, is_file
+    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.viz.movie import check_movie_path
+
+    for name, value, least, most in (
+        ("width", width, 320, WIDEST),
+        ("fps", fps, 1, FASTEST),
+        ("speed", speed, 0.1, 20),
+    ):
+        if not least <= value <= most:
+            raise InputError(f"video: --{name} {value} is not between {least} and {most}")
+    check_movie_path(out)
+    if not is_file(episode / NAME):
+        raise InputError(f"{episode / NAME}: there is none; search once more with --record")
+    recording = load_recording(episode / NAME)
+    check_writable(out.parent)
+    keep_compilations()
+    make_film(recording, out, Console(highlight=False), width, fps, speed)
+
+
+def make_film(
+    recording: Recording, path: Path, console: Console, width: int = WIDTH, fps: int = FPS, speed: float = 1.0
+) -> None:
+    """Write a film, and show how far it is.
+
+    Raises:
+      InputError: it cannot be written.
+    """
+    from rich.progress import track
+
+    from mechsearch_jax.envs.film import Film
+    from mechsearch_jax.viz.movie import save_movie
+
+    film = Film(recording, width, fps, speed)
+    save_movie(track(film, "filming", total=film.count, console=console, transient=True), path, fps)
+    console.print(str(path), soft_wrap=True)

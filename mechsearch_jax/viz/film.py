@@ -1,0 +1,183 @@
+"""A step of an episode while it is played: a bystander's view beside the shelf from above, where everything moves.
+
+What does not move is drawn once a step, by the functions of the filmstrip; what does is drawn over it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib import patches
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from mechsearch_jax.viz import drawing, sketches
+from mechsearch_jax.viz.filmstrip import Frame, draw_believed, draw_seen
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+# Of the picture [inches].
+WIDTH = 8.0
+_GAP, _LEFT, _HEADER, _FOOTER, _BETWEEN = 0.08, 4.8, 0.56, 0.44, 0.05
+
+
+class Moving(NamedTuple):
+    """What moves, at one moment.
+
+    Attributes:
+      bodies: for each body, the target last, points whose hull it is [m]; None for absent ones.
+      hand: points whose hulls are the fingers and the hand [m].
+      time: since the beginning [s].
+    """
+
+    bodies: Sequence[Float[np.ndarray, "points 3"] | None]
+    hand: Sequence[Float[np.ndarray, "points 3"]]
+    time: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where everything is: left, lower side, width and height of each part in pixels, from the lower left corner.
+
+    Attributes:
+      size: width and height of the whole picture; both are even.
+      beside: the bystander's view.
+      above: the shelf from above.
+      view: what the camera saw.
+    """
+
+    size: tuple[int, int]
+    beside: tuple[int, int, int, int]
+    above: tuple[int, int, int, int]
+    view: tuple[int, int, int, int]
+
+    @classmethod
+    def of(cls, width: int, camera: Camera, shelf: Shelf, room: float) -> Layout:
+        """For pictures `width` pixels wide, in which `room` m above the board are shown."""
+        left, right, top, bottom = drawing.view_window(camera, shelf, room)
+        column = WIDTH - _LEFT - 3 * _GAP
+        view, above = column * (bottom - top) / (right - left), column * drawing.map_share(shelf)
+        high = view + _BETWEEN + above
+        dots = width / WIDTH
+
+        def part(x: float, y: float, w: float, h: float) -> tuple[int, int, int, int]:
+            return round(x * dots), round(y * dots), round(w * dots), round(h * dots)
+
+        size = (width // 2 * 2, round((_HEADER + high + _FOOTER) * dots / 2) * 2)
+        across = 2 * _GAP + _LEFT
+        return cls(
+            size,
+            part(_GAP, _FOOTER, _LEFT, high),
+            part(across, _FOOTER + view + _BETWEEN, column, above),
+            part(across, _FOOTER, column, view),
+        )
+
+
+class Page:
+    """The picture of one step, at any moment of it."""
+
+    def __init__(self, frame: Frame, camera: Camera, shelf: Shelf, target: Target, room: float, layout: Layout):
+        """Args:
+        frame: the step.
+        camera, shelf, target: of the problem.
+        room: see `drawing.height_of`.
+        layout: where everything is.
+        """
+        width, height = layout.size
+        self._layout = layout
+        self._figure = Figure(figsize=(WIDTH, height * WIDTH / width), dpi=width / WIDTH, facecolor=drawing.PAPER)
+        self._canvas = FigureCanvasAgg(self._figure)
+        view, self._above = (
+            self._figure.add_axes((x / width, y / height, w / width, h / height))
+            for x, y, w, h in (layout.view, layout.above)
+        )
+        # Where the hand is now, it is drawn as it moves.
+        frame = dataclasses.replace(frame, sketch=dataclasses.replace(frame.sketch, hands=None))
+        draw_seen(view, frame, camera, shelf, target, room)
+        draw_believed(self._above, frame, shelf, target)
+        view.text(
+            0.985, 0.03, "what the camera saw", transform=view.transAxes, color=drawing.MUTED, fontsize=7.5,
+            ha="right", va="bottom", zorder=9,
+        )  # fmt: skip
+        self._write(frame)
+        self._movers = _Movers(self._above, frame)
+        self._clock = self._text(width - _GAP * width / WIDTH, 0.2, "", 8.5, drawing.MUTED, ha="right", animated=True)
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+
+    def image(self, beside: UInt8[np.ndarray, "h w 3"], moving: Moving) -> UInt8[np.ndarray, "rows columns 3"]:
+        """The whole picture at one moment.
+
+        Args:
+          beside: the bystander's view, as large as the layout's.
+          moving: what moves.
+        """
+        self._canvas.restore_region(self._background)
+        self._clock.set_text(f"{moving.time:.1f} s")
+        for artist in (*self._movers.at(moving), self._clock):
+            self._figure.draw_artist(artist)
+        image = np.array(self._canvas.buffer_rgba())[..., :3]
+        x, y, w, h = self._layout.beside
+        top = len(image) - y - h
+        image[top : top + h, x : x + w] = beside
+        return image
+
+    def _write(self, frame: Frame) -> None:
+        left, size = _GAP * self._layout.size[0] / WIDTH, 72.0 * (WIDTH - 1.0)
+        self._text(left, 0.2, frame.title, min(12.0, size / (0.62 * len(frame.title))), drawing.INK, weight="bold")
+        self._text(left, 0.42, frame.caption, min(9.0, size / (0.56 * len(frame.caption))), drawing.MUTED)
+        drawing.draw_legend(self._figure, frame.scene.capacity, 0.5 * _FOOTER / self._figure.get_figheight(), 7.2)
+
+    def _text(self, x: float, down: float, text: str, size: float, colour: str, **style):
+        """Text at pixel `x` and `down` inches from the top."""
+        width, height = self._layout.size
+        y = 1 - down * width / WIDTH / height
+        return self._figure.text(x / width, y, text, fontsize=size, color=colour, va="center", **style)
+
+
+class _Movers:
+    """What moves in the picture from above."""
+
+    def __init__(self, axes: Axes, frame: Frame):
+        self._bodies: list[tuple[patches.Polygon, Artist | None]] = []
+        self._axes, self._frame = axes, frame
+        self._hand = [self._polygon(drawing.HAND, 0.3, 0.8) for _ in range(3)]
+
+    def _polygon(self, colour: str, filled: float, width: float, **style) -> patches.Polygon:
+        polygon = patches.Polygon(
+            np.zeros((3, 2)), closed=True, facecolor=(*drawing.rgb(colour), filled), edgecolor=colour, lw=width,
+            animated=True, **style,
+        )  # fmt: skip
+        self._axes.add_patch(polygon)
+        return polygon
+
+    def at(self, moving: Moving) -> list[Artist]:
+        """The artists of a moment, those in front last."""
+        *objects, target = moving.bodies
+        while len(self._bodies) < len(objects):
+            number = drawing.number(self._axes, (0.0, 0.0), len(self._bodies), animated=True)
+            self._bodies.append((self._polygon(drawing.OBJECT, 0.22, 1.3), number))
+        if len(self._bodies) == len(objects):
+            style = {} if self._frame.found else {"linestyle": (0, (2, 1.5))}
+            filled = 1.0 if self._frame.found else 0.0
+            self._bodies.append((self._polygon(drawing.TARGET, filled, 1.6, **style), None))
+        shown: list[Artist] = []
+        for (polygon, number), points in zip(self._bodies, (*objects, target), strict=True):
+            if points is None:
+                continue
+            outline = drawing.hull(sketches.from_above(points))
+            polygon.set_xy(outline)
+            shown.append(polygon)
+            if number is not None:
+                number.set_position((outline.min(axis=0) + outline.max(axis=0)) / 2)  # pyright: ignore
+                shown.append(number)
+        for polygon, points in zip(self._hand, moving.hand, strict=True):
+            polygon.set_xy(drawing.hull(sketches.from_above(points)))
+        return [*shown, *self._hand]

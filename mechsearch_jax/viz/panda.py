@@ -1,0 +1,40 @@
+"""The Panda to be seen: the boxes and capsules that stand for it everywhere, in the colours of its parts."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.robot.arm_clearance import FOOT
+from mechsearch_jax.robot.gripper import HAND, LINKS, Primitive, fingers
+from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.viz.raycast import Capsule, Colour, Solid
+
+WHITE, GREY, DARK = (0.93, 0.94, 0.95), (0.62, 0.65, 0.69), (0.27, 0.30, 0.34)
+# Of links 1 to 7.
+COLOURS = (WHITE, WHITE, WHITE, WHITE, WHITE, GREY, GREY)
+_BOX, _CAPSULE = shape_of("box"), Capsule()
+
+
+def panda_solids(poses: Float[np.ndarray, "8 4 4"], opening: float) -> list[Solid]:
+    """The foot, the arm, the hand and its fingers.
+
+    Args:
+      poses: of links 1 to 7 and of the hand, as `kinematics.forward_kinematics` gives them.
+      opening: distance between the fingers [m].
+    """
+    start, end, radius = FOOT
+    foot = _capsule_solid(radius, (np.array(end) - start)[2] / 2, np.eye(3), (np.array(start) + end) / 2, GREY)
+    parts = [*zip(poses, LINKS, COLOURS, strict=False), (poses[7], HAND, DARK), (poses[7], fingers(opening), GREY)]
+    return [foot, *(_solid(T @ part.T_frame_primitive, part, colour) for T, some, colour in parts for part in some)]
+
+
+def _solid(T: np.ndarray, part: Primitive, colour: Colour) -> Solid:
+    if part.kind == "box":
+        return Solid(_BOX, np.array(part.size), T[:3, :3], T[:3, 3], colour)
+    radius, half = part.size
+    return _capsule_solid(radius, half, T[:3, :3], T[:3, 3], colour)
+
+
+def _capsule_solid(radius: float, half: float, rotation: np.ndarray, position: np.ndarray, colour: Colour) -> Solid:
+    return Solid(_CAPSULE, np.array([radius, radius, half + radius]), rotation, position, colour)

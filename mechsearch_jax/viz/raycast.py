@@ -1,0 +1,182 @@
+"""Pictures of solids without OpenGL: rays are cut with each solid in closed form, where its bounding box is in sight.
+
+Solids may be anything whose surface a ray can be cut with, such as the shapes of bodies. What never moves is cast once,
+into a `Picture` that is then drawn over. NumPy suffices: some 50 solids that fill a quarter of the image take 30 ms.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mechsearch_jax.workspace.camera import Camera
+
+# A solid that comes nearer to the camera's plane than this is looked for in the whole image [m].
+NEAREST = 0.02
+# Rays along each side of a pixel.
+RAYS = 2
+
+Colour = tuple[float, float, float]
+
+
+class Surface(Protocol):
+    """What `shapes.Shape` and `Capsule` have in common; see there."""
+
+    def cut(
+        self, origin: Sequence[Any], direction: Sequence[Any], half_size: Float[Any, " 3"], library: Any
+    ) -> Float[Any, "*rays"]: ...
+
+    def normal(
+        self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
+    ) -> Float[Any, "*batch 3"]: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Capsule:
+    """A `Surface`: a cylinder about its third axis with round ends; its half-extents are r, r and half its length."""
+
+    def cut(self, origin, direction, half_size, library):
+        """The nearest of the side between the centres of the ends, and of the ends."""
+        (x, y, z), (u, v, w) = origin, direction
+        radius, half = half_size[0], half_size[2] - half_size[0]
+        square = library.maximum(u * u + v * v, 1e-12)
+        along = u * x + v * y
+        chord = along * along - square * (x * x + y * y - radius * radius)
+        side = (-along - library.sqrt(library.maximum(chord, 0.0))) / square
+        on_side = (chord >= 0.0) & (library.abs(z + side * w) <= half) & (side > 0.0)
+        nearest = library.where(on_side, side, library.inf)
+        length = square + w * w
+        for end in (-half, half):
+            along = u * x + v * y + w * (z - end)
+            chord = along * along - length * (x * x + y * y + (z - end) ** 2 - radius * radius)
+            first = (-along - library.sqrt(library.maximum(chord, 0.0))) / length
+            hit = (chord >= 0.0) & (first > 0.0)
+            nearest = library.where(hit & (first < nearest), first, nearest)
+        return nearest
+
+    def normal(self, point, half_size, library):
+        half = half_size[..., 2:] - half_size[..., :1]
+        height = point[..., 2:] - library.clip(point[..., 2:], -half, half)
+        return library.concatenate([point[..., :2], height], axis=-1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Solid:
+    """Something to be seen.
+
+    Attributes:
+      surface: its shape.
+      half_size: half-extents [m], shape (3,).
+      rotation: `R_world_solid`, shape (3, 3).
+      position: `t_world_solid` [m], shape (3,).
+      colour: red, green and blue, 0 to 1.
+    """
+
+    surface: Surface
+    half_size: Float[np.ndarray, " 3"]
+    rotation: Float[np.ndarray, "3 3"]
+    position: Float[np.ndarray, " 3"]
+    colour: Colour
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Picture:
+    """An image with `RAYS` x `RAYS` rays for each pixel.
+
+    Attributes:
+      depth: along the camera's axis [m], infinite where nothing is, shape (rows, columns).
+      colour: 0 to 1, shape (rows, columns, 3).
+    """
+
+    depth: Float[np.ndarray, "rows columns"]
+    colour: Float[np.ndarray, "rows columns 3"]
+
+    @property
+    def pixels(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The image, 8 bits a channel, each pixel the mean of its rays."""
+        rows, columns, _ = self.colour.shape
+        mean = self.colour.reshape(rows // RAYS, RAYS, columns // RAYS, RAYS, 3).mean(axis=(1, 3))
+        return np.round(255 * mean).astype(np.uint8)
+
+
+class Eye:
+    """A camera that casts rays; what does not depend on the solids is computed once."""
+
+    def __init__(self, camera: Camera, light: Colour, ambient: float, background: Colour):
+        """Args:
+        camera: of the pixels; each gets `RAYS` x `RAYS` rays.
+        light: direction that it comes from.
+        ambient: share of the light that reaches every side.
+        background: colour where nothing is.
+        """
+        self._rotation = np.array(camera.rotation, np.float32)
+        self._position = np.array(camera.position, np.float32)
+        self._focal = np.array([camera.fx, camera.fy]) * RAYS
+        self._centre = np.array([camera.cx, camera.cy]) * RAYS
+        rows, columns = camera.height * RAYS, camera.width * RAYS
+        x = ((np.arange(columns) + 0.5 - self._centre[0]) / self._focal[0]).astype(np.float32)
+        y = ((np.arange(rows) + 0.5 - self._centre[1]) / self._focal[1]).astype(np.float32)
+        right, down, forward = self._rotation.T
+        # Directions by component, of unit depth.
+        self._rays = [x[None, :] * right[i] + y[:, None] * down[i] + forward[i] for i in range(3)]
+        self._background = np.array(background, np.float32)
+        self._light = np.array(light, np.float32) / np.float32(np.linalg.norm(light))
+        self._ambient = ambient
+
+    def empty(self) -> Picture:
+        """A picture of nothing."""
+        shape = self._rays[0].shape
+        colour = np.broadcast_to(self._background, (*shape, 3)).copy()
+        return Picture(np.full(shape, np.inf, np.float32), colour)
+
+    def picture(self, solids: Iterable[Solid], behind: Picture | None = None) -> Picture:
+        """What it sees of solids, before what is in another picture."""
+        start = behind or self.empty()
+        picture = Picture(start.depth.copy(), start.colour.copy())
+        # What is in front is drawn first, so that little is shaded in vain.
+        for solid in sorted(solids, key=lambda one: float(np.linalg.norm(one.position - self._position))):
+            self._draw(solid, picture)
+        return picture
+
+    def _draw(self, solid: Solid, picture: Picture) -> None:
+        window = self._window(solid)
+        if window is None:
+            return
+        rotation, half = np.asarray(solid.rotation, np.float32), np.asarray(solid.half_size, np.float32)
+        rays = [component[window] for component in self._rays]
+        origin = (self._position - np.asarray(solid.position, np.float32)) @ rotation
+        x, y, z = rays
+        local = [rotation[0, k] * x + rotation[1, k] * y + rotation[2, k] * z for k in range(3)]
+        with np.errstate(all="ignore"):
+            depth = solid.surface.cut([np.float32(o) for o in origin], local, half, np)
+        nearer = depth < picture.depth[window]
+        if not nearer.any():
+            return
+        depth = depth[nearer]
+        points = origin + depth[:, None] * np.stack([component[nearer] for component in local], axis=-1)
+        normal = solid.surface.normal(points, np.broadcast_to(half, points.shape), np)
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+        shade = self._ambient + (1.0 - self._ambient) * np.maximum(normal @ (rotation.T @ self._light), 0.0)
+        picture.depth[window][nearer] = depth
+        picture.colour[window][nearer] = shade[:, None] * np.array(solid.colour, np.float32)
+
+    def _window(self, solid: Solid) -> tuple[slice, slice] | None:
+        """The part of the image in which a solid's bounding box is; None if it is outside."""
+        signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
+        corners = (signs * solid.half_size) @ np.asarray(solid.rotation).T + solid.position
+        seen = (corners - self._position) @ self._rotation
+        rows, columns = self._rays[0].shape
+        if (seen[:, 2] < NEAREST).all():
+            return None
+        if (seen[:, 2] < NEAREST).any():
+            return slice(0, rows), slice(0, columns)
+        image = seen[:, :2] / seen[:, 2:] * self._focal + self._centre
+        low = np.maximum(np.floor(image.min(axis=0)), 0).astype(int)
+        high = np.minimum(np.ceil(image.max(axis=0)), (columns, rows)).astype(int)
+        if (low >= high).any():
+            return None
+        return slice(low[1], high[1]), slice(low[0], high[0])

@@ -1,0 +1,336 @@
+"""Reports by any columns: labels and their key, paired differences, intervals of steps, pages, and single episodes."""
+
+import csv
+import dataclasses
+import itertools
+import math
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import scipy.stats
+from matplotlib import image
+
+from mechsearch_jax.benchmarks import films
+from mechsearch_jax.benchmarks.pages import Heading, Paragraph, Table, as_html, as_latex, as_markdown
+from mechsearch_jax.benchmarks.paired import paired
+from mechsearch_jax.benchmarks.rates import bootstrap, summarise
+from mechsearch_jax.benchmarks.report import ASKED_FILES, FILES, Asked, Report, write_report
+from mechsearch_jax.benchmarks.report_figures import COLOURS, curve_figure, rates_figure, success_figure
+from mechsearch_jax.benchmarks.report_page import blocks
+from mechsearch_jax.benchmarks.rows import Row, configuration, episode_key, options_of, write_rows
+from mechsearch_jax.benchmarks.variants import Key, column, label_variants, natural
+from mechsearch_jax.benchmarks.worker import Worker
+from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import PRESETS
+from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+from mechsearch_jax.workspace.shelf import Shelf
+
+WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.6)
+LOST = dataclasses.replace(WON, found_step=None, graspable_step=None, retrieved=False, steps=10, failure="not found")
+
+
+def rows_of(variants, episodes=3, lost=lambda variant, episode: False):
+    """Rows of variants that differ in gamma, guided fraction and criterion."""
+    combinations = itertools.product(np.linspace(0.5, 1.0, 6).tolist(), (0.0, 0.4, 0.7, 0.9), "abcd")
+    found = []
+    for i, (gamma, guided, criterion) in enumerate(itertools.islice(combinations, variants)):
+        options = {"gamma": gamma, "guided_fraction": guided, "criterion": criterion, "push_distances": [0.1, 0.2]}
+        for j in range(episodes):
+            row = LOST if lost(i, j) else WON
+            more = {"gamma": gamma, "configuration": configuration(options)}
+            found.append(dataclasses.replace(row, scenario=f"s{j}", objects=2 * (j % 2 + 1), **more))
+    return found
+
+
+def test_labels_are_short_and_say_what_differs():
+    assert dict(Key.of([WON]).short) == {"search-for-grasp": "search-for-grasp"}
+    other = dataclasses.replace(WON, policy="search-and-grasp")
+    assert list(Key.of([WON, other]).short.values()) == ["search-and-grasp", "search-for-grasp"]
+    gammas = [dataclasses.replace(WON, gamma=gamma) for gamma in (1.0, 0.5)]
+    key = Key.of(gammas)
+    assert (list(key.short.values()), key.common, key.numbered) == (["gamma 0.5", "gamma 1"], "search-for-grasp", False)
+    counts = Key.of([dataclasses.replace(WON, sequences=n) for n in (1000, 30, 10)])
+    assert list(counts.short.values()) == ["sequences 10", "sequences 30", "sequences 1000"]
+    long = Key.of([*gammas, other])
+    assert long.numbered
+    assert list(long.short.values()) == ["V1", "V2", "V3"]
+    assert [dict(options) for options in long.options.values()][1] == {"policy": "search-for-grasp", "gamma": "0.5"}
+    many = Key.of(rows_of(96))
+    assert len(set(many.short.values())) == len(many.short) == 96
+    assert max(map(len, many.short.values())) == 3
+
+
+def test_a_variant_goes_by_its_label_or_by_what_tells_it_from_others():
+    key = Key.of(rows_of(8))
+    label = next(label for label, short in key.short.items() if short == "V4")
+    assert {key.named(text) for text in ("V4", label, "guided-fraction 0.4,criterion=b".replace("-", "_"))} == {label}
+    with pytest.raises(InputError, match=r'variant "criterion=b" is one of several: V3'):
+        key.named("criterion=b")
+    with pytest.raises(InputError, match=r'variant "V9" is unknown: V1 .*; \.\.\.$'):
+        key.named("V9")
+
+
+def test_numbers_in_texts_sort_as_numbers():
+    texts = ["b 10", "b 9", "b 1.5", "a 30", "b", "b 1e-05"]
+    assert sorted(texts, key=natural) == ["a 30", "b", "b 1e-05", "b 1.5", "b 9", "b 10"]
+    assert sorted([None, 3, "x", 2.5, True], key=natural) == [True, 2.5, 3, "x", None]
+
+
+def test_rates_are_told_by_any_columns():
+    rows = rows_of(8, lost=lambda variant, episode: variant < 4 and episode == 0)
+    assert set(column(rows, "guided-fraction")) == {0.0, 0.4}
+    assert set(column(rows, "push_distances")) == {"0.1/0.2"}
+    assert column(rows, "variant") == label_variants(rows)
+    summary = summarise(rows, ["guided_fraction", "scenario"])
+    assert [(*rates.group.values(), rates.episodes, rates.found) for rates in summary] == [
+        *((0.0, "s0", 4, 0.0), (0.0, "s1", 4, 1.0), (0.0, "s2", 4, 1.0), (0.0, None, 12, 8 / 12)),
+        *((0.4, "s0", 4, 1.0), (0.4, "s1", 4, 1.0), (0.4, "s2", 4, 1.0), (0.4, None, 12, 1.0)),
+    ]
+    assert [rates.group for rates in summarise(rows, ["seed"])] == [{"seed": 0}, {"seed": None}]
+    with pytest.raises(InputError, match=r"column gama is unknown; did you mean gamma\?"):
+        summarise(rows, ["gama"])
+
+
+def test_steps_have_a_bootstrap_interval():
+    steps = [1, 1, 2, 3, 3, 3, 5, 8, 2, 2]
+    low, high = bootstrap(steps)
+    expected = scipy.stats.bootstrap(
+        (steps,), np.mean, n_resamples=20_000, method="percentile", rng=np.random.default_rng(1)
+    ).confidence_interval
+    assert (low, high) == pytest.approx((expected.low, expected.high), abs=0.12)
+    assert bootstrap(steps[::-1]) == (low, high)
+    assert bootstrap([4, 4]) == (4.0, 4.0)
+    assert bootstrap([]) is None
+    (rates, _) = summarise([WON, dataclasses.replace(WON, steps=5, found_step=4), LOST], ["seed"])
+    assert (rates.found_steps, rates.graspable_steps, rates.retrieved_steps) == (2.5, 2.0, 4.0)
+    assert rates.retrieved_steps_interval == (3.0, 5.0)
+    assert summarise([LOST])[0].found_steps_interval is None
+
+
+def test_differences_are_paired():
+    """The baseline loses s0, the other s1 and s2 and has s4 twice; s3 is another scene under the same name, s5 has no
+    partner."""
+
+    def rows(gamma, lost, more=()):
+        names = ("s0", "s1", "s2", "s3", "s4")
+        each = [(LOST if name in lost else WON, name) for name in names]
+        return [
+            *(dataclasses.replace(row, scenario=name, gamma=gamma, content_hash=name) for row, name in each),
+            *(dataclasses.replace(row, gamma=gamma) for row in more),
+        ]
+
+    base = rows(0.9, {"s0"})
+    base[3] = dataclasses.replace(base[3], content_hash="other")
+    slower = dataclasses.replace(WON, scenario="s4", content_hash="s4", seed=7, steps=6)
+    other = rows(0.5, {"s1", "s2"}, [slower, dataclasses.replace(WON, scenario="s5")])
+    label = label_variants([*base, *other])[0]
+    found = {each.goal: each for each in paired([*base, *other], label, ["scenario"])}
+    values = [1.0, -1.0, -1.0, 0.0]
+    assert {each.method for each in found.values()} == {"search-for-grasp, gamma 0.5"}
+    retrieved = found["retrieved"]
+    assert (retrieved.pairs, retrieved.gains, retrieved.losses) == (4, 1, 2)
+    assert retrieved.difference == pytest.approx(np.mean(values))
+    assert retrieved.standard_error == pytest.approx(np.std(values, ddof=1) / math.sqrt(4))
+    # Only s4 was retrieved by both: after 3 actions, and after 3 and 6.
+    steps = found["retrieved_steps"]
+    assert (steps.pairs, steps.difference, steps.standard_error) == (1, 1.5, None)
+    assert {each.goal: each.pairs for each in paired([*base, *other], label)}["found"] == 4
+    with pytest.raises(InputError, match="no other variant shares seed with the baseline"):
+        paired([*base, *(dataclasses.replace(row, seed=9) for row in other)], label, ["seed"])
+
+
+@pytest.mark.parametrize("variants", [2, 96])
+def test_pictures_are_readable_with_few_and_with_many_variants(tmp_path, variants):
+    rows = rows_of(variants, lost=lambda variant, episode: (variant + episode) % 3 == 0)
+    report = Report.of(
+        rows, Asked(curve=["gamma", "guided_fraction"], baseline="V03" if variants > 2 else "criterion a")
+    )
+    write_report(report, tmp_path)
+    for name in ("success.png", "rates.png", "curve.png"):
+        height, width = image.imread(tmp_path / name).shape[:2]
+        assert 250 < height < 1300
+        assert 500 < width < 2200
+    drawn = [line for axes in success_figure(rows, report.baseline).axes for line in axes.get_lines()]
+    named = {line.get_label(): line.get_color() for line in drawn if not line.get_label().startswith("_")}
+    assert len(named) == len(set(named.values())) <= len(COLOURS)
+    if variants > 2:
+        assert any(label.startswith("V03, ") for label in named)
+    ticks = rates_figure(report.variants, report.key).axes[-1].get_xticklabels()
+    assert {tick.get_text() for tick in ticks} == set(report.key.short.values())
+    assert {path.name for path in tmp_path.iterdir()} == {*FILES, *ASKED_FILES}
+    # What is not asked for any more does not stay.
+    write_report(rows, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == set(FILES)
+
+
+def test_many_variants_have_a_line_each_and_the_rest_is_folded(tmp_path):
+    rows = rows_of(96, lost=lambda variant, episode: episode == variant % 3)
+    write_report(Report.of(rows, Asked(baseline="V01", paired=["scenario"])), tmp_path)
+    text, page = ((tmp_path / name).read_text() for name in ("report.md", "report.html"))
+    assert len(re.findall(r"^\| [a-d] \| .* \| V\d\d \| all \|", text, re.MULTILINE)) == 96
+    assert "see rates.csv" in text
+    assert "| V96 | 1 | a |" not in text
+    # Rates by number of objects, and reasons by variant.
+    assert page.count("<details>") == 2
+    with open(tmp_path / "key.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 96
+    assert (lines[0]["label"], lines[0]["gamma"], lines[0]["push_distances"]) == ("V01", "0.5", "0.1 0.2")
+    with open(tmp_path / "rates.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == 96 * 3
+    with open(tmp_path / "paired.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == 95 * 6
+
+
+class Checked(HTMLParser):
+    """Elements are closed in order, and nothing comes from elsewhere."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.seen, self.text = [], [], ""
+
+    def handle_starttag(self, tag, attributes):
+        assert all(value.startswith("data:image/png;base64,") for name, value in attributes if name in ("src", "href"))
+        self.seen.append(tag)
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def test_the_page_holds_everything_and_what_is_said_is_no_markup(tmp_path):
+    broken = dataclasses.replace(LOST, scenario="b", failure="error: <b>5 & 6</b> $x_1$ a|b")
+    write_report([WON, broken, dataclasses.replace(WON, policy="my_lab:Mine", scenario="c")], tmp_path)
+    page = Checked()
+    page.feed((tmp_path / "report.html").read_text())
+    assert page.open == []
+    assert page.seen.count("img") == 2
+    assert "error: <b>5 & 6</b> $x_1$ a|b" in page.text
+    tex = (tmp_path / "report.tex").read_text()
+    assert r"error: \textless{}b\textgreater{}5 \& 6\textless{}/b\textgreater{} \$x\_1\$ a\textbar{}b" in tex
+    assert r"my\_lab:Mine & all & 1 & 0 &" in tex
+    assert "a\\|b" in (tmp_path / "report.md").read_text()
+
+
+def test_a_page_is_written_three_ways():
+    parts = [Heading("A_b", 1), Paragraph("50% *of* all"), Table(("x", "n"), [("p|q", "1")]), Heading("C")]
+    assert as_markdown(parts) == "# A_b\n\n50% *of* all\n\n| x | n |\n| --- | --- |\n| p\\|q | 1 |\n\n## C\n"
+    tex = as_latex(parts)
+    assert "\\section*{A\\_b}\n\n50\\% " in tex
+    assert "\\begin{longtable}{lr}\n\\toprule\nx & n \\\\\n\\midrule\n\\endhead\np\\textbar{}q & 1 \\\\\n" in tex
+    assert "<p>50% <em>of</em> all</p>" in as_html(parts, "t", {})
+
+
+def test_a_curve_is_over_one_column_with_lines_for_another():
+    rows = rows_of(96)
+    report = Report.of(rows, Asked(curve=["gamma", "criterion"]))
+    assert len(report.curve) == 24
+    assert {rates.episodes for rates in report.curve} == {12}
+    axes = curve_figure(report.curve, report.curve_columns, {}).axes
+    assert [len(each.get_lines()) for each in axes] == [4, 4, 4]
+    assert axes[0].get_lines()[0].get_xdata() == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
+    assert "Rates over gamma and criterion" in as_markdown(blocks(report))
+    with pytest.raises(InputError, match="give one column, or a second one"):
+        Report.of(rows, Asked(curve=["gamma", "criterion", "seed"]))
+    with pytest.raises(InputError, match="method has 96 values"):
+        Report.of(rows, Asked(curve=["gamma", "method"]))
+
+
+def test_the_command_tells_what_is_asked_for(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    write_rows(rows_of(8, lost=lambda variant, episode: variant == 0), tmp_path / "table.parquet")
+    arguments = ["report", "table.parquet", "--rows", "guided-fraction,objects", "--curve", "guided_fraction"]
+    cli.parse([*arguments, "--baseline", "V1", "--paired", "scenario,seed", "--out", "out"])()
+    said = capsys.readouterr().out
+    assert "guided fraction objs runs found graspable paper's retrieved actions plan  act" in said
+    assert re.search(r"V2\s+3 \+100\.0 ± 0\.0", said)
+    assert not re.search("…", said)
+    assert max(map(len, said.splitlines())) <= 100
+    assert "no picture; report --films draws it" in (tmp_path / "out" / "report.md").read_text()
+    with pytest.raises(InputError, match="--films are drawn into a folder; give --out"):
+        cli.parse(["report", "table.parquet", "--films"])()
+    with pytest.raises(InputError, match="give --baseline"):
+        cli.parse(["report", "table.parquet", "--paired", "scenario"])()
+
+
+def test_episodes_are_chosen_for_what_they_show(tmp_path):
+    lost = [
+        dataclasses.replace(LOST, scenario=f"l{i}", failure=f"{reason} at action {i}")
+        for i, reason in enumerate(["dropped", "dropped", "fell", "dropped", "held up"])
+    ]
+    won = [dataclasses.replace(WON, scenario=f"w{i}", steps=steps) for i, steps in enumerate((1, 3, 3, 3, 3, 9))]
+    slow = dataclasses.replace(WON, scenario="slow", planning_seconds=99.0)
+    broken = dataclasses.replace(LOST, scenario="broken", failure="error: no", planning_seconds=999.0)
+    rows = [*lost, *won, slow, broken]
+    found = films.chosen(rows)
+    assert found == films.chosen(rows[::-1])
+    by_why = {
+        why: [row for reason, row in found if reason == why] for why in (films.TYPICAL, films.LOST, films.SLOWEST)
+    }
+    assert [len(chosen) for chosen in by_why.values()] == [3, 3, 3]
+    assert {row.steps for row in by_why[films.TYPICAL]} == {3}
+    assert [row.failure.partition(" at")[0] for row in by_why[films.LOST]] == ["dropped", "fell", "held up"]
+    assert by_why[films.SLOWEST][0] is slow
+    assert films.chosen([broken]) == []
+
+    drawn = []
+
+    def draw(row, file):
+        drawn.append(row)
+        if row in lost:
+            raise InputError("no such scenario")
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes((tmp_path / "report" / "rates.png").read_bytes())
+        return ""
+
+    write_report(rows, tmp_path / "report")
+    shown = films.films(rows, tmp_path / "report", draw)
+    assert len(drawn) == len({episode_key(row) for _, row in found})
+    assert [film.drawn for film in shown] == [row not in lost for _, row in found]
+    write_report(dataclasses.replace(Report.of(rows), films=shown), tmp_path / "report")
+    page = (tmp_path / "report" / "report.html").read_text()
+    # One variant has no picture of all of them.
+    assert page.count("<img") == 1 + sum(film.drawn for film in shown)
+    assert "no picture: no such scenario" in page
+    # What is there is not drawn again.
+    count = len(drawn)
+    films.films(rows, tmp_path / "report", draw)
+    assert all(row in lost for row in drawn[count:])
+
+
+def test_a_method_is_what_its_options_say():
+    method = Method(
+        "random",
+        dataclasses.replace(PRESETS["paper"](gamma=0.7, push_distances=(0.1,)), max_steps=4),
+        "masks",
+        workcell=Workcell(shelf=dataclasses.replace(Shelf(), back=0.75)),
+    )
+    actions = dataclasses.replace(method.config.problem.actions, push_tilt=0.4, placements=(16, 2))
+    problem = dataclasses.replace(method.config.problem, actions=actions)
+    method = dataclasses.replace(method, config=dataclasses.replace(method.config, problem=problem))
+    assert Method.of_options({**method.options(), "target": "box", "simulator": "MjxSimulator"}) == method
+    with pytest.raises(InputError, match=r"setting nowhere\.at is unknown"):
+        Method.of_options({**method.options(), "workcell.nowhere.at": 1})
+
+
+@pytest.mark.slow
+def test_an_episode_is_replayed_from_its_row(tmp_path):
+    file = example_scenarios()["first-light"]
+    row = Worker().run(str(file), Method(config=PRESETS["standard"](max_steps=1, sequences=5, horizon=1)), 3)
+    assert Method.of_options(options_of(row)).options()["max_steps"] == 1
+    assert films.replay(row, load_scenario(file), tmp_path / "film.png") == ""
+    assert image.imread(tmp_path / "film.png").std() > 0.05
+    told = films.replay(dataclasses.replace(row, steps=7), load_scenario(file), tmp_path / "film.png")
+    assert told.startswith("run again on another machine, perhaps, it ended otherwise: ")
+    with pytest.raises(InputError, match="holds something else today"):
+        films.replay(dataclasses.replace(row, content_hash="0"), load_scenario(file), tmp_path / "film.png")

@@ -1,0 +1,203 @@
+"""`mechsearch sweep`: all combinations of what flags and a file give, run as `evaluate` runs them; and what a run would
+take."""
+
+import dataclasses
+import itertools
+
+import pytest
+
+from mechsearch_jax.benchmarks import evaluate as evaluation
+from mechsearch_jax.benchmarks.estimate import CONTINUOUS, estimate
+from mechsearch_jax.benchmarks.evaluate import make_jobs, present_code
+from mechsearch_jax.benchmarks.shards import ShardWriter
+from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
+
+standard = PRESETS["standard"]
+TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("one", "two"):
+        save_scenario(Scenario(name, (), TARGET), tmp_path / f"{name}.json")
+    return tmp_path
+
+
+@pytest.fixture
+def jobs_of(folder, monkeypatch):
+    """The jobs that a command line asks for."""
+
+    def asked(*arguments):
+        seen = []
+
+        def evaluate(jobs, *rest):
+            seen.extend(jobs)
+            return []
+
+        monkeypatch.setattr(evaluation, "evaluate", evaluate)
+        cli.parse([*arguments, "--workers", "1", "--out", "rows"])()
+        return seen
+
+    return asked
+
+
+def told(jobs):
+    return [(job.scenario.name, job.method, job.seed) for job in jobs]
+
+
+def test_a_sweep_is_all_combinations(jobs_of):
+    jobs = jobs_of(
+        *("sweep", "one.json", "two.json", "--seed", "3", "4", "--gamma", "0.5", "1", "--recognition", "oracle"),
+        *("masks", "--policy", "random", "search-for-grasp", "--push-distances", "0.05,0.1", "0.1"),
+        *("--move-again", "True", "False"),
+    )
+    expected = {
+        (scene, Method(policy, standard(gamma=gamma, push_distances=pushes, move_again=again), seen), seed)
+        for scene, policy, gamma, pushes, again, seen, seed in itertools.product(
+            *(("one", "two"), ("random", "search-for-grasp"), (0.5, 1.0), ((0.05, 0.1), (0.1,)), (True, False)),
+            *(("oracle", "masks"), (3, 4)),
+        )
+    }
+    assert len(jobs) == len(expected) == 128
+    assert set(told(jobs)) == expected
+
+
+def test_a_sweep_of_one_point_is_what_evaluate_runs(jobs_of):
+    common = ("one.json", "--gamma", "0.7", "--preset", "paper", "--actions", "push", "--seed", "1")
+    swept, evaluated = jobs_of("sweep", *common), jobs_of("evaluate", *common)
+    assert [job.key for job in swept] == [job.key for job in evaluated]
+    assert told(jobs_of("sweep", "one.json")) == told(jobs_of("evaluate", "one.json"))
+
+
+def test_settings_that_come_to_the_same_are_run_once(jobs_of):
+    jobs = jobs_of("sweep", "one.json", "--preset", "paper", "standard", "--actions", "paper", "--gamma", "0.9", "0.9")
+    assert len(jobs) == len({job.key for job in jobs}) == 2
+    # The name of a set of actions stands for all of it, one value among others.
+    jobs = jobs_of("sweep", "one.json", "--actions", "paper", "standard", "push,pick-and-place", "push")
+    assert len(jobs) == 3
+
+
+FILE = """
+scenarios = ["one.json"]
+policy = "random"
+seed = [0, 1]
+gamma = [0.5, 1]
+horizon = 2
+push_distances = [[0.05, 0.1], [0.1]]
+push_directions = [1.5, -1.5]
+move_again = [true, false]
+preset = ["standard"]
+recognition = "masks"
+"""
+
+
+def test_a_file_says_it_all_and_what_is_given_goes_before_it(folder, jobs_of):
+    (folder / "sweep.toml").write_text(FILE)
+    jobs = jobs_of("sweep", "--file", "sweep.toml")
+    assert len(jobs) == 16
+    fixed = {"horizon": 2, "push_directions": (1.5, -1.5)}
+    assert {job.method for job in jobs} == {
+        Method("random", standard(gamma=gamma, push_distances=pushes, move_again=again, **fixed), "masks")
+        for gamma, pushes, again in itertools.product((0.5, 1.0), ((0.05, 0.1), (0.1,)), (True, False))
+    }
+    jobs = jobs_of(
+        *("sweep", "two.json", "--file", "sweep.toml", "--seed", "5", "--gamma", "0.8", "--recognition", "oracle"),
+        *("--method", "search-and-grasp", "--push-distances", "0.2"),
+    )
+    fixed |= {"gamma": 0.8, "push_distances": (0.2,)}
+    assert set(told(jobs)) == {
+        ("two", Method("search-and-grasp", standard(move_again=again, **fixed)), 5) for again in (True, False)
+    }
+
+
+def test_a_file_names_a_configuration(folder, jobs_of):
+    (folder / "mine.toml").write_text('[planner]\npreset = "paper"\ngamma = 0.6\n')
+    (folder / "sweep.toml").write_text('scenarios = "one.json"\nconfig = "mine.toml"\ndraws = [1, 2]\n')
+    jobs = jobs_of("sweep", "--file", "sweep.toml")
+    assert [job.method.config for job in jobs] == [PRESETS["paper"](gamma=0.6, draws=draws) for draws in (1, 2)]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    {
+        "gama = 0.5": r"sweep.toml:1: gama is unknown; did you mean gamma\?",
+        "seed = 0\ngamma = [0.5, 'x']": r"sweep.toml:2: gamma\[1\] must be a number",
+        "[planner]\ngamma = 0.5": r"sweep.toml:1: \[planner\] is a table",
+        "push_distances = [[0.1], 0.2]": r"sweep.toml:1: push_distances\[1\] must be a list",
+        "gamma = 1.5": "gamma 1.5 is outside",
+        "recognition = 'eyes'": "recognition must be one of",
+        "policy = 'none'": 'policy "none" is unknown',
+        "gamma = ": "sweep.toml:1: is not TOML",
+    }.items(),
+)
+def test_what_is_wrong_in_a_file_is_named_with_its_place(folder, jobs_of, text, message):
+    (folder / "sweep.toml").write_text(f"{text}\n")
+    with pytest.raises(InputError, match=message):
+        jobs_of("sweep", "one.json", "--file", "sweep.toml")
+
+
+def test_a_list_in_a_flag_has_commas(jobs_of):
+    with pytest.raises(InputError, match=r"--push-distances 0\.1;0\.2 is no list of numbers"):
+        jobs_of("sweep", "one.json", "--push-distances", "0.1;0.2")
+
+
+@pytest.mark.parametrize("option", OPTIONS, ids=lambda option: option.name)
+def test_every_option_may_be_swept(option):
+    usual = standard().options()[option.name]
+    given = ",".join(map(str, usual)) if isinstance(usual, list) else str(usual)
+    arguments = ("sweep", "first-light", "--out", "out", f"--{option.name.replace('_', '-')}", given, given)
+    points = cli.parse(arguments).keywords["options"].points()
+    assert [point.settings().config for point in points] == [standard()] * 2
+
+
+def test_what_a_run_would_take_is_told_and_nothing_is_run(folder, capsys):
+    common = ("one.json", "two.json", "--out", "rows", "--workers", "2", "--dry-run")
+    gammas = [str(0.5 + 0.01 * i) for i in range(24)]
+    cli.parse(
+        ["sweep", *common, "--gamma", *gammas, "--guided-fraction", "0", "0.7", "--unseen-contact-penalty", "0", "1"]
+    )()
+    said = capsys.readouterr().out
+    assert said.startswith("96 variants, 192 episodes, 0 of them there already, 192 left\n1 compilation of the planner")
+    assert "192 x 8 s in 2 processes" in said
+    assert "assumed" in said
+    cli.parse(["sweep", *common, "--gamma", "0.5", "1", "--horizon", "2", "3", "--max-steps", "5", "10"])()
+    assert "8 variants, 16 episodes, 0 of them there already, 16 left\n2 compilations" in capsys.readouterr().out
+    cli.parse(["evaluate", *common, "--shard", "1/2"])()
+    assert capsys.readouterr().out.startswith("1 variant, 1 episode, 0 of them there already, 1 left\n")
+    assert not (folder / "rows").exists()
+
+
+def test_an_estimate_is_of_the_rows_that_are_there(folder):
+    assert "gamma" in CONTINUOUS
+    assert "horizon" not in CONTINUOUS
+    methods = [Method(config=standard(gamma=gamma)) for gamma in (0.5, 0.9)]
+    jobs = make_jobs(["one.json", "two.json"], methods, (0,))
+    known = {"code": present_code(), "device": versions()["device"]}
+    rows = [
+        dataclasses.replace(
+            jobs[i].failed("no"),
+            **known,
+            failure=failure,
+            planning_seconds=2.0 + i,
+            simulation_seconds=1.0,
+            compile_seconds=compiling,
+        )
+        for i, failure, compiling in ((0, None, 100.0), (1, None, 50.0), (2, "error: no", None))
+    ]
+    with ShardWriter("rows", "me") as writer:
+        writer.append(rows)
+    found = estimate(jobs, "rows", 2)
+    assert (found.variants, found.episodes, found.there, found.compilations, found.measured) == (2, 4, 3, 1, 2)
+    assert (found.episode_seconds, found.compile_seconds) == (3.5, 75.0)
+    assert found.hours == pytest.approx((1 * 3.5 / 2 + 75.0) / 3600)
+    assert estimate(jobs, "rows", 2, retry_errors=True).there == 2
+    with ShardWriter("other", "me") as writer:
+        writer.append([dataclasses.replace(rows[0], code="other")])
+    with pytest.raises(InputError, match="its episodes were run by other"):
+        estimate(jobs, "other", 2)

@@ -1,0 +1,306 @@
+"""Recordings, how they are played, and films of them."""
+
+import dataclasses
+import itertools
+import types
+
+import av
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+from stage import HIDDEN
+
+from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
+from mechsearch_jax.commands import main as cli
+from mechsearch_jax.envs.film import Film
+from mechsearch_jax.envs.native import Trace
+from mechsearch_jax.envs.pictures import recorded_frame
+from mechsearch_jax.envs.playback import ENDS, LOOKS, WAY_TIME, playback
+from mechsearch_jax.envs.recording import (
+    NAME,
+    RecordedStep,
+    Recorder,
+    Recording,
+    empty_trace,
+    load_recording,
+    save_recording,
+)
+from mechsearch_jax.envs.world import BODIES, TARGET, from_scenario, true_superquadrics
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.robot.kinematics import HOME, VELOCITY_LIMIT
+from mechsearch_jax.viz.movie import save_movie
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+WORLD = jax.tree.map(np.asarray, from_scenario(HIDDEN))
+OBJECTS = jax.tree.map(np.asarray, true_superquadrics(from_scenario(HIDDEN)))
+TURNED = np.asarray(HOME) + np.array([0.3, 0.1, 0.0, 0.1, 0.0, 0.0, 0.0], np.float32)
+GRIPPER = jnp.array([[0, 0, 1, 0.5], [0, -1, 0, 0.05], [1, 0, 0, 0.46], [0, 0, 0, 1]], jnp.float32)
+PUSH = jax.tree.map(
+    np.asarray,
+    no_action().replace(
+        kind=jnp.int32(ActionKind.PUSH),
+        T_world_gripper=GRIPPER,
+        displacement=jnp.array([0.0, 0.1, 0.0]),
+        T_world_place=GRIPPER.at[1, 3].add(0.1),
+    ),
+)
+RETRIEVAL = jax.tree.map(np.asarray, retrieve_action(GRIPPER, jnp.float32(0.7), jnp.float32(0.08)))
+# What a simulator does: it sets the arm to where an action begins, and home after it.
+MOVES, RESTS = 1.0, 0.4
+
+
+def trace(shift, returns=True):
+    """The arm turns a little in front of the shelf, and the box moves meanwhile; then the arm is set home."""
+    share = np.linspace(0.0, 1.0, 26)
+    q = TURNED + share[:, None] * np.array([0.1, 0, 0, 0, 0, 0, 0])
+    rest = 10 if returns else 0
+    position = np.repeat(WORLD.position[None], 26 + rest, axis=0).astype(float)
+    position[:26, 0] += share[:, None] * shift
+    position[26:, 0] += shift
+    still = np.tile([1.0, 0.0, 0.0, 0.0], (26 + rest, BODIES, 1))
+    time = 0.04 * (1 + np.arange(26 + rest))
+    return Trace(time, np.concatenate([q, np.tile(HOME, (rest, 1))]), np.full((26 + rest, 2), 0.01), position, still)
+
+
+def step(title, **changes):
+    poses = Target.cylinder().candidate_poses(Shelf())
+    after = OBJECTS.replace(position=OBJECTS.position + np.array([0.0, 0.1, 0.0], np.float32))
+    fields = {
+        "title": title,
+        "caption": "why",
+        "found": False,
+        "world": WORLD,
+        "scene": OBJECTS,
+        "after": after,
+        "existence": poses[:, 1] > 0.2,
+        "graspability": np.arange(len(poses)) % 12 - 10,
+        "target_pose": np.array([0.62, 0.07, 0.0], np.float32),
+        "action": PUSH,
+        "trace": trace(np.array([0.0, 0.1, 0.0])),
+    }
+    return RecordedStep(**{**fields, **changes})
+
+
+FOUND = {"found": True, "action": RETRIEVAL, "trace": trace(np.zeros(3), returns=False)}
+RECORDING = Recording(
+    "hidden: retrieved",
+    Camera().scaled(8),
+    Shelf(),
+    Target.cylinder(),
+    (step("1  push"), step("2  give up", action=None, trace=empty_trace()), step("3  take the target out", **FOUND)),
+)
+
+
+@pytest.fixture(scope="module")
+def played():
+    return playback(RECORDING, 25)
+
+
+def test_a_recording_comes_back_as_it_was_written(tmp_path):
+    save_recording(RECORDING, tmp_path / NAME)
+    assert (tmp_path / NAME).stat().st_size < 30_000
+    again = load_recording(tmp_path / NAME)
+    for name in ("heading", "camera", "shelf", "target"):
+        assert getattr(again, name) == getattr(RECORDING, name)
+    for one, other in zip(again.steps, RECORDING.steps, strict=True):
+        assert (one.title, one.caption, one.found) == (other.title, other.caption, other.found)
+        assert (one.action is None) == (other.action is None)
+        for name in ("world", "scene", "after", "existence", "graspability", "target_pose", "action"):
+            jax.tree.map(np.testing.assert_array_equal, getattr(one, name), getattr(other, name))
+        for field in dataclasses.fields(Trace):
+            ours, theirs = getattr(one.trace, field.name), getattr(other.trace, field.name)
+            np.testing.assert_allclose(ours, theirs, atol=1e-6)
+            assert ours.shape == theirs.shape
+
+
+def cut(arrays):
+    arrays["trace.q"] = arrays["trace.q"][:-1]
+
+
+def forget(arrays):
+    del arrays["world.kind"]
+
+
+def rename(arrays):
+    arrays["head"] = np.array(str(arrays["head"]).replace("mechsearch recording", "something"))
+
+
+def widen(arrays):
+    arrays["world.position"] = np.zeros((3, BODIES, 2), np.float32)
+
+
+def misname(arrays):
+    arrays["world.kind"] = arrays["world.kind"] + 7
+
+
+def lose(arrays):
+    arrays["trace.q"] = arrays["trace.q"] * np.nan
+
+
+def retype(arrays):
+    arrays["existence"] = arrays["existence"].astype("U1")
+
+
+@pytest.mark.parametrize("spoil", [cut, forget, rename, widen, misname, lose, retype])
+def test_what_is_no_recording_is_refused_in_one_line(spoil, tmp_path):
+    save_recording(RECORDING, tmp_path / NAME)
+    with np.load(tmp_path / NAME) as file:
+        arrays = dict(file)
+    spoil(arrays)
+    np.savez(tmp_path / NAME, **arrays)
+    with pytest.raises(InputError, match=f"{NAME}: is no recording of an episode") as refused:
+        load_recording(tmp_path / NAME)
+    assert "\n" not in str(refused.value)
+    (tmp_path / NAME).write_bytes(b"PK")
+    with pytest.raises(InputError, match="is no whole archive"):
+        load_recording(tmp_path / NAME)
+
+
+def test_a_recorder_keeps_what_was_shown_and_what_moved():
+    one, two, _ = RECORDING.steps
+    simulator = types.SimpleNamespace(traces=[one.trace])
+    recorder = Recorder(simulator)
+    problem = types.SimpleNamespace(camera=RECORDING.camera, shelf=RECORDING.shelf, target=RECORDING.target)
+    for told in (one, two):
+        frame = recorded_frame(told, RECORDING.camera, RECORDING.shelf)
+        decision = None if told.action is None else types.SimpleNamespace(action=told.action)
+        outcome = None if told.action is None else object()
+        snapshot = types.SimpleNamespace(world=told.world)
+        recorder.note.__wrapped__(
+            recorder, types.SimpleNamespace(snapshot=snapshot, decision=decision, outcome=outcome), frame
+        )
+    kept = recorder.recording.__wrapped__(recorder, problem, "how it ended")
+    assert [s.title for s in kept.steps] == ["1  push", "2  give up"]
+    assert kept.steps[0].trace is one.trace
+    assert kept.steps[1].action is None
+    assert len(kept.steps[1].trace.time) == 0
+    assert kept.heading == "how it ended"
+
+
+def test_everything_that_was_simulated_is_played_at_its_pace(played):
+    first = played.step == 0
+    pushed = played.position[first, 0, 1] - WORLD.position[0, 1]
+    assert pushed[0] == 0.0
+    assert pushed[-1] == pytest.approx(0.1)
+    moving = played.time[first][(pushed > 1e-4) & (pushed < 0.0999)]
+    assert moving[-1] - moving[0] == pytest.approx(MOVES, abs=0.1)
+    assert (np.diff(pushed) > -1e-9).all()
+    np.testing.assert_allclose(played.position[:, TARGET], np.tile(WORLD.position[TARGET], (len(played.step), 1)))
+
+
+def test_the_arm_goes_where_it_was_set_and_nothing_faster_than_it_can(played):
+    assert (np.diff(played.step) >= 0).all()
+    turned = np.abs(np.diff(played.q, axis=0)) * 25
+    together = np.diff(played.step) == 0
+    assert (turned[together] < 1.01 * VELOCITY_LIMIT).all()
+    for i in (0, 1):
+        np.testing.assert_allclose(played.q[played.step == i][[0, -1]], [HOME, HOME], atol=1e-4)
+    # A retrieval ends where the hand holds the target.
+    np.testing.assert_allclose(played.q[-1], RECORDING.steps[2].trace.q[-1], atol=1e-6)
+    assert played.opening.min() >= 0.0
+    assert played.opening.max() == pytest.approx(0.02)
+
+
+def test_a_step_in_which_nothing_moves_is_shown_all_the_same(played):
+    lasts = (played.step == 1).sum() / 25
+    assert lasts == pytest.approx(LOOKS, abs=0.05)
+    resting = (np.abs(played.q[played.step == 2] - played.q[-1]).max(axis=1) < 1e-6).sum() / 25
+    assert resting == pytest.approx(ENDS, abs=0.1)
+
+
+def test_a_faster_film_has_fewer_pictures_of_the_same_time(played):
+    fast = playback(RECORDING, 25, speed=2.0)
+    assert len(fast.time) == pytest.approx(len(played.time) / 2, abs=1)
+    assert fast.time[-1] == pytest.approx(played.time[-1], abs=0.1)
+
+
+def test_where_no_way_is_found_a_straight_one_is_shown(monkeypatch):
+    def lost(*arguments, **options):
+        raise InputError("no way")
+
+    monkeypatch.setattr("mechsearch_jax.envs.playback.free_motion", lost)
+    shown = playback(dataclasses.replace(RECORDING, steps=RECORDING.steps[:1]), 25)
+    lasts = LOOKS + 2 * WAY_TIME + MOVES + RESTS + ENDS
+    assert shown.time[-1] == pytest.approx(lasts, abs=0.2)
+
+
+def test_a_film_shows_the_robot_the_map_and_what_the_camera_saw(tmp_path):
+    film = Film(RECORDING, 320, 1)
+    images = list(film)
+    assert len(images) == film.count > 6
+    width, height = film.size
+    assert width == 320
+    assert height % 2 == 0
+    assert {image.shape for image in images} == {(height, width, 3)}
+    left, right = (slice(None), slice(10, 190)), (slice(height // 8, height // 2), slice(200, None))
+    for part in (left, right):
+        changes = [np.abs(a[part].astype(int) - b[part]).max() for a, b in itertools.pairwise(images)]
+        assert max(changes) > 60
+    # White light grey: the arm.
+    assert (images[0][left].min(axis=-1) > 200).mean() > 0.1
+
+
+FADING = [np.full((32, 48, 3), shade, np.uint8) for shade in range(20, 240, 20)]
+
+
+def test_a_movie_is_what_its_ending_says(tmp_path):
+    save_movie(iter(FADING), tmp_path / "film.mp4", 5)
+    with av.open(tmp_path / "film.mp4") as container:
+        (stream,) = container.streams
+        shades = [frame.to_ndarray(format="rgb24").mean() for frame in container.decode(stream)]
+        assert (stream.width, stream.height, stream.average_rate) == (48, 32, 5)
+    np.testing.assert_allclose(shades, range(20, 240, 20), atol=4)
+    save_movie(iter(FADING), tmp_path / "film.webp", 5)
+    with Image.open(tmp_path / "film.webp") as picture:
+        assert (picture.format, picture.size, picture.n_frames) == ("WEBP", (48, 32), len(FADING))
+        picture.seek(3)
+        assert np.asarray(picture.convert("RGB")).mean() == pytest.approx(80, abs=4)
+        assert picture.info["duration"] == 200
+
+
+def test_a_movie_that_cannot_be_made_leaves_what_was_there(tmp_path):
+    path = tmp_path / "film.mp4"
+    path.write_text("from before")
+
+    def images():
+        yield FADING[0]
+        raise InputError("no more")
+
+    with pytest.raises(InputError, match="no more"):
+        save_movie(images(), path, 5)
+    assert path.read_text() == "from before"
+    assert [file.name for file in tmp_path.iterdir()] == ["film.mp4"]
+
+
+WRONG = {
+    "no recording": (["video", "."], "recording.npz: there is none; search once more with --record"),
+    "ending": (["video", ".", "--out", "film.avi"], "film.avi: ends in none of .mp4, .webp"),
+    "width": (["video", ".", "--width", "10"], "--width 10 is not between 320 and 3840"),
+    "ending of a search": (["search", "first-light", "--out", "new", "--video", "film.gif"], "film.gif: ends in none"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG, ids=list(WRONG))
+def test_what_cannot_be_filmed_is_told_at_once(case, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments, message = WRONG[case]
+    arguments = arguments if "--out" in arguments else [*arguments, "--out", "film.mp4"]
+    with pytest.raises(InputError) as refused:
+        cli.parse(arguments)()
+    assert message in str(refused.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_film_is_made_of_a_folder(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
+    save_recording(dataclasses.replace(RECORDING, steps=RECORDING.steps[1:2]), tmp_path / NAME)
+    out = tmp_path / "new" / "film.webp"
+    cli.parse(["video", str(tmp_path), "--out", str(out), "--width", "320", "--fps", "2"])()
+    with Image.open(out) as picture:
+        assert picture.size[0] == 320
+        assert picture.n_frames > 1
+    assert str(out) in capsys.readouterr().out.replace("\n", "")

@@ -1,0 +1,124 @@
+"""The ray-caster of films: against the simulated camera, and capsules against their own definition."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.envs import simulated_camera as seen_by
+from mechsearch_jax.envs.model import shelf_boxes
+from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.robot.arm_clearance import link_poses
+from mechsearch_jax.robot.kinematics import FINGER_TIPS, HOME
+from mechsearch_jax.shapes import in_order, shape_of
+from mechsearch_jax.viz.panda import GREY, panda_solids
+from mechsearch_jax.viz.raycast import RAYS, Capsule, Eye, Solid
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+
+CAMERA = Camera().scaled(16)
+TURNED = tuple(Rotation.from_rotvec((0.3, -0.5, 0.8)).as_quat(scalar_first=True))
+SCENE = Scenario(
+    "scene",
+    (
+        Body("box", (0.054, 0.025, 0.054), (0.55, 0.1, 0.47), TURNED),
+        Body("cylinder", (0.034, 0.034, 0.107), (0.6, 0.25, 0.52), TURNED),
+    ),
+    Body("cylinder", (0.02, 0.02, 0.05), (0.7, 0.0, 0.4545), (1.0, 0.0, 0.0, 0.0)),
+)
+BOARD = shape_of("box")
+
+
+def eye(camera=CAMERA):
+    return Eye(camera, seen_by.LIGHT, seen_by.AMBIENT, seen_by.BACKGROUND_COLOUR)
+
+
+def solids(world):
+    for low, high in shelf_boxes(Shelf()).values():
+        yield Solid(BOARD, (high - low) / 2, np.eye(3), (low + high) / 2, tuple(map(float, seen_by.PALETTE[-1])))
+    for i in np.flatnonzero(world.valid):
+        fields = (np.asarray(a[i]) for a in (world.half_size, world.rotation, world.position))
+        yield Solid(in_order()[int(world.kind[i])], *fields, tuple(map(float, seen_by.PALETTE[i])))
+
+
+def test_it_sees_what_the_simulated_camera_sees():
+    world = from_scenario(SCENE)
+    picture = eye().picture(solids(world))
+    expected = seen_by.observe(Camera().scaled(16 // RAYS), world)
+    np.testing.assert_allclose(picture.depth, expected.depth, atol=1e-5)
+    # The camera takes the boards' normals from where they are, at edges it may take the other face's.
+    differs = np.abs(picture.colour - np.asarray(expected.colour)).max(axis=-1) > 2e-3
+    assert not differs[np.asarray(expected.segmentation) != seen_by.SHELF].any()
+    assert differs.mean() < 0.05
+
+
+def test_what_is_drawn_later_is_the_same_as_drawn_at_once():
+    every = list(solids(from_scenario(SCENE)))
+    before = eye().picture(every[:4])
+    kept = before.colour.copy()
+    both = eye().picture(every[4:], before)
+    np.testing.assert_array_equal(both.pixels, eye().picture(every).pixels)
+    np.testing.assert_array_equal(before.colour, kept)
+
+
+def test_a_pixel_is_the_mean_of_its_rays():
+    assert eye().empty().pixels.shape == (CAMERA.height, CAMERA.width, 3)
+    picture = eye().picture(solids(from_scenario(SCENE)))
+    mean = picture.colour[2 * RAYS : 3 * RAYS, 5 * RAYS : 6 * RAYS].mean(axis=(0, 1))
+    np.testing.assert_allclose(picture.pixels[2, 5] / 255, mean, atol=0.003)
+
+
+@pytest.mark.parametrize("distance", [-0.5, 0.0, 4.0])
+def test_what_is_behind_around_or_far_from_the_camera_does_no_harm(distance):
+    forward = np.array(CAMERA.rotation)[:, 2]
+    ball = Solid(Capsule(), np.full(3, 0.05), np.eye(3), np.array(CAMERA.position) + distance * forward, GREY)
+    picture = eye().picture([ball])
+    assert np.isfinite(picture.colour).all()
+    assert np.isinf(picture.depth).all() == (distance <= 0.0)
+
+
+def outside(point, radius, half):
+    """Distance to a capsule, by its definition."""
+    nearest = np.clip(point[..., 2], -half, half)
+    return np.linalg.norm(point - np.stack([0 * nearest, 0 * nearest, nearest], axis=-1), axis=-1) - radius
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**31), radius=st.floats(0.02, 0.3), half=st.floats(0.0, 0.5))
+def test_rays_meet_a_capsule_where_they_first_come_to_its_surface(seed, radius, half):
+    rng = np.random.default_rng(seed)
+    start = rng.normal(size=(100, 3))
+    start *= 2.0 / np.linalg.norm(start, axis=1, keepdims=True)
+    way = rng.uniform(-0.8, 0.8, (100, 3)) - start
+    size = np.array([radius, radius, half + radius])
+    with np.errstate(all="ignore"):
+        met = Capsule().cut(list(start.T), list(way.T), size, np)
+    shares = np.linspace(0.0, 2.0, 801)[:, None]
+    distance = outside(start + shares[..., None] * way, radius, half)
+    missed = np.isinf(met)
+    assert distance[:, missed].min(initial=1.0) > -1e-6
+    assert (distance[:, ~missed] > 0.0)[shares < met[~missed] - 1e-3].all()
+    points = start[~missed] + met[~missed, None] * way[~missed]
+    np.testing.assert_allclose(outside(points, radius, half), 0.0, atol=1e-7)
+    normals = Capsule().normal(points, np.broadcast_to(size, points.shape), np)
+    assert (np.sum(normals * way[~missed], axis=1) <= 1e-6).all()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), radius, atol=1e-6)
+
+
+def test_the_panda_has_its_fingers_where_they_are():
+    (poses,) = link_poses(np.asarray(HOME)[None])
+    closed, opened = (panda_solids(poses, opening) for opening in (0.0, 0.08))
+    assert len(closed) == len(opened)
+    moved = [b.position - a.position for a, b in zip(closed, opened, strict=True)]
+    still, fingers = moved[:-6], moved[-6:]
+    np.testing.assert_allclose(still, 0.0)
+    across = poses[7][:3, 1]
+    np.testing.assert_allclose(fingers, np.outer([0.04] * 3 + [-0.04] * 3, across), atol=1e-6)
+    # The finger tips are where the gripper is, and nothing reaches further.
+    tip = poses[7][:3, 3] + FINGER_TIPS * poses[7][:3, 2]
+    reach = [
+        (s.position - tip) @ poses[7][:3, 2] + np.abs(s.rotation.T @ poses[7][:3, 2]) @ s.half_size for s in closed[-6:]
+    ]
+    assert max(reach) == pytest.approx(0.0, abs=0.01)
