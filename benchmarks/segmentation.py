@@ -24,6 +24,7 @@ from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.networks.weights import shipped_weights
+from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.train.scenes import PIXELS
 from mechsearch_jax.versions import versions
 from mechsearch_jax.viz import drawing
