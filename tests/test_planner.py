@@ -443,7 +443,7 @@ def test_a_risk_is_taken_only_where_nothing_else_gains():
     acted = jnp.ones((2, 1), bool)
     risky = jnp.float32([[19.0], [0.0]])
     # The first sequence gains 10 at a risk of 19; the second 0.1 or 4 at none.
-    for safe, best, value in ((19.9, 0, -9.0), (16.0, 1, -3.6)):
+    for safe, best, value in ((19.9, 0, -10.0), (16.0, 1, -4.0)):
         values, length = sequence_values(jnp.float32([[20.0, 10.0], [20.0, safe]]), risky, acted, 0.9)
         assert int(jnp.argmin(values)) == best
         assert float(values[best]) == pytest.approx(value)
