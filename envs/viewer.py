@@ -11,14 +11,14 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.film import LEFT_OUT, LOOKS_AT, STANDS
 from mechsearch_jax.envs.model import shelf_boxes
-from mechsearch_jax.envs.pictures import recorded_frame
 from mechsearch_jax.envs.playback import playback
-from mechsearch_jax.envs.recording import RecordedStep, Recording
+from mechsearch_jax.envs.recording import Recording
+from mechsearch_jax.envs.shown_decisions import ShownDecision, predicted, sampled_sketch, shown_decisions
 from mechsearch_jax.envs.simulated_camera import PALETTE, SHELF
 from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.shapes import in_order, shape_of
@@ -41,8 +41,11 @@ LAYERS = {
     "recognised": ("recognised shapes", False),
     "map": ("f and g on the board", True),
     "action": ("action and predicted result", True),
+    "sampled": ("sampled actions", True),
     "camera": ("camera", False),
 }
+# What is shown of a decision unless a sampled action is asked for.
+CHOSEN = "the one that was chosen"
 LEGEND = "Where the target can be, and what a grasp there would meet: "
 
 
@@ -60,16 +63,6 @@ class Pose(NamedTuple):
     @classmethod
     def of(cls, position: Float[np.ndarray, "rows 3"], rotation: Float[np.ndarray, "rows 3 3"]) -> Pose:
         return cls(position, Rotation.from_matrix(rotation).as_quat(scalar_first=True))
-
-
-class _Decision(NamedTuple):
-    """What is shown of a step: pictures, and meshes as name, mesh, colour and opacity."""
-
-    text: str
-    view: UInt8[np.ndarray, "h w 3"]
-    cells: web.Cells
-    meshes: list[tuple[str, web.Mesh, str, float]]
-    path: Float[np.ndarray, "points 3"] | None
 
 
 class Viewer:
@@ -91,8 +84,9 @@ class Viewer:
         self._recording, self._server, self._fps = recording, server, fps
         self._played = playback(recording, fps, speed)
         self.count, self.row, self.playing = len(self._played.time), 0, False
-        self._lock, self._step, self._shown = threading.RLock(), -1, []
-        self._decisions = _decisions(recording)
+        self._lock, self._step = threading.RLock(), -1
+        self._shown, self._ghosts = [], []
+        self._decisions = shown_decisions(recording)
         self._still()
         self._moving = {**self._robot(), **self._bodies()}
         self._panel()
@@ -109,12 +103,21 @@ class Viewer:
             for node, pose in self._moving.values():
                 # Those that did not change are not sent.
                 node.position, node.wxyz = pose.position[self.row], pose.wxyz[self.row]
-            step = int(self._played.step[self.row])
+            step = self.step_at(self.row)
             if step != self._step:
                 self._step = step
                 self._decide(self._decisions[step])
                 self._choice.value = self._titles[step]
             self._slider.value = float(self._played.time[self.row])
+
+    @property
+    def text(self) -> str:
+        """What is said of the present decision."""
+        return self._text.content
+
+    def step_at(self, row: int) -> int:
+        """The step that a moment belongs to."""
+        return int(self._played.step[row])
 
     def play(self, on: bool) -> None:
         """Let time go on or stand still; at the end it begins anew."""
@@ -194,6 +197,7 @@ class Viewer:
         self._button = gui.add_button("play")
         self._choice = gui.add_dropdown("decision", self._titles)
         self._text = gui.add_markdown("")
+        self._sample = gui.add_dropdown("action", (CHOSEN,), visible=False)
         self._picture = gui.add_image(self._decisions[0].view, label="what the camera saw")
         for name, (label, shown) in LAYERS.items():
             self._switch(name, gui.add_checkbox(label, shown))
@@ -205,6 +209,7 @@ class Viewer:
         self._choice.on_update(
             lambda event: event.client and self._seek(begins[self._titles.index(self._choice.value)])
         )
+        self._sample.on_update(lambda event: event.client and self.examine(self._index(self._sample.value)))
         self._button.on_click(lambda event: self.play(not self.playing))
 
     def _seek(self, row: int) -> None:
@@ -217,20 +222,51 @@ class Viewer:
 
         box.on_update(switched)
 
-    def _decide(self, decision: _Decision) -> None:
+    def _decide(self, decision: ShownDecision) -> None:
         """Show what belongs to a step instead of what belonged to another."""
-        scene = self._server.scene
         for node in self._shown:
             node.remove()
-        self._shown = [
-            self._mesh(name, mesh, tuple(drawing.rgb(colour)), opacity)
-            for name, mesh, colour, opacity in decision.meshes
-        ]
+        self._shown = [self._ghost(*ghost) for ghost in decision.meshes if not ghost[0].startswith("/action/")]
         if len(decision.cells.position):
-            self._shown.append(_map(scene, decision.cells))
-        if decision.path is not None:
-            self._shown += _arrow(scene, decision.path)
-        self._text.content, self._picture.image = decision.text, decision.view
+            self._shown.append(_map(self._server.scene, decision.cells))
+        for k, sample in enumerate(decision.samples):
+            arrow = None if sample.arrow is None else web.arrow_mesh(*sample.arrow)
+            if arrow is not None:
+                node = self._mesh(f"/sampled/{k}", arrow, sample.colour, 0.9)
+                node.on_click(lambda event, k=k: self.examine(k))
+                self._shown.append(node)
+        self._picture.image = decision.view
+        self._sample.options = (CHOSEN, *(sample.text for sample in decision.samples))
+        self._sample.visible = bool(decision.samples)
+        self.examine(None)
+
+    def examine(self, k: int | None) -> None:
+        """Show what a sampled action of the present decision was predicted to do.
+
+        Args:
+          k: which; None for the one that was chosen.
+        """
+        with self._lock, self._server.atomic():
+            step, decision = self._recording.steps[self._step], self._decisions[self._step]
+            for node in self._ghosts:
+                node.remove()
+            ghosts, path, told = decision.meshes, decision.path, CHOSEN
+            if k is not None:
+                sketch, told = sampled_sketch(step, k), decision.samples[k].text
+                ghosts = predicted(step.scene, step.sampled.after(k, step.scene), sketch)
+                path = sketches.shown_path(sketch, self._recording.shelf)
+            self._ghosts = [self._ghost(*ghost) for ghost in ghosts if ghost[0].startswith("/action/")]
+            self._ghosts += _arrow(self._server.scene, path) if path is not None else []
+            self._sample.value = told
+            self._text.content = decision.text if k is None else f"{decision.text}\n\nPredicted of {told}"
+
+    def _index(self, text: str) -> int | None:
+        """Which sampled action of the present decision has such a text; None for another text."""
+        samples = self._decisions[self._step].samples
+        return next((k for k, sample in enumerate(samples) if sample.text == text), None)
+
+    def _ghost(self, name: str, mesh: web.Mesh, colour: str, opacity: float) -> Any:
+        return self._mesh(name, mesh, tuple(drawing.rgb(colour)), opacity)
 
     def _mesh(self, name: str, mesh: web.Mesh, colour: tuple[float, ...], opacity: float | None = None) -> Any:
         red, green, blue = (round(255 * c) for c in colour)
@@ -243,35 +279,6 @@ class Viewer:
 def _colour(index: int) -> tuple[float, float, float]:
     red, green, blue = (float(c) for c in PALETTE[index])
     return red, green, blue
-
-
-def _decisions(recording: Recording) -> list[_Decision]:
-    scenes = [scene for step in recording.steps for scene in (step.scene, step.after)]
-    room = drawing.height_of(scenes, recording.shelf)
-    return [_decision(step, recording, room) for step in recording.steps]
-
-
-def _decision(step: RecordedStep, recording: Recording, room: float) -> _Decision:
-    camera, shelf, target = recording.camera, recording.shelf, recording.target
-    frame = recorded_frame(step, camera, shelf)
-    meshes = [(f"/recognised/{i}", m, drawing.OBJECT, 0.45) for i, m in _present(web.meshes_of(step.scene))]
-    ghosts = web.meshes_of(sketches.moved(step.scene, step.after))
-    meshes += [(f"/action/ghost{i}", m, drawing.ACTION, 0.4) for i, m in _present(ghosts)]
-    hands = frame.sketch.hands if frame.sketch.hands is not None else ()
-    for i, T in enumerate(hands):
-        mesh = web.hand_mesh(T, frame.sketch.opening)
-        meshes.append((f"/action/hand{i}", mesh, drawing.HAND, 0.35 if i == 0 else 0.15))
-    return _Decision(
-        text=f"**{step.title}**\n\n{step.caption}",
-        view=web.seen_picture(frame, camera, shelf, target, room),
-        cells=web.map_cells(frame, shelf, target),
-        meshes=meshes,
-        path=sketches.shown_path(frame.sketch, shelf),
-    )
-
-
-def _present(meshes: list[web.Mesh | None]) -> list[tuple[int, web.Mesh]]:
-    return [(i, mesh) for i, mesh in enumerate(meshes) if mesh is not None]
 
 
 def _map(scene: Any, cells: web.Cells) -> Any:

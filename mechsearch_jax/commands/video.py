@@ -52,7 +52,7 @@ def video(
     make_film(recording, out, Console(highlight=False), width, fps, speed)
 
 
-def check_option(command: str, name: str, value: float, least: float, most: float) -> None:
+def check_option(command: str, name: str, value: float | int, least: float | int, most: float | int) -> None:
     """Refuse a value of an option.
 
     Raises:
@@ -62,7 +62,7 @@ def check_option(command: str, name: str, value: float, least: float, most: floa
         raise InputError(f"{command}: --{name} {value} is not between {least} and {most}")
 
 
-def check_pace(command: str, fps: int, speed: float) -> None:
+def check_pace(command: str, fps: int, speed: float | int) -> None:
     """Refuse so many pictures in a second, or such a speed.
 
     Raises:

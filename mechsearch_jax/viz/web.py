@@ -8,11 +8,11 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterable
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8, UInt32
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -27,6 +27,8 @@ from mechsearch_jax.workspace.target import Target
 
 # Points of a recognised shape from pole to pole and around: its edges are round, and few suffice.
 GRID = (17, 33)
+# Radius of the shaft of a sampled action's arrow [m].
+SHAFT = 0.0025
 # Width of the camera's view [pixels].
 VIEW_WIDTH = 720
 # Share of a cell's width that is coloured, and how far above the board it lies [m], which would show through.
@@ -57,7 +59,7 @@ class Mesh(NamedTuple):
     """
 
     vertices: Float[np.ndarray, "points 3"]
-    faces: Int[np.ndarray, "triangles 3"]
+    faces: UInt32[np.ndarray, "triangles 3"]
 
 
 def mesh_of(solids: Iterable[Solid]) -> Mesh:
@@ -67,8 +69,7 @@ def mesh_of(solids: Iterable[Solid]) -> Mesh:
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = solid.rotation, solid.position
         parts.append(solid.surface.mesh([float(h) for h in solid.half_size]).apply_transform(T))
-    whole = trimesh.util.concatenate(parts)
-    return Mesh(np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.uint32))
+    return _joined(parts)
 
 
 def meshes_of(scene: Superquadrics) -> list[Mesh | None]:
@@ -83,9 +84,23 @@ def hand_mesh(T: Float[np.ndarray, "4 4"], opening: float) -> Mesh:
       T: pose of the gripper.
       opening: distance between the fingers [m].
     """
-    hulls = [trimesh.convex.convex_hull(points) for points in sketches.hand_points(T, opening)]
-    whole = trimesh.util.concatenate(hulls)
-    return Mesh(np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.uint32))
+    return _joined([trimesh.convex.convex_hull(points) for points in sketches.hand_points(T, opening)])
+
+
+def arrow_mesh(start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"]) -> Mesh | None:
+    """A straight arrow in the world; None where it is too short to be seen. Unlike a line, it can be clicked."""
+    way = np.asarray(end, float) - start
+    length = float(np.linalg.norm(way))
+    if length <= sketches.SHORTEST:
+        return None
+    head = min(6 * SHAFT, length / 2)
+    shaft = trimesh.creation.cylinder(radius=SHAFT, height=length - head, sections=8)
+    shaft.apply_translation([0.0, 0.0, (length - head) / 2])
+    cone = trimesh.creation.cone(radius=2.5 * SHAFT, height=head, sections=12)
+    cone.apply_translation([0.0, 0.0, length - head])
+    T = np.array(trimesh.geometry.align_vectors(np.array([0.0, 0.0, 1.0]), way / length))
+    T[:3, 3] = start
+    return _joined([part.apply_transform(T) for part in (shaft, cone)])
 
 
 def seen_picture(frame: Frame, camera: Camera, shelf: Shelf, target: Target, room: float) -> UInt8[np.ndarray, "h w 3"]:
@@ -133,12 +148,17 @@ def map_cells(frame: Frame, shelf: Shelf, target: Target) -> Cells:
     return Cells(mesh, position.astype(np.float32), colour, image[shown][:, 3].astype(np.float32))
 
 
+def _joined(parts: list[Any]) -> Mesh:
+    whole: Any = trimesh.util.concatenate(parts)
+    return Mesh(np.asarray(whole.vertices, np.float32), np.asarray(whole.faces, np.uint32))
+
+
 def _points(scene: Superquadrics) -> list[Float[np.ndarray, "points 3"] | None]:
     return drawing.surfaces(scene, GRID)
 
 
 @functools.cache
-def _faces() -> Int[np.ndarray, "triangles 3"]:
+def _faces() -> UInt32[np.ndarray, "triangles 3"]:
     """Two triangles for each cell of the grid, seen from outside counter-clockwise."""
     rows, columns = GRID
     index = np.arange(rows * columns).reshape(GRID)
