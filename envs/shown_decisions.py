@@ -26,12 +26,12 @@ class ShownSample(NamedTuple):
 
     Attributes:
       text: it in words, with its value and cost.
-      arrow: where what moves begins and ends [m]; None where nothing does.
+      arrow: from where what moves begins to where it ends; None where nothing does.
       colour: red, green and blue, 0 to 1, which tell its value.
     """
 
     text: str
-    arrow: Float[np.ndarray, "2 3"] | None
+    arrow: web.Mesh | None
     colour: tuple[float, ...]
 
 
@@ -42,7 +42,8 @@ class ShownDecision(NamedTuple):
       text: what was done and why.
       view: what the camera saw.
       cells: f and g.
-      meshes: the recognised shapes, `/recognised/...`, and what the action does, `/action/...`.
+      recognised: the shapes.
+      ghosts: what the action is predicted to do, and the hand.
       path: of the action [m]; None where nothing moves.
       samples: what it was chosen from, best first.
     """
@@ -50,7 +51,8 @@ class ShownDecision(NamedTuple):
     text: str
     view: UInt8[np.ndarray, "h w 3"]
     cells: web.Cells
-    meshes: list[Ghost]
+    recognised: list[Ghost]
+    ghosts: list[Ghost]
     path: Float[np.ndarray, "points 3"] | None
     samples: list[ShownSample]
 
@@ -65,12 +67,12 @@ def shown_decisions(recording: Recording) -> list[ShownDecision]:
 def _decision(step: RecordedStep, recording: Recording, room: float) -> ShownDecision:
     camera, shelf, target = recording.camera, recording.shelf, recording.target
     frame = recorded_frame(step, camera, shelf)
-    meshes = [(f"/recognised/{i}", m, drawing.OBJECT, 0.45) for i, m in _present(web.meshes_of(step.scene))]
     return ShownDecision(
         text=f"**{step.title}**\n\n{step.caption}",
         view=web.seen_picture(frame, camera, shelf, target, room),
         cells=web.map_cells(frame, shelf, target),
-        meshes=[*meshes, *predicted(step.scene, step.after, frame.sketch)],
+        recognised=[(str(i), m, drawing.OBJECT, 0.45) for i, m in _present(web.meshes_of(step.scene))],
+        ghosts=predicted(step.scene, step.after, frame.sketch),
         path=sketches.shown_path(frame.sketch, shelf),
         samples=_samples(step),
     )
@@ -81,9 +83,9 @@ def predicted(scene: Superquadrics, after: Superquadrics, sketch: Sketch) -> lis
     ghosts = _present(web.meshes_of(sketches.moved(scene, after)))
     hands = sketch.hands if sketch.hands is not None else ()
     return [
-        *((f"/action/ghost{i}", mesh, drawing.ACTION, 0.4) for i, mesh in ghosts),
+        *((f"ghost{i}", mesh, drawing.ACTION, 0.4) for i, mesh in ghosts),
         *(
-            (f"/action/hand{i}", web.hand_mesh(T, sketch.opening), drawing.HAND, 0.15 if i else 0.35)
+            (f"hand{i}", web.hand_mesh(T, sketch.opening), drawing.HAND, 0.15 if i else 0.35)
             for i, T in enumerate(hands)
         ),
     ]
@@ -101,7 +103,7 @@ def _samples(step: RecordedStep) -> list[ShownSample]:
         words = kind_of(int(sampled.action.kind[k])).describe(sampled.single(k), step.scene.capacity)
         text = f"{k + 1}. {words}: value {sampled.value[k]:.1f}, cost {sampled.cost[k]:.0f}"
         colour = tuple(((1 - share) * best + share * last).tolist())
-        result.append(ShownSample(text, None if path is None else path[[0, -1]], colour))
+        result.append(ShownSample(text, None if path is None else web.arrow_mesh(path[0], path[-1]), colour))
     return result
 
 

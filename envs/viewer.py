@@ -18,7 +18,7 @@ from mechsearch_jax.envs.film import LEFT_OUT, LOOKS_AT, STANDS
 from mechsearch_jax.envs.model import shelf_boxes
 from mechsearch_jax.envs.playback import playback
 from mechsearch_jax.envs.recording import Recording
-from mechsearch_jax.envs.shown_decisions import ShownDecision, predicted, sampled_sketch, shown_decisions
+from mechsearch_jax.envs.shown_decisions import Ghost, ShownDecision, predicted, sampled_sketch, shown_decisions
 from mechsearch_jax.envs.simulated_camera import PALETTE, SHELF
 from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.shapes import in_order, shape_of
@@ -38,10 +38,10 @@ HEAD, SHAFT = 0.03, 0.004
 LAYERS = {
     "robot": ("robot", True),
     "true": ("true shapes", True),
-    "recognised": ("recognised shapes", False),
-    "map": ("f and g on the board", True),
-    "action": ("action and predicted result", True),
-    "sampled": ("sampled actions", True),
+    "recognised": ("recognised", False),
+    "map": ("f and g", True),
+    "action": ("prediction", True),
+    "sampled": ("samples", True),
     "camera": ("camera", False),
 }
 # What is shown of a decision unless a sampled action is asked for.
@@ -85,9 +85,10 @@ class Viewer:
         self._played = playback(recording, fps, speed)
         self.count, self.row, self.playing = len(self._played.time), 0, False
         self._lock, self._step = threading.RLock(), -1
-        self._shown, self._ghosts = [], []
+        self._asked: Any = None
         self._decisions = shown_decisions(recording)
         self._still()
+        self._nodes = [self._decision(i, decision) for i, decision in enumerate(self._decisions)]
         self._moving = {**self._robot(), **self._bodies()}
         self._panel()
         self.show(0)
@@ -105,10 +106,8 @@ class Viewer:
                 node.position, node.wxyz = pose.position[self.row], pose.wxyz[self.row]
             step = self.step_at(self.row)
             if step != self._step:
-                self._step = step
-                self._decide(self._decisions[step])
-                self._choice.value = self._titles[step]
-            self._slider.value = float(self._played.time[self.row])
+                self._decide(step)
+            self._slider.value = round(float(self._played.time[self.row]), 2)
 
     @property
     def text(self) -> str:
@@ -147,16 +146,17 @@ class Viewer:
         scene, shelf = self._server.scene, self._recording.shelf
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
+        scene.configure_environment_map("studio", environment_intensity=0.25)
         edge = np.array([shelf.front, (shelf.left + shelf.right) / 2, shelf.board])
         self._server.initial_camera.position = edge + NEARER * STANDS
         self._server.initial_camera.look_at = edge + LOOKS_AT
+        self._layers = {name: scene.add_frame(f"/{name}", show_axes=False, visible=LAYERS[name][1]) for name in LAYERS}
         board = shape_of("box")
         for name, (low, high) in shelf_boxes(shelf).items():
             if name not in LEFT_OUT:
                 solid = Solid(board, (high - low) / 2, np.eye(3), (low + high) / 2, _colour(SHELF))
                 self._mesh(f"/shelf/{name}", web.mesh_of([solid]), solid.colour)
         _frustum(scene, self._recording.camera)
-        self._layers = {name: scene.add_frame(f"/{name}", show_axes=False, visible=LAYERS[name][1]) for name in LAYERS}
 
     def _robot(self) -> dict[str, tuple[Any, Pose]]:
         """Its nodes and where they are: links, hand, and fingers, which move along the hand's second axis."""
@@ -193,12 +193,14 @@ class Viewer:
         begins = [int(np.argmax(played.step == i)) for i in range(len(recording.steps))]
         last, apart = float(played.time[-1]), float(played.time[1] - played.time[0]) if self.count > 1 else 0.1
         marks = tuple((float(played.time[row]), str(i + 1)) for i, row in enumerate(begins))
-        self._slider = gui.add_slider("time [s]", 0.0, max(last, apart), apart, 0.0, marks=marks)
+        self._slider = gui.add_slider("time [s]", 0.0, max(last, apart), 0.01, 0.0, marks=marks)
         self._button = gui.add_button("play")
         self._choice = gui.add_dropdown("decision", self._titles)
         self._text = gui.add_markdown("")
         self._sample = gui.add_dropdown("action", (CHOSEN,), visible=False)
-        self._picture = gui.add_image(self._decisions[0].view, label="what the camera saw")
+        self._views = [
+            gui.add_image(decision.view, label="what the camera saw", visible=False) for decision in self._decisions
+        ]
         for name, (label, shown) in LAYERS.items():
             self._switch(name, gui.add_checkbox(label, shown))
         bands = drawing.bands(recording.steps[0].scene.capacity)
@@ -222,20 +224,40 @@ class Viewer:
 
         box.on_update(switched)
 
-    def _decide(self, decision: ShownDecision) -> None:
-        """Show what belongs to a step instead of what belonged to another."""
-        for node in self._shown:
-            node.remove()
-        self._shown = [self._ghost(*ghost) for ghost in decision.meshes if not ghost[0].startswith("/action/")]
+    def _decision(self, i: int, decision: ShownDecision) -> list[Any]:
+        """Send what belongs to a step, hidden, so that little is left to be sent when the step begins."""
+        scene = self._server.scene
+        frames = [
+            scene.add_frame(f"/{name}/{i}", show_axes=False, visible=False) for name in ("recognised", "map", "sampled")
+        ]
+        for ghost in decision.recognised:
+            self._ghost(f"/recognised/{i}", *ghost)
         if len(decision.cells.position):
-            self._shown.append(_map(self._server.scene, decision.cells))
+            _map(scene, f"/map/{i}/cells", decision.cells)
         for k, sample in enumerate(decision.samples):
-            arrow = None if sample.arrow is None else web.arrow_mesh(*sample.arrow)
-            if arrow is not None:
-                node = self._mesh(f"/sampled/{k}", arrow, sample.colour, 0.9)
+            if sample.arrow is not None:
+                node = self._mesh(f"/sampled/{i}/{k}", sample.arrow, sample.colour, 0.9)
                 node.on_click(lambda event, k=k: self.examine(k))
-                self._shown.append(node)
-        self._picture.image = decision.view
+        return [*frames, self._prediction(str(i), decision.ghosts, decision.path)]
+
+    def _prediction(self, name: str, ghosts: list[Ghost], path: Float[np.ndarray, "points 3"] | None) -> Any:
+        """Send what an action was predicted to do, hidden."""
+        frame = self._server.scene.add_frame(f"/action/{name}", show_axes=False, visible=False)
+        for ghost in ghosts:
+            self._ghost(f"/action/{name}", *ghost)
+        if path is not None:
+            _arrow(self._server.scene, f"/action/{name}", path)
+        return frame
+
+    def _decide(self, step: int) -> None:
+        """Show what belongs to a step instead of what belonged to another."""
+        if self._step >= 0:
+            for node in (*self._nodes[self._step], self._views[self._step]):
+                node.visible = False
+        self._step, decision = step, self._decisions[step]
+        for node in (*self._nodes[step], self._views[step]):
+            node.visible = True
+        self._choice.value = self._titles[step]
         self._sample.options = (CHOSEN, *(sample.text for sample in decision.samples))
         self._sample.visible = bool(decision.samples)
         self.examine(None)
@@ -248,15 +270,16 @@ class Viewer:
         """
         with self._lock, self._server.atomic():
             step, decision = self._recording.steps[self._step], self._decisions[self._step]
-            for node in self._ghosts:
-                node.remove()
-            ghosts, path, told = decision.meshes, decision.path, CHOSEN
+            if self._asked is not None:
+                self._asked.remove()
+                self._asked = None
             if k is not None:
-                sketch, told = sampled_sketch(step, k), decision.samples[k].text
+                sketch = sampled_sketch(step, k)
                 ghosts = predicted(step.scene, step.sampled.after(k, step.scene), sketch)
-                path = sketches.shown_path(sketch, self._recording.shelf)
-            self._ghosts = [self._ghost(*ghost) for ghost in ghosts if ghost[0].startswith("/action/")]
-            self._ghosts += _arrow(self._server.scene, path) if path is not None else []
+                self._asked = self._prediction("asked", ghosts, sketches.shown_path(sketch, self._recording.shelf))
+                self._asked.visible = True
+            self._nodes[self._step][-1].visible = k is None
+            told = CHOSEN if k is None else decision.samples[k].text
             self._sample.value = told
             self._text.content = decision.text if k is None else f"{decision.text}\n\nPredicted of {told}"
 
@@ -265,8 +288,8 @@ class Viewer:
         samples = self._decisions[self._step].samples
         return next((k for k, sample in enumerate(samples) if sample.text == text), None)
 
-    def _ghost(self, name: str, mesh: web.Mesh, colour: str, opacity: float) -> Any:
-        return self._mesh(name, mesh, tuple(drawing.rgb(colour)), opacity)
+    def _ghost(self, parent: str, name: str, mesh: web.Mesh, colour: str, opacity: float) -> Any:
+        return self._mesh(f"{parent}/{name}", mesh, tuple(drawing.rgb(colour)), opacity)
 
     def _mesh(self, name: str, mesh: web.Mesh, colour: tuple[float, ...], opacity: float | None = None) -> Any:
         red, green, blue = (round(255 * c) for c in colour)
@@ -281,30 +304,29 @@ def _colour(index: int) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _map(scene: Any, cells: web.Cells) -> Any:
+def _map(scene: Any, name: str, cells: web.Cells) -> None:
     """f and g on the board."""
     level = np.tile([1.0, 0.0, 0.0, 0.0], (len(cells.position), 1))
-    return scene.add_batched_meshes_simple(
-        "/map/cells", *cells.mesh, level, cells.position, batched_colors=cells.colour,
+    scene.add_batched_meshes_simple(
+        name, *cells.mesh, level, cells.position, batched_colors=cells.colour,
         batched_opacities=cells.opacity, side="double", cast_shadow=False, receive_shadow=False,
     )  # fmt: skip
 
 
-def _arrow(scene: Any, path: Float[np.ndarray, "points 3"]) -> list[Any]:
+def _arrow(scene: Any, parent: str, path: Float[np.ndarray, "points 3"]) -> None:
     """A line along a path, and an arrow where it ends; nothing for a path that is too short to be seen."""
     back = np.linalg.norm(path - path[-1], axis=1)
     if back[0] <= sketches.SHORTEST:
-        return []
+        return
     # The head begins where the path comes near its end for the last time.
     first = int(np.flatnonzero(back >= min(HEAD, back.max()))[-1])
     tail = path[[first, -1]]
     colour = tuple(round(255 * c) for c in drawing.rgb(drawing.ACTION))
     style = {"shaft_radius": SHAFT, "head_radius": 3 * SHAFT, "head_length": min(HEAD, 0.8 * float(back[first]))}
-    shown = [scene.add_arrows("/action/arrow", tail[None], colour, **style)]
+    scene.add_arrows(f"{parent}/arrow", tail[None], colour, **style)
     if first > 0:
         points = np.stack([path[:first], path[1 : first + 1]], axis=1)
-        shown.append(scene.add_line_segments("/action/path", points, colour, thickness=2 * SHAFT))
-    return shown
+        scene.add_line_segments(f"{parent}/path", points, colour, thickness=2 * SHAFT)
 
 
 def _frustum(scene: Any, camera: Camera) -> None:
