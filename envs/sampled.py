@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -125,7 +126,8 @@ def unpacked(arrays: Mapping[str, np.ndarray], steps: int) -> list[Sampled]:
     result = []
     for i in range(steps):
         one, places = slice(ends[i] - rows[i], ends[i]), slice(seen[i] - foreseen[i], seen[i])
-        action = Action(**{name: arrays[f"sampled.action.{name}"][one] for name in names})
+        fields: dict[str, Any] = {name: arrays[f"sampled.action.{name}"][one] for name in names}
+        action = Action(**fields)
         told = (arrays[f"sampled.{name}"][one] for name in ("value", "cost"))
         result.append(Sampled(action, *told, *(arrays[f"sampled.{n}"][places] for n in ("position", "rotation"))))
     return result

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 NEARER = 0.8
 # Length of an arrow's head, and radius of its shaft [m].
 HEAD, SHAFT = 0.03, 0.004
+# Intensities of the lights.
+AMBIENT_LIGHT, LIGHT_ABOVE = 1.4, 1.6
 # Layers that can be hidden, what they are called, and whether they are shown at first.
 LAYERS = {
     "robot": ("robot", True),
@@ -146,7 +148,11 @@ class Viewer:
         scene, shelf = self._server.scene, self._recording.shelf
         scene.set_up_direction("+z")
         scene.world_axes.visible = False
-        scene.configure_environment_map("studio", environment_intensity=0.25)
+        # The usual lights are so bright that colours fade.
+        scene.configure_default_lights(enabled=False)
+        scene.configure_environment_map(None)
+        scene.add_light_ambient("/lights/everywhere", intensity=AMBIENT_LIGHT)
+        scene.add_light_directional("/lights/above", intensity=LIGHT_ABOVE, position=(-0.6, 0.8, 1.5))
         edge = np.array([shelf.front, (shelf.left + shelf.right) / 2, shelf.board])
         self._server.initial_camera.position = edge + NEARER * STANDS
         self._server.initial_camera.look_at = edge + LOOKS_AT
