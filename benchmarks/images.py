@@ -17,7 +17,7 @@ from mechsearch_jax.envs.recognisers import true_labels
 from mechsearch_jax.envs.world import TARGET, World, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, replacing
-from mechsearch_jax.perception.cloud import shelf_view
+from mechsearch_jax.perception.cloud import View
 from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, measured_depth, no_noise
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import cast_world, random_world
@@ -63,7 +63,7 @@ class Scene:
 
     Attributes:
       name: of the scenario, or of a generated scene.
-      source: "held-out" if generated, else "files".
+      source: "held-out", or the name of a camera and shelf, if generated; else "files".
       world: where everything stands.
     """
 
@@ -72,8 +72,14 @@ class Scene:
     world: World
 
 
-def held_out_scenes(count: int, seed: int = 0) -> list[Scene]:
+def held_out_scenes(count: int, seed: int = 0, shelf: Shelf | None = None, source: str = "held-out") -> list[Scene]:
     """Random scenes as in training, of a seed that training refuses.
+
+    Args:
+      count: how many.
+      seed: of the scenes.
+      shelf: what they stand on; the default if None.
+      source: what they are called.
 
     Raises:
       InputError: the numbers do not fit.
@@ -83,8 +89,8 @@ def held_out_scenes(count: int, seed: int = 0) -> list[Scene]:
     if not 0 <= seed < 2**31:
         raise InputError(f"--seed {seed} must be from 0 to {2**31 - 1}")
     key = jax.random.fold_in(jax.random.key(HELD_OUT_SEED), seed)
-    make = jax.jit(random_world)
-    return [Scene(f"{seed}-{i}", "held-out", make(jax.random.fold_in(key, i))) for i in range(count)]
+    make = jax.jit(functools.partial(random_world, shelf=shelf))
+    return [Scene(f"{seed}-{i}", source, make(jax.random.fold_in(key, i))) for i in range(count)]
 
 
 def scenes_of(scenarios: Sequence[Scenario]) -> list[Scene]:
@@ -120,7 +126,9 @@ def look(key: Key[Array, ""], camera: Camera, shelf: Shelf, world: World, noise:
     )
 
 
-def image_of(scenes: Sequence[Scene], index: int, noise: str, seed: int, shelf: Shelf) -> tuple[Key[Array, ""], Look]:
+def image_of(
+    scenes: Sequence[Scene], index: int, noise: str, seed: int, view: View, shelf: Shelf
+) -> tuple[Key[Array, ""], Look]:
     """A key for what is measured, and the image of a scene; the same on every call.
 
     Args:
@@ -128,11 +136,11 @@ def image_of(scenes: Sequence[Scene], index: int, noise: str, seed: int, shelf: 
       index: which.
       noise: name of the sensor.
       seed: of the noise and the key.
+      view: which rays are cast.
       shelf: what the scenes stand on.
     """
     key = jax.random.fold_in(jax.random.key(seed), list(NOISES).index(noise))
     sensing, rest = jax.random.split(jax.random.fold_in(key, index))
-    view = shelf_view(shelf=shelf)
     return rest, look(sensing, view.camera, shelf, scenes[index].world, NOISES[noise], view.stride)
 
 

@@ -26,9 +26,11 @@ from mechsearch_jax.files import PathLike
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.networks.recognition import RecognitionNetwork
 from mechsearch_jax.networks.weights import Weights, shipped_weights
+from mechsearch_jax.perception.cloud import View, thinned_view
 from mechsearch_jax.perception.recognition import recognise
 from mechsearch_jax.perception.refinement import RefinementConfig, refine, select
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
+from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.shapes import by_shape, in_order
 from mechsearch_jax.train.scenes import PIXELS
 from mechsearch_jax.versions import versions
@@ -317,6 +319,7 @@ class Bench:
       seed: of the noise and of the methods.
       slow_scenes: on so many scenes, spread evenly over all, slow methods are measured too; None for all.
       shelf: what the scenes stand on.
+      camera: what looks at them.
     """
 
     scenes: Sequence[Scene]
@@ -325,6 +328,7 @@ class Bench:
     seed: int = 0
     slow_scenes: int | None = None
     shelf: Shelf = dataclasses.field(default_factory=Shelf)
+    camera: Camera = dataclasses.field(default_factory=Camera)
 
     def __post_init__(self):
         if not self.scenes:
@@ -338,6 +342,11 @@ class Bench:
         if self.slow_scenes is not None and self.slow_scenes < 1:
             raise InputError(f"bench recognition: scenes for slow methods ({self.slow_scenes}) must be at least 1")
 
+    @property
+    def view(self) -> View:
+        """Which rays of the camera are cast."""
+        return thinned_view(self.camera, self.shelf)
+
     def methods_for(self, index: int) -> dict[str, Method]:
         """The methods that are measured on a scene."""
         total = len(self.scenes)
@@ -348,7 +357,7 @@ class Bench:
 
     def image(self, index: int, noise: str) -> tuple[Key[Array, ""], Look]:
         """A key for the methods, and the image of a scene; the same on every call."""
-        return image_of(self.scenes, index, noise, self.seed, self.shelf)
+        return image_of(self.scenes, index, noise, self.seed, self.view, self.shelf)
 
     def answers(self, index: int, noise: str) -> tuple[Look, dict[str, Superquadrics], dict[str, float]]:
         """The image of a scene, every method's answer, and how long it took with the one that it begins with [s]."""
@@ -390,7 +399,7 @@ class Bench:
         }
         sources = [scene.source for scene in self.scenes]
         settings = {
-            "held_out_scenes": sources.count("held-out"),
+            "held_out_scenes": len(sources) - sources.count("files"),
             "scenario_files": sources.count("files"),
             "noises": {name: named(NOISES[name]) for name in self.noises},
             "seed": self.seed,
@@ -400,6 +409,44 @@ class Bench:
         }
         after = {name: method.after for name, method in self.methods.items()}
         return Measured(tuple(rows), after, times, settings, versions())
+
+
+def shipped_bench(
+    scenes: Sequence[Scene],
+    methods: Sequence[str],
+    noises: Sequence[str],
+    seed: int,
+    slow_scenes: int | None,
+    place: Workcell,
+) -> Bench:
+    """A comparison of some of `shipped_methods` on scenes in a place; see `Bench`.
+
+    Raises:
+      InputError: a name is unknown, a number is impossible, the camera does not see the shelf, or the shipped weights
+        are missing or damaged.
+    """
+    view = thinned_view(place.camera, place.shelf)
+    chosen = chosen_methods(shipped_methods(view.camera, place.shelf), methods)
+    return Bench(scenes, chosen, noises, seed, slow_scenes, place.shelf, place.camera)
+
+
+def joined(parts: Mapping[str, Measured], places: Mapping[str, Workcell]) -> Measured:
+    """Comparisons in several places as one; the rows tell the place as their source.
+
+    Images of different places differ in size: how long they take is told of one place alone.
+
+    Args:
+      parts: what was measured, by place; at least one, all with the same methods, noises and seed.
+      places: whose camera and shelf each is.
+    """
+    some = next(iter(parts.values()))
+    views = {
+        name: {"camera": dataclasses.asdict(places[name].camera), "shelf": dataclasses.asdict(places[name].shelf)}
+        for name in parts
+    }
+    rows = tuple(row for part in parts.values() for row in part.rows)
+    times = some.times if len(parts) == 1 else {}
+    return Measured(rows, some.after, times, some.settings | {"places": views}, some.versions)
 
 
 def _nothing() -> Superquadrics:

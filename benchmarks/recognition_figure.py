@@ -14,7 +14,6 @@ from mechsearch_jax.benchmarks.recognition import Bench, Row
 from mechsearch_jax.envs.world import true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.perception.scores import sharpened
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.workspace.camera import Camera
@@ -36,28 +35,27 @@ def worst(rows: Sequence[Row], method: str, count: int) -> list[Row]:
     return own[:count]
 
 
-def worst_figure(bench: Bench, rows: Sequence[Row]) -> Figure:
+def worst_figure(benches: Sequence[Bench], rows: Sequence[Row]) -> Figure:
     """Answers beside the truth: for each a part of the depth image, and the segment's points from above.
 
     Args:
-      bench: where the rows come from.
+      benches: where the rows come from.
       rows: one panel each.
     """
-    index = {(scene.source, scene.name): i for i, scene in enumerate(bench.scenes)}
-    camera = shelf_view(shelf=bench.shelf).camera
+    places = {(scene.source, scene.name): (bench, i) for bench in benches for i, scene in enumerate(bench.scenes)}
     columns = min(4, len(rows))
     lines = -(-len(rows) // columns)
     figure = Figure(figsize=(3.4 * columns, 4.9 * lines + 0.7), layout="constrained")
     grid = figure.subfigures(lines, columns, squeeze=False)
     for row, panel in zip(rows, grid.reshape(-1), strict=False):
-        i = index[row.source, row.scene]
+        bench, i = places[row.source, row.scene]
         image, found, _ = bench.answers(i, row.noise)
         truth = sharpened(true_superquadrics(bench.scenes[i].world))
         both = {"true": truth, "recognised": found[row.method]}
         drawn = {name: _slot(scene, row.object) for name, scene in both.items()}
         if row.outcome != "answered":
             del drawn["recognised"]
-        _draw_panel(panel, row, image.shown, camera, drawn)
+        _draw_panel(panel, row, image.shown, bench.view.camera, drawn)
     marks = figure.axes[1].get_legend_handles_labels()
     figure.legend(*marks, loc="outside lower center", ncols=len(marks[0]), frameon=False, fontsize=9)
     return figure

@@ -24,6 +24,7 @@ from mechsearch_jax.envs.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.networks.weights import shipped_weights
+from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.train.scenes import PIXELS
 from mechsearch_jax.versions import versions
 from mechsearch_jax.viz import drawing
@@ -179,7 +180,7 @@ class Bench:
         return jax.jit(label)
 
     def _label(self, label: Callable[..., Any], index: int, noise: str) -> tuple[Look, np.ndarray, float]:
-        key, image = image_of(self.scenes, index, noise, self.seed, self.shelf)
+        key, image = image_of(self.scenes, index, noise, self.seed, shelf_view(shelf=self.shelf), self.shelf)
         seen = jax.block_until_ready((image, is_found(Camera(), self.scenes[index].world)))[1]
         start = time.perf_counter()
         found = jax.block_until_ready(label(key, image, seen))

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.actions import Action, ActionKind, kind_of
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.records import Episode, Step, record_action
 from mechsearch_jax.envs.verdicts import Verdict
@@ -42,6 +43,7 @@ class Choice(flax.struct.PyTreeNode):
     others: Action | None = None
 
 
+@kept()
 def chosen(decision: Decision) -> Choice:
     """What a decision comes down to."""
     count = jnp.sum(jnp.isfinite(decision.sequences.value))

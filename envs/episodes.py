@@ -21,7 +21,6 @@ from contextlib import contextmanager
 from typing import Any, Protocol, runtime_checkable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, UInt
 
@@ -318,7 +317,7 @@ class _EpisodePool:
         assert world is not None
         clock = _Clock(len(self._slots), self._run.busy, self._run.compiling)
         steps = [slot.log.index if slot else 0 for slot in self._slots]
-        planner_keys, environment_keys = _keys_at(jnp.asarray(self._keys), jnp.array(steps, jnp.int32))
+        planner_keys, environment_keys = _keys_at(*jax.device_put((self._keys, np.array(steps, np.int32))))
 
         with clock("recognise", list(logs)):
             known = self._known.look(world, environment_keys, list(logs))
@@ -348,7 +347,7 @@ class _EpisodePool:
 
     def _target_troubles(self, world: World, rows: Sequence[int]) -> dict[int, str]:
         """In which of these slots the target can no longer be taken out, and why."""
-        position, rotation = jax.device_get((world.position[:, TARGET], world.rotation[:, TARGET]))
+        position, rotation = (a[:, TARGET] for a in jax.device_get((world.position, world.rotation)))
         reasons = {r: target_trouble(self._problem.shelf, position[r], rotation[r]) for r in rows}
         return {r: reason for r, reason in reasons.items() if reason}
 

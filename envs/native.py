@@ -410,14 +410,16 @@ class NativeSimulator:
             found = dict(zip(busy, jax.device_get(list(pool.map(run, busy))), strict=True))
         self._gather()
         idle = jax.device_get(_outcome(Failure.NONE, 0, True, np.zeros(BODIES, bool)))
-        return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *(found.get(i, idle) for i in range(count)))
+        return jax.tree.map(
+            lambda *leaves: jax.device_put(np.stack(leaves)), *(found.get(i, idle) for i in range(count))
+        )
 
     def _gather(self) -> World:
         worlds = [jax.device_get(world.world) for world in self._worlds]
-        world: World = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *worlds)
+        world: World = jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *worlds)
         self.world = world
         return world
 
 
 def _row(actions: Action, i: int) -> Action:
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf[i]), actions)
+    return jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[i]), actions)

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple, Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -185,7 +184,7 @@ def _executed(simulator: Simulator, choices: Mapping[int, Choice]) -> Outcome:
         for name in Action.__dataclass_fields__:
             getattr(actions, name)[row] = getattr(choice.action, name)
     active = np.isin(np.arange(count), list(choices))
-    return jax.device_get(simulator.execute(jax.tree.map(jnp.asarray, actions), jnp.asarray(active)))
+    return jax.device_get(simulator.execute(*jax.device_put((actions, active))))
 
 
 def _is_bad(choice: Choice, outcome: Outcome, row: int) -> bool:

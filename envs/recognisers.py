@@ -25,7 +25,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.assignment import assign
-from mechsearch_jax.perception.cloud import MARGIN, View, above_board, shelf_view
+from mechsearch_jax.perception.cloud import MARGIN, View, above_board, thinned_view
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
@@ -141,7 +141,7 @@ class ImageRecogniser:
     depth: Depth = measured_depth
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
-        view, shelf = shelf_view(snapshot.camera, snapshot.shelf), snapshot.shelf
+        view, shelf = thinned_view(snapshot.camera, snapshot.shelf), snapshot.shelf
         keys = jax.random.split(key, 4)
         image = labelled(keys[:2], self, view, shelf, snapshot.world, snapshot.target_seen)
         shapes = ShapeNetwork.of(self.weights)

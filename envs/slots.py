@@ -131,7 +131,7 @@ class OneSlot:
         self.belief = update_belief(self._problem, self.belief, observation, before, self.action)
         self.action = no_action()
         self.snapshot, self.observation, self.decision = snapshot, observation, None
-        return _known(self._problem, jax.tree.map(lambda a: a[None], self.belief), world)
+        return _known(self._problem, jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), self.belief), world)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`."""
@@ -157,7 +157,7 @@ class OneSlot:
         return {r: judge(self._problem, self._snapshot(world)) for r in rows}
 
     def _snapshot(self, world: World) -> Snapshot:
-        here = jax.tree.map(lambda a: a[0], world)
+        here = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[0]), world)
         return Snapshot(self._problem.camera, self._problem.shelf, here)
 
 

@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.simulated_camera import Image, is_found, observe
 from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -55,11 +56,17 @@ def oracle(key: Array, snapshot: Snapshot) -> Observation:
 
 def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:
     """The true objects, without those that have fallen off the board."""
-    scene, shelf = true_superquadrics(snapshot.world), snapshot.shelf
+    return _on_the_board(snapshot.world, snapshot.shelf)
+
+
+@kept(static_argnames=("shelf",))
+def _on_the_board(world: World, shelf: Shelf) -> Superquadrics:
+    scene = true_superquadrics(world)
     fallen = (scene.position[:, 0] < shelf.front) | (scene.position[:, 2] < shelf.board)
     return scene.replace(valid=scene.valid & ~fallen)
 
 
+@kept()
 def true_target_pose(world: World) -> Float[Array, " 3"]:
     """x, y [m] and yaw [rad] of the target."""
     R, t = world.rotation[TARGET], world.position[TARGET]

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.envs.world import TARGET
@@ -36,7 +37,8 @@ class Program(NamedTuple):
 def first_decision(problem: Problem, policy: Policy) -> list[Program]:
     """What takes long to compile of a first look and a first decision; that which takes longest first."""
     # Only shapes and types count.
-    seen = Observation(empty(TARGET), jnp.array(False), jnp.zeros(3))
+    shapes = jax.eval_shape(lambda: Observation(empty(TARGET), jnp.array(False), jnp.zeros(3)))
+    seen: Observation = jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
     belief = initial_belief(problem)
     found = []
     if isinstance(policy, Search):

@@ -57,11 +57,11 @@ def from_scenario(scenario: Scenario) -> World:
     bodies = slots(scenario)
     filled = [body or empty for body in bodies]
     return World(
-        kind=jnp.array([shape_of(b.shape).code for b in filled], jnp.int32),
-        half_size=jnp.array([b.half_size for b in filled], jnp.float32),
-        position=jnp.array([b.position for b in filled], jnp.float32),
-        rotation=jnp.array(np.stack([rotation_matrix(b.quaternion) for b in filled]), jnp.float32),
-        valid=jnp.array([b is not None for b in bodies]),
+        kind=jax.device_put(np.array([shape_of(b.shape).code for b in filled], np.int32)),
+        half_size=jax.device_put(np.array([b.half_size for b in filled], np.float32)),
+        position=jax.device_put(np.array([b.position for b in filled], np.float32)),
+        rotation=jax.device_put(np.stack([rotation_matrix(b.quaternion) for b in filled]).astype(np.float32)),
+        valid=jax.device_put(np.array([b is not None for b in bodies])),
     )
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import io
 import json
 import math
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import pytest
 
 from mechsearch_jax.benchmarks import images, recognition, recognition_figure, tables
 from mechsearch_jax.benchmarks.recognition import Bench, Method, Row
+from mechsearch_jax.commands import bench_quality
 from mechsearch_jax.envs.world import true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.cloud import shelf_view
@@ -158,7 +160,7 @@ def test_the_picture_shows_the_worst_answers(bench, measured, tmp_path):
     assert rows[0].outcome == "not finite"
     ious = [row.iou for row in measured.rows if row.method == "nan"]
     assert [row.iou for row in rows] == sorted(ious)[:3]
-    figure = recognition_figure.worst_figure(bench, rows)
+    figure = recognition_figure.worst_figure([bench], rows)
     lines = [len(axes.lines) for axes in figure.axes]
     # Both views of each: the truth alone where the answer cannot be drawn.
     assert lines == [1, 1, 1, 1, 2, 2]
@@ -216,6 +218,77 @@ def test_two_scenarios_of_one_name_are_refused():
     scenario = load_scenario(example_scenarios()["first-light"])
     with pytest.raises(InputError, match="two scenarios have the name"):
         images.scenes_of([scenario, scenario])
+
+
+PLACE = """
+[camera]
+width = 160
+height = 90
+fx = 76.2
+fy = 76.2
+cx = 80.0
+cy = 45.0
+
+[shelf]
+left = {left}
+"""
+
+
+def test_every_configuration_is_a_place_of_its_own(monkeypatch, tmp_path, capsys):
+    """The command, on generated scenes that are always the same one, with a method that knows the truth."""
+    stood, seen = [], []
+
+    def scenes(count, seed, shelf, source):
+        stood.append(shelf)
+        return [dataclasses.replace(SCENE, source=source)] * count
+
+    def methods(camera, shelf):
+        seen.append((camera, shelf))
+        return {"network": told(TRUTH), "network-refined": told(TRUTH, after="network")}
+
+    monkeypatch.setattr(images, "held_out_scenes", scenes)
+    monkeypatch.setattr(recognition, "shipped_methods", methods)
+    places = {"wide": 0.6, "wider": 0.7}
+    files = [tmp_path / f"{name}.toml" for name in places]
+    for file, left in zip(files, places.values(), strict=True):
+        file.write_text(PLACE.format(left=left))
+    out, picture = tmp_path / "places.json", tmp_path / "worst.png"
+    measured = {"noise": ("clean",), "method": ("network-refined",), "out": out, "picture": picture, "worst": 2}
+    bench_quality.bench_recognition(config=tuple(files), scenes=1, **measured)
+    assert [shelf.left for shelf in stood] == list(places.values())
+    assert [shelf.left for _, shelf in seen] == list(places.values())
+    assert {camera.fx for camera, _ in seen} == {76.2}
+    value = json.loads(out.read_text())
+    rows = [recognition.Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
+    assert list(dict.fromkeys(row.source for row in rows)) == list(places)
+    assert {name: place["shelf"]["left"] for name, place in value["settings"]["places"].items()} == places
+    assert value["settings"]["held_out_scenes"] == 1
+    assert value["seconds_per_object"] == {}
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    printed = capsys.readouterr().out
+    assert all(f"{name} scenes, clean" in printed for name in places)
+
+
+@pytest.mark.parametrize(
+    ("config", "scenarios", "message"),
+    [
+        (("a/x.toml", "b/x.toml"), (), "two configuration files are called x"),
+        (("x.toml",), ("first-light",), "leave the scenario files out"),
+    ],
+)
+def test_places_that_cannot_be_told_apart_are_refused(config, scenarios, message):
+    with pytest.raises(InputError, match=message):
+        bench_quality.bench_recognition(scenarios, config=tuple(map(Path, config)))
+
+
+@pytest.mark.slow
+def test_generated_scenes_stand_on_the_shelf_that_is_asked_for():
+    shelf = Shelf().moved((0.1, -0.05, 0.2))
+    (scene,) = images.held_out_scenes(1, 0, shelf, "there")
+    (usual,) = images.held_out_scenes(1)
+    shift = np.asarray(scene.world.position - usual.world.position)
+    np.testing.assert_allclose(shift[np.asarray(usual.world.valid)], [(0.1, -0.05, 0.2)], atol=1e-3)
+    assert (scene.source, usual.source) == ("there", "held-out")
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from mechsearch_jax.perception.image_files import (
     save_depth,
     save_mask,
 )
+from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.planner.settings import example_config, load_settings
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import check_name, example_scenarios, load_scenario
@@ -77,7 +78,7 @@ def weights(rng, folder):
     """An archive and its card, which may know of the damage."""
     small = PushConfig(width=4, layers=1)
     zeros = {key: np.zeros(shape, np.float32) for key, shape in weight_shapes("push", small).items()}
-    save_weights(folder / "file.npz", "push", small, unflatten_dict(zeros, sep="/"), {})
+    save_weights(folder / "file.npz", "push", small, unflatten_dict(zeros, sep="/"), {"view": TrainedView().entry()})
     archive, card = folder / "file.npz", folder / "file.json"
     if rng.random() < 0.4:
         card.write_bytes(either(rng, card.read_bytes(), mutated_json))

@@ -9,6 +9,7 @@ import numpy as np
 from mechsearch_jax.perception import segmentation
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, leave_out_smallest
+from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.shelf import Shelf
 
 SIZES = np.array([9, 8, 3, 7, 6, 12, 5, 4, 10])
@@ -36,20 +37,35 @@ def test_of_fewer_segments_none_is_left_out():
     np.testing.assert_array_equal(found, np.where(labels == 8, 4, labels))
 
 
-def test_the_networks_nine_segments_become_eight(monkeypatch):
-    """A network that tells nine things apart by where they are, of which the fourth is smallest."""
-    shelf = Shelf()
-    columns = np.delete(np.arange(9 * 20), np.s_[60:75])
-    instance = columns // 20
-    y = shelf.right + 0.03 + 0.08 * instance + 0.001 * (columns % 20)
-    points = np.stack([np.full(y.shape, 0.6), y, np.full(y.shape, 0.5)], axis=-1)[None].astype(np.float32)
+SHELF = Shelf()
+COLUMNS = np.delete(np.arange(9 * 20), np.s_[60:75])
+INSTANCE = COLUMNS // 20
+# A row of points: nine things beside each other, of which the fourth is smallest.
+Y = SHELF.right + 0.03 + 0.08 * INSTANCE + 0.001 * (COLUMNS % 20)
+POINTS = np.stack([np.full(Y.shape, 0.6), Y, np.full(Y.shape, 0.5)], axis=-1)[None].astype(np.float32)
+
+
+def labels_of(monkeypatch, shelf, points, view=None):
+    """What the segmenter makes of a network that tells nine things apart by where they are."""
 
     def network(_, parameters, cloud):
-        nearest = jnp.argmin(jnp.abs(cloud[0][:, None, 1] - jnp.asarray(y)[None]), axis=1)
-        logits = jax.nn.one_hot(jnp.asarray(instance)[nearest], INSTANCES + 1)
+        nearest = jnp.argmin(jnp.abs(cloud[0][:, None, 1] - jnp.asarray(Y)[None]), axis=1)
+        logits = jax.nn.one_hot(jnp.asarray(INSTANCE)[nearest], INSTANCES + 1)
         return types.SimpleNamespace(logits=logits[None, None])
 
     monkeypatch.setattr(segmentation, "apply_network", network)
     nowhere = jnp.zeros(points.shape[:2], bool)
-    labels = np.asarray(NetworkSegmenter({}, None)(jax.random.key(0), shelf, jnp.asarray(points), nowhere))[0]
-    np.testing.assert_array_equal(labels, np.where(instance == 3, OTHER, np.where(instance == 8, 3, instance)))
+    return np.asarray(NetworkSegmenter({}, None, view)(jax.random.key(0), shelf, jnp.asarray(points), nowhere))[0]
+
+
+def test_the_networks_nine_segments_become_eight(monkeypatch):
+    labels = labels_of(monkeypatch, SHELF, POINTS)
+    np.testing.assert_array_equal(labels, np.where(INSTANCE == 3, OTHER, np.where(INSTANCE == 8, 3, INSTANCE)))
+
+
+def test_the_network_sees_a_shelf_elsewhere_as_that_of_its_training(monkeypatch):
+    shift = (0.2, -0.1, 0.25)
+    usual = labels_of(monkeypatch, SHELF, POINTS, TrainedView())
+    elsewhere = SHELF.moved(shift), POINTS + np.float32(shift)
+    np.testing.assert_array_equal(labels_of(monkeypatch, *elsewhere, TrainedView()), usual)
+    assert (labels_of(monkeypatch, *elsewhere) != usual).any()

@@ -91,7 +91,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "actions": ["push", "pick-and-place"],
         "push_directions": pytest.approx(np.radians([90, -90, 0, 35, -35, 65, -65]).tolist()),
         "push_distances": [0.05, 0.1, 0.15],
-        "high_pushes": 0.25,
+        "high_pushes": 0.0,
         "avoid_unseen": True,
         "object_grasp_tilts": pytest.approx([np.radians(20), np.radians(30)]),
         "criterion": "detector",

@@ -33,6 +33,7 @@ from mechsearch_jax.perception.cloud import View, shelf_view
 from mechsearch_jax.perception.recognition import best_hypothesis
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
+from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import (
@@ -241,7 +242,8 @@ class RecognitionTask:
         return held_out_scores(self, parameters, scenes)
 
     def save(self, path: Path, parameters: Any, card: dict[str, Any]) -> None:
-        save_weights(path, self.name, self.network, parameters, card)
+        view = TrainedView(self.view.camera, self.shelf).entry()
+        save_weights(path, self.name, self.network, parameters, card | {"view": view})
 
 
 LOSS_WEIGHTS = {

@@ -21,6 +21,7 @@ from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.perception.cloud import POINTS, View, cloud_of, resample, shelf_view
 from mechsearch_jax.perception.labels import INSTANCES, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of
+from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, origin, random_world, worth_seeing
 from mechsearch_jax.workspace.shelf import Shelf
@@ -168,7 +169,8 @@ class SegmentationTask:
         return held_out_scores(self, parameters, scenes)
 
     def save(self, path: Path, parameters: Any, card: dict[str, Any]) -> None:
-        save_weights(path, self.name, self.network, parameters, card)
+        view = TrainedView(self.view.camera, self.shelf).entry()
+        save_weights(path, self.name, self.network, parameters, card | {"view": view})
 
 
 def instance_overlaps(

@@ -78,7 +78,7 @@ class ActionConfig:
     push_height: float = 0.08
     push_leverage: tuple[float, float] = LEVERAGE
     high_pushes: float = option(
-        0.25, "sampling weight of pushes that touch an object high up, beside its others; 0 for none, as in the paper"
+        0.0, "sampling weight of pushes that touch an object high up, beside its others; 0 for none"
     )
     topple: float = 0.5
     push_gap: float = 0.01

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import tyro
 
 from mechsearch_jax.commands.options import (
+    ConfigFiles,
     JsonFile,
     Scenarios,
     SomeScenarios,
@@ -18,10 +19,12 @@ from mechsearch_jax.commands.options import (
     check_files,
     find_scenarios,
     forget_kept_compilations,
+    settings_of,
 )
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from mechsearch_jax.planner.workcell import Workcell
     from mechsearch_jax.workspace.scenario import Scenario
 
 
@@ -84,6 +87,7 @@ def bench_recognition(
     scenarios: SomeScenarios = (),
     /,
     *,
+    config: ConfigFiles = (),
     scenes: int = 40,
     seed: int = 0,
     noise: tuple[Noise, ...] = ("clean", "gaussian"),
@@ -98,6 +102,8 @@ def bench_recognition(
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets, beside the generated scenes.
+      config: files of settings, one or more; the scenes are generated on the shelf, and looked at by the camera, of
+        each in turn. The defaults if not given.
       scenes: how many are generated, with a seed that training cannot have; may be 0 if there are scenarios.
       seed: of the generated scenes, of the noise and of the methods.
       noise: of the depth image, one or more; "gaussian" is the paper's, 1 mm.
@@ -112,37 +118,62 @@ def bench_recognition(
 
     from mechsearch_jax.benchmarks import images, recognition, recognition_figure
     from mechsearch_jax.benchmarks.tables import recognition_tables, recognition_times_table
-    from mechsearch_jax.perception.cloud import shelf_view
     from mechsearch_jax.viz.drawing import save_figure
-    from mechsearch_jax.workspace.shelf import Shelf
 
     at_least_one("bench recognition", worst=worst)
     check_files(out, picture)
+    places = _places("bench recognition", config, scenarios)
     given = images.scenes_of(_loaded(scenarios))
     console = Console(highlight=False)
     with console.status("making scenes") as status:
-        methods = recognition.shipped_methods(shelf_view().camera, Shelf())
-        bench = recognition.Bench(
-            [*images.held_out_scenes(scenes, seed), *given],
-            recognition.chosen_methods(methods, method),
-            tuple(dict.fromkeys(noise)),
-            seed,
-            ems_scenes,
-        )
-        if picture is not None and worst_of not in bench.methods:
-            raise InputError(f"bench recognition: --worst-of {worst_of} is not among the methods; add it to --method")
         forget_kept_compilations()
-        total = len(bench.scenes) * len(bench.noises)
-        status.update("compiling")
-        measured = bench.run(lambda done: status.update(f"recognising {done}/{total}"))
-        if out is not None:
-            recognition.save_recognition(measured, out)
+        benches = {
+            name: recognition.shipped_bench(
+                [*images.held_out_scenes(scenes, seed, place.shelf, name), *given],
+                method,
+                tuple(dict.fromkeys(noise)),
+                seed,
+                ems_scenes,
+                place,
+            )
+            for name, place in places.items()
+        }
+        if picture is not None and any(worst_of not in bench.methods for bench in benches.values()):
+            raise InputError(f"bench recognition: --worst-of {worst_of} is not among the methods; add it to --method")
+        parts: dict[str, recognition.Measured] = {}
+        for name, bench in benches.items():
+            total = len(bench.scenes) * len(bench.noises)
+            status.update(f"{name}: compiling")
+            parts[name] = bench.run(lambda done, name=name, total=total: status.update(f"{name}: {done}/{total}"))
+            # A place takes minutes: what is done is kept.
+            if out is not None:
+                recognition.save_recognition(recognition.joined(parts, places), out)
+        measured = recognition.joined(parts, places)
         if picture is not None:
             status.update("drawing")
             rows = recognition_figure.worst(measured.rows, worst_of, worst)
-            save_figure(recognition_figure.worst_figure(bench, rows), picture)
+            save_figure(recognition_figure.worst_figure(list(benches.values()), rows), picture)
     console.print(recognition_tables(measured))
-    console.print(recognition_times_table(measured))
+    if measured.times:
+        console.print(recognition_times_table(measured))
+
+
+def _places(command: str, files: Sequence[Path], scenarios: Sequence[str]) -> dict[str, Workcell]:
+    """The cameras and shelves of configuration files by the files' names; the default without any.
+
+    Raises:
+      InputError: a file cannot be used, two have the same name, or scenario files, which stand on the default shelf,
+        are given too.
+    """
+    from mechsearch_jax.planner.workcell import Workcell
+
+    if files and scenarios:
+        raise InputError(f"{command}: --config is for generated scenes; leave the scenario files out")
+    names = [file.stem for file in files]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{command}: two configuration files are called {twice}; rename one")
+    return {file.stem: settings_of(file).workcell for file in files} or {"held-out": Workcell()}
 
 
 def bench_segmentation(

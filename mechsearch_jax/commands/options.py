@@ -210,6 +210,7 @@ Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metav
 GivenShape = Annotated[TargetShape | None, tyro.conf.arg(metavar="{" + ",".join(SHAPES) + "}")]
 SomeScenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER|SET ...]")]
 ConfigFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")]
+ConfigFiles = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE.toml ...")]
 JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 WeightsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")]
 

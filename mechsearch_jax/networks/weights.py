@@ -30,6 +30,7 @@ from mechsearch_jax.networks.push_geometry import push_start
 from mechsearch_jax.networks.recognition import RecognitionConfig, RecognitionNetwork
 from mechsearch_jax.networks.segmentation import SegmentationConfig, SegmentationNetwork
 from mechsearch_jax.perception.segments import SegmentConfig
+from mechsearch_jax.perception.trained_view import TrainedView, read_view
 from mechsearch_jax.workspace.shelf import Shelf
 
 FORMAT = "mechsearch-weights"
@@ -85,11 +86,13 @@ class Weights:
       network: the Flax module; static under jit.
       parameters: its parameters, float32.
       card: what its card says.
+      view: which camera and shelf it was trained on, if it looks at any and its card says so.
     """
 
     network: nn.Module
     parameters: Any
     card: dict[str, Any]
+    view: TrainedView | None = None
 
 
 def save_weights(path: PathLike, name: str, config: Any, parameters: Any, card: dict[str, Any]) -> None:
@@ -203,6 +206,7 @@ def load_weights(path: PathLike, name: str) -> Weights:
     card = read_card(path, name)
     arrays = read_arrays(read_archive(path, card), path)
     config = _config(name, card.get("config"), arrays, path.with_suffix(".json"))
+    view = read_view(card, str(path.with_suffix(".json")))
     try:
         shapes = weight_shapes(name, config)
     except (TypeError, ValueError):
@@ -224,8 +228,8 @@ def load_weights(path: PathLike, name: str) -> Weights:
             raise InputError(f"{path}: {shown(key)} holds NaN or infinite numbers; train anew")
     # Numbers, also where the caller is traced.
     with jax.ensure_compile_time_eval():
-        parameters = {key: jnp.asarray(a) for key, a in arrays.items()}
-    return Weights(ARCHITECTURES[name].network(config), unflatten_dict(parameters, sep="/"), card)
+        parameters = {key: jax.device_put(a) for key, a in arrays.items()}
+    return Weights(ARCHITECTURES[name].network(config), unflatten_dict(parameters, sep="/"), card, view)
 
 
 def shipped_weights(name: str) -> Weights:

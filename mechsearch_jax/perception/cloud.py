@@ -95,6 +95,31 @@ def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride:
     return view(camera, (int(low[0]), int(high[0])), (int(low[1]), int(high[1])), stride)
 
 
+def middle(shelf: Shelf) -> tuple[float, float, float]:
+    """The middle of the board's top [m]."""
+    return (shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board
+
+
+def distance(camera: Camera, shelf: Shelf) -> float:
+    """From the camera to the middle of the board's top [m]; at least a nanometre."""
+    return max(float(np.linalg.norm(np.subtract(camera.position, middle(shelf)))), 1e-9)
+
+
+def density(camera: Camera, shelf: Shelf) -> float:
+    """How many of a camera's pixels there are to a metre across its view at the middle of the board."""
+    return camera.fx / distance(camera, shelf)
+
+
+def thinned_view(camera: Camera, shelf: Shelf) -> View:
+    """The shelf's part of a camera's image as networks are shown it: thinned to about the density of their training.
+
+    Raises:
+      InputError: the camera does not see the shelf.
+    """
+    finer = density(camera, shelf) / density(Camera(), Shelf())
+    return shelf_view(camera, shelf, max(1, round(STRIDE * finer)))
+
+
 class PointCloud(flax.struct.PyTreeNode):
     """Points in the world, a fixed number of them, some of which may be absent.
 

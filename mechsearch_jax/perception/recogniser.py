@@ -20,20 +20,19 @@ from mechsearch_jax.compiled import kept
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.cloud import MARGIN, OVERHANG, STRIDE, View, above_board, shelf_view
+from mechsearch_jax.perception.cloud import MARGIN, OVERHANG, above_board, thinned_view
 from mechsearch_jax.perception.colour import TargetColour
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
+from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 # Pixels of a 1280 x 720 image that make the target visible.
 VISIBLE_PIXELS = 100
-# The focal length, in pixels, of the images that the networks were trained on.
-_TRAINED_FOCAL = Camera().fx / STRIDE
 
 # Which pixels are the target's, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
 TargetDetector = Callable[[Array], Array]
@@ -60,8 +59,8 @@ class Recogniser:
     A callable `(key, depth, colour=None, mask=None, target_id=None) -> Observation` for `jit` and `vmap`, and a pytree,
     so that it can be an argument of either. Networks' weights are its leaves, all else is static.
 
-    The image is looked at with the angular resolution that the networks were trained on, about 0.19 degrees a pixel:
-    of a larger image every second pixel, or third, and so on, of the part in which the shelf's space appears.
+    The image is looked at about as densely as in the networks' training, with 400 pixels to a metre at the middle of
+    the board: of a finer one every second pixel, or third, and so on, of the part in which the shelf's space appears.
 
     Attributes:
       camera: what took the images; depth and colour are registered to it.
@@ -105,7 +104,7 @@ class Recogniser:
           InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
         """
         camera = camera or problem.camera
-        _view(camera, problem.shelf)
+        thinned_view(camera, problem.shelf)
         fields = {
             "camera": camera,
             "shelf": problem.shelf,
@@ -117,6 +116,14 @@ class Recogniser:
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
+
+    @property
+    def trained(self) -> dict[str, TrainedView]:
+        """Which camera and shelf the networks were trained on, by their names, where that is known."""
+        views = {"recognition": self.shapes.view}
+        if isinstance(self.segmenter, NetworkSegmenter):
+            views["segmentation"] = self.segmenter.view
+        return {name: view for name, view in views.items() if view is not None}
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         return (self.segmenter, self.shapes, self.detector), (self.camera, self.shelf, self.target, self.refinement)
@@ -165,7 +172,7 @@ class Recogniser:
         _check(self.camera, depth, colour, mask, target_id)
         keys = jax.random.split(key, 3)
         image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
-        camera = _view(self.camera, self.shelf).camera
+        camera = thinned_view(self.camera, self.shelf).camera
         # Compiled on its own, whatever the images that the labels come from.
         found = recognise_image(keys[1:], image, self.shapes, camera, self.shelf, self.target, self.refinement)
         return Observation(found[0], visible, found[1])
@@ -176,17 +183,13 @@ def _as_pytree(slot: Any) -> Any:
     return jax.tree_util.Partial(slot) if jax.tree_util.all_leaves([slot]) else slot
 
 
-def _view(camera: Camera, shelf: Shelf) -> View:
-    return shelf_view(camera, shelf, max(1, round(camera.fx / _TRAINED_FOCAL)))
-
-
 @kept()
 def _labelled(
     recogniser: Recogniser, key: Array, depth: Any, colour: Any, mask: Any, target_id: Any
 ) -> tuple[LabelledImage, Bool[Array, ""]]:
     """The shelf's part of the image with labels, and whether the target is visible in it."""
     camera, shelf = recogniser.camera, recogniser.shelf
-    view = _view(camera, shelf)
+    view = thinned_view(camera, shelf)
     seen = view.of(jnp.asarray(depth, jnp.float32))
     seen = jnp.where(seen > 0.0, seen, jnp.nan)
     points = back_project(view.camera, seen)

@@ -15,10 +15,11 @@ from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import matmul, transform
 from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import draw
+from mechsearch_jax.perception.cloud import distance, draw
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
 from mechsearch_jax.perception.target_pose import target_pose
+from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -42,6 +43,15 @@ def best_hypothesis(hypotheses: Hypotheses, segments: Segments) -> Superquadrics
         rotation=matmul(R_world_segment, chosen(hypotheses.rotation)),
         valid=segments.valid,
     )
+
+
+def nearness(camera: Camera, shelf: Shelf) -> float:
+    """The share of its distance from an object at which a camera is told to the network.
+
+    The network makes little of a camera farther away than that of its training. It is told of one that is not, on the
+    same line, from which the points look all but the same.
+    """
+    return min(1.0, distance(Camera(), Shelf()) / distance(camera, shelf))
 
 
 @functools.partial(jax.jit, static_argnames=("network", "camera", "shelf", "count", "config"))
@@ -71,7 +81,8 @@ def recognise(
       config: how segments' clouds are drawn; static.
     """
     segments = segment_clouds(key, camera, points, labels, shelf, count, config)
-    hypotheses = apply_network(network, parameters, segments.points, segments.mark, segments.camera)
+    eyes = nearness(camera, shelf or Shelf()) * segments.camera
+    hypotheses = apply_network(network, parameters, segments.points, segments.mark, eyes)
     return best_hypothesis(hypotheses, segments)
 
 
@@ -81,16 +92,18 @@ class ShapeNetwork(flax.struct.PyTreeNode):
     Attributes:
       parameters: of the network.
       network: static.
+      view: which camera and shelf it was trained on, if that is known; static.
     """
 
     parameters: Any
     network: RecognitionNetwork = flax.struct.field(pytree_node=False)
+    view: TrainedView | None = flax.struct.field(pytree_node=False, default=None)
 
     @classmethod
     def of(cls, weights: Weights | None = None) -> ShapeNetwork:
         """The network with the given weights; with those that ship with the package if None."""
         weights = weights or shipped_weights("recognition")
-        return cls(weights.parameters, cast(RecognitionNetwork, weights.network))
+        return cls(weights.parameters, cast(RecognitionNetwork, weights.network), weights.view)
 
 
 class LabelledImage(flax.struct.PyTreeNode):

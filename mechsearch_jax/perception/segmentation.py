@@ -9,14 +9,16 @@ from typing import Any, Protocol, cast
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.networks.segmentation import SegmentationNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import above_board, cloud_of, resample
+from mechsearch_jax.perception.cloud import above_board, cloud_of, middle, resample
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.shelf import Shelf
 
 
@@ -163,21 +165,30 @@ class NetworkSegmenter(flax.struct.PyTreeNode):
     Attributes:
       parameters: of the network.
       network: static.
+      view: which camera and shelf it was trained on, if that is known; static.
     """
 
     parameters: Any
     network: SegmentationNetwork = flax.struct.field(pytree_node=False)
+    view: TrainedView | None = flax.struct.field(pytree_node=False, default=None)
 
     @classmethod
     def of(cls, weights: Weights | None = None) -> NetworkSegmenter:
         """The segmenter with the given weights; with those that ship with the package if None."""
         weights = weights or shipped_weights("segmentation")
-        return cls(weights.parameters, cast(SegmentationNetwork, weights.network))
+        return cls(weights.parameters, cast(SegmentationNetwork, weights.network), weights.view)
 
     def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array) -> Array:
         objects = above_board(shelf, points) & ~of_target
         cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)))
-        output = apply_network(self.network, self.parameters, cloud.points[None])
+        output = apply_network(self.network, self.parameters, self._as_trained(shelf, cloud.points)[None])
         labels = clean_up(cloud.points, labels_of(output.logits[-1, 0]), cloud.valid)
         found = spread_labels(points, objects, cloud.points, labels)
         return leave_out_smallest(jnp.where(of_target & (found != MISSING), OTHER, found))
+
+    def _as_trained(self, shelf: Shelf, points: Float[Array, "p 3"]) -> Float[Array, "p 3"]:
+        """Points where they would be if the shelf stood where it stood in training: the network knows no other."""
+        if self.view is None or self.view.shelf == shelf:
+            return points
+        shift = np.subtract(middle(self.view.shelf), middle(shelf))
+        return points + jnp.asarray(shift, points.dtype).reshape(1, 3)

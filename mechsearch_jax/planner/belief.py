@@ -42,6 +42,7 @@ class Belief(flax.struct.PyTreeNode):
     restarts: jax.Array
 
 
+@kept()
 def initial_belief(problem: Problem) -> Belief:
     """Nothing is known: the target can be at every candidate pose."""
     return Belief(

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions.config import ActionTables
@@ -163,11 +162,11 @@ def _load(file: Path, key: str, parts: dict[str, Any]) -> Problem | None:
             arrays = {name: saved[name] for name in saved.files}
         if str(arrays.pop("digest")) != _digest(arrays, key):
             return None
-        poses = jnp.asarray(arrays.pop("poses"))
+        poses = jax.device_put(arrays.pop("poses"))
         fields: dict[str, dict[str, jax.Array]] = {table: {} for table in _TABLES}
         for name, array in arrays.items():
             table, field = name.split(".")
-            fields[table][field] = jnp.asarray(array)
+            fields[table][field] = jax.device_put(array)
         return Problem(poses=poses, **{table: kind(**fields[table]) for table, kind in _TABLES.items()}, **parts)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
         return None

@@ -30,6 +30,7 @@ from mechsearch_jax.files import PathLike
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.plausibility import camera_faults, image_faults
 from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.perception.trained_view import view_faults
 from mechsearch_jax.planner.belief import Belief, initial_belief, update_belief
 from mechsearch_jax.planner.config import Config
 from mechsearch_jax.planner.policies import Policy, search_for_grasp
@@ -131,7 +132,7 @@ class Searcher:
         return self._state
 
     def check(self) -> Check:
-        """Whether the arm can work in this shelf, and the camera sees it."""
+        """Whether the arm can work in this shelf, the camera sees it, and the networks are used to such a view."""
         poses = self.problem.poses.shape[0]
         reach = len(np.unique(np.asarray(self.problem.grasps.pair_pose))) / poses
         warnings = list(self._camera_faults)
@@ -275,8 +276,13 @@ class Searcher:
 
     @functools.cached_property
     def _camera_faults(self) -> tuple[str, ...]:
-        """What is wrong with the camera's pose, which does not change."""
-        return camera_faults(self.workcell.camera, self.workcell.shelf)
+        """What is wrong with the camera's pose, or far from what the networks know; it does not change."""
+        faults = camera_faults(self.workcell.camera, self.workcell.shelf)
+        recogniser = self.recogniser
+        # What else recognises may have no networks, or others.
+        if faults or not isinstance(recogniser, Recogniser):
+            return faults
+        return view_faults(recogniser.camera, recogniser.shelf, recogniser.trained)
 
     @functools.cached_property
     def _digest(self) -> str:
