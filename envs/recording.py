@@ -19,6 +19,7 @@ from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.arrays import read_arrays
 from mechsearch_jax.envs.episodes import Moment
 from mechsearch_jax.envs.native import Trace
+from mechsearch_jax.envs.sampled import Foresee, Sampled, nothing_sampled, packed, sampled, unpacked
 from mechsearch_jax.envs.simulator import ARM
 from mechsearch_jax.envs.world import BODIES, World
 from mechsearch_jax.errors import InputError
@@ -59,6 +60,7 @@ class RecordedStep:
       target_pose: x, y [m] and yaw [rad] of the true target.
       action: what was decided; None where nothing was.
       trace: what moved; without rows where nothing did.
+      sampled: what the decision chose from; nothing where that is not known.
     """
 
     title: str
@@ -72,6 +74,7 @@ class RecordedStep:
     target_pose: Float[np.ndarray, " 3"]
     action: Action | None
     trace: Trace
+    sampled: Sampled = dataclasses.field(default_factory=nothing_sampled)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -101,8 +104,12 @@ class Traced(Protocol):
 class Recorder:
     """Collects the steps of an episode that runs alone."""
 
-    def __init__(self, simulator: Traced):
-        self._simulator = simulator
+    def __init__(self, simulator: Traced, foresee: Foresee | None = None):
+        """Args:
+        simulator: of the episode.
+        foresee: predicts the actions that a decision chose from, if anything does.
+        """
+        self._simulator, self._foresee = simulator, foresee
         self._steps: list[RecordedStep] = []
 
     def note(self, moment: Moment, frame: Frame) -> None:
@@ -112,7 +119,11 @@ class Recorder:
           moment: all that is known of it.
           frame: its picture.
         """
-        acted = moment.outcome is not None
+        acted, foresee = moment.outcome is not None, self._foresee
+        chosen_from = nothing_sampled()
+        if acted and moment.decision is not None:
+            foreseen = None if foresee is None else lambda: foresee(moment)
+            chosen_from = sampled(moment.decision.sequences, foreseen)
         assert frame.target_pose is not None
         self._steps.append(
             RecordedStep(
@@ -127,6 +138,7 @@ class Recorder:
                 target_pose=frame.target_pose,
                 action=jax.tree.map(np.asarray, moment.decision.action) if acted and moment.decision else None,
                 trace=self._simulator.traces[0] if acted else empty_trace(),
+                sampled=chosen_from,
             )
         )
 
@@ -165,6 +177,7 @@ def save_recording(recording: Recording, path: PathLike) -> None:
         for field in _fields(kind):
             arrays[f"{name}.{field}"] = np.stack([np.asarray(getattr(tree, field)) for tree in trees])
     arrays |= {name: np.stack([np.asarray(getattr(step, name)) for step in steps]) for name in _ARRAYS}
+    arrays |= packed([step.sampled for step in steps])
     with replacing(path) as file:
         np.savez_compressed(file, allow_pickle=False, head=np.array(json.dumps(head)), **arrays)
 
@@ -184,7 +197,13 @@ def load_recording(path: PathLike) -> Recording:
         settings = {name: kind(**_tuples(head[name])) for name, kind in _SETTINGS.items()}
         _check(arrays, count, len(settings["target"].candidate_poses(settings["shelf"])))
         ends = np.cumsum(arrays["rows"])
-        steps = [_step(arrays, told[i], i, slice(ends[i] - arrays["rows"][i], ends[i])) for i in range(count)]
+        chosen_from = unpacked(arrays, count)
+        steps = [
+            dataclasses.replace(
+                _step(arrays, told[i], i, slice(ends[i] - arrays["rows"][i], ends[i])), sampled=chosen_from[i]
+            )
+            for i in range(count)
+        ]
         return Recording(str(head["heading"]), **settings, steps=tuple(steps))
     except (KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
         raise InputError(f"{path}: is no recording of an episode ({' '.join(str(error).split())})") from error

@@ -6,13 +6,11 @@ import types
 
 import av
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
-from stage import HIDDEN
+from recordings import MOVES, RECORDING, RESTS, SAMPLED, SEQUENCES, WORLD
 
-from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.film import Film
 from mechsearch_jax.envs.native import Trace
@@ -20,79 +18,14 @@ from mechsearch_jax.envs.pictures import recorded_frame
 from mechsearch_jax.envs.playback import ENDS, LOOKS, WAY_TIME, playback
 from mechsearch_jax.envs.recording import (
     NAME,
-    RecordedStep,
     Recorder,
-    Recording,
-    empty_trace,
     load_recording,
     save_recording,
 )
-from mechsearch_jax.envs.world import BODIES, TARGET, from_scenario, true_superquadrics
+from mechsearch_jax.envs.world import BODIES, TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME, VELOCITY_LIMIT
 from mechsearch_jax.viz.movie import save_movie
-from mechsearch_jax.workspace.camera import Camera
-from mechsearch_jax.workspace.shelf import Shelf
-from mechsearch_jax.workspace.target import Target
-
-WORLD = jax.tree.map(np.asarray, from_scenario(HIDDEN))
-OBJECTS = jax.tree.map(np.asarray, true_superquadrics(from_scenario(HIDDEN)))
-TURNED = np.asarray(HOME) + np.array([0.3, 0.1, 0.0, 0.1, 0.0, 0.0, 0.0], np.float32)
-GRIPPER = jnp.array([[0, 0, 1, 0.5], [0, -1, 0, 0.05], [1, 0, 0, 0.46], [0, 0, 0, 1]], jnp.float32)
-PUSH = jax.tree.map(
-    np.asarray,
-    no_action().replace(
-        kind=jnp.int32(ActionKind.PUSH),
-        T_world_gripper=GRIPPER,
-        displacement=jnp.array([0.0, 0.1, 0.0]),
-        T_world_place=GRIPPER.at[1, 3].add(0.1),
-    ),
-)
-RETRIEVAL = jax.tree.map(np.asarray, retrieve_action(GRIPPER, jnp.float32(0.7), jnp.float32(0.08)))
-# What a simulator does: it sets the arm to where an action begins, and home after it.
-MOVES, RESTS = 1.0, 0.4
-
-
-def trace(shift, returns=True):
-    """The arm turns a little in front of the shelf, and the box moves meanwhile; then the arm is set home."""
-    share = np.linspace(0.0, 1.0, 26)
-    q = TURNED + share[:, None] * np.array([0.1, 0, 0, 0, 0, 0, 0])
-    rest = 10 if returns else 0
-    position = np.repeat(WORLD.position[None], 26 + rest, axis=0).astype(float)
-    position[:26, 0] += share[:, None] * shift
-    position[26:, 0] += shift
-    still = np.tile([1.0, 0.0, 0.0, 0.0], (26 + rest, BODIES, 1))
-    time = 0.04 * (1 + np.arange(26 + rest))
-    return Trace(time, np.concatenate([q, np.tile(HOME, (rest, 1))]), np.full((26 + rest, 2), 0.01), position, still)
-
-
-def step(title, **changes):
-    poses = Target.cylinder().candidate_poses(Shelf())
-    after = OBJECTS.replace(position=OBJECTS.position + np.array([0.0, 0.1, 0.0], np.float32))
-    fields = {
-        "title": title,
-        "caption": "why",
-        "found": False,
-        "world": WORLD,
-        "scene": OBJECTS,
-        "after": after,
-        "existence": poses[:, 1] > 0.2,
-        "graspability": np.arange(len(poses)) % 12 - 10,
-        "target_pose": np.array([0.62, 0.07, 0.0], np.float32),
-        "action": PUSH,
-        "trace": trace(np.array([0.0, 0.1, 0.0])),
-    }
-    return RecordedStep(**{**fields, **changes})
-
-
-FOUND = {"found": True, "action": RETRIEVAL, "trace": trace(np.zeros(3), returns=False)}
-RECORDING = Recording(
-    "hidden: retrieved",
-    Camera().scaled(8),
-    Shelf(),
-    Target.cylinder(),
-    (step("1  push"), step("2  give up", action=None, trace=empty_trace()), step("3  take the target out", **FOUND)),
-)
 
 
 @pytest.fixture(scope="module")
@@ -111,10 +44,23 @@ def test_a_recording_comes_back_as_it_was_written(tmp_path):
         assert (one.action is None) == (other.action is None)
         for name in ("world", "scene", "after", "existence", "graspability", "target_pose", "action"):
             jax.tree.map(np.testing.assert_array_equal, getattr(one, name), getattr(other, name))
+        jax.tree.map(np.testing.assert_array_equal, one.sampled.action, other.sampled.action)
+        for name in ("value", "cost", "position", "rotation"):
+            np.testing.assert_allclose(getattr(one.sampled, name), getattr(other.sampled, name), atol=1e-6)
         for field in dataclasses.fields(Trace):
             ours, theirs = getattr(one.trace, field.name), getattr(other.trace, field.name)
             np.testing.assert_allclose(ours, theirs, atol=1e-6)
             assert ours.shape == theirs.shape
+
+
+def test_a_recording_of_an_earlier_version_tells_of_no_samples(tmp_path):
+    save_recording(RECORDING, tmp_path / NAME)
+    with np.load(tmp_path / NAME) as file:
+        arrays = {name: array for name, array in file.items() if not name.startswith("sampled.")}
+    np.savez(tmp_path / NAME, **arrays)
+    steps = load_recording(tmp_path / NAME).steps
+    assert [len(step.sampled) for step in steps] == [0, 0, 0]
+    assert steps[0].sampled.after(0, steps[0].scene) is steps[0].scene
 
 
 def cut(arrays):
@@ -145,7 +91,15 @@ def retype(arrays):
     arrays["existence"] = arrays["existence"].astype("U1")
 
 
-@pytest.mark.parametrize("spoil", [cut, forget, rename, widen, misname, lose, retype])
+def forget_samples(arrays):
+    arrays["sampled.value"] = arrays["sampled.value"][1:]
+
+
+def misname_samples(arrays):
+    arrays["sampled.action.kind"] = arrays["sampled.action.kind"] + 90
+
+
+@pytest.mark.parametrize("spoil", [forget_samples, misname_samples, cut, forget, rename, widen, misname, lose, retype])
 def test_what_is_no_recording_is_refused_in_one_line(spoil, tmp_path):
     save_recording(RECORDING, tmp_path / NAME)
     with np.load(tmp_path / NAME) as file:
@@ -167,7 +121,7 @@ def test_a_recorder_keeps_what_was_shown_and_what_moved():
     problem = types.SimpleNamespace(camera=RECORDING.camera, shelf=RECORDING.shelf, target=RECORDING.target)
     for told in (one, two):
         frame = recorded_frame(told, RECORDING.camera, RECORDING.shelf)
-        decision = None if told.action is None else types.SimpleNamespace(action=told.action)
+        decision = None if told.action is None else types.SimpleNamespace(action=told.action, sequences=SEQUENCES)
         outcome = None if told.action is None else object()
         snapshot = types.SimpleNamespace(world=told.world)
         recorder.note.__wrapped__(
@@ -176,6 +130,11 @@ def test_a_recorder_keeps_what_was_shown_and_what_moved():
     kept = recorder.recording.__wrapped__(recorder, problem, "how it ended")
     assert [s.title for s in kept.steps] == ["1  push", "2  give up"]
     assert kept.steps[0].trace is one.trace
+    assert kept.steps[0].sampled.after(0, told.scene) is told.scene
+    assert kept.steps[0].sampled.value.tolist() == [-30.0, -10.0]
+    assert kept.steps[0].sampled.cost.tolist() == [90.0, 95.0]
+    np.testing.assert_array_equal(kept.steps[0].sampled.single(1).displacement, SAMPLED.action.displacement[1])
+    assert len(kept.steps[1].sampled) == 0
     assert kept.steps[1].action is None
     assert len(kept.steps[1].trace.time) == 0
     assert kept.heading == "how it ended"

@@ -30,6 +30,7 @@ from mechsearch_jax.commands.reproduce import reproduce
 from mechsearch_jax.commands.search import search
 from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
 from mechsearch_jax.commands.video import video
+from mechsearch_jax.commands.view import view
 from mechsearch_jax.errors import InputError, nearest
 
 Commands = Mapping[str, Callable[..., None]]
@@ -49,6 +50,7 @@ COMMANDS: Commands = {
     "plan": plan,
     "inspect": inspect_scenarios,
     "video": video,
+    "view": view,
     "evaluate": evaluate,
     "sweep": sweep,
     "reproduce": reproduce,

@@ -88,13 +88,14 @@ def search(
             from mechsearch_jax.envs.recognisers import recogniser
             from mechsearch_jax.envs.recording import NAME, TRACE_EVERY, Recorder, save_recording
             from mechsearch_jax.envs.records import save_episode
+            from mechsearch_jax.envs.sampled import foresight
             from mechsearch_jax.viz.drawing import save_figure
             from mechsearch_jax.viz.filmstrip import filmstrip
 
             simulator = NativeSimulator(
                 config=SimulatorConfig(trace_every=TRACE_EVERY), shelf=workcell.shelf, camera=workcell.camera
             )
-            recorder = Recorder(simulator)
+            recorder = Recorder(simulator, foresight(policy_now, problem) if record or video is not None else None)
             narrator = Narrator(console, status, problem, recorder.note)
             episode = run_episode(
                 seed,

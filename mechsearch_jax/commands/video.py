@@ -39,25 +39,51 @@ def video(
     """
     from rich.console import Console
 
-    from mechsearch_jax.envs.recording import NAME, load_recording
-    from mechsearch_jax.files import check_writable, is_file
+    from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.viz.movie import check_movie_path
 
-    for name, value, least, most in (
-        ("width", width, 320, WIDEST),
-        ("fps", fps, 1, FASTEST),
-        ("speed", speed, 0.1, 20),
-    ):
-        if not least <= value <= most:
-            raise InputError(f"video: --{name} {value} is not between {least} and {most}")
+    check_option("video", "width", width, 320, WIDEST)
+    check_pace("video", fps, speed)
     check_movie_path(out)
-    if not is_file(episode / NAME):
-        raise InputError(f"{episode / NAME}: there is none; search once more with --record")
-    recording = load_recording(episode / NAME)
+    recording = recording_of(episode)
     check_writable(out.parent)
     keep_compilations()
     make_film(recording, out, Console(highlight=False), width, fps, speed)
+
+
+def check_option(command: str, name: str, value: float | int, least: float | int, most: float | int) -> None:
+    """Refuse a value of an option.
+
+    Raises:
+      InputError: it is out of bounds.
+    """
+    if not least <= value <= most:
+        raise InputError(f"{command}: --{name} {value} is not between {least} and {most}")
+
+
+def check_pace(command: str, fps: int, speed: float | int) -> None:
+    """Refuse so many pictures in a second, or such a speed.
+
+    Raises:
+      InputError: one is out of bounds.
+    """
+    check_option(command, "fps", fps, 1, FASTEST)
+    check_option(command, "speed", speed, 0.1, 20)
+
+
+def recording_of(episode: Path) -> Recording:
+    """The recording in an episode's folder.
+
+    Raises:
+      InputError: there is none, or it cannot be read.
+    """
+    from mechsearch_jax.envs.recording import NAME, load_recording
+    from mechsearch_jax.files import is_file
+
+    if not is_file(episode / NAME):
+        raise InputError(f"{episode / NAME}: there is none; search once more with --record")
+    return load_recording(episode / NAME)
 
 
 def make_film(

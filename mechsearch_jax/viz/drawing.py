@@ -74,10 +74,15 @@ def rgb(colour: str) -> np.ndarray:
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
 
 
-def surfaces(scene: Superquadrics) -> list[Float[np.ndarray, "points 3"] | None]:
-    """Points of each object's surface [m]; None for absent objects."""
-    elevation = np.linspace(-np.pi / 2, np.pi / 2, 33)[:, None]
-    azimuth = np.linspace(-np.pi, np.pi, 97)[None, :]
+def surfaces(scene: Superquadrics, grid: tuple[int, int] = (33, 97)) -> list[Float[np.ndarray, "points 3"] | None]:
+    """Points of each object's surface [m]; None for absent objects.
+
+    Args:
+      scene: the objects.
+      grid: how many from pole to pole, and how many around, the last the same as the first.
+    """
+    elevation = np.linspace(-np.pi / 2, np.pi / 2, grid[0])[:, None]
+    azimuth = np.linspace(-np.pi, np.pi, grid[1])[None, :]
 
     def power(base: np.ndarray, exponent: float) -> np.ndarray:
         return np.sign(base) * np.abs(base) ** exponent

@@ -23,10 +23,28 @@ def panda_solids(poses: Float[np.ndarray, "8 4 4"], opening: float) -> list[Soli
       poses: of links 1 to 7 and of the hand, as `kinematics.forward_kinematics` gives them.
       opening: distance between the fingers [m].
     """
+    parts = ((poses[frame], some, colour) for frame, some, colour in _parts(opening))
+    return [_foot(), *(_solid(T @ part.T_frame_primitive, part, colour) for T, some, colour in parts for part in some)]
+
+
+def panda_pieces() -> list[list[Solid]]:
+    """What is rigid, each in its own frame: links 1 to 7 and the hand, and in the hand's the left and the right finger,
+    where they touch; the foot, in the world, comes last."""
+    pieces = [[_solid(part.T_frame_primitive, part, colour) for part in some] for _, some, colour in _parts(0.0)]
+    return [*pieces, [_foot()]]
+
+
+def _parts(opening: float) -> list[tuple[int, tuple[Primitive, ...], Colour]]:
+    """The frame, the primitives and the colour of each link, of the hand and of its fingers."""
+    both = fingers(opening)
+    half = len(both) // 2
+    links = [(i, tuple(some), colour) for i, (some, colour) in enumerate(zip(LINKS, COLOURS, strict=True))]
+    return [*links, (7, tuple(HAND), DARK), (7, both[:half], GREY), (7, both[half:], GREY)]
+
+
+def _foot() -> Solid:
     start, end, radius = FOOT
-    foot = _capsule_solid(radius, (np.array(end) - start)[2] / 2, np.eye(3), (np.array(start) + end) / 2, GREY)
-    parts = [*zip(poses, LINKS, COLOURS, strict=False), (poses[7], HAND, DARK), (poses[7], fingers(opening), GREY)]
-    return [foot, *(_solid(T @ part.T_frame_primitive, part, colour) for T, some, colour in parts for part in some)]
+    return _capsule_solid(radius, (np.array(end) - start)[2] / 2, np.eye(3), (np.array(start) + end) / 2, GREY)
 
 
 def _solid(T: np.ndarray, part: Primitive, colour: Colour) -> Solid:

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from mechsearch_jax.workspace.camera import Camera
+
+if TYPE_CHECKING:
+    import trimesh
 
 # A solid that comes nearer to the camera's plane than this is looked for in the whole image [m].
 NEAREST = 0.02
@@ -33,6 +36,8 @@ class Surface(Protocol):
     def normal(
         self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
     ) -> Float[Any, "*batch 3"]: ...
+
+    def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +67,14 @@ class Capsule:
         half = half_size[..., 2:] - half_size[..., :1]
         height = point[..., 2:] - library.clip(point[..., 2:], -half, half)
         return library.concatenate([point[..., :2], height], axis=-1)
+
+    def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh:
+        """Its surface, of triangles [m]."""
+        import trimesh
+
+        radius, _, half = half_size
+        mesh = trimesh.creation.capsule(height=2 * (half - radius), radius=radius, count=(16, 12))
+        return mesh.apply_translation(-mesh.bounds.mean(axis=0))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,0 +1,155 @@
+"""What a decision chose from: the first actions of its sampled sequences, as a recording keeps them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from mechsearch_jax.actions import Action, ActionKind, kind_of, no_action
+from mechsearch_jax.envs.episodes import Moment
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.planner import Problem
+from mechsearch_jax.planner.policies import Policy, Search
+from mechsearch_jax.planner.prediction import first_scenes, push_model_of
+from mechsearch_jax.planner.state import Sequences
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS
+
+# Where the objects are predicted to be after each first action, fields (K, N, ...).
+Foresee = Callable[[Moment], Superquadrics]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sampled:
+    """First actions, those of the best sequences first; NumPy arrays with a leading axis K.
+
+    Attributes:
+      action: what would be done.
+      value: equation 2 of its sequence: the change of the cost, negative is good.
+      cost: J that is expected after it.
+      position: of the objects after it [m], shape (K, N, 3); of no row where nobody predicted it.
+      rotation: theirs, shape (K, N, 3, 3).
+    """
+
+    action: Action
+    value: Float[np.ndarray, " k"]
+    cost: Float[np.ndarray, " k"]
+    position: Float[np.ndarray, "k n 3"]
+    rotation: Float[np.ndarray, "k n 3 3"]
+
+    def __len__(self) -> int:
+        return len(self.value)
+
+    def single(self, k: int) -> Action:
+        """One of the actions."""
+        return jax.tree.map(lambda a: a[k], self.action)
+
+    def after(self, k: int, scene: Superquadrics) -> Superquadrics:
+        """The objects of a scene after one of the actions; where they are if nobody predicted it."""
+        if not len(self.position):
+            return scene
+        return scene.replace(position=self.position[k], rotation=self.rotation[k])
+
+
+def foresight(policy: Policy, problem: Problem) -> Foresee | None:
+    """How a policy predicts what it samples; None for one that does not tell, such as one of one's own."""
+    model = push_model_of(policy.predict) if isinstance(policy, Search) else None
+    if model is None:
+        return None
+
+    def foresee(moment: Moment) -> Superquadrics:
+        assert moment.decision is not None
+        actions = jax.tree.map(lambda a: a[:, 0], moment.decision.sequences.actions)
+        return first_scenes(model, problem, moment.belief, moment.observation.objects, actions)
+
+    return foresee
+
+
+def sampled(sequences: Sequences, foresee: Callable[[], Superquadrics] | None = None) -> Sampled:
+    """What a decision chose from.
+
+    Args:
+      sequences: all that it sampled.
+      foresee: predicts their first actions, if anything does.
+    """
+    found = jax.device_get(sequences)
+    action, value, cost = jax.tree.map(lambda a: a[:, 0], found.actions), found.value, found.cost[:, 0]
+    rows = np.flatnonzero((action.kind != ActionKind.NONE) & np.isfinite(value) & np.isfinite(cost))
+    if not len(rows):
+        return nothing_sampled()
+    scenes = None if foresee is None else jax.device_get(foresee())
+    empty = nothing_sampled()
+    return Sampled(
+        action=jax.tree.map(lambda a: a[rows], action),
+        value=value[rows],
+        cost=cost[rows],
+        position=empty.position if scenes is None else scenes.position[rows],
+        rotation=empty.rotation if scenes is None else scenes.rotation[rows],
+    )
+
+
+def nothing_sampled() -> Sampled:
+    """No actions."""
+    none = jax.tree.map(lambda a: np.asarray(a)[None][:0], no_action())
+    numbers = np.zeros(0, np.float32)
+    return Sampled(none, numbers, numbers, np.zeros((0, MAX_OBJECTS, 3)), np.zeros((0, MAX_OBJECTS, 3, 3)))
+
+
+def packed(every: Sequence[Sampled]) -> dict[str, np.ndarray]:
+    """The arrays of some steps, one after the other, and how many rows each step has."""
+    arrays = {"sampled.rows": np.array([len(one) for one in every])}
+    arrays["sampled.foreseen"] = np.array([len(one.position) for one in every])
+    for name in ("value", "cost", "position", "rotation"):
+        arrays[f"sampled.{name}"] = np.concatenate([np.asarray(getattr(one, name), np.float32) for one in every])
+    for field in dataclasses.fields(Action):
+        arrays[f"sampled.action.{field.name}"] = np.concatenate([getattr(one.action, field.name) for one in every])
+    return arrays
+
+
+def unpacked(arrays: Mapping[str, np.ndarray], steps: int) -> list[Sampled]:
+    """What `packed` packed; nothing for each step of a recording that has none.
+
+    Raises:
+      ValueError: it is something else.
+      KeyError: an array is missing.
+    """
+    if "sampled.rows" not in arrays:
+        return [nothing_sampled()] * steps
+    rows, foreseen = arrays["sampled.rows"], arrays["sampled.foreseen"]
+    _check(arrays, steps, rows, foreseen)
+    ends, seen = np.cumsum(rows), np.cumsum(foreseen)
+    names = [field.name for field in dataclasses.fields(Action)]
+    result = []
+    for i in range(steps):
+        one, places = slice(ends[i] - rows[i], ends[i]), slice(seen[i] - foreseen[i], seen[i])
+        fields: dict[str, Any] = {name: arrays[f"sampled.action.{name}"][one] for name in names}
+        action = Action(**fields)
+        told = (arrays[f"sampled.{name}"][one] for name in ("value", "cost"))
+        result.append(Sampled(action, *told, *(arrays[f"sampled.{n}"][places] for n in ("position", "rotation"))))
+    return result
+
+
+def _check(
+    arrays: Mapping[str, np.ndarray], steps: int, rows: Int[np.ndarray, "..."], foreseen: Int[np.ndarray, "..."]
+) -> None:
+    for counts in (rows, foreseen):
+        if counts.shape != (steps,) or counts.dtype.kind not in "iu" or counts.min() < 0:
+            raise ValueError("it is not told how many actions were sampled")
+    if ((foreseen != rows) & (foreseen != 0)).any():
+        raise ValueError("predictions are missing")
+    empty = packed([nothing_sampled()])
+    for name, like in empty.items():
+        if name in ("sampled.rows", "sampled.foreseen"):
+            continue
+        count = int((foreseen if name in ("sampled.position", "sampled.rotation") else rows).sum())
+        array = arrays[name]
+        if array.shape != (count, *like.shape[1:]) or array.dtype.kind != like.dtype.kind:
+            raise ValueError(f"{name} is of another shape or type")
+        if not np.isfinite(array).all():
+            raise ValueError("there are numbers that are not finite")
+    for kind in np.unique(arrays["sampled.action.kind"]):
+        kind_of(int(kind))
