@@ -12,10 +12,8 @@ from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
-from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.graspability import crowding, grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import prediction
 from mechsearch_jax.planner.belief import possible_poses, with_target
 from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.moved_target import BEYOND, beyond_candidates, candidate_of
@@ -144,27 +142,9 @@ def test_without_the_option_the_target_stays(problem, belief, objects):
     assert root.available.tolist() == [True] * 3 + [False] * 6
 
 
-def test_a_found_target_may_be_pushed_along_as_long_as_it_may_be_pushed(problem, belief, objects, states, monkeypatch):
-    told = []
-
-    class Listens:
-        def predict(self, space, tables, push_model, scene, untouchable, action, wrist):
-            told.append(np.flatnonzero(untouchable).tolist())
-            return Prediction(scene, jnp.array(True), jnp.float32(0.0))
-
-    monkeypatch.setattr(prediction, "KINDS", {ActionKind.PUSH: Listens()})
-    root, after, _ = states
-    fixed = rollout_of(problem, belief, planner.search_for_grasp(move_target=False)).root(objects)
-    push = no_action().replace(kind=jnp.int32(ActionKind.PUSH), object=jnp.int32(0))
-    predict = prediction.PredictByKind(QuasiStatic(), QuasiStatic())
-    for state in (root, after, fixed):
-        predict(problem, state, Sample(push, jnp.int32(0), jnp.float32(0.0)), jnp.array(True))
-    assert told == [[], [8], [8]]
-
-
 def test_a_target_that_nothing_else_frees_is_pushed(problem, belief, objects):
     decision = POLICY(jax.random.key(0), problem, belief, seen(objects))
-    assert int(decision.action.kind) == ActionKind.PUSH
+    assert (int(decision.action.kind), int(decision.action.object)) == (ActionKind.PUSH, 8)
     assert float(decision.predicted_cost) < float(decision.cost) - 0.5
     kind, index = (np.asarray(a) for a in (decision.sequences.actions.kind, decision.sequences.actions.object))
     of_target = index == 8

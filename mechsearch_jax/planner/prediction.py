@@ -71,7 +71,7 @@ class LaterPlacementsStay:
 class PredictByKind:
     """The default `Predict`: every kind of action predicts itself, pushes with a push model.
 
-    A found target moves only as long as it is `State.available`, and stays among its candidate poses.
+    A found target moves only where it is what the action moves, and stays among its candidate poses.
 
     Attributes:
       push_model: predicts pushes that are the first action of a sequence.
@@ -84,8 +84,8 @@ class PredictByKind:
     def __call__(self, problem: Problem, state: State, sample: Sample, first: Bool[Array, ""]) -> Prediction:
         push_model = _either(first, self.push_model, self.later_push_model)
         action, scene = sample.action, state.scene
-        # What is sampled may move the target only if it is known where it is, by pushing it or what pushes it along.
-        untouchable = state.is_target & ~state.available
+        # What is sampled may move the target only by pushing it itself.
+        untouchable = state.is_target & (jnp.arange(scene.capacity) != action.object)
         found = Prediction(scene, jnp.array(False), jnp.float32(0.0))
         for code, kind in KINDS.items():
             told = kind.predict(problem.space, problem.actions, push_model, scene, untouchable, action, sample.wrist)
