@@ -10,7 +10,7 @@ import json
 import re
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from matplotlib.figure import Figure
 
@@ -286,7 +286,8 @@ def write_report(rows: Sequence[Row] | Report, out: PathLike, told: Callable[[st
     for film in report.films:
         if film.drawn:
             images[film.file] = (folder / film.file).read_bytes()
-    page = blocks(report)
+    # The type checker takes what a folder beside the package holds for another module than the installed one.
+    page = blocks(cast(Any, report))
     texts = _texts(report)
     texts |= {"report.md": as_markdown(page), "report.tex": as_latex(page)}
     texts["report.html"] = as_html(page, "Results", images)

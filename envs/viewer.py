@@ -47,7 +47,7 @@ LAYERS = {
     "camera": ("camera", False),
 }
 # What is shown of a decision unless a sampled action is asked for.
-CHOSEN = "the one that was chosen"
+CHOSEN: str = "the one that was chosen"
 LEGEND = "Where the target can be, and what a grasp there would meet: "
 
 
