@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -18,6 +18,31 @@ from mechsearch_jax.commands.options import (
 )
 from mechsearch_jax.commands.video import make_film
 from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from mechsearch_jax.envs.records import Episode
+    from mechsearch_jax.workspace.scenario import Scenario
+
+
+def _check_scene(scenario: str | None, objects: int | None, target: str | None) -> None:
+    """Refuse what does not say one scene."""
+    if (scenario is None) == (objects is None):
+        raise InputError("search: give either a scenario or --objects N, not both")
+    if scenario is not None and target is not None:
+        raise InputError("search: --target is for a generated scenario; a scenario file says itself what its target is")
+
+
+def _save(out: Path, scene: Scenario, episode: Episode, strip: Figure) -> None:
+    """Write what there is of every episode."""
+    from mechsearch_jax.envs.records import save_episode
+    from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.workspace.scenario import save_scenario
+
+    save_figure(strip, out / "filmstrip.png")
+    save_scenario(scene, out / "scenario.json")
+    save_episode(episode, out / "episode.json")
 
 
 def search(
@@ -57,12 +82,9 @@ def search(
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.viz.movie import check_movie_path
-    from mechsearch_jax.workspace.scenario import load_scenario, save_scenario
+    from mechsearch_jax.workspace.scenario import load_scenario
 
-    if (scenario is None) == (objects is None):
-        raise InputError("search: give either a scenario or --objects N, not both")
-    if scenario is not None and target is not None:
-        raise InputError("search: --target is for a generated scenario; a scenario file says itself what its target is")
+    _check_scene(scenario, objects, target)
     options.only_native("search")
     (chosen,) = options.methods(chosen_policies("search", method and (method,), policy and (policy,)))
     settings, workcell = options.settings(), chosen.workcell
@@ -87,9 +109,7 @@ def search(
             from mechsearch_jax.envs.native import NativeSimulator
             from mechsearch_jax.envs.recognisers import recogniser
             from mechsearch_jax.envs.recording import NAME, TRACE_EVERY, Recorder, save_recording
-            from mechsearch_jax.envs.records import save_episode
             from mechsearch_jax.envs.sampled import foresight
-            from mechsearch_jax.viz.drawing import save_figure
             from mechsearch_jax.viz.filmstrip import filmstrip
 
             simulator = NativeSimulator(
@@ -111,9 +131,7 @@ def search(
             )
         status.update("writing")
         strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
-        save_figure(strip, out / "filmstrip.png")
-        save_scenario(scene, out / "scenario.json")
-        save_episode(episode, out / "episode.json")
+        _save(out, scene, episode, strip)
         recording = recorder.recording(problem, verdict(episode))
         if record or video is not None:
             save_recording(recording, out / NAME)
