@@ -6,10 +6,11 @@ neither on its slot nor on its neighbours. An episode alone is a pool of one slo
 scene, and which can be watched.
 
 Three verdicts are passed on an episode, all on the true state: `graspable` (the target is in sight and a collision-free
-grasp exists), `paper_graspable` (the same of the paper's grasps alone) and `retrieved` (the hand took it out of the
-shelf, and no object fell, neither then nor before). An action that fails costs a step and leaves the world as it made
-it. Once an object has left the board nothing can be retrieved any more: the episode goes on until it is known whether
-the target is found and graspable, and takes nothing out. No episode goes on for the sake of `paper_graspable`.
+grasp exists, or it is retrieved), `paper_graspable` (a collision-free one among the paper's grasps) and `retrieved`
+(the hand took it out of the shelf, and no object fell, neither then nor before). An action that fails costs a step and
+leaves the world as it made it. Once an object has left the board nothing can be retrieved any more: the episode goes on
+until it is known whether the target is found and graspable, and takes nothing out. No episode goes on for the sake of
+`paper_graspable`.
 """
 
 from __future__ import annotations

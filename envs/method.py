@@ -12,6 +12,7 @@ from mechsearch_jax.envs.policy_numbers import mould
 from mechsearch_jax.envs.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
+from mechsearch_jax.envs.retrieval_models import retrieval_model
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
 from mechsearch_jax.planner.workcell import Workcell
@@ -41,13 +42,18 @@ class Method:
     protocol: ProtocolName = "strict"
 
     def policy(self) -> Policy:
-        """The policy, with the push models that the configuration names.
+        """The policy, with the models that the configuration names.
 
         Raises:
           InputError: there is no such policy, or its push model cannot be used.
         """
         first, later = push_models(self.config.push_model)
-        return policy_factory(self.name)(self.config.planner, push_model=first, later_push_model=later)
+        return policy_factory(self.name)(
+            self.config.planner,
+            push_model=first,
+            later_push_model=later,
+            retrieval_model=retrieval_model(self.config.retrieval_model),
+        )
 
     @property
     def terms(self) -> EpisodeProtocol:

@@ -17,6 +17,7 @@ import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -115,7 +116,7 @@ class NativeWorld:
             return self._finish(Failure.UNREACHABLE, True)
         before, gone = copy.copy(self._data), self._fallen()
         states = self._follow(reference)
-        error = float(np.abs(states[:, 1 : 1 + ARM] - np.asarray(reference.q[: len(states)], float)).max())
+        error = self._tracking_error(states, reference)
         dropped = kind.holds_object and not self._slip(states, reference, int(action.object)) < self.config.slip
         if kind.returns_home:
             self._go_home()
@@ -151,11 +152,32 @@ class NativeWorld:
         target = found.pop(TARGET)
         return Scenario(name, tuple(found.values()), target)
 
-    def _begin(self, bodies: list[Body | None], world: World) -> World:
+    def place(self, bodies: list[Body | None]) -> None:
+        """Start from bodies, everything at rest and the robot at home; `world` stays what it was."""
         self._bodies = bodies
         self._model = models.with_bodies(self._blank, bodies)
         self._data = models.initial_state(self._model, bodies)
         self._go_home()
+
+    def settle_and_retrieve(self, reference: Reference) -> bool:
+        """Whether a motion takes the target out once everything is at rest, and nothing falls meanwhile.
+
+        Nothing is computed with JAX, so that a callback of JAX may ask; `world` stays what it was.
+
+        Args:
+          reference: of the arm, as NumPy arrays.
+        """
+        self._recorder = _Recorder(self._data, self.config.trace_every)
+        self._come_to_rest()
+        gone = self._fallen()
+        error = self._tracking_error(self._follow(reference), reference)
+        self._come_to_rest()
+        if self._diverged() or error > self.config.tracking_bound:
+            return False
+        return self._retrieval(gone).failure is Failure.NONE
+
+    def _begin(self, bodies: list[Body | None], world: World) -> World:
+        self.place(bodies)
         self.world = world
         return world
 
@@ -176,6 +198,10 @@ class NativeWorld:
         start = np.asarray(reference.start, float)
         self._set_robot(start[:ARM], float(start[ARM]))
         return self._run(controls(reference))
+
+    def _tracking_error(self, states: np.ndarray, reference: Reference) -> float:
+        """How far a joint was at most from its reference [rad]."""
+        return float(np.abs(states[:, 1 : 1 + ARM] - np.asarray(reference.q[: len(states)], float)).max())
 
     def _slip(self, states: np.ndarray, reference: Reference, body: int) -> float:
         """How far a body has moved in the hand between when it closed and when it was to open [m]."""
@@ -236,16 +262,22 @@ class NativeWorld:
         valid = np.array([body is not None for body in self._bodies])
         return valid & ((position[:, 0] < self.shelf.front) | (position[:, 2] < self.shelf.board))
 
-    def _finish_retrieval(self, failure: Failure, settled: bool, gone: Bool[np.ndarray, " 9"]) -> Outcome:
-        """Say what became of an attempt to take the target out, before which some bodies were gone."""
+    def _retrieval(self, gone: Bool[np.ndarray, " 9"]) -> _Retrieval:
+        """What became of an attempt to take the target out, before which some bodies were gone."""
         held = self._holds(TARGET)
         outside = bool(self._data.joint(f"body{TARGET}").qpos[0] < self.shelf.front)
-        self._take_over()
         fallen = self._fallen() & ~(held & (np.arange(BODIES) == TARGET))
         lost = (fallen & ~gone).any()
         checks = ((Failure.MISSED, not held), (Failure.INSIDE, not outside), (Failure.FALLEN, lost))
-        failure = failure or next((code for code, applies in checks if applies), Failure.NONE)
-        return _outcome(failure, self._recorder.steps, settled, fallen, held, outside)
+        failure = next((code for code, applies in checks if applies), Failure.NONE)
+        return _Retrieval(failure, held, outside, fallen)
+
+    def _finish_retrieval(self, failure: Failure, settled: bool, gone: Bool[np.ndarray, " 9"]) -> Outcome:
+        """Say what became of an attempt to take the target out, before which some bodies were gone."""
+        told = self._retrieval(gone)
+        self._take_over()
+        failure = failure or told.failure
+        return _outcome(failure, self._recorder.steps, settled, told.fallen, told.held, told.outside)
 
     def _finish(self, failure: Failure, settled: bool) -> Outcome:
         """Say what became of anything else."""
@@ -279,6 +311,15 @@ def _outcome(
         overflow=jnp.int32(0),
         tracking_error=jnp.float32(0.0),
     )
+
+
+class _Retrieval(NamedTuple):
+    """What became of an attempt to take the target out: as `Outcome` tells it."""
+
+    failure: Failure
+    held: bool
+    outside: bool
+    fallen: Bool[np.ndarray, " 9"]
 
 
 class _Recorder:

@@ -287,7 +287,7 @@ class _Rollouts:
         """What becomes of pushes; see `_simulate`, with a single leading axis n."""
         count = len(active)
         start = Poses(world.position.copy(), world.rotation.copy())
-        failed = ~_sound(world, reference) & active
+        failed = ~sound(world, reference) & active
         told = Simulated(start, jax.tree.map(np.copy, start), failed)
         # The sequences of a plan begin in the same scene, which is built once, and comes to rest once.
         of_scene: dict[bytes, int] = {}
@@ -395,8 +395,12 @@ class _Rollouts:
         return states, broke
 
 
-def _sound(world: World, reference: Reference) -> Bool[np.ndarray, " n"]:
-    """Where there is a scene and a motion: numbers that are finite, and rotations that are none of mirrors."""
+def sound(world: World, reference: Reference) -> Bool[np.ndarray, " n"]:
+    """Where there is a scene and a motion: numbers that are finite, and rotations that are none of mirrors.
+
+    Args:
+      world, reference: fields with one leading axis, as NumPy arrays.
+    """
     here = np.asarray(world.valid)
     numbers = [np.asarray(a).reshape(len(here), -1) for a in (reference.q, reference.velocity)]
     for leaf in (world.half_size, world.position, world.rotation):

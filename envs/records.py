@@ -115,7 +115,8 @@ class Episode:
       versions: as `versions` returns them.
       steps: one for each observation.
       found_step: number of actions before the target was found; None where it never was.
-      graspable_step: number of actions before it could also be grasped; None where it never could.
+      graspable_step: number of actions before it could also be grasped, at the latest before the one that retrieved it;
+        None where it never could.
       retrieved: whether the hand took the target out of the shelf and no object fell, neither then nor before.
       failure: why the episode ended without a retrieval; None after one. Where an object left the board, this is the
         reason, with the number of the action.

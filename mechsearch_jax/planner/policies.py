@@ -30,7 +30,7 @@ from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGr
 from mechsearch_jax.planner.prediction import LaterPlacementsStay, Predict, PredictByKind
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import Propose, guided_draw
-from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at
+from mechsearch_jax.planner.retrieval import GraspChoice, RetrievalModel, take_out
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
 
@@ -59,13 +59,15 @@ class PolicyFactory(Protocol):
         *,
         push_model: PushModel | None = None,
         later_push_model: PushModel | None = None,
+        retrieval_model: RetrievalModel | None = None,
     ) -> Policy:
-        """A policy with a configuration and push models, of which it may take what it likes.
+        """A policy with a configuration and models, of which it may take what it likes.
 
         Args:
           config: how it decides.
           push_model: predicts pushes; the learned one if left out.
           later_push_model: predicts those that are not the first action of a sequence; `push_model` if left out.
+          retrieval_model: tells which grasps take a found target out; if left out, those that hit nothing.
         """
         ...
 
@@ -79,12 +81,13 @@ class Plan(Protocol):
 
 
 class Search(flax.struct.PyTreeNode):
-    """The engine as a `Policy`: takes a found target out as soon as a grasp hits nothing, and else plans.
+    """The engine as a `Policy`: takes a found target out as soon as a grasp will do, and else plans.
 
     Attributes:
       config: how it decides.
       propose, predict, objective: the slots; static.
       plan: how it plans with them; static.
+      retrieval_model: tells which grasps will do; static. None where those do that hit nothing.
     """
 
     config: PlannerConfig
@@ -92,34 +95,40 @@ class Search(flax.struct.PyTreeNode):
     predict: Predict = flax.struct.field(pytree_node=False)
     objective: Objective = flax.struct.field(pytree_node=False)
     plan: Plan = flax.struct.field(pytree_node=False, default=plan)
+    retrieval_model: RetrievalModel | None = flax.struct.field(pytree_node=False, default=None)
+
+    @property
+    def _planning(self) -> Search:
+        """What a plan depends on: it is the same, and compiled once, whatever takes the target out."""
+        return self.replace(retrieval_model=None)
 
     def prepare(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> None:
         """Load or compile what a plan with such arguments needs, without planning; see `compiled.Kept.prepare`."""
-        _plan.prepare(self, key, problem, belief, observation)
+        _plan.prepare(self._planning, key, problem, belief, observation)
 
     def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
         """Whether nothing has to be compiled for a plan with such arguments; see `compiled.Kept.is_ready`."""
-        return _plan.is_ready(self, key, problem, belief, observation)
+        return _plan.is_ready(self._planning, key, problem, belief, observation)
 
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """See `Policy`."""
         if not isinstance(belief.found, Tracer):
             # Outside of any transformation, what is not needed is neither computed nor compiled.
             if not belief.found:
-                return _plan(self, key, problem, belief, observation)
-            grasp = graspable_at(problem, observation.objects, belief.found_pose)
+                return _plan(self._planning, key, problem, belief, observation)
+            grasp = take_out(self.retrieval_model, problem, observation.objects, belief.found_pose)
             # The belief may be known where the observation is traced.
             if not isinstance(grasp.success, Tracer):
                 if not grasp.success:
-                    return _plan(self, key, problem, belief, observation)
+                    return _plan(self._planning, key, problem, belief, observation)
                 return _take_out(self, observation, grasp)
         # Both are computed, each with next to nothing to do where it does not count. A `cond` would under `vmap` give
         # every scene of a batch a problem of its own, and what they share could no longer be computed together.
-        grasp = graspable_at(problem, observation.objects, belief.found_pose, belief.found)
+        grasp = take_out(self.retrieval_model, problem, observation.objects, belief.found_pose, belief.found)
         able = belief.found & grasp.success
         rest = observation.objects.replace(valid=observation.objects.valid & ~able)
         planned = _plan(
-            self,
+            self._planning,
             key,
             problem,
             belief.replace(exists=belief.exists & ~able, found=belief.found & ~able),
@@ -162,6 +171,7 @@ def search(
     *,
     push_model: PushModel | None = None,
     later_push_model: PushModel | None = None,
+    retrieval_model: RetrievalModel | None = None,
     objective: Objective,
     propose: Propose = guided_draw,
     **changes: Any,
@@ -170,7 +180,7 @@ def search(
 
     Args:
       config: how it decides; the defaults if left out.
-      push_model, later_push_model: predict pushes.
+      push_model, later_push_model, retrieval_model: predict pushes and retrievals.
       objective: what it makes small.
       propose: samples an action in a state.
       **changes: fields of `config` that are to be different.
@@ -186,6 +196,7 @@ def search(
         propose=propose,
         predict=predict if config.later_placements else LaterPlacementsStay(predict),
         objective=objective,
+        retrieval_model=retrieval_model,
     )
 
 

@@ -55,6 +55,7 @@ def paper(**changes: Any) -> Config:
         "draws": REDRAWS,
         "move_again": True,
         "move_target": False,
+        "retrieval_model": "collision-free",
         "horizon": 3,
         "sequences": 30,
     }

@@ -1,9 +1,15 @@
-"""How a target that has been found is taken out: the best of a dense set of grasps."""
+"""How a target that has been found is taken out: the best of a dense set of grasps.
+
+Without a `RetrievalModel` a grasp counts if nothing is hit on the whole way in and out. But many that hit something
+only brush it, or push aside what is free to move. A model is asked of a few grasps, the clearest first, and the first
+that it says takes the target out is made.
+"""
 
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+import math
+from typing import NamedTuple, Protocol
 
 import flax.struct
 import jax
@@ -21,6 +27,14 @@ from mechsearch_jax.planner.problem import Problem, TargetGrasps
 
 # By how much objects are grown to find the grasp that keeps furthest from them [m].
 CLEARANCES = (0.004, 0.008, 0.012, 0.02)
+# By how much they are shrunk to find the grasp that runs into them least deep [m].
+DEPTHS = (0.006, 0.012, 0.024)
+# A `RetrievalModel` is asked of so many grasps.
+TRIES = 8
+# Grasps are alike whose approaches differ by less than this, and whose angles of joint 7 do by less than that [rad].
+ALIKE, ALIKE_WRIST = math.radians(10), math.radians(20)
+# More than any rank of a grasp that arm and shelf allow.
+FAR = 1_000_000
 
 
 class GraspChoice(flax.struct.PyTreeNode):
@@ -37,6 +51,83 @@ class GraspChoice(flax.struct.PyTreeNode):
     success: jax.Array
     hits: jax.Array
     action: Action
+
+
+class RetrievalModel(Protocol):
+    """Tells which of several grasps take the target out."""
+
+    def __call__(
+        self,
+        problem: Problem,
+        scene: Superquadrics,
+        pose: Float[Array, "3"],
+        actions: Action,
+        asked: Bool[Array, " k"],
+    ) -> Bool[Array, " k"]:
+        """Which retrievals succeed; those after the first that does need not be looked at, and are False then.
+
+        Args:
+          problem: what does not change.
+          scene: the objects, without the target, fields (N, ...).
+          pose: of the target as x, y [m], yaw [rad].
+          actions: of kind RETRIEVE, fields (K, ...).
+          asked: of which it is asked; of the others it says False.
+        """
+        ...
+
+
+def take_out(
+    model: RetrievalModel | None,
+    problem: Problem,
+    scene: Superquadrics,
+    pose: Float[Array, "3"],
+    active: Bool[Array, ""] | bool = True,
+) -> GraspChoice:
+    """How to take out a target at a pose: as `graspable_at` says, or as a model does of `worth_trying`.
+
+    Where the model says of none that it takes the target out, one that hits nothing is made all the same.
+
+    Args:
+      model: what is asked; None where only grasps count that hit nothing.
+      problem, scene, pose, active: as in `graspable_at`.
+    """
+    if model is None:
+        return graspable_at(problem, scene, pose, active)
+    tried = worth_trying(problem, scene, pose, active)
+    works = model(problem, scene, pose, tried.action, tried.hits <= scene.capacity)
+    return _first_that_works(tried, works)
+
+
+@kept()
+def _first_that_works(tried: GraspChoice, works: Bool[Array, " k"]) -> GraspChoice:
+    best = jax.tree.map(lambda a: a[jnp.argmax(works)], tried)
+    return best.replace(success=best.success | jnp.any(works))
+
+
+@kept()
+def worth_trying(
+    problem: Problem, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool = True
+) -> GraspChoice:
+    """`TRIES` grasps of a target at a pose that differ from each other, leading axis, best first.
+
+    Those that hit nothing come first, ranked as for `best_grasp`, then those that run into objects least deep.
+
+    Args:
+      problem, scene, pose, active: as in `graspable_at`.
+    """
+    grasps = problem.target_grasps
+    ranked = _ranked(grasps, scene, pose, active, DEPTHS)
+    way, q7 = ranked.T_world_gripper[:, :3, 2], grasps.tables.q7
+
+    def pick(order, _):
+        i = jnp.argmin(order)
+        alike = (jnp.sum(way * way[i][None], axis=-1) > math.cos(ALIKE)) & (jnp.abs(q7 - q7[i]) < ALIKE_WRIST)
+        return (order + jnp.where(alike, FAR, 0)).at[i].add(100 * FAR), i
+
+    # What arm or shelf do not allow comes after all that is alike.
+    order = ranked.order + jnp.where(ranked.hits > scene.capacity, 10 * FAR, 0)
+    _, best = jax.lax.scan(pick, order, length=min(TRIES, len(q7)))
+    return jax.vmap(lambda i: _choice(grasps, ranked, i))(best)
 
 
 @kept()
@@ -92,20 +183,36 @@ class _Ranked(NamedTuple):
 
 
 def _ranked(
-    grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool
+    grasps: TargetGrasps,
+    scene: Superquadrics,
+    pose: Float[Array, "3"],
+    active: Bool[Array, ""] | bool,
+    depths: tuple[float, ...] = (),
 ) -> _Ranked:
+    """All grasps, ranked by how many objects they hit and how near they come to others.
+
+    Args:
+      grasps, scene, pose, active: as in `best_grasp`.
+      depths: by how much objects are shrunk [m]: what a grasp hits even then goes before how many it hits.
+    """
     T_world_target = upright_pose(pose, grasps.target.height(grasps.shelf))
     tables = grasps.tables
     found = found_grasps(grasps, T_world_target, active)
     here = jnp.asarray(active)[None]
     worst = scene.capacity + 1
 
-    def count(clearance):
+    def near(clearance):
         return jnp.sum(grasp_hits(tables, found, scene.replace(size=scene.size + clearance), here), axis=1)
 
-    hits = jnp.where(found.feasible, jnp.sum(found_hits(grasps, found, scene, active), axis=1), worst)
-    crowd = jnp.sum(jax.lax.map(count, jnp.float32(CLEARANCES)), axis=0)
-    return _Ranked(compose(T_world_target[None], tables.T_target_gripper), hits, hits * 100 + crowd)
+    def hit(depth):
+        slim = scene.replace(size=jnp.maximum(scene.size - depth, 0.25 * scene.size))
+        return jnp.sum(found_hits(grasps, found, slim, active), axis=1)
+
+    all_hits, *deeper = jax.lax.map(hit, jnp.float32((0.0, *depths)))
+    hits = jnp.where(found.feasible, all_hits, worst)
+    crowd = jnp.sum(jax.lax.map(near, jnp.float32(CLEARANCES)), axis=0)
+    order = 1000 * sum(deeper, jnp.zeros_like(hits)) + 100 * hits + crowd
+    return _Ranked(compose(T_world_target[None], tables.T_target_gripper), hits, order)
 
 
 def _choice(grasps: TargetGrasps, ranked: _Ranked, i: Int[Array, ""]) -> GraspChoice:
