@@ -19,7 +19,7 @@ RENAMED: Mapping[str, str] = {
 EARLIER: Mapping[str, Any] = {
     "protocol": "strict",
     "push_model": "quasi-static",
-    "retrieval_model": "collision-free",
+    "rehearsal": "none",
     "topple_charge": 0.0,
     "crowding_weight": 0.02,
     "hindrance_weight": 1.0,

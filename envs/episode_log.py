@@ -17,14 +17,11 @@ from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.records import Episode, Step, record_action
 from mechsearch_jax.envs.verdicts import Verdict
-from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.envs.world import MAX_TILT, TARGET
 from mechsearch_jax.planner import Decision
 from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
-
-# A target that leans further than this has fallen over [rad].
-MAX_TILT = math.radians(15)
 
 
 class Choice(flax.struct.PyTreeNode):

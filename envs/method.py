@@ -12,7 +12,7 @@ from mechsearch_jax.envs.policy_numbers import mould
 from mechsearch_jax.envs.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
-from mechsearch_jax.envs.retrieval_models import retrieval_model
+from mechsearch_jax.envs.rehearsals import rehearsal
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
 from mechsearch_jax.planner.workcell import Workcell
@@ -52,7 +52,7 @@ class Method:
             self.config.planner,
             push_model=first,
             later_push_model=later,
-            retrieval_model=retrieval_model(self.config.retrieval_model),
+            rehearsal=rehearsal(self.config.rehearsal),
         )
 
     @property

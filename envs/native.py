@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -26,13 +27,13 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.actions import Action, kind_of
+from mechsearch_jax.actions import Action, Kind, kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.cores import cores
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.outcome import Failure, Outcome
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, check_actions, controls
-from mechsearch_jax.envs.world import BODIES, TARGET, World, bodies_of, from_scenario, slots
+from mechsearch_jax.envs.world import BODIES, MAX_TILT, TARGET, World, bodies_of, from_scenario, slots
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference
@@ -115,17 +116,10 @@ class NativeWorld:
         if not reachable:
             return self._finish(Failure.UNREACHABLE, True)
         before, gone = copy.copy(self._data), self._fallen()
-        states = self._follow(reference)
-        error = self._tracking_error(states, reference)
-        dropped = kind.holds_object and not self._slip(states, reference, int(action.object)) < self.config.slip
-        if kind.returns_home:
-            self._go_home()
-        settled = self._come_to_rest()
+        failure, error, settled = self._perform(kind, reference, int(action.object))
         if self._diverged():
             self._data = before
             return self._finish(Failure.UNSTABLE, False)
-        failure = Failure.DROPPED if dropped else Failure.NONE
-        failure = Failure.HELD_UP if error > self.config.tracking_bound else failure
         if kind.takes_target:
             return self._finish_retrieval(failure, settled, gone).replace(tracking_error=jnp.float32(error))
         return self._finish(failure, settled).replace(tracking_error=jnp.float32(error))
@@ -159,22 +153,42 @@ class NativeWorld:
         self._data = models.initial_state(self._model, bodies)
         self._go_home()
 
-    def settle_and_retrieve(self, reference: Reference) -> bool:
-        """Whether a motion takes the target out once everything is at rest, and nothing falls meanwhile.
+    def rehearse(self, kind: Kind, reference: Reference, index: int) -> tuple[bool, bool]:
+        """What becomes of a motion once everything is at rest: whether it is carried out, and whether it does no harm.
 
         Nothing is computed with JAX, so that a callback of JAX may ask; `world` stays what it was.
 
         Args:
+          kind: of the action.
           reference: of the arm, as NumPy arrays.
+          index: slot of the object that the action moves.
         """
         self._recorder = _Recorder(self._data, self.config.trace_every)
         self._come_to_rest()
         gone = self._fallen()
-        error = self._tracking_error(self._follow(reference), reference)
-        self._come_to_rest()
-        if self._diverged() or error > self.config.tracking_bound:
-            return False
-        return self._retrieval(gone).failure is Failure.NONE
+        failure, *_ = self._perform(kind, reference, index)
+        if self._diverged():
+            return False, False
+        if kind.takes_target:
+            told = self._retrieval(gone)
+            return not (failure or told.failure), not (told.fallen & ~gone).any()
+        return not failure, not (self._fallen() & ~gone).any() and self._target_stands()
+
+    def _target_stands(self) -> bool:
+        """Whether the target is upright, if there is one."""
+        _, x, y, _ = self._data.joint(f"body{TARGET}").qpos[3:]
+        return self._bodies[TARGET] is None or bool(abs(1.0 - 2.0 * (x * x + y * y)) >= math.cos(MAX_TILT))
+
+    def _perform(self, kind: Kind, reference: Reference, index: int) -> tuple[Failure, float, bool]:
+        """Run a motion and let everything come to rest: why it failed, the tracking error [rad], and whether all is."""
+        states = self._follow(reference)
+        error = self._tracking_error(states, reference)
+        dropped = kind.holds_object and not self._slip(states, reference, index) < self.config.slip
+        if kind.returns_home:
+            self._go_home()
+        settled = self._come_to_rest()
+        failure = Failure.DROPPED if dropped else Failure.NONE
+        return Failure.HELD_UP if error > self.config.tracking_bound else failure, error, settled
 
     def _begin(self, bodies: list[Body | None], world: World) -> World:
         self.place(bodies)

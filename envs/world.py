@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,8 @@ from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotat
 
 TARGET = MAX_OBJECTS
 BODIES = MAX_OBJECTS + 1
+# A target that leans further than this has fallen over [rad].
+MAX_TILT = math.radians(15)
 
 
 class World(flax.struct.PyTreeNode):

@@ -37,6 +37,7 @@ SEQUENCES = Sequences(
     cost=np.array([[90.0, 80.0], [95.0, 95.0], [np.nan, np.nan]], np.float32),
     value=np.array([-30.0, -10.0, np.inf], np.float32),
     length=np.array([2, 1, 1], np.int32),
+    after=jax.tree.map(lambda a: np.stack([a] * 3), OBJECTS),
 )
 
 

@@ -157,6 +157,7 @@ class Grab(flax.struct.PyTreeNode):
                 cost=cost[None, None] - 1.0,
                 value=tried,
                 length=jnp.ones(1, jnp.int32),
+                after=jax.tree.map(lambda a: a[None], observation.objects),
             ),
         )
 

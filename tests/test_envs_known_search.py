@@ -91,7 +91,9 @@ def sequences(*rows):
     longest = max(len(actions) for _, *actions in rows)
     padded = [[*actions, *[jax.device_get(no_action())] * (longest - len(actions))] for _, *actions in rows]
     stacked = [jax.tree.map(lambda *a: np.stack(a), *actions) for actions in padded]
+    scene = superquadric.empty(1)
     return Sequences(
+        after=jax.tree.map(lambda a: np.stack([a] * len(rows)), scene),
         actions=jax.tree.map(lambda *a: np.stack(a), *stacked),
         cost=np.zeros((len(rows), longest)),
         value=np.array([value for value, *_ in rows]),

@@ -71,7 +71,7 @@ def test_what_earlier_files_ran_with_by_default_is_the_default_but_for_what_is_n
         push_directions=(math.pi / 2, -math.pi / 2),
         high_pushes=0.0,
         move_target=False,
-        retrieval_model="collision-free",
+        rehearsal="none",
     )
     assert present_options(earlier) == Method(config=then).options()
 
@@ -89,7 +89,7 @@ def test_the_row_of_a_job_is_that_of_its_episode():
 def test_a_policy_of_another_module_is_found(tmp_path, monkeypatch):
     source = (
         "class Mine:",
-        "    def __init__(self, config, *, push_model, later_push_model, retrieval_model):",
+        "    def __init__(self, config, *, push_model, later_push_model, rehearsal):",
         "        self.known = config.gamma, push_model is later_push_model",
         "    def __call__(self, key, problem, belief, observation): ...",
     )

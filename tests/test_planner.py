@@ -102,7 +102,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "grasp_tilts": pytest.approx([np.radians(20), np.radians(25), np.radians(30)]),
         "retrieval_tilts": pytest.approx(np.radians([20, 22.5, 25, 27.5, 30]).tolist()),
         "push_model": "learned",
-        "retrieval_model": "physics",
+        "rehearsal": "physics",
         "max_steps": 10,
     }
     # What is no option.
@@ -129,7 +129,7 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     assert (actions.push_directions, actions.high_pushes) == ((np.pi / 2, -np.pi / 2), 0.0)
     assert config.problem.grasps.tilts == config.problem.retrieval.tilts == (np.radians(20),)
     assert actions.grasps.tilts == (np.radians(20),)
-    assert config.retrieval_model == "collision-free"
+    assert config.rehearsal == "none"
     # Where the paper is silent.
     assert search.gamma == planner.standard().planner.gamma
     assert planner.paper(gamma=0.5).planner.gamma == 0.5

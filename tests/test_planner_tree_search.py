@@ -124,7 +124,7 @@ def test_what_is_impossible_is_never_chosen(decide):
 
 def test_a_decision_has_the_form_of_any_other(decide, objects):
     told = decide()
-    expected = no_sequences(CONFIG)
+    expected = no_sequences(CONFIG, objects)
     assert jax.tree.map(lambda a: (a.shape, a.dtype), told.sequences) == jax.tree.map(
         lambda a: (a.shape, a.dtype), expected
     )

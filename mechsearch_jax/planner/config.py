@@ -23,7 +23,7 @@ from mechsearch_jax.graspability import GraspConfig
 from mechsearch_jax.options import option
 
 LaterDraws = Literal["predicted", "present"]
-RetrievalModelName = Literal["collision-free", "physics"]
+RehearsalName = Literal["none", "physics"]
 
 
 class Weights(NamedTuple):
@@ -173,8 +173,7 @@ class Config:
       problem: how the problem is built.
       planner: how the planner decides.
       push_model: name of what predicts pushes; see `dynamics.named`, and `envs.push_models` for "physics".
-      retrieval_model: name of what tells whether a grasp takes a found target out; see `envs.retrieval_models`. The
-        paper's are those that hit nothing.
+      rehearsal: name of what tries actions out before one is made; see `envs.rehearsals`. The paper tries nothing.
       max_steps: T, actions in an episode.
     """
 
@@ -185,18 +184,17 @@ class Config:
         "what predicts pushes: a network, geometry, or simulating them, on a CPU only those that come first",
         get_args(PushModelName),
     )
-    retrieval_model: RetrievalModelName = option(
+    rehearsal: RehearsalName = option(
         "physics",
-        "what tells whether a grasp takes a found target out: that it hits nothing, or simulating a few",
-        get_args(RetrievalModelName),
+        "what tries the best few actions out before one is made: nothing, or a simulation",
+        get_args(RehearsalName),
     )
     max_steps: int = option(10, "actions in an episode")
 
     def __post_init__(self):
         check_name(self.push_model)
-        if self.retrieval_model not in get_args(RetrievalModelName):
-            names = ", ".join(get_args(RetrievalModelName))
-            raise InputError(f'retrieval_model "{self.retrieval_model}" is unknown; use {names}')
+        if self.rehearsal not in get_args(RehearsalName):
+            raise InputError(f'rehearsal "{self.rehearsal}" is unknown; use {", ".join(get_args(RehearsalName))}')
         if self.max_steps < 1:
             raise InputError(f"max_steps {self.max_steps} must be at least 1")
 

@@ -30,7 +30,8 @@ from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGr
 from mechsearch_jax.planner.prediction import LaterPlacementsStay, Predict, PredictByKind
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import Propose, guided_draw
-from mechsearch_jax.planner.retrieval import GraspChoice, RetrievalModel, take_out
+from mechsearch_jax.planner.rehearsal import Rehearsal, rehearsed
+from mechsearch_jax.planner.retrieval import GraspChoice, take_out
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
 
@@ -59,7 +60,7 @@ class PolicyFactory(Protocol):
         *,
         push_model: PushModel | None = None,
         later_push_model: PushModel | None = None,
-        retrieval_model: RetrievalModel | None = None,
+        rehearsal: Rehearsal | None = None,
     ) -> Policy:
         """A policy with a configuration and models, of which it may take what it likes.
 
@@ -67,7 +68,7 @@ class PolicyFactory(Protocol):
           config: how it decides.
           push_model: predicts pushes; the learned one if left out.
           later_push_model: predicts those that are not the first action of a sequence; `push_model` if left out.
-          retrieval_model: tells which grasps take a found target out; if left out, those that hit nothing.
+          rehearsal: tries actions out before one is made; if left out, nothing does.
         """
         ...
 
@@ -87,7 +88,7 @@ class Search(flax.struct.PyTreeNode):
       config: how it decides.
       propose, predict, objective: the slots; static.
       plan: how it plans with them; static.
-      retrieval_model: tells which grasps will do; static. None where those do that hit nothing.
+      rehearsal: tries actions out before one is made; static. None where nothing does: a grasp then has to hit nothing.
     """
 
     config: PlannerConfig
@@ -95,12 +96,12 @@ class Search(flax.struct.PyTreeNode):
     predict: Predict = flax.struct.field(pytree_node=False)
     objective: Objective = flax.struct.field(pytree_node=False)
     plan: Plan = flax.struct.field(pytree_node=False, default=plan)
-    retrieval_model: RetrievalModel | None = flax.struct.field(pytree_node=False, default=None)
+    rehearsal: Rehearsal | None = flax.struct.field(pytree_node=False, default=None)
 
     @property
     def _planning(self) -> Search:
-        """What a plan depends on: it is the same, and compiled once, whatever takes the target out."""
-        return self.replace(retrieval_model=None)
+        """What a plan depends on: it is the same, and compiled once, whatever tries it out."""
+        return self.replace(rehearsal=None)
 
     def prepare(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> None:
         """Load or compile what a plan with such arguments needs, without planning; see `compiled.Kept.prepare`."""
@@ -115,26 +116,32 @@ class Search(flax.struct.PyTreeNode):
         if not isinstance(belief.found, Tracer):
             # Outside of any transformation, what is not needed is neither computed nor compiled.
             if not belief.found:
-                return _plan(self._planning, key, problem, belief, observation)
-            grasp = take_out(self.retrieval_model, problem, observation.objects, belief.found_pose)
+                return self._searched(key, problem, belief, observation)
+            grasp = take_out(self.rehearsal, problem, observation.objects, belief.found_pose)
             # The belief may be known where the observation is traced.
             if not isinstance(grasp.success, Tracer):
                 if not grasp.success:
-                    return _plan(self._planning, key, problem, belief, observation)
-                return _take_out(self, observation, grasp)
+                    return self._searched(key, problem, belief, observation)
+                return _take_out(self._planning, observation, grasp)
         # Both are computed, each with next to nothing to do where it does not count. A `cond` would under `vmap` give
         # every scene of a batch a problem of its own, and what they share could no longer be computed together.
-        grasp = take_out(self.retrieval_model, problem, observation.objects, belief.found_pose, belief.found)
+        grasp = take_out(self.rehearsal, problem, observation.objects, belief.found_pose, belief.found)
         able = belief.found & grasp.success
         rest = observation.objects.replace(valid=observation.objects.valid & ~able)
-        planned = _plan(
-            self._planning,
+        planned = self._searched(
             key,
             problem,
             belief.replace(exists=belief.exists & ~able, found=belief.found & ~able),
             observation.replace(objects=rest),
         )
-        return jax.tree.map(lambda a, b: jnp.where(able, a, b), _take_out(self, observation, grasp), planned)
+        return jax.tree.map(lambda a, b: jnp.where(able, a, b), _take_out(self._planning, observation, grasp), planned)
+
+    def _searched(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
+        """What is planned, tried out if anything does."""
+        decision = _plan(self._planning, key, problem, belief, observation)
+        if self.rehearsal is None:
+            return decision
+        return rehearsed(self.rehearsal, problem, observation.objects, belief.found_pose, belief.found, decision)
 
 
 @kept()
@@ -151,7 +158,7 @@ def _take_out(search: Search, observation: Observation, grasp: GraspChoice) -> D
         cost=jnp.float32(search.objective.reached),
         predicted_cost=jnp.float32(jnp.nan),
         predicted=observation.objects,
-        sequences=no_sequences(search.config),
+        sequences=no_sequences(search.config, observation.objects),
     )
 
 
@@ -171,7 +178,7 @@ def search(
     *,
     push_model: PushModel | None = None,
     later_push_model: PushModel | None = None,
-    retrieval_model: RetrievalModel | None = None,
+    rehearsal: Rehearsal | None = None,
     objective: Objective,
     propose: Propose = guided_draw,
     **changes: Any,
@@ -180,7 +187,8 @@ def search(
 
     Args:
       config: how it decides; the defaults if left out.
-      push_model, later_push_model, retrieval_model: predict pushes and retrievals.
+      push_model, later_push_model: predict pushes.
+      rehearsal: tries actions out before one is made.
       objective: what it makes small.
       propose: samples an action in a state.
       **changes: fields of `config` that are to be different.
@@ -196,7 +204,7 @@ def search(
         propose=propose,
         predict=predict if config.later_placements else LaterPlacementsStay(predict),
         objective=objective,
-        retrieval_model=retrieval_model,
+        rehearsal=rehearsal,
     )
 
 

@@ -55,7 +55,7 @@ def paper(**changes: Any) -> Config:
         "draws": REDRAWS,
         "move_again": True,
         "move_target": False,
-        "retrieval_model": "collision-free",
+        "rehearsal": "none",
         "horizon": 3,
         "sequences": 30,
     }

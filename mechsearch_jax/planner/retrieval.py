@@ -1,15 +1,15 @@
 """How a target that has been found is taken out: the best of a dense set of grasps.
 
-Without a `RetrievalModel` a grasp counts if nothing is hit on the whole way in and out. But many that hit something
-only brush it, or push aside what is free to move. A model is asked of a few grasps, the clearest first, and the first
-that it says takes the target out is made.
+Without a `Rehearsal` a grasp counts if nothing is hit on the whole way in and out. But many that hit something only
+brush it, or push aside what is free to move. So a few grasps are tried out, the clearest first, and the first is made
+that takes the target out.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import flax.struct
 import jax
@@ -24,13 +24,12 @@ from mechsearch_jax.geometry.transforms import compose, upright_pose
 from mechsearch_jax.graspability import grasp_hits
 from mechsearch_jax.planner.found_target import found_grasps, found_hits
 from mechsearch_jax.planner.problem import Problem, TargetGrasps
+from mechsearch_jax.planner.rehearsal import TRIES, Rehearsal, Rehearsed
 
 # By how much objects are grown to find the grasp that keeps furthest from them [m].
 CLEARANCES = (0.004, 0.008, 0.012, 0.02)
 # By how much they are shrunk to find the grasp that runs into them least deep [m].
 DEPTHS = (0.006, 0.012, 0.024)
-# A `RetrievalModel` is asked of so many grasps.
-TRIES = 8
 # Grasps are alike whose approaches differ by less than this, and whose angles of joint 7 do by less than that [rad].
 ALIKE, ALIKE_WRIST = math.radians(10), math.radians(20)
 # More than any rank of a grasp that arm and shelf allow.
@@ -53,53 +52,31 @@ class GraspChoice(flax.struct.PyTreeNode):
     action: Action
 
 
-class RetrievalModel(Protocol):
-    """Tells which of several grasps take the target out."""
-
-    def __call__(
-        self,
-        problem: Problem,
-        scene: Superquadrics,
-        pose: Float[Array, "3"],
-        actions: Action,
-        asked: Bool[Array, " k"],
-    ) -> Bool[Array, " k"]:
-        """Which retrievals succeed; those after the first that does need not be looked at, and are False then.
-
-        Args:
-          problem: what does not change.
-          scene: the objects, without the target, fields (N, ...).
-          pose: of the target as x, y [m], yaw [rad].
-          actions: of kind RETRIEVE, fields (K, ...).
-          asked: of which it is asked; of the others it says False.
-        """
-        ...
-
-
 def take_out(
-    model: RetrievalModel | None,
+    rehearsal: Rehearsal | None,
     problem: Problem,
     scene: Superquadrics,
     pose: Float[Array, "3"],
     active: Bool[Array, ""] | bool = True,
 ) -> GraspChoice:
-    """How to take out a target at a pose: as `graspable_at` says, or as a model does of `worth_trying`.
+    """How to take out a target at a pose: as `graspable_at` says, or with what of `worth_trying` succeeds.
 
-    Where the model says of none that it takes the target out, one that hits nothing is made all the same.
+    Where none of these does, one that hits nothing is made all the same.
 
     Args:
-      model: what is asked; None where only grasps count that hit nothing.
+      rehearsal: tries out; None where only grasps count that hit nothing.
       problem, scene, pose, active: as in `graspable_at`.
     """
-    if model is None:
+    if rehearsal is None:
         return graspable_at(problem, scene, pose, active)
     tried = worth_trying(problem, scene, pose, active)
-    works = model(problem, scene, pose, tried.action, tried.hits <= scene.capacity)
-    return _first_that_works(tried, works)
+    told = rehearsal(problem, scene, pose, active, tried.action, tried.hits <= scene.capacity)
+    return _first_that_works(tried, told)
 
 
 @kept()
-def _first_that_works(tried: GraspChoice, works: Bool[Array, " k"]) -> GraspChoice:
+def _first_that_works(tried: GraspChoice, told: Int[Array, " k"]) -> GraspChoice:
+    works = told == Rehearsed.SUCCEEDED
     best = jax.tree.map(lambda a: a[jnp.argmax(works)], tried)
     return best.replace(success=best.success | jnp.any(works))
 

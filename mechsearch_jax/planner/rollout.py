@@ -228,27 +228,28 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     cost, now = jnp.swapaxes(cost, 0, 1), cost[0, 0]
     values = jax.vmap(functools.partial(prefix_values, gamma=config.gamma))
     value, length = values(cost, price * cost[:, :-1], actions.kind != ActionKind.NONE)
-    sequences = Sequences(actions, cost[:, 1:], value, length)
+    # Without the target's slot, which comes after those of the objects.
+    after = jax.tree.map(lambda a: a[0, :, : objects.capacity], scenes)
+    sequences = Sequences(actions, cost[:, 1:], value, length, after)
     order = jnp.argsort(sequences.value, stable=True)
     sequences = jax.tree.map(lambda a: a[order], sequences)
-    best, slots = order[0], objects.capacity
     return Decision(
         action=jax.tree.map(lambda a: a[0, 0], sequences.actions),
         value=sequences.value[0],
         cost=now,
         predicted_cost=sequences.cost[0, 0],
-        # Without the target's slot, which comes after those of the objects.
-        predicted=jax.tree.map(lambda a: a[0, best, :slots], scenes),
+        predicted=jax.tree.map(lambda a: a[0], sequences.after),
         sequences=sequences,
     )
 
 
-def no_sequences(config: PlannerConfig) -> Sequences:
-    """What there is where nothing was sampled."""
+def no_sequences(config: PlannerConfig, objects: Superquadrics) -> Sequences:
+    """What there is where nothing was sampled, and the objects are as they are."""
     count, horizon = config.sequences, config.horizon
     return Sequences(
         actions=repeated(repeated(no_action(), horizon), count),
         cost=jnp.full((count, horizon), jnp.nan),
         value=jnp.full(count, jnp.inf),
         length=jnp.ones(count, jnp.int32),
+        after=repeated(objects, count),
     )

@@ -57,12 +57,15 @@ class Sequences(flax.struct.PyTreeNode):
       cost: J after each action, shape (S, M).
       value: equation 2 of the best prefix, shape (S,); infinite if there was no first action.
       length: number of actions in that prefix, shape (S,).
+      after: the objects as they are expected to be after the first action of each, without the target, fields (S, N,
+        ...); as they are where there is none.
     """
 
     actions: Action
     cost: jax.Array
     value: jax.Array
     length: jax.Array
+    after: Superquadrics
 
 
 class Decision(flax.struct.PyTreeNode):

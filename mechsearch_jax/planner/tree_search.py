@@ -158,11 +158,13 @@ def _decision(rollout: Rollout, begin: Node, found: Any, slots: int) -> Decision
     actions, cost, value, scenes = jax.tree.map(lambda a: a[order], (actions, cost, value, scenes))
 
     # In the shapes of sampled sequences: of one action each, and fewer than there could be.
-    nothing, count = no_sequences(config), width(config)
+    nothing, count = no_sequences(config, jax.tree.map(lambda a: a[:slots], begin.state.scene)), width(config)
     sequences = nothing.replace(
         actions=jax.tree.map(lambda a, b: b.at[:count, 0].set(a), actions, nothing.actions),
         cost=nothing.cost.at[:count, 0].set(cost),
         value=nothing.value.at[:count].set(value),
+        # Without the target's slot, which comes after those of the objects.
+        after=jax.tree.map(lambda a, b: b.at[:count].set(a[:, :slots]), scenes, nothing.after),
     )
     able = jnp.isfinite(value[0])
     return Decision(
@@ -170,7 +172,6 @@ def _decision(rollout: Rollout, begin: Node, found: Any, slots: int) -> Decision
         value=value[0],
         cost=begin.cost,
         predicted_cost=jnp.where(able, cost[0], begin.cost),
-        # Without the target's slot, which comes after those of the objects.
         predicted=jax.tree.map(lambda a, b: jnp.where(able, a[0, :slots], b[:slots]), scenes, begin.state.scene),
         sequences=sequences,
     )

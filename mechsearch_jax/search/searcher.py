@@ -36,7 +36,7 @@ from mechsearch_jax.planner.config import Config
 from mechsearch_jax.planner.policies import Policy, search_for_grasp
 from mechsearch_jax.planner.presets import standard
 from mechsearch_jax.planner.problem import Problem
-from mechsearch_jax.planner.retrieval import RetrievalModel
+from mechsearch_jax.planner.rehearsal import Rehearsal
 from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.robot.free_motion import check_joints
 from mechsearch_jax.robot.motion import MotionConfig
@@ -76,7 +76,7 @@ class Searcher:
         *,
         seed: int = 0,
         policy: Policy | None = None,
-        retrieval_model: RetrievalModel | None = None,
+        rehearsal: Rehearsal | None = None,
         recogniser: Callable[[Problem], Any] = Recogniser,
         trajectories: TrajectoryConfig | None = None,
     ):
@@ -88,8 +88,9 @@ class Searcher:
             models are not used.
           seed: of all random numbers.
           policy: what decides; by default search-for-grasp with the planner's part of `config`.
-          retrieval_model: tells that policy which grasps take the target out, such as
-            `envs.physics_retrieval.NativeRetrieval()`. If left out, only those do that touch nothing.
+          rehearsal: tries that policy's actions out before one is made, such as
+            `envs.physics_rehearsal.NativeRehearsal()`. If left out, nothing does, and the target is only taken out
+            where nothing is touched.
           recogniser: makes what recognises of a problem, with the signature of `Recogniser`.
           trajectories: how motions are made, where a controller should stop, and when recognition is too doubtful to
             move; the default if left out.
@@ -100,7 +101,7 @@ class Searcher:
         self.workcell = workcell or Workcell()
         self.config = config or standard()
         self._seed = seed
-        self._policy = policy or search_for_grasp(self.config.planner, retrieval_model=retrieval_model)
+        self._policy = policy or search_for_grasp(self.config.planner, rehearsal=rehearsal)
         self._make_recogniser = recogniser
         self._trajectories = trajectories
         self._state: State | None = None

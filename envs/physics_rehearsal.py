@@ -1,0 +1,182 @@
+"""Rehearsals in simulation: what the planner would do is tried out in C MuJoCo first.
+
+The recognised objects become bodies as in `physics_push`, and a found target one of its own shape; they come to rest,
+and the arm moves as the environment's does. The environment's own simulator is not involved.
+
+An approximation: what is not recognised is not there, a hidden target least of all.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.actions import KINDS, Action, kind_of
+from mechsearch_jax.actions.trajectory import reference_motion
+from mechsearch_jax.compiled import kept
+from mechsearch_jax.cores import cores
+from mechsearch_jax.envs.native import NativeWorld
+from mechsearch_jax.envs.physics_push import bodies, sound
+from mechsearch_jax.envs.simulator import SimulatorConfig
+from mechsearch_jax.envs.world import TARGET, World, bodies_of
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import upright_pose
+from mechsearch_jax.planner import Problem
+from mechsearch_jax.planner.rehearsal import Rehearsed
+from mechsearch_jax.robot.motion import Reference
+from mechsearch_jax.shapes import shape_of
+from mechsearch_jax.workspace.shelf import Shelf
+
+# What the arm is to do, and whether it can; None where nothing is to be done.
+Motion = tuple[Reference, Any] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class NativeRehearsal:
+    """The `Rehearsal` in C MuJoCo, of all that are mapped over at once, on several threads.
+
+    The actions of a scene are tried in the order that they are given in, until one succeeds. The same ones always give
+    the same results. One that diverges, or whose scene is no scene, does harm; one that the arm cannot follow fails.
+    While it is traced, `jax.pure_callback` takes the actions to the host, for which JAX needs two cores.
+
+    Attributes:
+      simulation: how it is simulated.
+      threads: how many; one for each of `cores.cores` if left out.
+    """
+
+    simulation: SimulatorConfig = dataclasses.field(default_factory=SimulatorConfig)
+    threads: int | None = None
+
+    def __call__(
+        self,
+        problem: Problem,
+        scene: Superquadrics,
+        pose: Float[Array, "3"],
+        found: Bool[Array, ""] | bool,
+        actions: Action,
+        asked: Bool[Array, " k"],
+    ) -> Int[Array, " k"]:
+        """See `rehearsal.Rehearsal`."""
+        world = _world(problem, scene, pose, jnp.asarray(found))
+        where = problem.shelf, self.simulation, self.threads or cores()
+        if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((world, actions, asked))):
+            host: tuple[World, Action, np.ndarray] = jax.device_get((world, actions, asked))
+            return jax.device_put(_tried_alone(*where, *host))
+        references = _references(actions, self.simulation)
+        result = jax.ShapeDtypeStruct(asked.shape, jnp.int32)
+        told = world, actions.kind, actions.object, references, asked
+        return jax.pure_callback(functools.partial(_tried, *where), result, *told, vmap_method="broadcast_all")
+
+
+@kept()
+def _world(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"], found: Bool[Array, ""]) -> World:
+    """The bodies that stand for the objects, and for the target where it is found."""
+    target = problem.target
+    T_world_target = upright_pose(pose, target.height(problem.shelf))
+    world = bodies(scene)
+    return World(
+        kind=world.kind.at[TARGET].set(shape_of(target.shape).code),
+        half_size=world.half_size.at[TARGET].set(jnp.asarray(target.half_size)),
+        position=world.position.at[TARGET].set(T_world_target[:3, 3]),
+        rotation=world.rotation.at[TARGET].set(T_world_target[:3, :3]),
+        valid=world.valid.at[TARGET].set(found),
+    )
+
+
+def _references(actions: Action, config: SimulatorConfig) -> dict[int, tuple[Reference, Bool[Array, " k"]]]:
+    """What each kind of action would have the arm do, by its code."""
+    found = {int(code): jax.vmap(lambda a, k=k: k.reference(a, config.motion))(actions) for code, k in KINDS.items()}
+    return {code: motion for code, motion in found.items() if motion is not None}
+
+
+def _tried_alone(
+    shelf: Shelf, config: SimulatorConfig, threads: int, world: World, actions: Action, asked: Bool[np.ndarray, " k"]
+) -> Int[np.ndarray, " k"]:
+    """What becomes of the actions in one scene; a motion is computed when its action is tried."""
+
+    def motion(_: int, i: int) -> Motion:
+        action: Action = jax.tree.map(lambda a: jnp.asarray(a[i]), actions)
+        return jax.device_get(reference_motion(kind_of(int(actions.kind[i])), action, config.motion))
+
+    one = jax.tree.map(lambda a: a[None], (world, actions.kind, actions.object, asked))
+    return _in_turn(shelf, config, threads, *one, motion)[0]
+
+
+def _tried(
+    shelf: Shelf, config: SimulatorConfig, threads: int, world: Any, kind: Any, index: Any, references: Any, asked: Any
+) -> Int[np.ndarray, "*lead k"]:
+    """What becomes of the actions in many scenes; any leading axes.
+
+    It must not compute with JAX, which is waiting for it.
+    """
+    told = world, kind, index, references, asked
+    world, kind, index, references, asked = jax.tree.map(np.asarray, told)
+    lead = asked.shape[:-1]
+    flat = functools.partial(jax.tree.map, lambda a: a.reshape(-1, *a.shape[len(lead) :]))
+    world, kind, index, references, asked = map(flat, (world, kind, index, references, asked))
+
+    def motion(row: int, i: int) -> Motion:
+        known = references.get(int(kind[row, i]))
+        return None if known is None else jax.tree.map(lambda a: a[row, i], known)
+
+    return _in_turn(shelf, config, threads, world, kind, index, asked, motion).reshape(*lead, -1)
+
+
+def _in_turn(
+    shelf: Shelf,
+    config: SimulatorConfig,
+    threads: int,
+    world: World,
+    kind: Int[np.ndarray, "n k"],
+    index: Int[np.ndarray, "n k"],
+    asked: Bool[np.ndarray, "n k"],
+    motion: Callable[[int, int], Motion],
+) -> Int[np.ndarray, "n k"]:
+    """What becomes of the actions of each scene, tried in their order until one succeeds.
+
+    Args:
+      shelf, config, threads: where, how, and how many at a time.
+      world: fields with a leading axis.
+      kind, index: codes of the actions, and the objects that they move.
+      asked: which are to be tried.
+      motion: of an action by row and column.
+    """
+    told = np.full(asked.shape, Rehearsed.HARMFUL, np.int32)
+    left = {row: iter(np.flatnonzero(asked[row]).tolist()) for row in np.flatnonzero(asked.any(axis=1)).tolist()}
+    with ThreadPoolExecutor(threads) as pool:
+        while left:
+            # Of few scenes several actions are tried at the same time.
+            some = [(row, i) for row, rest in left.items() for i in itertools.islice(rest, -(-threads // len(left)))]
+            tasks = [
+                (jax.tree.map(lambda a, row=row: a[row], world), int(kind[row, i]), motion(row, i), int(index[row, i]))
+                for row, i in some
+            ]
+            for at, result in zip(some, pool.map(lambda task: _tried_out(shelf, config, *task), tasks), strict=True):
+                told[at] = result
+            tried = {row for row, _ in some}
+            left = {r: rest for r, rest in left.items() if r in tried and told[r].max() < Rehearsed.SUCCEEDED}
+    return told
+
+
+def _tried_out(shelf: Shelf, config: SimulatorConfig, world: World, kind: int, motion: Motion, index: int) -> Rehearsed:
+    """What becomes of one action."""
+    if motion is None or not motion[1]:
+        return Rehearsed.FAILED
+    if not sound(*jax.tree.map(lambda a: a[None], (world, motion[0]))):
+        return Rehearsed.HARMFUL
+    here = NativeWorld(shelf, config=config)
+    here.place(bodies_of(world))
+    succeeds, harmless = here.rehearse(kind_of(kind), motion[0], index)
+    if not harmless:
+        return Rehearsed.HARMFUL
+    return Rehearsed.SUCCEEDED if succeeds else Rehearsed.FAILED
