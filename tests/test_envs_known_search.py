@@ -19,6 +19,7 @@ from mechsearch_jax.envs.outcome import Failure, Outcome
 from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world import BODIES, TARGET, World, from_scenario
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.graspability import no_hits, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import GraspChoice, Sequences, graspable_at

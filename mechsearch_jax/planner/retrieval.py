@@ -57,7 +57,7 @@ def take_out(
     problem: Problem,
     scene: Superquadrics,
     pose: Float[Array, "3"],
-    active: Bool[Array, ""] | bool = True,
+    *active: Bool[Array, ""],
 ) -> GraspChoice:
     """How to take out a target at a pose: as `graspable_at` says, or with what of `worth_trying` succeeds.
 
@@ -65,12 +65,13 @@ def take_out(
 
     Args:
       rehearsal: tries out; None where only grasps count that hit nothing.
-      problem, scene, pose, active: as in `graspable_at`.
+      problem, scene, pose: as in `graspable_at`.
+      *active: nothing, or its last argument; so it is called, and compiled, as elsewhere.
     """
     if rehearsal is None:
-        return graspable_at(problem, scene, pose, active)
-    tried = worth_trying(problem, scene, pose, active)
-    told = rehearsal(problem, scene, pose, active, tried.action, tried.hits <= scene.capacity)
+        return graspable_at(problem, scene, pose, *active)
+    tried = worth_trying(problem, scene, pose, *active)
+    told = rehearsal(problem, scene, pose, *(active or (True,)), tried.action, tried.hits <= scene.capacity)
     return _first_that_works(tried, told)
 
 
