@@ -72,9 +72,8 @@ class NativeRehearsal:
         if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((world, actions, asked))):
             host: tuple[World, Action, np.ndarray] = jax.device_get((world, actions, asked))
             return jax.device_put(_tried_alone(*where, *host))
-        references = _references(actions, self.simulation)
         result = jax.ShapeDtypeStruct(asked.shape, jnp.int32)
-        told = world, actions.kind, actions.object, references, asked
+        told = world, actions.kind, actions.object, *_references(actions, self.simulation), asked
         return jax.pure_callback(functools.partial(_tried, *where), result, *told, vmap_method="broadcast_all")
 
 
@@ -93,10 +92,28 @@ def _world(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"], foun
     )
 
 
-def _references(actions: Action, config: SimulatorConfig) -> dict[int, tuple[Reference, Bool[Array, " k"]]]:
-    """What each kind of action would have the arm do, by its code."""
-    found = {int(code): jax.vmap(lambda a, k=k: k.reference(a, config.motion))(actions) for code, k in KINDS.items()}
-    return {code: motion for code, motion in found.items() if motion is not None}
+def _references(actions: Action, config: SimulatorConfig) -> tuple[Reference, Bool[Array, " k"]]:
+    """What actions have the arm do, in arrays as long as the longest kind's, and whether it can.
+
+    Where nothing is to be done, it cannot.
+    """
+    found = {code: jax.vmap(lambda a, k=k: k.reference(a, config.motion))(actions) for code, k in KINDS.items()}
+    motions = {code: motion for code, motion in found.items() if motion is not None}
+    steps = max(reference.fingers.shape[1] for reference, _ in motions.values())
+
+    def longer(rows):
+        return jnp.pad(rows, ((0, 0), (0, steps - rows.shape[1])) + ((0, 0),) * (rows.ndim - 2), mode="edge")
+
+    def of_its_kind(*leaves):
+        mine = [(actions.kind == int(code)).reshape(-1, *[1] * (leaves[0].ndim - 1)) for code in motions]
+        return functools.reduce(lambda rest, one: jnp.where(one[0], one[1], rest), zip(mine, leaves, strict=True), 0)
+
+    padded = [
+        (r.replace(**{name: longer(getattr(r, name)) for name in ("q", "velocity", "fingers")}), able)
+        for r, able in motions.values()
+    ]
+    reference, able = jax.tree.map(of_its_kind, *padded)
+    return reference, able.astype(bool)
 
 
 def _tried_alone(
@@ -113,21 +130,28 @@ def _tried_alone(
 
 
 def _tried(
-    shelf: Shelf, config: SimulatorConfig, threads: int, world: Any, kind: Any, index: Any, references: Any, asked: Any
+    shelf: Shelf,
+    config: SimulatorConfig,
+    threads: int,
+    world: World,
+    kind: Array,
+    index: Array,
+    reference: Reference,
+    able: Array,
+    asked: Array,
 ) -> Int[np.ndarray, "*lead k"]:
     """What becomes of the actions in many scenes; any leading axes.
 
     It must not compute with JAX, which is waiting for it.
     """
-    told = world, kind, index, references, asked
-    world, kind, index, references, asked = jax.tree.map(np.asarray, told)
     lead = asked.shape[:-1]
-    flat = functools.partial(jax.tree.map, lambda a: a.reshape(-1, *a.shape[len(lead) :]))
-    world, kind, index, references, asked = map(flat, (world, kind, index, references, asked))
+    told: Any = jax.tree.map(
+        lambda a: np.asarray(a).reshape(-1, *a.shape[len(lead) :]), (world, kind, index, (reference, able), asked)
+    )
+    world, kind, index, motions, asked = told
 
     def motion(row: int, i: int) -> Motion:
-        known = references.get(int(kind[row, i]))
-        return None if known is None else jax.tree.map(lambda a: a[row, i], known)
+        return jax.tree.map(lambda a: a[row, i], motions)
 
     return _in_turn(shelf, config, threads, world, kind, index, asked, motion).reshape(*lead, -1)
 
