@@ -196,6 +196,20 @@ def test_the_policy_takes_out_what_can_be_and_searches_on_where_nothing_can(prob
         assert [kind == ActionKind.RETRIEVE for kind in kinds] == [takes, objects is OPEN]
 
 
+def test_a_policy_that_rehearses_decides_the_same_alone_and_mapped_over(problem):
+    over, _, aside = pushes()
+    policy = search_for_grasp(rehearsal=MODEL).replace(plan=planned(over, aside))
+    rows = [look(problem, EDGE, found=False), look(problem, LOOSE), look(problem, FIRM)]
+    beliefs, seen = stack(*rows)
+    keys = jax.random.split(jax.random.key(0), len(rows))
+    mapped = jax.jit(jax.vmap(lambda *row: policy(row[0], problem, *row[1:])))(keys, beliefs, seen)
+    for i, (belief, observation) in enumerate(rows):
+        alone = policy(keys[i], problem, belief, observation)
+        assert int(alone.action.kind) == int(mapped.action.kind[i])
+        np.testing.assert_allclose(alone.action.T_world_gripper, mapped.action.T_world_gripper[i], atol=1e-6)
+    assert mapped.action.kind.tolist()[:2] == [ActionKind.PUSH, ActionKind.RETRIEVE]
+
+
 def test_mapped_over_it_says_the_same_and_nothing_where_it_is_not_asked(problem, told):
     over, away, aside = pushes()
     scenes = stack(*(known(problem, objects) for objects in (EDGE, LOOSE, FIRM)))
