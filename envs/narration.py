@@ -62,7 +62,7 @@ class Narrator:
         kind = kind_of(int(moment.decision.action.kind))
         self._line("does", kind.describe(moment.decision.action, moment.observation.objects.capacity))
         if kind.takes_target:
-            self._line("why", "a grasp that hits nothing is known")
+            self._line("why", "a grasp that takes it out is known")
         elif record.sequences and record.predicted_cost is not None:
             length = int(moment.decision.sequences.length[0])
             self._line(

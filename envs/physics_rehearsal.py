@@ -125,8 +125,9 @@ def _tried_alone(
         action: Action = jax.tree.map(lambda a: jnp.asarray(a[i]), actions)
         return jax.device_get(reference_motion(kind_of(int(actions.kind[i])), action, config.motion))
 
-    one = jax.tree.map(lambda a: a[None], (world, actions.kind, actions.object, asked))
-    return _in_turn(shelf, config, threads, *one, motion)[0]
+    told: Any = jax.tree.map(lambda a: a[None], (world, actions.kind, actions.object, asked))
+    worlds, kind, index, some = told
+    return _in_turn(shelf, config, threads, worlds, kind, index, some, motion)[0]
 
 
 def _tried(
@@ -148,12 +149,12 @@ def _tried(
     told: Any = jax.tree.map(
         lambda a: np.asarray(a).reshape(-1, *a.shape[len(lead) :]), (world, kind, index, (reference, able), asked)
     )
-    world, kind, index, motions, asked = told
+    worlds, kinds, indices, motions, some = told
 
     def motion(row: int, i: int) -> Motion:
         return jax.tree.map(lambda a: a[row, i], motions)
 
-    return _in_turn(shelf, config, threads, world, kind, index, asked, motion).reshape(*lead, -1)
+    return _in_turn(shelf, config, threads, worlds, kinds, indices, some, motion).reshape(*lead, -1)
 
 
 def _in_turn(

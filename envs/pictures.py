@@ -38,7 +38,7 @@ def frame(moment: Moment, problem: Problem) -> Frame:
         decision, kind = moment.decision, kind_of(int(moment.decision.action.kind))
         after = jax.tree.map(np.asarray, decision.predicted)
         sketch, does = kind.sketch(objects, after, decision.action), kind.describe(decision.action, objects.capacity)
-        why = "a grasp that hits nothing is known"
+        why = "a grasp that takes it out is known"
         if not kind.takes_target:
             expected = "" if record.predicted_cost is None else f" → {record.predicted_cost:.0f} expected"
             why = f"cost {record.cost:.0f}{expected}, best of {record.sequences} sequences"

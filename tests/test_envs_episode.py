@@ -99,7 +99,7 @@ def test_what_is_told_of_an_episode_is_what_its_record_says(problem):
     assert f"no target; it can be at {episode.steps[0].belief_size} of 792 poses" in first
     assert f"cost {episode.steps[0].cost:.0f} now" in first
     assert "the target at x" in told
-    assert "a grasp that hits nothing is known" in told
+    assert "a grasp that takes it out is known" in told
     assert "failed  retrieval: missed" in told
     assert told.strip().endswith(verdict(episode))
     assert len(narrator.frames) == len(episode.steps)

@@ -71,7 +71,8 @@ def take_out(
     if rehearsal is None:
         return graspable_at(problem, scene, pose, *active)
     tried = worth_trying(problem, scene, pose, *active)
-    told = rehearsal(problem, scene, pose, *(active or (True,)), tried.action, tried.hits <= scene.capacity)
+    here = active[0] if active else True
+    told = rehearsal(problem, scene, pose, here, tried.action, tried.hits <= scene.capacity)
     return _first_that_works(tried, told)
 
 
