@@ -245,7 +245,9 @@ def test_a_judgement_is_the_planners_own(problem):
         world = from_scenario(scene)
         objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
         pose = true_target_pose(world)
-        judgement = jax.device_get(judge(problem, InFullView(), 0.02, world, jnp.array(True)))
+        judgement = jax.device_get(
+            judge(problem, InFullView(), planner.PlannerConfig().weights, world, jnp.array(True))
+        )
         grasp = graspable_at(problem, objects, pose)
         assert judgement.least == int(grasp.hits)
         seen = Observation(objects, jnp.array(True), pose)
