@@ -41,7 +41,7 @@ class GraspChoice(flax.struct.PyTreeNode):
 
     Attributes:
       success: whether there is a grasp with which neither gripper, target nor arm hits anything on the whole way from
-        outside the shelf and out again.
+        outside the shelf and out again, or, as `take_out` tells it, one that succeeded in a rehearsal.
       hits: number of objects that the best grasp hits; one more than there can be if no grasp is feasible.
       action: takes it out with the best grasp: of those that hit fewest the one whose straight way keeps furthest from
         the objects.
