@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import flax.struct
@@ -17,7 +16,7 @@ from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.records import Episode, Step, record_action
 from mechsearch_jax.envs.verdicts import Verdict
-from mechsearch_jax.envs.world import MAX_TILT, TARGET
+from mechsearch_jax.envs.world import TARGET, fallen_over
 from mechsearch_jax.planner import Decision
 from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.scenario import Scenario
@@ -30,6 +29,7 @@ class Choice(flax.struct.PyTreeNode):
     Attributes:
       action, cost, predicted_cost: of the `Decision`.
       sequences: how many sequences it was chosen from.
+      refused: how many more began with what did harm in a rehearsal.
       others: the first actions of all of these, the best first, of kind NONE after the last; None where not known.
     """
 
@@ -37,6 +37,7 @@ class Choice(flax.struct.PyTreeNode):
     cost: jax.Array
     predicted_cost: jax.Array
     sequences: jax.Array
+    refused: jax.Array | int = 0
     others: Action | None = None
 
 
@@ -45,7 +46,7 @@ def chosen(decision: Decision) -> Choice:
     """What a decision comes down to."""
     count = jnp.sum(jnp.isfinite(decision.sequences.value))
     others = jax.tree.map(lambda a: a[:, 0], decision.sequences.actions)
-    return Choice(decision.action, decision.cost, decision.predicted_cost, count, others)
+    return Choice(decision.action, decision.cost, decision.predicted_cost, count, decision.refused, others)
 
 
 def takes_target(choice: Choice) -> bool:
@@ -63,7 +64,7 @@ def target_trouble(shelf: Shelf, position: Float[np.ndarray, " 3"], rotation: Fl
     """Why a target at this pose can no longer be taken out as the planner knows it; None if it can."""
     if position[0] < shelf.front or position[2] < shelf.board:
         return "the target fell off the board"
-    return "the target fell over" if abs(rotation[2, 2]) < math.cos(MAX_TILT) else None
+    return "the target fell over" if fallen_over(rotation) else None
 
 
 def overflow_trouble(outcome: Outcome, i: int) -> str | None:
@@ -119,7 +120,7 @@ def failure_of(choice: Choice, outcome: Outcome, i: int) -> str | None:
     """Why the action in world `i` was not carried out as chosen, in the words of a record; None if it was."""
     kind, reason = kind_of(int(choice.action.kind)), outcome.reason(i)
     if kind.code == ActionKind.NONE:
-        return "no action is possible"
+        return "all that was tried out did harm" if int(choice.refused) else "no action is possible"
     return f"retrieval: {reason}" if reason and kind.takes_target else reason
 
 

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.status import Status
 
-from mechsearch_jax.actions import kind_of
+from mechsearch_jax.actions import ActionKind, kind_of
 from mechsearch_jax.envs import pictures
 from mechsearch_jax.envs.episodes import Moment
 from mechsearch_jax.envs.records import Episode, Step
@@ -22,6 +22,7 @@ STAGES = {
     "judge": "judging whether the target can be grasped",
     "simulate": "acting",
 }
+NOTHING = "no action is possible"
 
 
 class Narrator:
@@ -63,12 +64,17 @@ class Narrator:
         self._line("does", kind.describe(moment.decision.action, moment.observation.objects.capacity))
         if kind.takes_target:
             self._line("why", "a grasp that takes it out is known")
+        elif kind.code == ActionKind.NONE:
+            refused = int(moment.decision.refused)
+            self._line("why", f"each of the {refused} best does harm as it is tried out" if refused else NOTHING)
         elif record.sequences and record.predicted_cost is not None:
             length = int(moment.decision.sequences.length[0])
+            refused = int(moment.decision.refused)
             self._line(
                 "why",
                 f"cost {record.cost:.0f} now, {record.predicted_cost:.0f} expected after it; the best of "
-                f"{record.sequences} sequences, {length} action{'s' if length > 1 else ''} long",
+                f"{record.sequences} sequences, {length} action{'s' if length > 1 else ''} long"
+                + (f", after {refused} that do harm as they are tried out" if refused else ""),
             )
 
     def acted(self, moment: Moment) -> None:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
@@ -33,7 +32,7 @@ from mechsearch_jax.cores import cores
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.outcome import Failure, Outcome
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, check_actions, controls
-from mechsearch_jax.envs.world import BODIES, MAX_TILT, TARGET, World, bodies_of, from_scenario, slots
+from mechsearch_jax.envs.world import BODIES, TARGET, World, bodies_of, fallen_over, from_scenario, slots
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference
@@ -117,7 +116,7 @@ class NativeWorld:
             return self._finish(Failure.UNREACHABLE, True)
         before, gone = copy.copy(self._data), self._fallen()
         failure, error, settled = self._perform(kind, reference, int(action.object))
-        if self._diverged():
+        if self._recorder.diverged:
             self._data = before
             return self._finish(Failure.UNSTABLE, False)
         if kind.takes_target:
@@ -129,7 +128,7 @@ class NativeWorld:
         self._recorder = _Recorder(self._data, self.config.trace_every)
         before = copy.copy(self._data)
         settled = self._come_to_rest()
-        if self._diverged():
+        if self._recorder.diverged:
             self._data = before
             return self._finish(Failure.UNSTABLE, False)
         return self._finish(Failure.NONE, settled)
@@ -165,19 +164,21 @@ class NativeWorld:
         """
         self._recorder = _Recorder(self._data, self.config.trace_every)
         self._come_to_rest()
-        gone = self._fallen()
+        gone, lay = self._fallen(), self._target_lies()
         failure, *_ = self._perform(kind, reference, index)
-        if self._diverged():
+        if self._recorder.diverged:
             return False, False
+        held, fallen = False, self._fallen()
         if kind.takes_target:
             told = self._retrieval(gone)
-            return not (failure or told.failure), not (told.fallen & ~gone).any()
-        return not failure, not (self._fallen() & ~gone).any() and self._target_stands()
+            failure, held, fallen = failure or told.failure, told.held, told.fallen
+        toppled = self._target_lies() and not (lay or held)
+        return not failure, not (toppled or (fallen & ~gone).any())
 
-    def _target_stands(self) -> bool:
-        """Whether the target is upright, if there is one."""
-        _, x, y, _ = self._data.joint(f"body{TARGET}").qpos[3:]
-        return self._bodies[TARGET] is None or bool(abs(1.0 - 2.0 * (x * x + y * y)) >= math.cos(MAX_TILT))
+    def _target_lies(self) -> bool:
+        """Whether there is a target that has fallen over."""
+        quaternion = self._data.joint(f"body{TARGET}").qpos[3:]
+        return self._bodies[TARGET] is not None and fallen_over(rotation_matrix(quaternion))
 
     def _perform(self, kind: Kind, reference: Reference, index: int) -> tuple[Failure, float, bool]:
         """Run a motion and let everything come to rest: why it failed, the tracking error [rad], and whether all is."""
@@ -204,7 +205,7 @@ class NativeWorld:
         mujoco.rollout.rollout(self._model, self._data, state[None], controls[None], state=states)
         mujoco.mj_setState(self._model, self._data, states[0, -1], mujoco.mjtState.mjSTATE_FULLPHYSICS)
         self._data.ctrl[:] = controls[-1]
-        self._recorder.add(states[0])
+        self._recorder.add(states[0], self._diverged())
         return states[0]
 
     def _follow(self, reference: Reference) -> np.ndarray:
@@ -263,6 +264,7 @@ class NativeWorld:
         return all((f, held) in touching or (held, f) in touching for f in fingers)
 
     def _diverged(self) -> bool:
+        """Whether the steps of the last `_run` went wrong; what MuJoCo then makes of the state means nothing."""
         warnings = (
             mujoco.mjtWarning.mjWARN_BADQPOS,
             mujoco.mjtWarning.mjWARN_BADQVEL,
@@ -337,15 +339,22 @@ class _Retrieval(NamedTuple):
 
 
 class _Recorder:
-    """Collects the states that make a trace."""
+    """Collects the states that make a trace.
+
+    Attributes:
+      steps: how many were taken.
+      diverged: whether the simulation did in any of them.
+    """
 
     def __init__(self, data: mujoco.MjData, every: int):
         self.steps = 0
+        self.diverged = False
         self._begin = data.time
         self._every = every
         self._kept: list[np.ndarray] = []
 
-    def add(self, states: np.ndarray) -> None:
+    def add(self, states: np.ndarray, diverged: bool) -> None:
+        self.diverged |= diverged
         self._kept.extend(states[(-self.steps) % self._every :: self._every])
         self.steps += len(states)
 

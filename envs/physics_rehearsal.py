@@ -17,11 +17,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import KINDS, Action, kind_of
+from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.cores import cores
@@ -29,6 +31,7 @@ from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.physics_push import bodies, sound
 from mechsearch_jax.envs.simulator import SimulatorConfig
 from mechsearch_jax.envs.world import TARGET, World, bodies_of
+from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.planner import Problem
@@ -46,7 +49,9 @@ class NativeRehearsal:
     """The `Rehearsal` in C MuJoCo, of all that are mapped over at once, on several threads.
 
     The actions of a scene are tried in the order that they are given in, until one succeeds. The same ones always give
-    the same results. One that diverges, or whose scene is no scene, does harm; one that the arm cannot follow fails.
+    the same results. One that the arm cannot follow fails; one that diverges, or whose scene is no scene, does harm.
+    The gripper is the problem's.
+
     While it is traced, `jax.pure_callback` takes the actions to the host, for which JAX needs two cores.
 
     Attributes:
@@ -65,15 +70,24 @@ class NativeRehearsal:
         found: Bool[Array, ""] | bool,
         actions: Action,
         asked: Bool[Array, " k"],
+        kinds: tuple[ActionKind, ...],
     ) -> Int[Array, " k"]:
-        """See `rehearsal.Rehearsal`."""
+        """See `rehearsal.Rehearsal`.
+
+        Raises:
+          InputError: the simulator has too few slots for the objects.
+        """
+        if scene.capacity > TARGET:
+            raise InputError(f"the simulator has slots for {TARGET} objects, not for {scene.capacity}")
         world = _world(problem, scene, pose, jnp.asarray(found))
-        where = problem.shelf, self.simulation, self.threads or cores()
+        motion = dataclasses.replace(self.simulation.motion, gripper=problem.gripper)
+        simulation = dataclasses.replace(self.simulation, motion=motion)
+        where = problem.shelf, simulation, self.threads or cores()
         if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((world, actions, asked))):
             host: tuple[World, Action, np.ndarray] = jax.device_get((world, actions, asked))
             return jax.device_put(_tried_alone(*where, *host))
         result = jax.ShapeDtypeStruct(asked.shape, jnp.int32)
-        told = world, actions.kind, actions.object, *_references(actions, self.simulation), asked
+        told = world, actions.kind, actions.object, *_references(actions, simulation, kinds), asked
         return jax.pure_callback(functools.partial(_tried, *where), result, *told, vmap_method="broadcast_all")
 
 
@@ -92,12 +106,14 @@ def _world(problem: Problem, scene: Superquadrics, pose: Float[Array, "3"], foun
     )
 
 
-def _references(actions: Action, config: SimulatorConfig) -> tuple[Reference, Bool[Array, " k"]]:
-    """What actions have the arm do, in arrays as long as the longest kind's, and whether it can.
+def _references(
+    actions: Action, config: SimulatorConfig, kinds: tuple[ActionKind, ...]
+) -> tuple[Reference, Bool[Array, " k"]]:
+    """What actions of some kinds have the arm do, in arrays as long as the longest kind's, and whether it can.
 
     Where nothing is to be done, it cannot.
     """
-    found = {code: jax.vmap(lambda a, k=k: k.reference(a, config.motion))(actions) for code, k in KINDS.items()}
+    found = {k: jax.vmap(lambda a, k=k: KINDS[k].reference(a, config.motion))(actions) for k in kinds}
     motions = {code: motion for code, motion in found.items() if motion is not None}
     steps = max(reference.fingers.shape[1] for reference, _ in motions.values())
 
@@ -200,8 +216,12 @@ def _tried_out(shelf: Shelf, config: SimulatorConfig, world: World, kind: int, m
     if not sound(*jax.tree.map(lambda a: a[None], (world, motion[0]))):
         return Rehearsed.HARMFUL
     here = NativeWorld(shelf, config=config)
-    here.place(bodies_of(world))
-    succeeds, harmless = here.rehearse(kind_of(kind), motion[0], index)
+    try:
+        here.place(bodies_of(world))
+        succeeds, harmless = here.rehearse(kind_of(kind), motion[0], index)
+    except (ValueError, mujoco.FatalError):
+        # A scene that cannot be built must not end those beside it.
+        return Rehearsed.HARMFUL
     if not harmless:
         return Rehearsed.HARMFUL
     return Rehearsed.SUCCEEDED if succeeds else Rehearsed.FAILED

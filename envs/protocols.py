@@ -194,9 +194,10 @@ def _is_bad(choice: Choice, outcome: Outcome, row: int) -> bool:
 
 
 def _has(choice: Choice, rank: int) -> bool:
-    """Whether there is a next best action of so high a rank, counted from 0."""
+    """Whether there is a next best action of so high a rank, counted from 0; none comes after doing nothing."""
     kinds = np.zeros(0) if choice.others is None else np.asarray(choice.others.kind)
-    return rank < len(kinds) and int(kinds[rank]) != ActionKind.NONE
+    nothing = int(choice.action.kind) == ActionKind.NONE
+    return not nothing and rank < len(kinds) and int(kinds[rank]) != ActionKind.NONE
 
 
 def _next(choice: Choice, rank: int) -> Choice:

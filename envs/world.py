@@ -8,6 +8,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.errors import InputError
@@ -19,6 +20,11 @@ TARGET = MAX_OBJECTS
 BODIES = MAX_OBJECTS + 1
 # A target that leans further than this has fallen over [rad].
 MAX_TILT = math.radians(15)
+
+
+def fallen_over(rotation: Float[np.ndarray, "3 3"]) -> bool:
+    """Whether a target with this `R_world_target` no longer stands."""
+    return bool(abs(rotation[2, 2]) < math.cos(MAX_TILT))
 
 
 class World(flax.struct.PyTreeNode):

@@ -15,11 +15,13 @@ from test_envs_simulator import take_out as retrieval
 from mechsearch_jax.actions import ActionKind, no_action
 from mechsearch_jax.envs import physics_rehearsal
 from mechsearch_jax.envs.native import NativeWorld
+from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.physics_rehearsal import NativeRehearsal
 from mechsearch_jax.envs.rehearsals import rehearsal
 from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rehearsal import TRIES, Rehearsed
@@ -50,6 +52,7 @@ def known(problem, objects):
 
 EDGE = (standing("cylinder", (0.024, 0.024, 0.067), 0.43, 0.1), standing("box", (0.054, 0.025, 0.054), 0.6, 0.2))
 SCENES = {"open": OPEN, "loose": LOOSE, "firm": FIRM}
+PUSHES, GRASPS = (ActionKind.PUSH,), (ActionKind.RETRIEVE,)
 DONE, FAILED, HARM = Rehearsed.SUCCEEDED, Rehearsed.FAILED, Rehearsed.HARMFUL
 
 
@@ -99,7 +102,7 @@ def told(problem):
     for name, objects in SCENES.items():
         seen, at = known(problem, objects)
         tried = worth_trying(problem, seen, at)
-        found[name] = tried, MODEL(problem, seen, at, True, tried.action, tried.hits <= seen.capacity)
+        found[name] = tried, MODEL(problem, seen, at, True, tried.action, tried.hits <= seen.capacity, GRASPS)
     return found
 
 
@@ -139,10 +142,10 @@ def test_what_throws_an_object_down_does_harm_and_what_is_out_of_reach_fails(pro
     over, away, aside = pushes()
     seen, at = known(problem, EDGE)
     all_asked = jnp.ones(3, bool)
-    assert MODEL(problem, seen, at, False, stack(over, away, aside), all_asked).tolist() == [HARM, FAILED, DONE]
+    assert MODEL(problem, seen, at, False, stack(over, away, aside), all_asked, PUSHES).tolist() == [HARM, FAILED, DONE]
     # After what succeeds nothing is tried any more, with one thread.
     alone = NativeRehearsal(threads=1)
-    assert alone(problem, seen, at, False, stack(aside, over, away), all_asked).tolist() == [DONE, HARM, HARM]
+    assert alone(problem, seen, at, False, stack(aside, over, away), all_asked, PUSHES).tolist() == [DONE, HARM, HARM]
     world = NativeWorld()
     world.reset(begin(EDGE))
     assert np.asarray(world.execute(over).fallen).tolist() == [True] + [False] * 8
@@ -153,8 +156,8 @@ def test_a_target_that_is_found_must_not_fall_and_one_that_is_not_is_not_there(p
     # High against the target, from its side.
     tip = push(pose(0.63, -0.02 - 0.1125, 0.09, tilt=math.radians(30)), (0.0, 0.1, 0.0))
     asked = jnp.ones(1, bool)
-    assert MODEL(problem, seen, at, True, stack(tip), asked).tolist() == [HARM]
-    assert MODEL(problem, seen, at, False, stack(tip), asked).tolist() == [DONE]
+    assert MODEL(problem, seen, at, True, stack(tip), asked, PUSHES).tolist() == [HARM]
+    assert MODEL(problem, seen, at, False, stack(tip), asked, PUSHES).tolist() == [DONE]
 
 
 def test_the_policy_does_the_first_thing_that_goes_well(problem):
@@ -173,15 +176,119 @@ def test_the_policy_does_the_first_thing_that_goes_well(problem):
     np.testing.assert_array_equal(done.action.T_world_gripper, over.T_world_gripper)
 
 
+def says(*codes):
+    """A rehearsal that says the same of the first actions, whatever they are and whether or not it is asked."""
+
+    def rehearsal(problem, scene, pose, found, actions, asked, kinds):
+        return jnp.full(asked.shape, HARM).at[: len(codes)].set(jnp.array(codes))
+
+    return rehearsal
+
+
 def test_where_everything_does_harm_nothing_is_done(problem):
     over, *_ = pushes()
     belief, observation = look(problem, EDGE, found=False)
-    for actions in ((over,), (no_action(),)):
+    for actions, refused in (((over, over), 2), ((no_action(),), 0)):
         policy = search_for_grasp(rehearsal=MODEL).replace(plan=planned(*actions))
         decision = policy(jax.random.key(0), problem, belief, observation)
-        assert int(decision.action.kind) == ActionKind.NONE
-    kept = search_for_grasp().replace(plan=planned(no_action()))(jax.random.key(0), problem, belief, observation)
-    jax.tree.map(np.testing.assert_array_equal, decision, kept)
+        assert (int(decision.action.kind), int(decision.refused)) == (ActionKind.NONE, refused)
+        assert (float(decision.value), float(decision.predicted_cost)) == (math.inf, 20.0)
+        jax.tree.map(np.testing.assert_array_equal, decision.predicted, observation.objects)
+        assert (decision.sequences.actions.kind == ActionKind.NONE).all()
+
+
+def test_what_does_harm_is_refused_and_what_is_made_comes_first(problem):
+    over, _, aside = pushes()
+    belief, observation = look(problem, EDGE, found=False)
+    plan = planned(over, aside, over, aside)
+    for codes, order, refused in (
+        ((DONE, HARM, HARM, HARM), (0, 1, 2, 3), 0),
+        ((HARM, FAILED, DONE, HARM), (2, 1, 3), 1),
+        ((FAILED, HARM, FAILED, HARM), (0, 2), 2),
+    ):
+        policy = search_for_grasp(rehearsal=says(*codes)).replace(plan=plan)
+        decision = policy(jax.random.key(0), problem, belief, observation)
+        value, after = np.asarray(decision.sequences.value), decision.sequences.after
+        assert value[: len(order)].tolist() == [i - 10.0 for i in order]
+        assert np.isinf(value[len(order) :]).all()
+        assert (decision.sequences.actions.kind[len(order) :] == ActionKind.NONE).all()
+        assert int(decision.refused) == refused
+        jax.tree.map(
+            np.testing.assert_array_equal, decision.action, jax.tree.map(lambda a: a[0, 0], decision.sequences.actions)
+        )
+        jax.tree.map(np.testing.assert_array_equal, decision.predicted, jax.tree.map(lambda a: a[0], after))
+
+
+def test_what_is_said_of_what_was_not_asked_for_counts_for_nothing(problem):
+    _, _, aside = pushes()
+    belief, observation = look(problem, EDGE, found=False)
+    policy = search_for_grasp(rehearsal=says(FAILED, DONE)).replace(plan=planned(aside))
+    decision = policy(jax.random.key(0), problem, belief, observation)
+    assert (int(decision.action.kind), float(decision.value)) == (ActionKind.PUSH, -10.0)
+    seen, at = known(problem, FIRM)
+    far = at.at[0].set(3.0)
+    assert not take_out(says(*[DONE] * TRIES), problem, seen, far).success
+
+
+def test_where_no_grasp_succeeds_one_that_hits_nothing_is_made(problem):
+    for objects, success in ((OPEN, True), (FIRM, False)):
+        seen, at = known(problem, objects)
+        told, plain = take_out(says(*[FAILED] * TRIES), problem, seen, at), graspable_at(problem, seen, at)
+        assert bool(told.success) == success == bool(plain.success)
+        np.testing.assert_array_equal(told.action.T_world_gripper, plain.action.T_world_gripper)
+
+
+def test_a_simulation_that_diverges_at_any_time_does_harm(problem):
+    seen, at = known(problem, EDGE)
+    actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
+    # It does as everything comes to rest, long before the push is over.
+    thrown = seen.replace(position=seen.position.at[0, 0].set(1e11))
+    assert MODEL(problem, thrown, at, False, actions, asked, PUSHES).tolist() == [HARM]
+    world = NativeWorld()
+    world.reset(begin(EDGE))
+    world._data.qvel[-1] = 1e12
+    before = world._data.qpos.copy()
+    outcome = world.execute(pushes()[2])
+    assert Failure(int(outcome.failure)) is Failure.UNSTABLE
+    np.testing.assert_array_equal(world._data.qpos, before)
+
+
+def test_the_hand_of_the_problem_is_the_one_that_is_rehearsed(problem):
+    seen, at = known(problem, EDGE)
+    actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
+    heard = []
+
+    def tried_alone(shelf, config, threads, *rest):
+        heard.append(config.motion.gripper)
+        return np.full(1, DONE, np.int32)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(physics_rehearsal, "_tried_alone", tried_alone)
+        other = problem.replace(gripper=dataclasses.replace(problem.gripper, approach=0.09))
+        for here in (problem, other):
+            MODEL(here, seen, at, False, actions, asked, PUSHES)
+    assert heard == [problem.gripper, other.gripper]
+
+
+def test_a_scene_that_cannot_be_built_costs_its_own_row_alone(problem, monkeypatch):
+    seen, at = known(problem, EDGE)
+    built = NativeWorld.place
+
+    def place(world, bodies):
+        if bodies[0].position[0] > 0.5:
+            raise ValueError("no such body")
+        built(world, bodies)
+
+    monkeypatch.setattr(NativeWorld, "place", place)
+    other = seen.replace(position=seen.position.at[0, 0].set(0.55))
+    actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
+    said = jax.vmap(lambda here: MODEL(problem, here, at, False, actions, asked, PUSHES))(stack(other, seen))
+    assert said.tolist() == [[HARM], [DONE]]
+
+
+def test_more_objects_than_the_simulator_has_slots_for_are_refused(problem):
+    with pytest.raises(InputError, match="slots for 8 objects, not for 9"):
+        MODEL(problem, empty(9), jnp.zeros(3), False, stack(no_action()), jnp.ones(1, bool), PUSHES)
 
 
 def test_the_policy_takes_out_what_can_be_and_searches_on_where_nothing_can(problem):
@@ -217,7 +324,7 @@ def test_mapped_over_it_says_the_same_and_nothing_where_it_is_not_asked(problem,
     actions = stack(stack(over, away, aside), grasps, grasps)
     asked = jnp.array([[True, True, True], [True, True, True], [False, False, False]])
     found = jnp.array([False, True, True])
-    mapped = jax.jit(jax.vmap(lambda scene, found, *row: MODEL(problem, *scene, found, *row)))(
+    mapped = jax.jit(jax.vmap(lambda scene, found, *row: MODEL(problem, *scene, found, *row, PUSHES + GRASPS)))(
         scenes, found, actions, asked
     )
     assert mapped[0].tolist() == [HARM, FAILED, DONE]
@@ -229,7 +336,7 @@ def test_a_scene_that_is_none_is_harmed_and_leaves_the_others_alone(problem):
     seen, at = known(problem, EDGE)
     broken = seen.replace(position=seen.position.at[0, 0].set(jnp.nan))
     actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
-    said = jax.vmap(lambda here: MODEL(problem, here, at, False, actions, asked))(stack(broken, seen))
+    said = jax.vmap(lambda here: MODEL(problem, here, at, False, actions, asked, PUSHES))(stack(broken, seen))
     assert said.tolist() == [[HARM], [DONE]]
 
 

@@ -107,6 +107,26 @@ def test_without_an_action_it_says_why(problem):
     assert "nothing that could be moved is recognised" in step.reason
 
 
+def test_where_all_that_was_tried_out_does_harm_it_says_so_and_draws_others_when_asked_again(problem):
+    drawn = []
+
+    def harmed(key, problem, belief, observation):
+        drawn.append(jax.random.key_data(key).tolist())
+        return idle(key, problem, belief, observation).replace(refused=jnp.int32(8))
+
+    searcher = searcher_of(problem, HIDDEN, policy=harmed)
+    for _ in range(2):
+        step = searcher.next(IMAGES.depth)
+        assert (step.kind, step.trajectory, step.index) == ("none", None, 0)
+        assert "each of the 8 best actions does harm" in step.reason
+    assert drawn[0] != drawn[1]
+
+
+def test_a_policy_is_given_its_rehearsal_itself(problem):
+    with pytest.raises(InputError, match="give it the rehearsal"):
+        Searcher(policy=idle, rehearsal=lambda *args: None)
+
+
 @pytest.mark.slow
 def test_an_impasse_is_told_from_another(problem):
     belief = initial_belief(problem)

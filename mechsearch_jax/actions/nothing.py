@@ -1,4 +1,4 @@
-"""Doing nothing: what is left where no action is possible."""
+"""Doing nothing: what is left where no action is possible, or all that was tried out did harm."""
 
 from __future__ import annotations
 
@@ -49,4 +49,4 @@ class Nothing:
         return Sketch()
 
     def describe(self, action: Action, target: int | None = None) -> str:
-        return "do nothing: no action is possible"
+        return "do nothing"

@@ -159,6 +159,7 @@ def _take_out(search: Search, observation: Observation, grasp: GraspChoice) -> D
         predicted_cost=jnp.float32(jnp.nan),
         predicted=observation.objects,
         sequences=no_sequences(search.config, observation.objects),
+        refused=jnp.int32(0),
     )
 
 

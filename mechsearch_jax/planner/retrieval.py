@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.compiled import kept
@@ -42,9 +43,9 @@ class GraspChoice(flax.struct.PyTreeNode):
     Attributes:
       success: whether there is a grasp with which neither gripper, target nor arm hits anything on the whole way from
         outside the shelf and out again, or, as `take_out` tells it, one that succeeded in a rehearsal.
-      hits: number of objects that the best grasp hits; one more than there can be if no grasp is feasible.
-      action: takes it out with the best grasp: of those that hit fewest the one whose straight way keeps furthest from
-        the objects.
+      hits: number of objects that the grasp hits; one more than there can be if no grasp is feasible.
+      action: takes it out with the best grasp: the first that succeeded in a rehearsal, or of those that hit fewest the
+        one whose straight way keeps furthest from the objects.
     """
 
     success: jax.Array
@@ -72,13 +73,15 @@ def take_out(
         return graspable_at(problem, scene, pose, *active)
     tried = worth_trying(problem, scene, pose, *active)
     here = active[0] if active else True
-    told = rehearsal(problem, scene, pose, here, tried.action, tried.hits <= scene.capacity)
-    return _first_that_works(tried, told)
+    asked = tried.hits <= scene.capacity
+    told = rehearsal(problem, scene, pose, here, tried.action, asked, (ActionKind.RETRIEVE,))
+    return _first_that_works(tried, asked, told)
 
 
 @kept()
-def _first_that_works(tried: GraspChoice, told: Int[Array, " k"]) -> GraspChoice:
-    works = told == Rehearsed.SUCCEEDED
+def _first_that_works(tried: GraspChoice, asked: Bool[Array, " k"], told: Int[Array, " k"]) -> GraspChoice:
+    """What succeeded, or the best of those that were tried where nothing did."""
+    works = asked & (told == Rehearsed.SUCCEEDED)
     best = jax.tree.map(lambda a: a[jnp.argmax(works)], tried)
     return best.replace(success=best.success | jnp.any(works))
 

@@ -240,6 +240,7 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
         predicted_cost=sequences.cost[0, 0],
         predicted=jax.tree.map(lambda a: a[0], sequences.after),
         sequences=sequences,
+        refused=jnp.int32(0),
     )
 
 

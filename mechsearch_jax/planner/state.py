@@ -53,9 +53,10 @@ class Sequences(flax.struct.PyTreeNode):
     """Sampled sequences of actions, best first; leading axis S, and M within.
 
     Attributes:
-      actions: shape (S, M), of kind NONE from where a sequence found nothing more to do.
+      actions: shape (S, M), of kind NONE from where a sequence found nothing more to do; all of them where the first
+        was refused because it did harm in a rehearsal.
       cost: J after each action, shape (S, M).
-      value: equation 2 of the best prefix, shape (S,); infinite if there was no first action.
+      value: equation 2 of the best prefix, shape (S,); infinite if there was no first action, or it was refused.
       length: number of actions in that prefix, shape (S,).
       after: the objects as they are expected to be after the first action of each, without the target, fields (S, N,
         ...); as they are where there is none.
@@ -72,12 +73,16 @@ class Decision(flax.struct.PyTreeNode):
     """What to do next, and everything that was considered.
 
     Attributes:
-      action: what to do next; of kind NONE if nothing is possible, of kind RETRIEVE if the target can be taken out.
-      value: equation 2 of the sequence it begins: the change of the cost, negative is good; 0 for a retrieval.
+      action: what to do next; of kind NONE if nothing is possible or all that was rehearsed was refused, of kind
+        RETRIEVE if the target can be taken out.
+      value: equation 2 of the sequence it begins: the change of the cost, negative is good; 0 for a retrieval, infinite
+        where nothing is done.
       cost: J now.
       predicted_cost: J that is expected after the action; NaN after a retrieval.
       predicted: the objects as they are expected to be after the action, without the target, fields (N, ...).
-      sequences: all sampled sequences, best first; none has a first action where none was sampled.
+      sequences: all sampled sequences, the chosen one first, then the best; none has a first action where none was
+        sampled.
+      refused: how many of the best sequences began with what did harm in a rehearsal.
     """
 
     action: Action
@@ -86,3 +91,4 @@ class Decision(flax.struct.PyTreeNode):
     predicted_cost: jax.Array
     predicted: Superquadrics
     sequences: Sequences
+    refused: jax.Array | int = 0

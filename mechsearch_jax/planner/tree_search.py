@@ -174,4 +174,5 @@ def _decision(rollout: Rollout, begin: Node, found: Any, slots: int) -> Decision
         predicted_cost=jnp.where(able, cost[0], begin.cost),
         predicted=jax.tree.map(lambda a, b: jnp.where(able, a[0, :slots], b[:slots]), scenes, begin.state.scene),
         sequences=sequences,
+        refused=jnp.int32(0),
     )

@@ -96,8 +96,11 @@ class Searcher:
             move; the default if left out.
 
         Raises:
-          InputError: the target cannot be grasped by the gripper, or the camera does not see the shelf.
+          InputError: the target cannot be grasped by the gripper, the camera does not see the shelf, or a policy is
+            given beside a rehearsal.
         """
+        if policy is not None and rehearsal is not None:
+            raise InputError("Searcher: a policy rehearses by itself; give it the rehearsal, and leave the keyword out")
         self.workcell = workcell or Workcell()
         self.config = config or standard()
         self._seed = seed
@@ -195,7 +198,8 @@ class Searcher:
     ) -> SearchStep:
         """Look, and decide what to do next.
 
-        Asked again without `acted` in between, it looks again: nothing was done since.
+        Asked again without `acted` in between, it looks again: nothing was done since. Where all that was tried out did
+        harm, it then draws other actions.
 
         Args:
           depth: float (H, W), metres along the camera's z; 0 or NaN where nothing was measured.
@@ -213,7 +217,9 @@ class Searcher:
         problem, now = self.problem, self._now
         if now.finished:
             raise InputError("next: the target was taken out, and the search is finished; make another Searcher")
-        seeing, deciding = jax.random.split(jax.random.fold_in(jax.random.key(self._seed), now.index))
+        here = jax.random.fold_in(jax.random.key(self._seed), now.index)
+        # What was refused would be drawn again.
+        seeing, deciding = jax.random.split(jax.random.fold_in(here, now.refusals))
         depth = np.asarray(depth)
         if joints is not None:
             joints = np.asarray(joints, float)
@@ -244,7 +250,8 @@ class Searcher:
             image=shown(depth, colour),
         )
         handed = done.trajectory is not None
-        self._state = State(now.index, belief, observation, decision.action, handed, acted=False, finished=False)
+        refusals = now.refusals + bool(decision.refused and not handed)
+        self._state = State(now.index, belief, observation, decision.action, handed, False, False, refusals)
         return step
 
     def acted(self, ok: bool = True) -> None:
@@ -262,7 +269,7 @@ class Searcher:
         if not now.handed:
             raise InputError("acted: no motion was handed out since the last one; call next first")
         took = ok and kind_of(int(now.action.kind)).takes_target
-        self._state = dataclasses.replace(now, index=now.index + 1, handed=False, acted=True, finished=took)
+        self._state = dataclasses.replace(now, index=now.index + 1, handed=False, acted=True, finished=took, refusals=0)
 
     def save(self, path: PathLike) -> None:
         """Write down how far the search is, so that `load` can go on after a crash: an archive of arrays, .npz.

@@ -24,7 +24,7 @@ from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 
 FORMAT = "mechsearch-search"
-VERSION = 1
+VERSION = 2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,6 +38,7 @@ class State:
       handed: whether the action's motion was handed out, and nothing was said of it since.
       acted: whether the action was tried since the last look.
       finished: whether the target was taken out.
+      refusals: after how many looks since the last action all that was tried out did harm.
     """
 
     index: int
@@ -47,9 +48,16 @@ class State:
     handed: bool
     acted: bool
     finished: bool
+    refusals: int = 0
 
 
-_PLAIN: dict[str, Callable[[Any], Any]] = {"index": int, "handed": bool, "acted": bool, "finished": bool}
+_PLAIN: dict[str, Callable[[Any], Any]] = {
+    "index": int,
+    "handed": bool,
+    "acted": bool,
+    "finished": bool,
+    "refusals": int,
+}
 _PYTREES = ("belief", "observation", "action")
 
 

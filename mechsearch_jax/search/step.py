@@ -32,7 +32,8 @@ class SearchStep:
 
     Attributes:
       index: how many actions were taken before.
-      kind: name of the kind of action: "push", "pick-and-place", "retrieve", or "none" where nothing is possible.
+      kind: name of the kind of action: "push", "pick-and-place", "retrieve", or "none" where nothing is possible,
+        or all that was tried out does harm.
       reason: what is to be done and what for, or why nothing can be, in one line.
       warnings: what does not fit, a line each; empty where all is well.
       trajectory: the motion, from where the arm is, through the action, and home; None where there is no action.
@@ -113,7 +114,9 @@ def motion(
     found = bool(belief.found)
     known = "the target is found" if found else f"the target can be at {int(jnp.sum(belief.exists))} poses"
     if kind.code == ActionKind.NONE:
-        return Motion(nothing, f"{known}; {impasse(problem, belief, observation.objects)}", None)
+        refused = int(decision.refused)
+        why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
+        return Motion(nothing, f"{known}; {why if refused else impasse(problem, belief, observation.objects)}", None)
     does = kind.describe(decision.action, observation.objects.capacity)
     try:
         trajectory = whole_trajectory(
@@ -129,7 +132,7 @@ def motion(
     except InputError as error:
         return Motion(nothing, f"{known}; to {does} is not possible: {error}", None)
     if kind.takes_target:
-        return Motion(kind.name, f"{known}; {does}: a grasp is known that meets nothing", trajectory)
+        return Motion(kind.name, f"{known}; {does}: a grasp that takes it out is known", trajectory)
     cost = f"cost {float(decision.cost):.0f}, {float(decision.predicted_cost):.0f} expected afterwards"
     return Motion(kind.name, f"{known}; {does}: {cost}", trajectory)
 
