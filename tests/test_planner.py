@@ -23,7 +23,7 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.prediction import LaterPlacementsStay, PredictByKind, first_scenes, push_model_of
-from mechsearch_jax.planner.proposal import ALONE, blame, sampling_weights
+from mechsearch_jax.planner.proposal import ALONE, DEPTH, blame, passed_on, sampling_weights
 from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values
 from mechsearch_jax.workspace import scenario
 
@@ -259,6 +259,34 @@ def test_what_is_in_the_way_alone_matters_most():
     np.testing.assert_allclose(share, expected / expected.sum(), rtol=1e-5)
     assert share[4] == 0
     assert not np.asarray(blame(jnp.asarray(rows), jnp.zeros(200, bool))).any()
+
+
+def test_the_share_of_what_cannot_be_moved_yet_goes_to_what_is_in_the_way(root):
+    rng = np.random.default_rng(0)
+    n = root.scene.capacity
+    given = jax.jit(passed_on)
+    for chance in (0.1, 0.5, 0.8):
+        options = [
+            w.replace(reached=rng.random(w.reached.shape) < 0.05, hits=rng.random(w.hits.shape) < chance)
+            for w in root.options
+        ]
+        state = root.replace(options=tuple(options), available=jnp.asarray(rng.random(n) < 0.8))
+        able, share = np.asarray(state.able), rng.random(n)
+        ways = [[] for _ in range(n)]
+        for kind, can in zip(options, able, strict=True):
+            for i in range(n):
+                ways[i] += [hits for hits, at in zip(kind.hits[i], kind.reached[i], strict=True) if can[i] and at.any()]
+        expected, stuck = (
+            share.astype(float),
+            np.array([able[:, i].any() and all(map(np.any, w)) for i, w in enumerate(ways)]),
+        )
+        for _ in range(DEPTH):
+            held, expected = np.where(stuck, expected, 0.0), np.where(stuck, 0.0, expected)
+            for i in np.flatnonzero(stuck):
+                blames = sum((np.where(hits, ALONE ** (1.0 - hits.sum()), 0.0) for hits in ways[i]), np.zeros(n))
+                expected += held[i] * blames / max(blames.sum(), 1e-12)
+        np.testing.assert_allclose(given(state, jnp.float32(share)), expected, rtol=1e-4, atol=1e-6)
+        assert chance < 0.8 or stuck.any()
 
 
 def test_draws_go_to_what_hides_the_target(decision, root, problem):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -18,6 +19,8 @@ from mechsearch_jax.planner.state import State
 
 # How much more an object matters that is in the way alone than one of two that are, one of two than one of three, ...
 ALONE = 4.0
+# How many objects deep what is in the way of moving an object is looked for.
+DEPTH = 2
 
 
 class Propose(Protocol):
@@ -53,10 +56,31 @@ def blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[Ar
     return total / jnp.maximum(jnp.sum(total), 1e-12)
 
 
+def passed_on(state: State, share: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Shares of the objects, where those that cannot be moved yet give theirs to what is in the way of moving them.
+
+    What is in the way of that in turn counts, too, `DEPTH` objects deep. The share of an object that arm and shelf do
+    not allow to be moved at all is lost.
+
+    Args:
+      state: with the ways to move each object.
+      share: of each object, shape (N,).
+    """
+    reached = [jnp.any(w.reached, axis=-1) & able[:, None] for w, able in zip(state.options, state.able, strict=True)]
+    wanted, hits = jnp.concatenate(reached, axis=1), jnp.concatenate([ways.hits for ways in state.options], axis=1)
+    stuck = ~jnp.any(wanted & ~jnp.any(hits, axis=-1), axis=1) & jnp.any(state.able, axis=0)
+    in_the_way = jax.vmap(blame)(hits, wanted)
+    for _ in range(DEPTH):
+        given = jnp.where(stuck, share, 0.0)
+        share = share - given + jnp.sum(given[:, None] * in_the_way, axis=0)
+    return share
+
+
 def sampling_weights(
     problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
 ) -> Float[Array, " n"]:
-    """Sampling weight of each object: in part even, in part by what it hides and which grasps it blocks.
+    """Sampling weight of each object: in part even, in part by what it hides and which grasps it blocks, or by what of
+    that it keeps from being moved.
 
     A found target that may be pushed is one more object in the way of each of its grasps that is blocked; where none is
     feasible, it alone is in the way.
@@ -68,8 +92,8 @@ def sampling_weights(
     blocks = blame(state.hits | (blocked[:, None] & target[None]), counts)
     blocks = jnp.where(jnp.any(counts), blocks, target)
     hides = blame(occluders(problem.existence, state.views), state.exists & ~belief.found)
-    both = blocks + hides
-    share = both / jnp.maximum(jnp.sum(both), 1e-12)
+    share = passed_on(state, blocks + hides)
+    share = share / jnp.maximum(jnp.sum(share), 1e-12)
     return (1.0 - guided_fraction) / state.scene.capacity + guided_fraction * share
 
 
