@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mechsearch_jax.benchmarks.evaluate import present_code
+from mechsearch_jax.benchmarks.exact_existence import SIDE, exact_existence
 from mechsearch_jax.benchmarks.images import save_rows
 from mechsearch_jax.envs.episodes import target_of
 from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS, target_pixels
@@ -52,6 +53,9 @@ class Row:
       target_share: that number over the one that there would be if it stood alone.
       visible: how many objects show at least 100 pixels of themselves.
       objects_share: mean over the objects of what each shows of the pixels that it would show if it stood alone.
+      exact_cells: number of poses whose cell holds a place where a target is hidden, by brute force; None if not asked.
+      exact_missed: how many of these f lacks.
+      exact_poses: number of poses that are such places themselves.
     """
 
     source: str
@@ -66,6 +70,9 @@ class Row:
     target_share: float
     visible: int
     objects_share: float
+    exact_cells: int | None = None
+    exact_missed: int | None = None
+    exact_poses: int | None = None
 
 
 @jax.jit
@@ -94,7 +101,9 @@ def nearest_pose(target: Target, shelf: Shelf, pose: Float[np.ndarray, " 3"]) ->
     return int(np.flatnonzero(at_place)[np.argmin(np.abs(turn[at_place]))])
 
 
-def look_at(source: str, scenario: Scenario, problem: Problem, camera: Camera, shelf: Shelf) -> Row:
+def look_at(
+    source: str, scenario: Scenario, problem: Problem, camera: Camera, shelf: Shelf, exact: bool = False
+) -> Row:
     """What a scene is like.
 
     Args:
@@ -102,6 +111,7 @@ def look_at(source: str, scenario: Scenario, problem: Problem, camera: Camera, s
       scenario: the scene.
       problem: built for its target.
       camera, shelf: static.
+      exact: whether to look at f by brute force, too.
     """
     world = from_scenario(scenario)
     only_target = world.replace(valid=jnp.arange(TARGET + 1) == TARGET)
@@ -111,6 +121,14 @@ def look_at(source: str, scenario: Scenario, problem: Problem, camera: Camera, s
     body = scenario.target
     yaw = 2 * np.arctan2(body.quaternion[3], body.quaternion[0])
     truth = nearest_pose(problem.target, shelf, np.array([*body.position[:2], yaw]))
+    counted = {}
+    if exact:
+        cells, poses = (np.asarray(exact_existence(problem, true_superquadrics(world), side)) for side in (SIDE, 1))
+        counted = {
+            "exact_cells": int(cells.sum()),
+            "exact_missed": int((cells & ~exists).sum()),
+            "exact_poses": int(poses.sum()),
+        }
     return Row(
         source=source,
         scenario=scenario.name,
@@ -124,17 +142,19 @@ def look_at(source: str, scenario: Scenario, problem: Problem, camera: Camera, s
         target_share=round(shown / max(whole, 1), 4),
         visible=int((pixels >= PIXELS).sum()),
         objects_share=round(float(np.mean(pixels / np.maximum(alone, 1))), 4) if len(pixels) else 1.0,
+        **counted,
     )
 
 
 def look_at_all(
-    sources: Mapping[str, Sequence[Scenario]], watcher: Callable[[int], None] = lambda done: None
+    sources: Mapping[str, Sequence[Scenario]], watcher: Callable[[int], None] = lambda done: None, exact: bool = False
 ) -> list[Row]:
     """What the scenes of several sources are like.
 
     Args:
       sources: scenes by the name of where they come from.
       watcher: is told how many are done.
+      exact: whether to look at f by brute force, too, which takes seconds a scene.
 
     Raises:
       InputError: a target cannot be grasped.
@@ -144,7 +164,7 @@ def look_at_all(
     rows: list[Row] = []
     for source, scenarios in sources.items():
         for scenario in scenarios:
-            rows.append(look_at(source, scenario, problems(target_of(scenario)), camera, shelf))
+            rows.append(look_at(source, scenario, problems(target_of(scenario)), camera, shelf, exact))
             watcher(len(rows))
     return rows
 
@@ -164,6 +184,16 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def _figures(rows: Sequence[Row]) -> dict[str, Any]:
     possible = [row.possible for row in rows]
     p10, p90 = np.percentile(possible, (10, 90))
+    exact = [row for row in rows if row.exact_cells is not None]
+    cells, missed, poses = (
+        sum(getattr(row, f"exact_{name}") for row in exact) for name in ("cells", "missed", "poses")
+    )
+    by_brute_force = {
+        "exact_scenes": len(exact),
+        "possible_over_exact_cells": sum(row.possible for row in exact) / max(cells, 1),
+        "exact_cells_over_exact_poses": cells / max(poses, 1),
+        "exact_missed_share": missed / max(cells, 1),
+    }
     return {
         "scenes": len(rows),
         "possible_mean": statistics.mean(possible),
@@ -179,6 +209,7 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
         "target_share_mean": statistics.mean(row.target_share for row in rows),
         "visible_mean": statistics.mean(row.visible for row in rows),
         "objects_share_mean": statistics.mean(row.objects_share for row in rows),
+        **(by_brute_force if exact else {}),
     }
 
 

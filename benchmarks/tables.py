@@ -238,7 +238,13 @@ def scenes_table(rows: Sequence[scenes.Row]) -> Group:
         "pose that is nearest to the target's. hidden, ≤100, >100: scenes by the target's pixels. seen: share of the "
         "target's pixels. visible: objects that show at least 100 pixels. of each: share of an object's that is seen."
     )
-    return Group(table, Text(explanation, style="dim"))
+    told = [
+        f"{line['source']}, {line['objects']} objects: f is {line['possible_over_exact_cells']:.2f} times what brute "
+        f"force finds, and lacks {100 * line['exact_missed_share']:.1f}% of that"
+        for line in scenes.summary(rows)
+        if "exact_scenes" in line
+    ]
+    return Group(table, Text(explanation, style="dim"), *(Text(one) for one in told))
 
 
 def scene_sets_table() -> Table:

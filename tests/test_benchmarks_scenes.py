@@ -10,10 +10,11 @@ from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO
 
 from mechsearch_jax.benchmarks import scenes
 from mechsearch_jax.benchmarks.evaluate import present_code
+from mechsearch_jax.benchmarks.exact_existence import exact_existence
 from mechsearch_jax.benchmarks.scenes import Row, look_at_all, nearest_pose, save_scenes, summary
 from mechsearch_jax.benchmarks.tables import scenes_table
-from mechsearch_jax.envs.simulated_camera import observe
-from mechsearch_jax.envs.world import TARGET, from_scenario
+from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS, observe, target_pixels
+from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Scenario
@@ -61,6 +62,41 @@ def test_f_is_that_of_a_target_that_is_not_seen(looked):
     assert 10 < looked["hidden"].possible < 200
     assert looked["two"].possible > looked["hidden"].possible
     assert {row.candidates for row in looked.values()} == {792}
+
+
+@pytest.mark.slow
+def test_brute_force_finds_the_poses_at_which_the_image_shows_too_few_pixels_to_detect(problem):
+    for scene in (HIDDEN, TWO):
+        world = from_scenario(scene)
+        exists = np.asarray(exact_existence(problem, true_superquadrics(world), side=1))
+        cells = np.asarray(exact_existence(problem, true_superquadrics(world), side=3))
+        assert not (exists & ~cells).any()
+        assert exists.sum() < cells.sum()
+        # Half of them where it exists, half elsewhere.
+        rng = np.random.default_rng(0)
+        asked = np.concatenate(
+            [rng.choice(np.flatnonzero(exists == there), 15, replace=False) for there in (True, False)]
+        )
+        for i in asked:
+            x, y, _ = np.asarray(problem.poses[i])
+            moved = world.replace(position=world.position.at[TARGET, :2].set(np.array([x, y])))
+            pixels = int(target_pixels(Camera(), moved))
+            # The edges of superquadrics are a little rounder than those of bodies.
+            if not 60 < pixels < 160 and not (pixels == 0 and not exists[i]):
+                assert exists[i] == (pixels <= FOUND_PIXELS)
+            # Where it shows nothing it exists, unless it would stand in an object.
+            if pixels == 0 and not exists[i]:
+                assert min(np.hypot(*(np.array(b.position[:2]) - (x, y))) for b in scene.objects) < 0.12
+
+
+def test_rows_by_brute_force_say_how_much_larger_f_is():
+    exact = dataclasses.replace(ROW, exact_cells=32, exact_missed=1, exact_poses=20)
+    line = summary([exact, dataclasses.replace(exact, possible=30, exact_cells=30), ROW])[0]
+    assert line["exact_scenes"] == 2
+    assert line["possible_over_exact_cells"] == pytest.approx(70 / 62)
+    assert line["exact_cells_over_exact_poses"] == pytest.approx(62 / 40)
+    assert line["exact_missed_share"] == pytest.approx(2 / 62)
+    assert "exact_scenes" not in summary([ROW])[0]
 
 
 def test_the_nearest_pose_is_near_in_place_and_yaw():
@@ -124,5 +160,5 @@ def test_figures_are_those_of_the_rows(tmp_path):
     assert value["code"] == present_code()
     with pytest.raises(InputError, match="there are no scenes"):
         save_scenes([], tmp_path / "none.json")
-    table, _ = scenes_table(rows).renderables
+    table, *_ = scenes_table(rows).renderables
     assert table.row_count == 3

@@ -276,11 +276,12 @@ def bench_push(
     console.print(push_scores_tables(measured))
 
 
-def bench_scenes(scenarios: Scenarios, /, *, out: JsonFile = None) -> None:
+def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile = None) -> None:
     """Tell what scenes are like at their start: size of f, and what is seen of the target and of the objects.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets; each is a source of its own.
+      exact: also find f by brute force, at full resolution and 25 places of each cell; seconds a scene.
       out: JSON file for the figures and for every scene's row.
     """
     from rich.console import Console
@@ -301,7 +302,7 @@ def bench_scenes(scenarios: Scenarios, /, *, out: JsonFile = None) -> None:
     console = Console(highlight=False)
     total = sum(map(len, sources.values()))
     with console.status("looking") as status:
-        rows = scenes.look_at_all(sources, lambda done: status.update(f"looking {done}/{total}"))
+        rows = scenes.look_at_all(sources, lambda done: status.update(f"looking {done}/{total}"), exact)
     if out is not None:
         scenes.save_scenes(rows, out)
     console.print(scenes_table(rows))

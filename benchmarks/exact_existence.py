@@ -1,0 +1,83 @@
+"""f by brute force: what a target would show is counted at the camera's full resolution, without any margin.
+
+The measure for `existence`, which looks at a coarse image and at five places of a cell.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from mechsearch_jax.existence import (
+    ExistenceConfig,
+    ExistenceTables,
+    allowances,
+    existence,
+    existence_tables,
+    object_views,
+)
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.planner import Problem
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.target import Target
+
+# Places along each side of a cell, its edges among them.
+SIDE = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class FullResolution(ExistenceConfig):
+    """Every pixel of the camera counts, and every overlap.
+
+    Attributes:
+      side: a target is tried at so many places along each side of its cell, in a square grid; 1 is the middle alone.
+    """
+
+    downscale: int = 1
+    closer_look: int = 0
+    erosion: float = 0.0
+    window: tuple[int, int] = (336, 336)
+    side: int = 1
+
+    @property
+    def places(self) -> np.ndarray:
+        """As of `ExistenceConfig`; the yaw is the pose's own."""
+        along = np.linspace(-1.0, 1.0, self.side) if self.side > 1 else np.zeros(1)
+        x, y = np.meshgrid(along, along, indexing="ij")
+        # The middle comes first.
+        grid = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+        return grid[np.argsort(np.abs(grid).sum(axis=1), kind="stable")].astype(np.float32)
+
+
+@functools.cache
+def _tables(problem_key: tuple, config: FullResolution) -> ExistenceTables:
+    camera, shelf, target = problem_key
+    return existence_tables(camera, shelf, target, config)
+
+
+@functools.partial(jax.jit, static_argnames=("camera", "target", "config"))
+def _possible(
+    tables: ExistenceTables, camera: Camera, target: Target, scene: Superquadrics, config: FullResolution
+) -> Bool[Array, " x"]:
+    everywhere = jnp.ones(tables.corner.shape[0], bool)
+    views = object_views(tables, camera, scene, everywhere, config)
+    allowed = allowances(tables, camera, target, scene, views, config)
+    return existence(tables, camera, views, everywhere, allowed, config)
+
+
+def exact_existence(problem: Problem, scene: Superquadrics, side: int = SIDE) -> Bool[Array, " x"]:
+    """The candidate poses whose cell holds a place where the target would be hidden and overlap nothing.
+
+    Args:
+      problem: says the camera, the shelf and the target.
+      scene: the objects, fields (N, ...).
+      side: how many places of a cell are looked at along each side; 1 is the candidate pose alone.
+    """
+    config = FullResolution(side=side)
+    tables = _tables((problem.camera, problem.shelf, problem.target), config)
+    return _possible(tables, problem.camera, problem.target, scene, config)
