@@ -24,7 +24,7 @@ from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.prediction import LaterPlacementsStay, PredictByKind, first_scenes, push_model_of
 from mechsearch_jax.planner.proposal import ALONE, DEPTH, blame, passed_on, sampling_weights
-from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values
+from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, sequence_values
 from mechsearch_jax.workspace import scenario
 
 CONFIG = PlannerConfig()
@@ -468,6 +468,17 @@ def test_what_is_dear_is_not_chosen():
         charge = jnp.float32([[price * 20.0], [0.0]])
         value = [prefix_values(c, h, jnp.array([True]), 0.9)[0] for c, h in zip(cost, charge, strict=True)]
         assert int(np.argmin(value)) == best
+
+
+def test_a_risk_is_taken_only_where_nothing_else_gains():
+    acted = jnp.ones((2, 1), bool)
+    risky = jnp.float32([[19.0], [0.0]])
+    # The first sequence gains 10 at a risk of 19; the second 0.1 or 4 at none.
+    for safe, best, value in ((19.9, 0, -10.0), (16.0, 1, -4.0)):
+        values, length = sequence_values(jnp.float32([[20.0, 10.0], [20.0, safe]]), risky, acted, 0.9)
+        assert int(jnp.argmin(values)) == best
+        assert float(values[best]) == pytest.approx(value)
+        assert length.tolist() == [1, 1]
 
 
 @pytest.mark.slow

@@ -68,7 +68,8 @@ class PlannerConfig:
       horizon: M, actions in a sequence; static.
       sequences: how many sequences are sampled for a decision; static.
       unseen_contact_penalty: what touching the target unseen would cost, in units of J: a sampled action is charged
-        with J times the share of the possible poses at which it would do so. The paper charges nothing.
+        with J times the share of the possible poses at which it would do so, unless no sequence gains anything then.
+        The paper charges nothing.
       topple_charge: what an object that falls over would cost, in units of J: a sampled push is charged with J times
         the number of objects that are expected to. `ActionConfig.topple` says which pushes are ruled out altogether;
         to charge what is left with 0.5 gained nothing.

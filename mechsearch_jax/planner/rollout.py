@@ -32,6 +32,8 @@ from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import Propose
 from mechsearch_jax.planner.state import Decision, Sequences, State
 
+# A sequence whose value is a smaller share of J gains nothing.
+GAIN = 0.02
 # What an action changes in a state, and what is then computed for the next one.
 CHANGING = ("scene", "target_at", "moved", "available", "alive", "options")
 
@@ -46,6 +48,19 @@ def prefix_values(
     discount = gamma ** jnp.arange(charge.shape[0], dtype=jnp.float32)
     values = jnp.where(acted, jnp.cumsum(discount * (jnp.diff(cost) + charge)), jnp.inf)
     return jnp.min(values), jnp.argmin(values) + 1
+
+
+def sequence_values(
+    cost: Float[Array, "s n"], charge: Float[Array, "s m"], acted: Bool[Array, "s m"], gamma: Array | float
+) -> tuple[Float[Array, " s"], Int[Array, " s"]]:
+    """`prefix_values` of all sequences, which begin in the same state.
+
+    Where none of them gains anything, nothing is charged: a risk is taken rather than nothing done.
+    """
+    values = jax.vmap(functools.partial(prefix_values, gamma=gamma))
+    charged, free = values(cost, charge, acted), values(cost, jnp.zeros_like(charge), acted)
+    stuck = jnp.min(charged[0]) > -GAIN * cost[0, 0]
+    return jax.tree.map(functools.partial(jnp.where, stuck), free, charged)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -226,8 +241,7 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     )
     actions, price = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, price))
     cost, now = jnp.swapaxes(cost, 0, 1), cost[0, 0]
-    values = jax.vmap(functools.partial(prefix_values, gamma=config.gamma))
-    value, length = values(cost, price * cost[:, :-1], actions.kind != ActionKind.NONE)
+    value, length = sequence_values(cost, price * cost[:, :-1], actions.kind != ActionKind.NONE, config.gamma)
     # Without the target's slot, which comes after those of the objects.
     after = jax.tree.map(lambda a: a[0, :, : objects.capacity], scenes)
     sequences = Sequences(actions, cost[:, 1:], value, length, after)
