@@ -19,7 +19,7 @@ from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.arrays import read_arrays
 from mechsearch_jax.envs.episodes import Moment
 from mechsearch_jax.envs.native import Trace
-from mechsearch_jax.envs.sampled import Foresee, Sampled, nothing_sampled, packed, sampled, unpacked
+from mechsearch_jax.envs.sampled import Sampled, nothing_sampled, packed, sampled, unpacked
 from mechsearch_jax.envs.simulator import ARM
 from mechsearch_jax.envs.world import BODIES, World
 from mechsearch_jax.errors import InputError
@@ -104,12 +104,11 @@ class Traced(Protocol):
 class Recorder:
     """Collects the steps of an episode that runs alone."""
 
-    def __init__(self, simulator: Traced, foresee: Foresee | None = None):
+    def __init__(self, simulator: Traced):
         """Args:
         simulator: of the episode.
-        foresee: predicts the actions that a decision chose from, if anything does.
         """
-        self._simulator, self._foresee = simulator, foresee
+        self._simulator = simulator
         self._steps: list[RecordedStep] = []
 
     def note(self, moment: Moment, frame: Frame) -> None:
@@ -119,11 +118,10 @@ class Recorder:
           moment: all that is known of it.
           frame: its picture.
         """
-        acted, foresee = moment.outcome is not None, self._foresee
+        acted = moment.outcome is not None
         chosen_from = nothing_sampled()
         if acted and moment.decision is not None:
-            foreseen = None if foresee is None else lambda: foresee(moment)
-            chosen_from = sampled(moment.decision.sequences, foreseen)
+            chosen_from = sampled(moment.decision.sequences)
         assert frame.target_pose is not None
         self._steps.append(
             RecordedStep(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -11,16 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mechsearch_jax.actions import Action, ActionKind, kind_of, no_action
-from mechsearch_jax.envs.episodes import Moment
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.planner import Problem
-from mechsearch_jax.planner.policies import Policy, Search
-from mechsearch_jax.planner.prediction import first_scenes, push_model_of
 from mechsearch_jax.planner.state import Sequences
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
-
-# Where the objects are predicted to be after each first action, fields (K, N, ...).
-Foresee = Callable[[Moment], Superquadrics]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,41 +48,15 @@ class Sampled:
         return scene.replace(position=self.position[k], rotation=self.rotation[k])
 
 
-def foresight(policy: Policy, problem: Problem) -> Foresee | None:
-    """How a policy predicts what it samples; None for one that does not tell, such as one of one's own."""
-    model = push_model_of(policy.predict) if isinstance(policy, Search) else None
-    if model is None:
-        return None
-
-    def foresee(moment: Moment) -> Superquadrics:
-        assert moment.decision is not None
-        actions = jax.tree.map(lambda a: a[:, 0], moment.decision.sequences.actions)
-        return first_scenes(model, problem, moment.belief, moment.observation.objects, actions)
-
-    return foresee
-
-
-def sampled(sequences: Sequences, foresee: Callable[[], Superquadrics] | None = None) -> Sampled:
-    """What a decision chose from.
-
-    Args:
-      sequences: all that it sampled.
-      foresee: predicts their first actions, if anything does.
-    """
+def sampled(sequences: Sequences) -> Sampled:
+    """What a decision chose from: all that it sampled."""
     found = jax.device_get(sequences)
     action, value, cost = jax.tree.map(lambda a: a[:, 0], found.actions), found.value, found.cost[:, 0]
     rows = np.flatnonzero((action.kind != ActionKind.NONE) & np.isfinite(value) & np.isfinite(cost))
     if not len(rows):
         return nothing_sampled()
-    scenes = None if foresee is None else jax.device_get(foresee())
-    empty = nothing_sampled()
-    return Sampled(
-        action=jax.tree.map(lambda a: a[rows], action),
-        value=value[rows],
-        cost=cost[rows],
-        position=empty.position if scenes is None else scenes.position[rows],
-        rotation=empty.rotation if scenes is None else scenes.rotation[rows],
-    )
+    chosen = jax.tree.map(lambda a: a[rows], (action, value, cost, found.after.position, found.after.rotation))
+    return Sampled(*chosen)
 
 
 def nothing_sampled() -> Sampled:

@@ -32,13 +32,6 @@ PUSH = jax.tree.map(
 RETRIEVAL = jax.tree.map(np.asarray, retrieve_action(GRIPPER, jnp.float32(0.7), jnp.float32(0.08)))
 # Two sequences of two actions, and one that found nothing to do.
 FAR = PUSH.replace(displacement=2 * PUSH.displacement)
-SEQUENCES = Sequences(
-    actions=jax.tree.map(lambda a, b, c: np.array([[a, b], [b, c], [c, c]]), PUSH, FAR, jax.device_get(no_action())),
-    cost=np.array([[90.0, 80.0], [95.0, 95.0], [np.nan, np.nan]], np.float32),
-    value=np.array([-30.0, -10.0, np.inf], np.float32),
-    length=np.array([2, 1, 1], np.int32),
-    after=jax.tree.map(lambda a: np.stack([a] * 3), OBJECTS),
-)
 
 
 def shifted(*shifts):
@@ -48,7 +41,14 @@ def shifted(*shifts):
     return every.replace(position=np.stack(moved))
 
 
-SAMPLED = sampled(SEQUENCES, lambda: shifted(0.1, 0.2, 0.0))
+SEQUENCES = Sequences(
+    actions=jax.tree.map(lambda a, b, c: np.array([[a, b], [b, c], [c, c]]), PUSH, FAR, jax.device_get(no_action())),
+    cost=np.array([[90.0, 80.0], [95.0, 95.0], [np.nan, np.nan]], np.float32),
+    value=np.array([-30.0, -10.0, np.inf], np.float32),
+    length=np.array([2, 1, 1], np.int32),
+    after=shifted(0.1, 0.2, 0.0),
+)
+SAMPLED = sampled(SEQUENCES)
 # What a simulator does: it sets the arm to where an action begins, and home after it.
 MOVES, RESTS = 1.0, 0.4
 

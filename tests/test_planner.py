@@ -12,7 +12,6 @@ from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionConfig, ActionKind
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.types import Prediction, Sample
-from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.errors import InputError
@@ -22,7 +21,7 @@ from mechsearch_jax.graspability import GraspConfig, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner.config import Weights
-from mechsearch_jax.planner.prediction import LaterPlacementsStay, PredictByKind, first_scenes, push_model_of
+from mechsearch_jax.planner.prediction import LaterPlacementsStay, PredictByKind
 from mechsearch_jax.planner.proposal import ALONE, DEPTH, blame, passed_on, sampling_weights
 from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, sequence_values
 from mechsearch_jax.workspace import scenario
@@ -647,35 +646,3 @@ def test_decisions_in_a_batch_are_those_made_alone(problem):
         assert int(together.action.kind[i]) == int(alone.action.kind)
         assert int(together.action.object[i]) == int(alone.action.object)
         np.testing.assert_allclose(together.action.T_world_gripper[i], alone.action.T_world_gripper, atol=1e-4)
-
-
-def drags(shelf, scene, pusher, T_world_gripper, displacement, q7):
-    """A push model that moves everything along."""
-    after = scene.replace(position=scene.position + displacement[None])
-    return PushOutcome(after, jnp.float32(0.0), jnp.zeros(scene.capacity))
-
-
-def test_first_scenes_are_what_is_predicted_of_each_kind_of_action(problem):
-    size = jnp.full((2, 3), 0.03)
-    position = jnp.array([[0.5, 0.0, 0.44], [0.6, 0.1, 0.44]])
-    objects = superquadric.pad(
-        superquadric.empty(2).replace(size=size, position=position, valid=jnp.ones(2, bool)), scenario.MAX_OBJECTS
-    )
-    here = jnp.eye(4).at[:3, 3].set(position[1])
-    push = no_action().replace(kind=jnp.int32(ActionKind.PUSH), displacement=jnp.array([0.0, 0.05, 0.0]))
-    pick = no_action().replace(
-        kind=jnp.int32(ActionKind.PICK_AND_PLACE),
-        object=jnp.int32(1),
-        T_world_gripper=here,
-        T_world_place=here.at[0, 3].add(0.1),
-    )
-    actions = jax.tree.map(lambda *each: jnp.stack(each), push, pick, no_action())
-    predict = LaterPlacementsStay(PredictByKind(drags, QuasiStatic()))
-    assert push_model_of(predict) is drags
-    assert push_model_of(lambda *arguments: None) is None
-    found = first_scenes(drags, problem, planner.initial_belief(problem), objects, actions)
-    moved = np.asarray(found.position) - np.asarray(objects.position)
-    assert found.capacity == objects.capacity
-    np.testing.assert_allclose(moved[0, :2], [[0.0, 0.05, 0.0]] * 2, atol=1e-6)
-    np.testing.assert_allclose(moved[1, :2], [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], atol=1e-6)
-    np.testing.assert_allclose(moved[2], 0.0)

@@ -109,13 +109,12 @@ def search(
             from mechsearch_jax.envs.native import NativeSimulator
             from mechsearch_jax.envs.recognisers import recogniser
             from mechsearch_jax.envs.recording import NAME, TRACE_EVERY, Recorder, save_recording
-            from mechsearch_jax.envs.sampled import foresight
             from mechsearch_jax.viz.filmstrip import filmstrip
 
             simulator = NativeSimulator(
                 config=SimulatorConfig(trace_every=TRACE_EVERY), shelf=workcell.shelf, camera=workcell.camera
             )
-            recorder = Recorder(simulator, foresight(policy_now, problem) if record or video is not None else None)
+            recorder = Recorder(simulator)
             narrator = Narrator(console, status, problem, recorder.note)
             episode = run_episode(
                 seed,

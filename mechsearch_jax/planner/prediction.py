@@ -10,12 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from mechsearch_jax.actions.registry import KINDS, ActionKind
-from mechsearch_jax.actions.types import Action, Prediction, Sample
+from mechsearch_jax.actions.registry import KINDS
+from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.dynamics.push_model import PushModel
-from mechsearch_jax.dynamics.rigid import moved_objects, pick_and_place
-from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.planner.belief import Belief, with_target
+from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.planner.moved_target import beyond_candidates
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.state import State
@@ -94,38 +92,3 @@ class PredictByKind:
         found = found.replace(possible=found.possible & ~jnp.any(lost))
         after = jax.tree.map(lambda new, old: jnp.where(found.possible, new, old), found.scene, scene)
         return found.replace(scene=after)
-
-
-def push_model_of(predict: Predict) -> PushModel | None:
-    """What pushes are predicted with that are the first action of a sequence; None for another slot than the usual."""
-    if isinstance(predict, LaterPlacementsStay):
-        return push_model_of(predict.inner)
-    return predict.push_model if isinstance(predict, PredictByKind) else None
-
-
-@functools.partial(jax.jit, static_argnums=(0,))
-def first_scenes(
-    push_model: PushModel, problem: Problem, belief: Belief, objects: Superquadrics, actions: Action
-) -> Superquadrics:
-    """What `PredictByKind` predicts of actions that it found possible, each the first of its sequence.
-
-    Args:
-      push_model: predicts pushes; static.
-      problem, belief: what does not change, and what is known.
-      objects: as recognised, fields (N, ...).
-      actions: pushes and pick-and-places, fields (K, ...); others change nothing.
-
-    Returns:
-      The objects after each, without the target, fields (K, N, ...).
-    """
-    scene, _ = with_target(problem, belief, objects)
-
-    def after(action: Action) -> Superquadrics:
-        pushes, picks = action.kind == ActionKind.PUSH, action.kind == ActionKind.PICK_AND_PLACE
-        way, pusher = jnp.where(pushes, action.displacement, 0.0), problem.actions.pusher
-        pushed = push_model(problem.space.shelf, scene, pusher, action.T_world_gripper, way, action.q7).scene
-        placed = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
-        moved = jax.tree.map(lambda a, b, c: jnp.where(pushes, a, jnp.where(picks, b, c)), pushed, placed, scene)
-        return jax.tree.map(lambda a: a[: objects.capacity], moved)
-
-    return jax.vmap(after)(actions)
