@@ -178,6 +178,27 @@ def test_the_table_of_scenes_is_the_stored_result():
     assert set(re.findall(r"`(published-\d-\d\d)` \((\d+)\)", read("docs/results.md"))) == in_sight
 
 
+def test_the_rates_of_the_readme_and_of_the_results_are_the_stored_ones():
+    runs = json.loads((ROOT / "benchmarks/results/rehearsal-h200.json").read_text())["runs"]
+    rates = ("found", "graspable", "retrieved")
+    published = {key.split("-")[1]: row for key, row in runs[0]["by_objects"].items() if key != "all"}
+    told = re.findall(
+        r"^\| (\d) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \| [\d.]+ \| [\d.]+ \|$", read("README.md"), re.MULTILINE
+    )
+    assert [objects for objects, *_ in told] == ["2", "4", "6", "8"]
+    for objects, *figures in told:
+        assert figures == [f"{published[objects][rate]:.2f}" for rate in rates]
+    table = read("docs/results.md")
+    columns = ("object_left_board", "target_tipped_or_fell", "held_up", "truth_ruled_out", "mean_steps")
+    for run, label in zip(runs, ("published", "`c2`", "`c2`, nothing rehearsed"), strict=True):
+        for key, row in run["by_objects"].items():
+            if key != "all":
+                places = (3, 3, 2, 3, 1)
+                rest = [f"{row[c]:.{n}f}" for c, n in zip(columns, places, strict=True)]
+                cells = [label, key[-1], str(row["episodes"]), *(f"{row[rate]:.2f}" for rate in rates), *rest]
+                assert f"| {' | '.join(cells)} |" in table
+
+
 def test_stored_scenes_are_those_on_record():
     stored = json.loads((ROOT / "benchmarks/results/scenes-cpu.json").read_text())
     made = {(row[1], row[2]) for row in stored["rows"] if row[0] in SETS}
