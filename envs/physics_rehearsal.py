@@ -6,6 +6,9 @@ and the arm moves as the environment's does. The environment's own simulator is 
 An approximation: what is not recognised is not there, a hidden target least of all.
 """
 
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 import dataclasses

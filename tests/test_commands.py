@@ -442,6 +442,14 @@ def test_generated_scenarios_are_good_and_reproducible(folder):
         assert (folder / "a" / name).read_bytes() == (folder / "b" / name).read_bytes()
 
 
+def test_who_stops_reading_ends_a_command_without_a_word(folder):
+    program = (sys.executable, "-m", "mechsearch_jax.commands.main", "bench", "plan", "--help")
+    with subprocess.Popen(program, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as running:
+        running.stdout.close()
+        assert running.stderr.read() == b""
+    assert running.returncode == 141
+
+
 def test_a_complaint_is_one_line_on_a_terminal_that_knows_ascii_alone(folder):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     program = (

@@ -12,6 +12,7 @@ import gc
 import importlib.metadata
 import inspect
 import io
+import os
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -164,6 +165,10 @@ def main() -> None:
     except KeyboardInterrupt:
         print("mechsearch: stopped", file=sys.stderr)
         raise SystemExit(130) from None
+    except BrokenPipeError:
+        # Who reads has seen enough, as `head` has. What is left is written nowhere when Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(141) from None
 
 
 if __name__ == "__main__":
