@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -60,10 +61,20 @@ class NativeRehearsal:
     Attributes:
       simulation: how it is simulated.
       threads: how many; one for each of `cores.cores` if left out.
+      frictions: sliding frictions that an action is tried out with, as multiples of what they are taken to be. Of
+        several the worst counts, so that who does not know the friction names the range.
+
+    Raises:
+      InputError: there are no frictions, or one is not positive.
     """
 
     simulation: SimulatorConfig = dataclasses.field(default_factory=SimulatorConfig)
     threads: int | None = None
+    frictions: tuple[float, ...] = (1.0,)
+
+    def __post_init__(self):
+        if not self.frictions or not all(0.0 < friction < math.inf for friction in self.frictions):
+            raise InputError(f"NativeRehearsal: frictions {self.frictions} must be one or more positive numbers")
 
     def __call__(
         self,
@@ -85,7 +96,7 @@ class NativeRehearsal:
         world = _world(problem, scene, pose, jnp.asarray(found))
         motion = dataclasses.replace(self.simulation.motion, gripper=problem.gripper)
         simulation = dataclasses.replace(self.simulation, motion=motion)
-        where = problem.shelf, simulation, self.threads or cores()
+        where = problem.shelf, dataclasses.replace(self, simulation=simulation, threads=self.threads or cores())
         if not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((world, actions, asked))):
             host: tuple[World, Action, np.ndarray] = jax.device_get((world, actions, asked))
             return jax.device_put(_tried_alone(*where, *host))
@@ -136,23 +147,22 @@ def _references(
 
 
 def _tried_alone(
-    shelf: Shelf, config: SimulatorConfig, threads: int, world: World, actions: Action, asked: Bool[np.ndarray, " k"]
+    shelf: Shelf, how: NativeRehearsal, world: World, actions: Action, asked: Bool[np.ndarray, " k"]
 ) -> Int[np.ndarray, " k"]:
     """What becomes of the actions in one scene; a motion is computed when its action is tried."""
 
     def motion(_: int, i: int) -> Motion:
         action: Action = jax.tree.map(lambda a: jnp.asarray(a[i]), actions)
-        return jax.device_get(reference_motion(kind_of(int(actions.kind[i])), action, config.motion))
+        return jax.device_get(reference_motion(kind_of(int(actions.kind[i])), action, how.simulation.motion))
 
     told: Any = jax.tree.map(lambda a: a[None], (world, actions.kind, actions.object, asked))
     worlds, kind, index, some = told
-    return _in_turn(shelf, config, threads, worlds, kind, index, some, motion)[0]
+    return _in_turn(shelf, how, worlds, kind, index, some, motion)[0]
 
 
 def _tried(
     shelf: Shelf,
-    config: SimulatorConfig,
-    threads: int,
+    how: NativeRehearsal,
     world: World,
     kind: Array,
     index: Array,
@@ -173,13 +183,12 @@ def _tried(
     def motion(row: int, i: int) -> Motion:
         return jax.tree.map(lambda a: a[row, i], motions)
 
-    return _in_turn(shelf, config, threads, worlds, kinds, indices, some, motion).reshape(*lead, -1)
+    return _in_turn(shelf, how, worlds, kinds, indices, some, motion).reshape(*lead, -1)
 
 
 def _in_turn(
     shelf: Shelf,
-    config: SimulatorConfig,
-    threads: int,
+    how: NativeRehearsal,
     world: World,
     kind: Int[np.ndarray, "n k"],
     index: Int[np.ndarray, "n k"],
@@ -189,12 +198,14 @@ def _in_turn(
     """What becomes of the actions of each scene, tried in their order until one succeeds.
 
     Args:
-      shelf, config, threads: where, how, and how many at a time.
+      shelf: where.
+      how: as it is tried out; its threads are known.
       world: fields with a leading axis.
       kind, index: codes of the actions, and the objects that they move.
       asked: which are to be tried.
       motion: of an action by row and column.
     """
+    threads = how.threads or 1
     told = np.full(asked.shape, Rehearsed.HARMFUL, np.int32)
     left = {row: iter(np.flatnonzero(asked[row]).tolist()) for row in np.flatnonzero(asked.any(axis=1)).tolist()}
     with ThreadPoolExecutor(threads) as pool:
@@ -205,26 +216,28 @@ def _in_turn(
                 (jax.tree.map(lambda a, row=row: a[row], world), int(kind[row, i]), motion(row, i), int(index[row, i]))
                 for row, i in some
             ]
-            for at, result in zip(some, pool.map(lambda task: _tried_out(shelf, config, *task), tasks), strict=True):
+            for at, result in zip(some, pool.map(lambda task: _tried_out(shelf, how, *task), tasks), strict=True):
                 told[at] = result
             tried = {row for row, _ in some}
             left = {r: rest for r, rest in left.items() if r in tried and told[r].max() < Rehearsed.SUCCEEDED}
     return told
 
 
-def _tried_out(shelf: Shelf, config: SimulatorConfig, world: World, kind: int, motion: Motion, index: int) -> Rehearsed:
-    """What becomes of one action."""
+def _tried_out(shelf: Shelf, how: NativeRehearsal, world: World, kind: int, motion: Motion, index: int) -> Rehearsed:
+    """What becomes of one action, with the friction that is worst for it."""
     if motion is None or not motion[1]:
         return Rehearsed.FAILED
     if not sound(*jax.tree.map(lambda a: a[None], (world, motion[0]))):
         return Rehearsed.HARMFUL
-    here = NativeWorld(shelf, config=config)
-    try:
-        here.place(bodies_of(world))
-        succeeds, harmless = here.rehearse(kind_of(kind), motion[0], index)
-    except (ValueError, mujoco.FatalError):
-        # A scene that cannot be built must not end those beside it.
-        return Rehearsed.HARMFUL
-    if not harmless:
-        return Rehearsed.HARMFUL
-    return Rehearsed.SUCCEEDED if succeeds else Rehearsed.FAILED
+    here, worst = NativeWorld(shelf, config=how.simulation), Rehearsed.SUCCEEDED
+    for friction in how.frictions:
+        try:
+            here.place(bodies_of(world), friction)
+            succeeds, harmless = here.rehearse(kind_of(kind), motion[0], index)
+        except (ValueError, mujoco.FatalError):
+            # A scene that cannot be built must not end those beside it.
+            return Rehearsed.HARMFUL
+        if not harmless:
+            return Rehearsed.HARMFUL
+        worst = worst if succeeds else Rehearsed.FAILED
+    return worst

@@ -258,8 +258,8 @@ def test_the_hand_of_the_problem_is_the_one_that_is_rehearsed(problem):
     actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
     heard = []
 
-    def tried_alone(shelf, config, threads, *rest):
-        heard.append(config.motion.gripper)
+    def tried_alone(shelf, how, *rest):
+        heard.append(how.simulation.motion.gripper)
         return np.full(1, DONE, np.int32)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -274,16 +274,34 @@ def test_a_scene_that_cannot_be_built_costs_its_own_row_alone(problem, monkeypat
     seen, at = known(problem, EDGE)
     built = NativeWorld.place
 
-    def place(world, bodies):
+    def place(world, bodies, friction):
         if bodies[0].position[0] > 0.5:
             raise ValueError("no such body")
-        built(world, bodies)
+        built(world, bodies, friction)
 
     monkeypatch.setattr(NativeWorld, "place", place)
     other = seen.replace(position=seen.position.at[0, 0].set(0.55))
     actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
     said = jax.vmap(lambda here: MODEL(problem, here, at, False, actions, asked, PUSHES))(stack(other, seen))
     assert said.tolist() == [[HARM], [DONE]]
+
+
+def test_of_several_frictions_the_worst_counts(problem):
+    seen, at = known(problem, EDGE)
+    actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
+    # What is rough holds the hand up, and what is rougher still tips over.
+    for frictions, said in (
+        ((1.0,), DONE),
+        ((5.0,), FAILED),
+        ((1.0, 5.0), FAILED),
+        ((5.0, 1.0), FAILED),
+        ((5.0, 20.0), HARM),
+    ):
+        model = NativeRehearsal(frictions=frictions)
+        assert model(problem, seen, at, False, actions, asked, PUSHES).tolist() == [said]
+    for wrong in ((), (0.0,), (1.0, math.nan)):
+        with pytest.raises(InputError, match="one or more positive numbers"):
+            NativeRehearsal(frictions=wrong)
 
 
 def test_more_objects_than_the_simulator_has_slots_for_are_refused(problem):
@@ -344,7 +362,7 @@ def test_a_scene_that_is_none_is_harmed_and_leaves_the_others_alone(problem):
 def test_the_first_that_succeeds_is_the_same_with_any_number_of_threads(problem, monkeypatch, threads):
     made = []
 
-    def tried_out(shelf, config, world, kind, motion, index):
+    def tried_out(shelf, how, world, kind, motion, index):
         made.append(motion)
         return DONE if motion >= (3, 6)[int(world.kind)] else FAILED
 
@@ -353,7 +371,7 @@ def test_the_first_that_succeeds_is_the_same_with_any_number_of_threads(problem,
     world = from_scenario(begin(OPEN)).replace(kind=np.arange(2))
     world = world.replace(**{n: np.zeros(2) for n in ("half_size", "position", "rotation", "valid")})
     said = physics_rehearsal._in_turn(
-        problem.shelf, MODEL.simulation, threads, world, blank, blank, blank == 0, lambda row, i: i
+        problem.shelf, NativeRehearsal(threads=threads), world, blank, blank, blank == 0, lambda row, i: i
     )
     assert said.argmax(axis=1).tolist() == [3, 6]
     assert (said.max(axis=1) == DONE).all()
