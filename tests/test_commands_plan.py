@@ -72,6 +72,7 @@ def test_the_example_is_planned_on_and_written_as_files_like_a_users(see, tmp_pa
     assert json.loads((again / "step.json").read_text()) == step
 
 
+@pytest.mark.slow
 def test_a_search_goes_on_from_call_to_call(see, tmp_path, monkeypatch, capsys):
     see(OPEN)
     out, state = tmp_path / "out", tmp_path / "search.npz"

@@ -321,6 +321,7 @@ def test_the_policy_takes_out_what_can_be_and_searches_on_where_nothing_can(prob
         assert [kind == ActionKind.RETRIEVE for kind in kinds] == [takes, objects is OPEN]
 
 
+@pytest.mark.slow
 def test_a_policy_that_rehearses_decides_the_same_alone_and_mapped_over(problem):
     over, _, aside = pushes()
     policy = search_for_grasp(rehearsal=MODEL).replace(plan=planned(over, aside))

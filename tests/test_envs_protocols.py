@@ -164,6 +164,7 @@ def test_what_is_swept_at_some_grasp_must_meet_neither_objects_nor_shelf(problem
     assert not free(scene, pose.at[1].set(problem.shelf.left - 0.02), jnp.array(True))
 
 
+@pytest.mark.slow
 def test_slots_try_on_their_own(problem):
     """As alone: one succeeds at once, one at the third try, one never."""
     names = {"at once": 0, "third": 2, "never": 9}
