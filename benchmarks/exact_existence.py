@@ -29,6 +29,9 @@ from mechsearch_jax.workspace.target import Target
 # Places along each side of a cell, its edges among them.
 SIDE = 5
 
+# They take seconds, and are the same for every scene.
+_tables = functools.cache(existence_tables)
+
 
 @dataclasses.dataclass(frozen=True)
 class FullResolution(ExistenceConfig):
@@ -54,12 +57,6 @@ class FullResolution(ExistenceConfig):
         return grid[np.argsort(np.abs(grid).sum(axis=1), kind="stable")].astype(np.float32)
 
 
-@functools.cache
-def _tables(problem_key: tuple, config: FullResolution) -> ExistenceTables:
-    camera, shelf, target = problem_key
-    return existence_tables(camera, shelf, target, config)
-
-
 @functools.partial(jax.jit, static_argnames=("camera", "target", "config"))
 def _possible(
     tables: ExistenceTables, camera: Camera, target: Target, scene: Superquadrics, config: FullResolution
@@ -79,5 +76,5 @@ def exact_existence(problem: Problem, scene: Superquadrics, side: int = SIDE) ->
       side: how many places of a cell are looked at along each side; 1 is the candidate pose alone.
     """
     config = FullResolution(side=side)
-    tables = _tables((problem.camera, problem.shelf, problem.target), config)
+    tables = _tables(problem.camera, problem.shelf, problem.target, config)
     return _possible(tables, problem.camera, problem.target, scene, config)

@@ -184,16 +184,6 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def _figures(rows: Sequence[Row]) -> dict[str, Any]:
     possible = [row.possible for row in rows]
     p10, p90 = np.percentile(possible, (10, 90))
-    exact = [row for row in rows if row.exact_cells is not None]
-    cells, missed, poses = (
-        sum(getattr(row, f"exact_{name}") for row in exact) for name in ("cells", "missed", "poses")
-    )
-    by_brute_force = {
-        "exact_scenes": len(exact),
-        "possible_over_exact_cells": sum(row.possible for row in exact) / max(cells, 1),
-        "exact_cells_over_exact_poses": cells / max(poses, 1),
-        "exact_missed_share": missed / max(cells, 1),
-    }
     return {
         "scenes": len(rows),
         "possible_mean": statistics.mean(possible),
@@ -209,7 +199,20 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
         "target_share_mean": statistics.mean(row.target_share for row in rows),
         "visible_mean": statistics.mean(row.visible for row in rows),
         "objects_share_mean": statistics.mean(row.objects_share for row in rows),
-        **(by_brute_force if exact else {}),
+        **_by_brute_force([row for row in rows if row.exact_cells is not None]),
+    }
+
+
+def _by_brute_force(rows: Sequence[Row]) -> dict[str, Any]:
+    """Figures of the scenes in which f was found by brute force, too; nothing if there are none."""
+    if not rows:
+        return {}
+    cells, missed, poses = (sum(getattr(row, f"exact_{name}") for row in rows) for name in ("cells", "missed", "poses"))
+    return {
+        "exact_scenes": len(rows),
+        "possible_over_exact_cells": sum(row.possible for row in rows) / max(cells, 1),
+        "exact_cells_over_exact_poses": cells / max(poses, 1),
+        "exact_missed_share": missed / max(cells, 1),
     }
 
 

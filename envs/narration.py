@@ -60,16 +60,14 @@ class Narrator:
         self._sees(moment)
         if moment.decision is None:
             return
-        kind = kind_of(int(moment.decision.action.kind))
+        kind, refused = kind_of(int(moment.decision.action.kind)), int(moment.decision.refused)
         self._line("does", kind.describe(moment.decision.action, moment.observation.objects.capacity))
         if kind.takes_target:
             self._line("why", "a grasp that takes it out is known")
         elif kind.code == ActionKind.NONE:
-            refused = int(moment.decision.refused)
             self._line("why", f"each of the {refused} best does harm as it is tried out" if refused else NOTHING)
         elif record.sequences and record.predicted_cost is not None:
             length = int(moment.decision.sequences.length[0])
-            refused = int(moment.decision.refused)
             self._line(
                 "why",
                 f"cost {record.cost:.0f} now, {record.predicted_cost:.0f} expected after it; the best of "

@@ -21,8 +21,14 @@ from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from rich.console import Console
+    from rich.status import Status
 
+    from mechsearch_jax.envs.method import Method
+    from mechsearch_jax.envs.narration import Narrator
+    from mechsearch_jax.envs.recording import Recorder
     from mechsearch_jax.envs.records import Episode
+    from mechsearch_jax.planner import Problem
     from mechsearch_jax.workspace.scenario import Scenario
 
 
@@ -43,6 +49,42 @@ def _save(out: Path, scene: Scenario, episode: Episode, strip: Figure) -> None:
     save_figure(strip, out / "filmstrip.png")
     save_scenario(scene, out / "scenario.json")
     save_episode(episode, out / "episode.json")
+
+
+def _run(
+    console: Console, status: Status, chosen: Method, scene: Scenario, problem: Problem, seed: int
+) -> tuple[Episode, Narrator, Recorder]:
+    """Run the episode; what was told of it, and what was recorded."""
+    from mechsearch_jax.envs.episodes import run_episode
+    from mechsearch_jax.envs.simulator import SimulatorConfig
+    from mechsearch_jax.envs.warm_up import first_decision, prepared
+
+    policy, workcell = chosen.policy(), chosen.workcell
+    with prepared(first_decision(problem, policy), lambda text: console.print(text, style="dim")):
+        # These take long to import, and meanwhile what the first decision needs is read or compiled.
+        from mechsearch_jax.envs.narration import Narrator
+        from mechsearch_jax.envs.native import NativeSimulator
+        from mechsearch_jax.envs.recognisers import recogniser
+        from mechsearch_jax.envs.recording import TRACE_EVERY, Recorder
+
+        simulator = NativeSimulator(
+            config=SimulatorConfig(trace_every=TRACE_EVERY), shelf=workcell.shelf, camera=workcell.camera
+        )
+        recorder = Recorder(simulator)
+        narrator = Narrator(console, status, problem, recorder.note)
+        episode = run_episode(
+            seed,
+            scene,
+            problem,
+            policy,
+            simulator,
+            recogniser(chosen.recognition, problem.target),
+            chosen.config.max_steps,
+            chosen.options(),
+            narrator,
+            chosen.terms,
+        )
+    return episode, narrator, recorder
 
 
 def search(
@@ -75,10 +117,8 @@ def search(
     """
     from rich.console import Console
 
-    from mechsearch_jax.envs.episodes import run_episode, target_of
+    from mechsearch_jax.envs.episodes import target_of
     from mechsearch_jax.envs.generator import ScenarioGenerator
-    from mechsearch_jax.envs.simulator import SimulatorConfig
-    from mechsearch_jax.envs.warm_up import first_decision, prepared
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.viz.movie import check_movie_path
@@ -100,34 +140,13 @@ def search(
         console.print(
             f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
         )
-        wanted = target_of(scene, workcell.target)
-        problem = workcell.problem(wanted, chosen.problem_config)
-        policy_now = chosen.policy()
-        with prepared(first_decision(problem, policy_now), lambda text: console.print(text, style="dim")):
-            # These take long to import, and meanwhile what the first decision needs is read or compiled.
-            from mechsearch_jax.envs.narration import Narrator, verdict
-            from mechsearch_jax.envs.native import NativeSimulator
-            from mechsearch_jax.envs.recognisers import recogniser
-            from mechsearch_jax.envs.recording import NAME, TRACE_EVERY, Recorder, save_recording
-            from mechsearch_jax.viz.filmstrip import filmstrip
+        problem = workcell.problem(target_of(scene, workcell.target), chosen.problem_config)
+        episode, narrator, recorder = _run(console, status, chosen, scene, problem, seed)
+        # Not before: these take long to import.
+        from mechsearch_jax.envs.narration import verdict
+        from mechsearch_jax.envs.recording import NAME, save_recording
+        from mechsearch_jax.viz.filmstrip import filmstrip
 
-            simulator = NativeSimulator(
-                config=SimulatorConfig(trace_every=TRACE_EVERY), shelf=workcell.shelf, camera=workcell.camera
-            )
-            recorder = Recorder(simulator)
-            narrator = Narrator(console, status, problem, recorder.note)
-            episode = run_episode(
-                seed,
-                scene,
-                problem,
-                policy_now,
-                simulator,
-                recogniser(chosen.recognition, wanted),
-                chosen.config.max_steps,
-                chosen.options(),
-                narrator,
-                chosen.terms,
-            )
         status.update("writing")
         strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
         _save(out, scene, episode, strip)

@@ -251,7 +251,16 @@ class Searcher:
         )
         handed = done.trajectory is not None
         refusals = now.refusals + bool(decision.refused and not handed)
-        self._state = State(now.index, belief, observation, decision.action, handed, False, False, refusals)
+        self._state = State(
+            now.index,
+            belief,
+            observation,
+            decision.action,
+            handed=handed,
+            acted=False,
+            finished=False,
+            refusals=refusals,
+        )
         return step
 
     def acted(self, ok: bool = True) -> None:
