@@ -24,6 +24,7 @@ EARLIER: Mapping[str, Any] = {
     "crowding_weight": 0.02,
     "hindrance_weight": 1.0,
     "draws": 1,
+    "first_draws": 1,
     "move_again": False,
     "move_target": False,
     "predicted_collisions": False,

@@ -61,20 +61,20 @@ class NativeRehearsal:
     Attributes:
       simulation: how it is simulated.
       threads: how many; one for each of `cores.cores` if left out.
-      frictions: sliding frictions that an action is tried out with, as multiples of what they are taken to be. Of
-        several the worst counts, so that who does not know the friction names the range.
+      friction: sliding friction of everything, as a multiple of what it is taken to be; too little of it holds the arm
+        up where a rehearsal was not.
 
     Raises:
-      InputError: there are no frictions, or one is not positive.
+      InputError: the friction is not positive.
     """
 
     simulation: SimulatorConfig = dataclasses.field(default_factory=SimulatorConfig)
     threads: int | None = None
-    frictions: tuple[float, ...] = (1.0,)
+    friction: float = 1.0
 
     def __post_init__(self):
-        if not self.frictions or not all(0.0 < friction < math.inf for friction in self.frictions):
-            raise InputError(f"NativeRehearsal: frictions {self.frictions} must be one or more positive numbers")
+        if not 0.0 < self.friction < math.inf:
+            raise InputError(f"NativeRehearsal: friction {self.friction} must be a positive number")
 
     def __call__(
         self,
@@ -224,20 +224,18 @@ def _in_turn(
 
 
 def _tried_out(shelf: Shelf, how: NativeRehearsal, world: World, kind: int, motion: Motion, index: int) -> Rehearsed:
-    """What becomes of one action, with the friction that is worst for it."""
+    """What becomes of one action."""
     if motion is None or not motion[1]:
         return Rehearsed.FAILED
     if not sound(*jax.tree.map(lambda a: a[None], (world, motion[0]))):
         return Rehearsed.HARMFUL
-    here, worst = NativeWorld(shelf, config=how.simulation), Rehearsed.SUCCEEDED
-    for friction in how.frictions:
-        try:
-            here.place(bodies_of(world), friction)
-            succeeds, harmless = here.rehearse(kind_of(kind), motion[0], index)
-        except (ValueError, mujoco.FatalError):
-            # A scene that cannot be built must not end those beside it.
-            return Rehearsed.HARMFUL
-        if not harmless:
-            return Rehearsed.HARMFUL
-        worst = worst if succeeds else Rehearsed.FAILED
-    return worst
+    here = NativeWorld(shelf, config=how.simulation)
+    try:
+        here.place(bodies_of(world), how.friction)
+        succeeds, harmless = here.rehearse(kind_of(kind), motion[0], index)
+    except (ValueError, mujoco.FatalError):
+        # A scene that cannot be built must not end those beside it.
+        return Rehearsed.HARMFUL
+    if not harmless:
+        return Rehearsed.HARMFUL
+    return Rehearsed.SUCCEEDED if succeeds else Rehearsed.FAILED

@@ -82,6 +82,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "crowding_weight": 0.02,
         "hindrance_weight": 1.0,
         "draws": 1,
+        "first_draws": 4,
         "move_again": False,
         "move_target": True,
         "predicted_collisions": False,
@@ -121,7 +122,7 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     assert (search.guided_fraction, search.unseen_contact_penalty, search.crowding_weight) == (0.0, 0.0, 0.0)
     assert (search.topple_charge, search.move_again, search.predicted_collisions) == (0.0, True, True)
     assert not search.move_target
-    assert search.draws > 1
+    assert search.draws > search.first_draws == 1
     assert (config.problem.existence.erosion, config.problem.existence.reopen) == (0.0, False)
     assert (config.problem.existence.criterion, actions.avoid_unseen) == ("depth-mse", False)
     assert (actions.push_distances, set(actions.actions)) == ((0.05, 0.10, 0.15), {"push", "pick-and-place"})
@@ -222,6 +223,28 @@ def test_later_actions_are_drawn_in_the_present_scene_if_asked_for(problem):
 
     np.testing.assert_allclose(starts("predicted"), [0.0, 0.05, 0.1], atol=1e-6)
     np.testing.assert_allclose(starts("present"), 0.0, atol=1e-6)
+
+
+def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(problem, root):
+    belief = planner.initial_belief(problem)
+
+    def counts(key, problem, belief, objective, guided_fraction, state):
+        return Sample(no_action(), jnp.int32(0), jax.random.uniform(key))
+
+    def seldom(problem, state, sample, first):
+        return Prediction(state.scene, sample.risk < 0.3, sample.risk)
+
+    def share(first, **changes):
+        config = dataclasses.replace(CONFIG, **changes)
+        rollout = Rollout(problem, belief, config, counts, seldom, POLICY.objective)
+        keys = jax.random.split(jax.random.key(0), 4000)
+        told = jax.vmap(lambda key: rollout.act(jnp.array(first), root, key)[0]["alive"])(keys)
+        return float(jnp.mean(told))
+
+    for draws, first_draws, first, later in ((1, 1, 1, 1), (1, 4, 4, 1), (3, 1, 3, 3), (2, 4, 4, 2)):
+        changes = {"draws": draws, "first_draws": first_draws}
+        assert share(True, **changes) == pytest.approx(1 - 0.7**first, abs=0.03)
+        assert share(False, **changes) == pytest.approx(1 - 0.7**later, abs=0.03)
 
 
 def test_options_are_changed_by_name_and_survive_json():
@@ -437,7 +460,7 @@ def test_what_may_topple_or_touch_the_target_is_charged_for(decision, root, prob
     action = jax.tree.map(lambda a: a[0, 0], decision[2].sequences.actions)
     policy = dataclasses.replace(
         POLICY,
-        config=dataclasses.replace(CONFIG, topple_charge=2.0, unseen_contact_penalty=0.5),
+        config=dataclasses.replace(CONFIG, topple_charge=2.0, unseen_contact_penalty=0.5, first_draws=1),
         propose=lambda key, *_: Sample(action, jnp.int32(0), jax.random.uniform(key)),
         predict=lambda problem, state, *_: Prediction(state.scene, jnp.array(True), jnp.float32(0.4)),
     )
@@ -451,7 +474,8 @@ def test_what_may_topple_or_touch_the_target_is_charged_for(decision, root, prob
 @pytest.mark.slow
 def test_what_may_topple_is_charged_for(drawn, decision, root, problem):
     sample, (possible, topples) = drawn
-    dear = POLICY.replace(config=dataclasses.replace(CONFIG, topple_charge=2.0), predict=foreseen(Shaky(0.4, 0.0)))
+    config = dataclasses.replace(CONFIG, topple_charge=2.0, first_draws=1)
+    dear = POLICY.replace(config=config, predict=foreseen(Shaky(0.4, 0.0)))
     keys = jax.random.split(jax.random.key(0), 30)
     charges = charges_of(rollout_of(problem, decision[1], dear), root, keys)
     sure = possible[:, 0]
@@ -509,6 +533,7 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"hindrance_weight": -0.1}, "hindrance_weight -0.1 must be a number that is not negative"),
         ({"later_draws": "past"}, 'later_draws "past" is unknown; use predicted, present'),
         ({"draws": 0}, "draws 0 must be at least 1"),
+        ({"first_draws": 0}, "first_draws 0 must be at least 1"),
         ({"max_steps": 0}, "max_steps 0 must be at least 1"),
         ({"push_model": "guess"}, 'push model "guess" is unknown; use quasi-static, learned, physics'),
         ({"criterion": "guess"}, 'criterion "guess" is unknown'),

@@ -52,6 +52,7 @@ class Weights(NamedTuple):
         "horizon",
         "sequences",
         "draws",
+        "first_draws",
         "move_again",
         "move_target",
         "predicted_collisions",
@@ -80,6 +81,8 @@ class PlannerConfig:
       hindrance_weight: how much J minds what is in the way of a grasp: the factor of f (1 - g) in equation 2. The
         paper's is 1, the published code's 0.1.
       draws: how often an action is drawn, until one is possible; static. The paper draws until one is.
+      first_draws: the same for the first action of a sequence, where that is more; static. Of the first actions one is
+        made, so that they are worth more draws.
       move_again: whether an object may move more than once in a sequence, as in the paper; static.
       move_target: whether a found target may be pushed, too; static. Where every grasp of it hits an object that can
         neither be grasped nor pushed, nothing else helps.
@@ -111,6 +114,7 @@ class PlannerConfig:
         1.0, "how much J minds what is in the way of a grasp; the paper's is 1, the published code's 0.1"
     )
     draws: int = option(1, "how often an action is drawn until one is possible")
+    first_draws: int = option(4, "the same for the first action of a sequence, where that is more")
     move_again: bool = option(False, "whether an object may move more than once in a sequence, as in the paper")
     move_target: bool = option(True, "whether a found target may be pushed, too; not in the paper")
     predicted_collisions: bool = option(
@@ -144,7 +148,7 @@ class PlannerConfig:
             )
         if self.later_draws not in get_args(LaterDraws):
             raise InputError(f'later_draws "{self.later_draws}" is unknown; use {", ".join(get_args(LaterDraws))}')
-        for name in ("horizon", "sequences", "draws"):
+        for name in ("horizon", "sequences", "draws", "first_draws"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} {getattr(self, name)} must be at least 1")
 

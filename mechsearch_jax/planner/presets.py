@@ -53,6 +53,7 @@ def paper(**changes: Any) -> Config:
         "topple_charge": 0.0,
         "crowding_weight": 0.0,
         "draws": REDRAWS,
+        "first_draws": 1,
         "move_again": True,
         "move_target": False,
         "rehearsal": "none",

@@ -143,10 +143,12 @@ class Rollout:
         return sample, self.predict(self.problem, state, sample, first)
 
     def _draw(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
-        """An action and what it does; drawn again, at most `config.draws` times in all, until it is possible."""
+        """An action and what it does; drawn again until it is possible, at most so often as `config` says."""
         attempt = functools.partial(self._attempt, first, state)
-        if self.config.draws == 1:
+        most = max(self.config.draws, self.config.first_draws)
+        if most == 1:
             return attempt(key)
+        draws = jnp.where(first, most, self.config.draws)
         shapes, _ = jax.eval_shape(attempt, key)
         nothing = Prediction(state.scene, jnp.array(False), jnp.float32(0.0))
         blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
@@ -160,7 +162,7 @@ class Rollout:
 
         def wanted(carry):
             i, (_, prediction) = carry
-            return (i < self.config.draws) & ~prediction.possible & state.alive
+            return (i < draws) & ~prediction.possible & state.alive
 
         return jax.lax.while_loop(wanted, again, (jnp.int32(0), blank))[1]
 
