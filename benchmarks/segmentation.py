@@ -175,7 +175,9 @@ class Bench:
 
         def label(key, image, target_seen):
             labels = image.shown.labels
-            return labeller(key, self.shelf, image.shown.points, (labels == TARGET) & target_seen, labels)
+            of_target = (labels == TARGET) & target_seen
+            # Small segments are judged, too.
+            return labeller(key, self.shelf, image.shown.points, of_target, labels, 0.0)
 
         return jax.jit(label)
 

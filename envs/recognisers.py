@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.compiled import kept
-from mechsearch_jax.envs.simulated_camera import observe
+from mechsearch_jax.envs.simulated_camera import found_pixels, observe
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.errors import InputError
@@ -26,7 +26,7 @@ from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.assignment import assign
 from mechsearch_jax.perception.cloud import MARGIN, View, above_board, thinned_view
-from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
+from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
@@ -34,6 +34,9 @@ from mechsearch_jax.perception.segmentation import NetworkSegmenter
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
+
+# In a thinned image a thing may seem to have so many times the pixels that it has.
+SAMPLED = 1.5
 
 RecognitionName = Literal["oracle", "masks", "full"]
 
@@ -59,6 +62,7 @@ class Labeller(Protocol):
         points: Float[Array, "h w 3"],
         of_target: Bool[Array, "h w"],
         masks: Int[Array, "h w"],
+        unseen: float,
     ) -> Int[Array, "h w"]:
         """Label an image.
 
@@ -69,11 +73,12 @@ class Labeller(Protocol):
           of_target: where the detector sees the target; nowhere as long as it does not.
           masks: the true labels; a labeller that should not know them takes no more from them than the numbers that
             objects go by, so that what is done to an object can be judged.
+          unseen: of how few pixels the detector does not find the target.
         """
         ...
 
 
-def true_masks(key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array) -> Array:
+def true_masks(key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array, unseen: float) -> Array:
     """The `Labeller` that is told everything."""
     return masks
 
@@ -82,14 +87,18 @@ def true_masks(key: Array, shelf: Shelf, points: Array, of_target: Array, masks:
 class Segmenter:
     """The `Labeller` that segments the image with a network, and names the segments after the true objects.
 
+    What shows so little of itself that it may be the target is no object to it: it would rule out the target where the
+    target is.
+
     Attributes:
       weights: of the segmentation network.
     """
 
     weights: Weights
 
-    def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array) -> Array:
-        return numbered(NetworkSegmenter.of(self.weights)(key, shelf, points, of_target), masks)
+    def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array, unseen: float) -> Array:
+        found = NetworkSegmenter.of(self.weights)(key, shelf, points, of_target)
+        return numbered(large_segments(found, SAMPLED * unseen), masks)
 
 
 def numbered(found: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "h w"]:
@@ -103,6 +112,12 @@ def numbered(found: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "
     # With nothing shared, a segment still gets one of the slots of objects that nobody sees.
     name = assign(-jnp.matmul(own.T, truth))
     return jnp.where(found >= 0, name[jnp.maximum(found, 0)], found).astype(jnp.int8)
+
+
+def large_segments(labels: Int[Array, "h w"], pixels: float) -> Int[Array, "h w"]:
+    """Labels in which segments, numbered from 0, that have no more than so many pixels are OTHER."""
+    small = jnp.sum(labels.reshape(-1)[:, None] == jnp.arange(INSTANCES)[None], axis=0) <= pixels
+    return jnp.where((labels >= 0) & small[labels], OTHER, labels).astype(jnp.int8)
 
 
 class Depth(Protocol):
@@ -143,14 +158,15 @@ class ImageRecogniser:
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
         view, shelf = thinned_view(snapshot.camera, snapshot.shelf), snapshot.shelf
         keys = jax.random.split(key, 4)
-        image = labelled(keys[:2], self, view, shelf, snapshot.world, snapshot.target_seen)
+        unseen = found_pixels(snapshot.camera) / view.stride**2
+        image = labelled(keys[:2], self, view, shelf, snapshot.world, snapshot.target_seen, unseen)
         shapes = ShapeNetwork.of(self.weights)
         # Compiled on its own, whatever the labels come from.
         objects, pose = recognise_image(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
         return Observation(objects, snapshot.target_seen, pose)
 
 
-@kept(static_argnames=("recogniser", "view", "shelf"))
+@kept(static_argnames=("recogniser", "view", "shelf", "unseen"))
 def labelled(
     keys: Key[Array, "2"],
     recogniser: ImageRecogniser,
@@ -158,6 +174,7 @@ def labelled(
     shelf: Shelf,
     world: World,
     target_seen: Bool[Array, ""],
+    unseen: float,
 ) -> LabelledImage:
     """What a recogniser makes shapes of: the part of the image that shows the shelf, as measured, with labels.
 
@@ -166,11 +183,12 @@ def labelled(
       recogniser, view, shelf: static.
       world: the true state.
       target_seen: whether the detector sees the target; where it does not, nothing is said of its pixels.
+      unseen: of how few pixels of the view the detector does not find the target; static.
     """
     image = observe(view.camera, world, shelf)
     points = recogniser.noise(keys[0], view.camera, image.depth)
     masks = true_labels(points, image.segmentation, shelf)
-    labels = recogniser.labeller(keys[1], shelf, points, (image.segmentation == TARGET) & target_seen, masks)
+    labels = recogniser.labeller(keys[1], shelf, points, (image.segmentation == TARGET) & target_seen, masks, unseen)
     depth = recogniser.depth(view.camera, image.depth, points)
     return LabelledImage(points, depth, labels, (masks == TARGET) & target_seen)
 

@@ -187,6 +187,10 @@ def target_pixels(camera: Camera, world: World, window: int | None = None) -> In
 
 def is_found(camera: Camera, world: World) -> Bool[Array, ""]:
     """Whether the detector sees the target: more than 100 pixels of it at 1280 x 720."""
-    share = camera.width * camera.height / (1280 * 720)
     # Of no weak type, so that what takes it is compiled once.
-    return jnp.asarray(target_pixels(camera, world) > FOUND_PIXELS * share, bool)
+    return jnp.asarray(target_pixels(camera, world) > found_pixels(camera), bool)
+
+
+def found_pixels(camera: Camera) -> float:
+    """The detector does not find a target of which no more pixels are seen: 100 at 1280 x 720."""
+    return FOUND_PIXELS * camera.width * camera.height / (1280 * 720)

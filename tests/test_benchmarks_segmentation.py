@@ -20,7 +20,7 @@ from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 SCENE = images.scenes_of([load_scenario(example_scenarios()["first-light"])])[0]
 
 
-def two_as_one(key, shelf, points, of_target, masks):
+def two_as_one(key, shelf, points, of_target, masks, unseen):
     """The first object taken for a part of the second."""
     return jnp.where(masks == 0, 1, masks)
 

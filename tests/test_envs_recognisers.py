@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.envs.episodes import target_of
-from mechsearch_jax.envs.recognisers import labelled, numbered, recogniser, true_labels
+from mechsearch_jax.envs.recognisers import labelled, large_segments, numbered, recogniser, true_labels
 from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
@@ -111,11 +111,20 @@ def test_no_segment_is_lost_because_the_truth_knows_no_object_there():
     np.testing.assert_array_equal(named, np.where(truth == TARGET, 3, truth))
 
 
+def test_what_may_be_the_target_is_no_segment():
+    labels = np.full((10, 10), FREE, np.int8)
+    labels[0, :5], labels[1, :6], labels[2, :2], labels[3] = 0, 7, 8, OTHER
+    expected = labels.copy()
+    expected[0, :5], expected[2, :2] = OTHER, OTHER
+    np.testing.assert_array_equal(large_segments(jnp.asarray(labels), 5.9), expected)
+    np.testing.assert_array_equal(large_segments(jnp.asarray(labels), 0.0), labels)
+
+
 @dataclasses.dataclass
 class Curious:
     """A labeller that takes the target's pixels for the ninth instance, and all else for the shelf."""
 
-    def __call__(self, key, shelf, points, of_target, masks):
+    def __call__(self, key, shelf, points, of_target, masks, unseen):
         return jnp.where(of_target, 8, FREE).astype(jnp.int8)
 
     __hash__ = object.__hash__
@@ -129,7 +138,7 @@ def shown():
     def see(world):
         view, snapshot = shelf_view(CAMERA, SHELF), Snapshot(CAMERA, SHELF, world)
         keys = jax.random.split(jax.random.key(0))
-        image = labelled(keys, curious, view, SHELF, world, snapshot.target_seen)
+        image = labelled(keys, curious, view, SHELF, world, snapshot.target_seen, 0.0)
         owner = np.asarray(observe(view.camera, world, SHELF).segmentation)
         return jax.tree.map(np.asarray, image), owner, bool(snapshot.target_seen)
 
