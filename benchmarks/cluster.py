@@ -34,6 +34,8 @@ AUTO = "auto"
 MOST_DEATHS = 3
 # How long a cluster's machine may take to answer, and a worker's thread here to end [s].
 PATIENCE = 10.0
+# How often it is looked whether what waits for a worker still has to [s].
+LOOK_EVERY = 0.5
 # Rows are small, and what nobody needs is taken from this machine's memory [bytes].
 OBJECT_STORE = 100_000_000
 
@@ -268,7 +270,12 @@ class _Feeder(threading.Thread):
                     return False
                 self._host = host = self._start()
             try:
-                self._ray.get(host.started.remote())
+                # One that is killed while it starts may not say so for long.
+                up = host.started.remote()
+                while not self._stopped and not self._ray.wait([up], timeout=LOOK_EVERY)[0]:
+                    pass
+                if not self._stopped:
+                    self._ray.get(up)
             except self._ray.exceptions.RayError as error:
                 self._host = None
                 deaths += 1

@@ -169,9 +169,9 @@ class OnRay:
 
         from mechsearch_jax.benchmarks.cluster import join
 
+        join(self.address)
         # Were it to use a GPU of this machine, this process would take most of its memory.
         jax.config.update("jax_platforms", "cpu")
-        join(self.address)
 
     def has_gpu(self) -> bool:
         """See `Site`."""
