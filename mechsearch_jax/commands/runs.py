@@ -53,34 +53,44 @@ class RunOptions:
     time_limit: Annotated[float | None, _count("SECONDS")] = None
     dry_run: bool = False
 
-    def in_processes(self, command: str, simulator: str) -> bool:
-        """Whether worker processes run the episodes, with a simulator as `EpisodeOptions` has it.
+    def check(self, command: str, simulator: str) -> None:
+        """Fail before anything is begun, with a simulator as `EpisodeOptions` has it.
 
         Raises:
-          InputError: an option is impossible, or does not go with another.
+          InputError: an option is impossible, or does not go with another, wherever the episodes run.
         """
+        parsed_shard(command, self.shard)
+        self.site(command)
         at_least_one(command, workers=self.workers, batch=self.batch)
         if self.workers is not None and self.batch is not None:
             raise InputError(f"{command}: give either --workers or --batch, not both")
         if self.workers is not None and simulator == "mjx":
             raise InputError(f"{command}: --workers run the native simulator; leave --workers out, or --simulator mjx")
+        if self.time_limit is not None and not 0 < self.time_limit < math.inf:
+            raise InputError(f"{command}: --time-limit {self.time_limit:g} must be a number of seconds above 0")
+
+    def in_processes(self, command: str, simulator: str) -> bool:
+        """Whether worker processes run the episodes, with a simulator as `EpisodeOptions` has it.
+
+        Raises:
+          InputError: as `check`, or there is a limit of time for batches.
+        """
+        self.check(command, simulator)
         site = self.site(command)
         found = self.workers is not None or (self.batch is None and simulator != "mjx" and not site.has_gpu())
         if self.time_limit is not None and not found:
             raise InputError(
                 f"{command}: --time-limit is for worker processes, not for batches; leave it out, or --workers N"
             )
-        if self.time_limit is not None and not 0 < self.time_limit < math.inf:
-            raise InputError(f"{command}: --time-limit {self.time_limit:g} must be a number of seconds above 0")
         return found
 
     def engine(self, command: str, options: EpisodeOptions) -> EngineName:
         """The simulator that the episodes run in.
 
         Raises:
-          InputError: as `in_processes`, the part of the episodes is none, or the simulator is not installed.
+          InputError: as `in_processes`, the place where they run cannot be reached, or the simulator is not installed.
         """
-        parsed_shard(command, self.shard)
+        self.check(command, options.simulator)
         site = self.site(command)
         site.enter()
         return "NativeSimulator" if self.in_processes(command, options.simulator) else options.engine(site.has_gpu)
