@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from stage import HIDDEN, OPEN
 
-from mechsearch_jax.benchmarks import cluster
+from mechsearch_jax.benchmarks import batches, cluster
 from mechsearch_jax.benchmarks.batches import Batches
 from mechsearch_jax.benchmarks.cluster import MOST_DEATHS, RayCluster, join
 from mechsearch_jax.benchmarks.cluster_workers import InTurn, OnCpus, OnGpus
@@ -24,6 +24,7 @@ from mechsearch_jax.commands.options import EpisodeOptions
 from mechsearch_jax.commands.runs import Here, OnRay, RunOptions
 from mechsearch_jax.cores import VARIABLE
 from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.records import Episode
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
@@ -91,7 +92,19 @@ class OnImaginedGpus(OnGpus):
     def runner(self):
         with open(Path(self.folder) / "gpus", "a") as log:
             log.write(f"{os.environ['CUDA_VISIBLE_DEVICES']} {os.environ[VARIABLE]}\n")
+        batches.run_episodes, batches.Workcell.problem = at_once, lambda *ignored: None
         return Batches(self.worlds)
+
+
+def at_once(starts, problem, policy, simulator, slots, ended, **rest):
+    """Stands in for `run_episodes`: all episodes are over at once, but for one that fails."""
+    for place, start in enumerate(starts):
+        scene = start.scenario
+        if scene.name == "bad":
+            raise ValueError("out of luck")
+        config = {**start.options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
+        facts = (scene.name, len(scene.objects), config, {}, (), 0, slots, False, "not found", scene.content_hash)
+        ended([(place, Episode(*facts))])
 
 
 class Known(InTurn):
@@ -181,6 +194,20 @@ def test_jobs_of_dead_and_strange_workers_are_rows_like_the_others(ray, tmp_path
     assert set(asked.values()) == {1}
     # Of what was lost with the worker, each was run again, and nothing that had ended before.
     assert Counter(ran(tmp_path)) == Counter([*names, "once"])
+
+
+def test_gpus_run_batches(ray, tmp_path, monkeypatch):
+    jobs = jobs_of(tmp_path, "one", "bad", "three", seeds=range(2))
+    rows = evaluate(jobs, tmp_path / "cluster", RayCluster(OnImaginedGpus(folder=str(tmp_path))))
+    assert set((tmp_path / "gpus").read_text().splitlines()) <= {"0 1", "1 1"}
+    assert [row.failure for row in rows] == [
+        *["not found"] * 2,
+        *["error: ValueError: out of luck"] * 2,
+        *["not found"] * 2,
+    ]
+    monkeypatch.setattr(batches, "run_episodes", at_once)
+    monkeypatch.setattr(batches.Workcell, "problem", lambda *ignored: None)
+    assert without_times(rows) == without_times(evaluate(jobs, tmp_path / "local", Batches(3)))
 
 
 @pytest.mark.slow
@@ -324,14 +351,3 @@ def test_rows_are_those_of_a_local_run_although_a_worker_was_killed(ray, tmp_pat
     assert len(list(tmp_path.glob("*.worker"))) == 3
     assert not any(row.is_error for row in rows)
     assert without_times(rows) == without_times(evaluate(jobs, tmp_path / "local", Processes(2)))
-
-
-@pytest.mark.slow
-def test_batches_run_where_gpus_are(ray, tmp_path):
-    for scene in (HIDDEN, OPEN):
-        save_scenario(scene, tmp_path / f"{scene.name}.json")
-    method = Method(config=PRESETS["standard"](max_steps=1, sequences=5, horizon=1, rehearsal="none"))
-    jobs = make_jobs([tmp_path / "hidden.json", tmp_path / "open.json"], [method], range(2))
-    rows = evaluate(jobs, tmp_path / "cluster", RayCluster(OnImaginedGpus(folder=str(tmp_path))))
-    assert sorted((tmp_path / "gpus").read_text().splitlines()) == ["0 1", "1 1"]
-    assert without_times(rows) == without_times(evaluate(jobs, tmp_path / "local", Batches(2)))
