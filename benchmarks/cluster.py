@@ -178,14 +178,14 @@ class _Todo:
     """The chunks that nobody runs, and how many somebody runs, of which some may come back."""
 
     def __init__(self, chunks: Iterable[_Chunk]) -> None:
-        self._chunks, self._running = deque(chunks), 0
+        self._chunks, self._running, self._closed = deque(chunks), 0, False
         self._changed = threading.Condition()
 
     def wait(self) -> bool:
         """Wait for a chunk. False where none will come."""
         with self._changed:
-            self._changed.wait_for(lambda: self._chunks or not self._running)
-            return bool(self._chunks)
+            self._changed.wait_for(lambda: self._closed or self._chunks or not self._running)
+            return bool(self._chunks) and not self._closed
 
     def take(self) -> _Chunk | None:
         """A chunk to run, for which `over` has to be called; None if somebody else was faster."""
@@ -205,8 +205,7 @@ class _Todo:
     def close(self) -> None:
         """There is nothing more to do."""
         with self._changed:
-            self._chunks.clear()
-            self._running = 0
+            self._closed = True
             self._changed.notify_all()
 
 
