@@ -78,7 +78,9 @@ def join(address: str = LOCAL) -> list[Mapping[str, float]]:
         try:
             ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
         except (OSError, ValueError, RuntimeError) as error:
-            raise InputError(f"Ray at {address}: {_one_line(error)}; give HOST:PORT as ray start tells it") from error
+            raise InputError(
+                f'Ray at {address}: {_one_line(error).rstrip(".")}; how to start it: docs/gpu.md, "Several machines"'
+            ) from error
     return [node["Resources"] for node in ray.nodes() if node["Alive"]]
 
 
