@@ -176,6 +176,7 @@ def test_every_job_becomes_one_row_and_no_file_is_needed(ray, tmp_path):
     assert [row.failure for row in rows] == [None] * 9
 
 
+@pytest.mark.slow
 def test_jobs_of_dead_and_strange_workers_are_rows_like_the_others(ray, tmp_path):
     names = ("one", "once", "three", "hang", "five", "other", "confused", "eight")
     jobs = jobs_of(tmp_path, *names)
@@ -196,6 +197,7 @@ def test_jobs_of_dead_and_strange_workers_are_rows_like_the_others(ray, tmp_path
     assert Counter(ran(tmp_path)) == Counter([*names, "once"])
 
 
+@pytest.mark.slow
 def test_gpus_run_batches(ray, tmp_path, monkeypatch):
     jobs = jobs_of(tmp_path, "one", "bad", "three", seeds=range(2))
     rows = evaluate(jobs, tmp_path / "cluster", RayCluster(OnImaginedGpus(folder=str(tmp_path))))
@@ -221,17 +223,20 @@ def test_an_episode_that_kills_its_workers_is_a_row_with_the_reason(ray, tmp_pat
     assert ran(tmp_path).count("crash") == MOST_DEATHS
 
 
+@pytest.mark.slow
 def test_what_is_no_episodes_fault_ends_the_run(ray, tmp_path):
     with pytest.raises(InputError, match=r"^the weights are missing$"):
         evaluate(jobs_of(tmp_path, "one", "refuse"), tmp_path / "rows", scripted(tmp_path))
 
 
+@pytest.mark.slow
 def test_workers_that_cannot_be_started_end_the_run(ray, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "MOST_DEATHS", 1)
     with pytest.raises(InputError, match=r"^Ray at local: no worker can be started \(ImportError: no such library\)$"):
         evaluate(jobs_of(tmp_path, "one"), tmp_path / "rows", RayCluster(Unable(1)))
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_all_workers(ray, tmp_path):
     jobs = jobs_of(tmp_path, "one", "hang", "three")
 
