@@ -77,7 +77,7 @@ class Batches:
             not suffice for a single world.
         """
         failures = _Failures(ended)
-        for target, group in _groups(jobs):
+        for target, group in groups(jobs):
             method = group[0].method
             simulator = new_simulator(method.engine, method.workcell)
             worlds = min(self.worlds or fitting_worlds(simulator), len(group))
@@ -216,7 +216,7 @@ class _Failures:
         Raises:
           Exception: the error, if too many have failed one after the other.
         """
-        self._waiting.append(job.failed(f"{type(error).__name__}: {' '.join(str(error).split())}"[:500]))
+        self._waiting.append(job.failed_by(error))
         if len(self._waiting) == MOST_FAILURES:
             if self._any_ended:
                 self.hand_on()
@@ -229,7 +229,7 @@ class _Failures:
             self._ended(rows)
 
 
-def _groups(jobs: Sequence[Job]) -> list[tuple[Target, list[Job]]]:
+def groups(jobs: Sequence[Job]) -> list[tuple[Target, list[Job]]]:
     """The jobs by what is compiled for them, with their target."""
     mould = functools.cache(Method.mould)
     groups: dict[tuple[Target, Hashable], list[Job]] = {}

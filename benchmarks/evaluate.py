@@ -1,8 +1,9 @@
 """Many scenarios, methods and seeds: what is wanted, what is there already, and what becomes of the rest.
 
 How the episodes are run is a slot: `processes.Processes` runs one after the other in several worker processes,
-`batches.Batches` many at a time in this one. Rows are on disk as soon as their episodes have ended, so that a run that
-was killed goes on where it stopped. `shards` keeps them, `claims` divides the work among those who share a folder.
+`batches.Batches` many at a time in this one, `cluster.RayCluster` does either on the machines of a cluster. Rows are on
+disk as soon as their episodes have ended, so that a run that was killed goes on where it stopped. `shards` keeps them,
+`claims` divides the work among those who share a folder.
 """
 
 from __future__ import annotations
@@ -59,6 +60,10 @@ class Job:
     def failed(self, reason: str) -> Row:
         """The row of an episode that could not be run to its end."""
         return Row.failed(self.scenario, self.options, reason, present_code())
+
+    def failed_by(self, error: Exception) -> Row:
+        """The same, where an exception says why."""
+        return self.failed(f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
 
 
 @functools.lru_cache(maxsize=4096)

@@ -120,7 +120,7 @@ class _Feeder(threading.Thread):
         try:
             return self._run(job)
         except Exception as error:
-            return job.failed(f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
+            return job.failed_by(error)
 
     def stop(self) -> None:
         """End the worker, whatever it is doing."""

@@ -23,7 +23,7 @@ from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.recognisers import recogniser
 from mechsearch_jax.planner.cache import keep_compilations
 from mechsearch_jax.planner.workcell import Workcell
-from mechsearch_jax.workspace.scenario import load_scenario
+from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
 
 class Worker:
@@ -40,8 +40,15 @@ class Worker:
         Raises:
           InputError: the file is no scenario, or the method cannot be used.
         """
+        return self.run_scenario(load_scenario(path, method.workcell.shelf), method, seed)
+
+    def run_scenario(self, scenario: Scenario, method: Method, seed: int) -> Row:
+        """Run one episode of a scenario.
+
+        Raises:
+          InputError: the method cannot be used.
+        """
         workcell = method.workcell
-        scenario = load_scenario(path, workcell.shelf)
         target = target_of(scenario, workcell.target)
         episode = run_episode(
             seed,

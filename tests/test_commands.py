@@ -114,6 +114,19 @@ WRONG = {
     "no shard": (["evaluate", "good.json", "--out", "new", "--shard", "3/2"], "--shard 3/2 is not K/N"),
     "half a shard": (["evaluate", "good.json", "--out", "new", "--shard", "1"], "--shard 1 is not K/N"),
     "no time": (["evaluate", "good.json", "--out", "new", "--time-limit", "0"], "--time-limit 0 must be"),
+    "no cluster": (["evaluate", "good.json", "--out", "new", "--cluster", "slurm"], "--cluster slurm is unknown; give"),
+    "a cluster's client": (
+        ["evaluate", "good.json", "--out", "new", "--cluster", "ray://a:1"],
+        "give ray, ray:auto or",
+    ),
+    "what a cluster would take": (
+        ["evaluate", "good.json", "--out", "new", "--cluster", "ray", "--dry-run"],
+        "--dry-run tells of runs on this machine; leave --cluster out",
+    ),
+    "batch simulator in workers of a cluster": (
+        ["sweep", "good.json", "--out", "new", "--cluster", "ray", "--workers", "1", "--simulator", "mjx"],
+        "--workers run the native simulator",
+    ),
     "time of a batch": (
         ["evaluate", "good.json", "--out", "new", "--batch", "2", "--time-limit", "9"],
         "--time-limit is for worker processes",

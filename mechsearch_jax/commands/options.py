@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -82,13 +82,16 @@ class EpisodeOptions:
             method.check()
         return methods
 
-    def engine(self) -> EngineName:
+    def engine(self, gpu: Callable[[], bool] | None = None) -> EngineName:
         """The simulator that runs many episodes.
+
+        Args:
+          gpu: whether there is a GPU where they run; asked where it matters. Of this machine if None.
 
         Raises:
           InputError: it is not installed.
         """
-        if self.simulator == "native" or (self.simulator == "auto" and not has_gpu()):
+        if self.simulator == "native" or (self.simulator == "auto" and not (gpu or has_gpu)()):
             return "NativeSimulator"
         from mechsearch_jax.envs.mjx_model import import_mjx
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from mechsearch_jax.commands.options import PaperMethod, at_least_one, files_of, with_planner_options
+from mechsearch_jax.commands.options import EpisodeOptions, PaperMethod, at_least_one, files_of, with_planner_options
 from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, run_jobs
 from mechsearch_jax.errors import InputError
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.benchmarks.paper_tables import PaperTable
     from mechsearch_jax.benchmarks.reproduce import Setting
     from mechsearch_jax.benchmarks.rows import Row
+    from mechsearch_jax.envs.method import EngineName
 
 TableName = Literal["table1", "table3", "table4", "table5"]
 Recognition = Literal["oracle", "masks", "full"]
@@ -47,17 +48,16 @@ def _settings(
 
 
 def _jobs(
-    settings: Sequence[Setting], scenarios: Sequence[Path], seeds: Sequence[int], simulator: str, run: RunOptions
+    settings: Sequence[Setting], scenarios: Sequence[Path], seeds: Sequence[int], simulator: str, engine: EngineName
 ) -> dict[Setting, list[Job]]:
     """The episodes of every setting.
 
     Raises:
-      InputError: a setting cannot be used, or the simulator is not there.
+      InputError: a setting cannot be used.
     """
     from mechsearch_jax.benchmarks.evaluate import make_jobs
 
     options: Any = with_planner_options()
-    engine = run.engine("reproduce", options(simulator=simulator))
 
     def method_of(setting: Setting) -> Any:
         point = options(
@@ -116,6 +116,7 @@ def reproduce(
 
     at_least_one("reproduce", scenes=scenes)
     chosen = TABLES[table]
+    engine = run.engine("reproduce", EpisodeOptions(simulator=simulator))
     files = files_of(table_scenes(chosen, objects, scenes))
     settings = _settings(
         chosen,
@@ -124,7 +125,7 @@ def reproduce(
         preset or ("paper", "standard"),
         protocol or ("strict",),
     )
-    jobs = _jobs(settings, files, seed, simulator, run)
+    jobs = _jobs(settings, files, seed, simulator, engine)
     every = [job for own in jobs.values() for job in own]
     if run.dry_run:
         print(f"{chosen.name}: {chosen.about}; {len(files)} scenes")
