@@ -178,25 +178,93 @@ def test_the_table_of_scenes_is_the_stored_result():
     assert set(re.findall(r"`(published-\d-\d\d)` \((\d+)\)", read("docs/results.md"))) == in_sight
 
 
-def test_the_rates_of_the_readme_and_of_the_results_are_the_stored_ones():
-    runs = json.loads((ROOT / "benchmarks/results/rehearsal-h200.json").read_text())["runs"]
-    rates = ("found", "graspable", "retrieved")
-    published = {key.split("-")[1]: row for key, row in runs[0]["by_objects"].items() if key != "all"}
+def stored_runs(name):
+    """The runs of a stored result, whose episodes are by the names of their columns."""
+    stored = json.loads((ROOT / "benchmarks/results" / name).read_text())
+    return [
+        run | {"episodes": [dict(zip(stored["columns"], row, strict=True)) for row in run["episodes"]]}
+        for run in stored["runs"]
+    ]
+
+
+# What a table calls the shares that it tells, and how often it was so in some episodes.
+RATES = {
+    "found": lambda e: e["found_step"] is not None,
+    "graspable": lambda e: e["graspable_step"] is not None,
+    "retrieved": lambda e: e["retrieved"],
+    "left": lambda e: e["objects_fallen"],
+    "fell": lambda e: (e["failure"] or "").startswith("the target fell"),
+    "held": lambda e: e["held_up"],
+    "ruled out": lambda e: e["truth_lost"],
+}
+
+
+def share(name, episodes, digits):
+    return f"{sum(bool(RATES[name](episode)) for episode in episodes) / len(episodes):.{digits}f}"
+
+
+def mean_steps(episodes):
+    return f"{sum(episode['steps'] or 0 for episode in episodes) / len(episodes):.1f}"
+
+
+def with_objects(episodes, count):
+    return [episode for episode in episodes if episode["scenario"].split("-")[1] == count]
+
+
+def test_the_rates_of_the_readme_are_the_stored_ones():
+    published = [
+        episode for name in ("standard-cpu.json", "standard-h200.json") for episode in stored_runs(name)[0]["episodes"]
+    ]
     told = re.findall(
         r"^\| (\d) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \| [\d.]+ \| [\d.]+ \|$", read("README.md"), re.MULTILINE
     )
     assert [objects for objects, *_ in told] == ["2", "4", "6", "8"]
     for objects, *figures in told:
-        assert figures == [f"{published[objects][rate]:.2f}" for rate in rates]
-    table = read("docs/results.md")
-    columns = ("object_left_board", "target_tipped_or_fell", "held_up", "truth_ruled_out", "mean_steps")
-    for run, label in zip(runs, ("published", "`c2`", "`c2`, nothing rehearsed"), strict=True):
-        for key, row in run["by_objects"].items():
-            if key != "all":
-                places = (3, 3, 2, 3, 1)
-                rest = [f"{row[c]:.{n}f}" for c, n in zip(columns, places, strict=True)]
-                cells = [label, key[-1], str(row["episodes"]), *(f"{row[rate]:.2f}" for rate in rates), *rest]
-                assert f"| {' | '.join(cells)} |" in table
+        episodes = with_objects(published, objects)
+        assert len(episodes) == 150
+        assert figures == [share(rate, episodes, 2) for rate in ("found", "graspable", "retrieved")]
+
+
+@pytest.mark.parametrize(
+    ("name", "labels"),
+    [
+        ("rehearsal-h200.json", ["published", "`c2`", "`c2`, nothing rehearsed"]),
+        ("standard-cpu.json", ["published, C MuJoCo"]),
+        (
+            "standard-h200.json",
+            [
+                "published",
+                "`c2`",
+                "published, `--preset best`, 20 actions",
+                "published, `--recognition masks`",
+                "published, `--recognition full`",
+            ],
+        ),
+    ],
+)
+def test_the_rates_of_the_results_by_number_of_objects_are_the_stored_ones(name, labels):
+    page = read("docs/results.md")
+    for run, label in zip(stored_runs(name), labels, strict=True):
+        for objects in "2468":
+            episodes = with_objects(run["episodes"], objects)
+            rates = [share(rate, episodes, 2) for rate in ("found", "graspable", "retrieved")]
+            rest = [share(rate, episodes, n) for rate, n in (("left", 3), ("fell", 3), ("held", 2), ("ruled out", 3))]
+            cells = [label, objects, str(len(episodes)), *rates, *rest, mean_steps(episodes)]
+            assert f"| {' | '.join(cells)} |" in page
+
+
+def test_the_rates_of_the_experiments_are_the_stored_ones():
+    page = read("docs/results.md")
+    for run in stored_runs("first-draws-h200.json"):
+        shares = [(rate, 2) for rate in ("found", "graspable", "retrieved", "left")]
+        cells = [share(rate, run["episodes"], n) for rate, n in (*shares, ("ruled out", 3))]
+        assert f"| {' | '.join(cells)} | {mean_steps(run['episodes'])} |" in page
+    for run in stored_runs("rehearsal-frictions-cpu.json"):
+        found, graspable, retrieved, held = (
+            share(rate, run["episodes"], 2) for rate in ("found", "graspable", "retrieved", "held")
+        )
+        assert graspable == retrieved
+        assert f"| {found} | {retrieved} | {held} | {mean_steps(run['episodes'])} |" in page
 
 
 def test_stored_scenes_are_those_on_record():
