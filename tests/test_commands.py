@@ -428,6 +428,7 @@ def test_a_report_is_printed_and_written(folder, monkeypatch, capsys):
     assert "report/report.md" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_inspecting_writes_maps_and_a_picture(folder):
     answer = mechsearch(folder, "inspect", "good.json", "--out", "maps")
     assert answer.returncode == 0, answer.stderr

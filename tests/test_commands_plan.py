@@ -48,6 +48,7 @@ def test_what_does_not_fit_together_is_refused(arguments, words, tmp_path, monke
     assert len(told.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_the_example_is_planned_on_and_written_as_files_like_a_users(see, tmp_path, monkeypatch):
     see(OPEN)
     out = tmp_path / "out"

@@ -57,9 +57,8 @@ def without_times(episode):
     return value
 
 
-@pytest.mark.parametrize(
-    "policy", ["grab", pytest.param("search-for-grasp", marks=pytest.mark.slow)], ids=["grab", "search"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["grab", "search-for-grasp"], ids=["grab", "search"])
 def test_episodes_are_the_same_alone_and_in_a_batch_whatever_their_slot(problem, policy):
     """More episodes than slots; and in the native simulator."""
     decides = grab if policy == "grab" else search_for_grasp()

@@ -103,6 +103,7 @@ def test_the_same_pushes_give_the_same_results_on_any_number_of_threads(outcome)
     jax.tree.map(np.testing.assert_array_equal, outcome, alone)
 
 
+@pytest.mark.slow
 def test_alone_it_is_as_in_a_batch(outcome):
     action = jax.tree.map(lambda a: a[1], PUSHES)
     # References differ by 1e-6 rad, which contacts amplify.

@@ -86,7 +86,7 @@ def iou(scene, truth):
     return np.array(scores.intersection_over_union(scene, scores.sharpened(truth)))
 
 
-@pytest.mark.parametrize(("noise", "least"), [(0.0, 0.95), (0.001, 0.93)])
+@pytest.mark.parametrize(("noise", "least"), [pytest.param(0.0, 0.95, marks=pytest.mark.slow), (0.001, 0.93)])
 def test_visible_objects_are_refined_to_their_true_shapes(noise, least):
     rng = np.random.default_rng(0)
     points, labels, depth, truth = measured([SCENE] * 6, rng, noise)

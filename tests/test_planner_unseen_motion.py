@@ -125,6 +125,7 @@ def test_what_moves_away_touches_nothing_where_it_stood(problem, opened):
     assert not opened(behind, BEFORE, boxes((0.6, -0.2), (0.6, 0.3)), pick).any()
 
 
+@pytest.mark.slow
 def test_it_works_in_a_batch(problem, opened):
     everywhere = jnp.ones(problem.poses.shape[0], bool)
     ways = jnp.stack([LEFT, 0.5 * LEFT])

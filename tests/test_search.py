@@ -52,6 +52,7 @@ def moved(camera, by):
     return dataclasses.replace(camera, position=tuple(np.add(camera.position, by).tolist()))
 
 
+@pytest.mark.slow
 def test_a_target_in_the_open_is_taken_out_and_the_search_is_over(problem, tmp_path):
     searcher = searcher_of(problem, OPEN)
     step = searcher.next(IMAGES.depth, IMAGES.colour)
