@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.envs.recognisers import true_labels
-from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS, observe
+from mechsearch_jax.envs.simulated_camera import found_pixels, observe
 from mechsearch_jax.envs.world import TARGET, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.examples import Images, save_images
@@ -41,8 +41,7 @@ def sensed_images(scenario: Scenario, camera: Camera | None = None, seed: int = 
     points = back_project(camera, jnp.where(measured, depth, jnp.nan))
     mask = np.asarray(true_labels(points, image.segmentation, shelf))
     colour = np.round(255 * np.clip(np.asarray(image.colour), 0.0, 1.0)).astype(np.uint8)
-    share = camera.width * camera.height / (1280 * 720)
-    seen = np.sum(np.asarray(image.segmentation) == TARGET) > FOUND_PIXELS * share
+    seen = np.sum(np.asarray(image.segmentation) == TARGET) > found_pixels(camera)
     return Images(depth, colour, mask, TARGET if seen else None, camera)
 
 

@@ -64,7 +64,7 @@ def paper(**changes: Any) -> Config:
 
 
 def best(**changes: Any) -> Config:
-    """What solves most, for who has a GPU or time: `standard` with up to four draws of an action, and 20 actions.
+    """What solves most, for who has a GPU or time: `standard` with up to four draws of every action, and 20 actions.
 
     Args:
       **changes: options by name, see `Config.with_options`.
