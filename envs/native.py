@@ -181,6 +181,40 @@ class NativeWorld:
         toppled = self._target_lies() and not (lay or held)
         return not failure, not (toppled or (fallen & ~gone).any())
 
+    def drive(self, controls: Float[np.ndarray, "steps 9"], at_once: bool = False) -> Float[np.ndarray, "steps 9"]:
+        """Step with one row of controls per step from where everything is, and let the bodies come to rest.
+
+        `world` stays what it was.
+
+        Args:
+          controls: of joints [rad] and fingers [m].
+          at_once: set the robot to where the first row says beforehand, rather than move it there.
+
+        Returns:
+          Joints and fingers after each step.
+        """
+        if at_once:
+            self._set_robot(controls[0, :ARM], float(controls[0, ARM]))
+        self._recorder = _Recorder(self._data, self.config.trace_every)
+        states = self._run(np.ascontiguousarray(controls))
+        self._come_to_rest()
+        return states[:, 1 : 1 + ROBOT]
+
+    @property
+    def positions(self) -> Float[np.ndarray, " coordinates"]:
+        """Joints [rad], fingers [m], and position [m] and quaternion of every body, as MuJoCo has them."""
+        return self._data.qpos.copy()
+
+    @property
+    def fallen(self) -> Bool[np.ndarray, " 9"]:
+        """Which bodies are off the board, the target last."""
+        return self._fallen()
+
+    @property
+    def holds_target(self) -> tuple[bool, bool]:
+        """Whether both fingers press on the target, and whether it is outside the shelf."""
+        return self._holds(TARGET), bool(self._data.joint(f"body{TARGET}").qpos[0] < self.shelf.front)
+
     def _target_lies(self) -> bool:
         """Whether there is a target that has fallen over."""
         quaternion = self._data.joint(f"body{TARGET}").qpos[3:]

@@ -1,0 +1,106 @@
+"""The simulated cell: what its camera sees, where its arm goes, and what it says became of a trajectory."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from stage import HIDDEN, OPEN
+
+from mechsearch_jax.envs.simulated_camera import observe
+from mechsearch_jax.envs.simulated_cell import SHELF, SensorNoise, SimulatedCell, _owner
+from mechsearch_jax.envs.world import TARGET, from_scenario
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.robot.robot_trajectory import Bounds, RobotTrajectory
+from mechsearch_jax.workspace.camera import Camera
+
+SMALL = Camera(width=320, height=180, fx=152.4, fy=152.4, cx=160.0, cy=90.0)
+CELL = Workcell(camera=SMALL)
+EXACT = SensorNoise(depth=0.0, colour=0.0, missing=0.0)
+
+
+def moving(start, by, steps=250):
+    """A smooth trajectory of all joints."""
+    share = np.linspace(0.0, 1.0, steps + 1)
+    smooth = (share**3 * (10 - 15 * share + 6 * share**2))[:, None]
+    position = start[None] + smooth * by
+    zero = np.zeros(steps + 1)
+    return RobotTrajectory(
+        time=0.004 * np.arange(steps + 1),
+        position=position,
+        velocity=np.gradient(position, 0.004, axis=0),
+        acceleration=np.zeros_like(position),
+        width=zero,
+        force=zero,
+        part=zero.astype(int),
+        action="push",
+        bounds=Bounds(),
+        clearance=0.1,
+        straight=True,
+        ends_at_home=False,
+    )
+
+
+def test_the_images_are_those_of_an_independent_ray_cast():
+    depth, colour = SimulatedCell(CELL, HIDDEN, noise=EXACT).look()
+    image = observe(SMALL, from_scenario(HIDDEN), CELL.shelf)
+    expected = np.where(np.isfinite(image.depth), image.depth, 0.0)
+    # The one shows the robot, too, and the pixels at edges may differ.
+    same = np.abs(depth - expected) < 2e-3
+    assert same.mean() > 0.97
+    assert colour.shape == (180, 320, 3)
+    assert colour.dtype == np.uint8
+
+
+def test_noise_is_as_large_as_it_says_and_missing_pixels_are_0():
+    exact, _ = SimulatedCell(CELL, HIDDEN, noise=EXACT).look()
+    noisy, colour = SimulatedCell(CELL, HIDDEN, noise=SensorNoise(0.001, 4 / 255, 0.01)).look()
+    seen = (exact > 0) & (noisy > 0)
+    assert np.std((noisy - exact)[seen]) == pytest.approx(0.001, rel=0.05)
+    assert np.mean(noisy[exact > 0] == 0.0) == pytest.approx(0.01, rel=0.3)
+    _, clean = SimulatedCell(CELL, HIDDEN, noise=EXACT).look()
+    dark = (clean > 30) & (clean < 225)
+    assert np.std((colour.astype(float) - clean)[dark]) == pytest.approx(4.0, rel=0.1)
+
+
+def test_the_target_is_counted_where_it_is_seen():
+    assert SimulatedCell(CELL, HIDDEN, noise=EXACT).target_pixels() == 0
+    assert SimulatedCell(CELL, OPEN, noise=EXACT).target_pixels() > 20
+
+
+def test_every_geometry_has_an_owner():
+    assert [_owner(name) for name in ("box3", "cylinder8", "board_box", "")] == [3, TARGET, SHELF, SHELF + 1]
+
+
+def test_the_arm_follows_a_trajectory_and_says_where_it_is():
+    cell = SimulatedCell(CELL, OPEN, noise=EXACT)
+    np.testing.assert_allclose(cell.joints, CELL.arm.home, atol=2e-3)
+    done = cell.follow(moving(cell.joints, np.array([0.1, 0.0, 0.0, 0.1, 0.0, 0.0, 0.2])))
+    assert done.ok
+    assert done.tracking_error < 0.01
+    assert (done.retrieved, done.fallen) == (False, ())
+    np.testing.assert_allclose(cell.joints[[0, 3, 6]] - np.array(CELL.arm.home)[[0, 3, 6]], [0.1, 0.1, 0.2], atol=3e-3)
+
+
+def test_a_trajectory_that_begins_elsewhere_is_refused():
+    cell = SimulatedCell(CELL, OPEN)
+    with pytest.raises(InputError, match=r"begins 0\.500 rad from where the arm is"):
+        cell.follow(moving(cell.joints + 0.5, np.zeros(7)))
+
+
+def test_an_arm_that_is_held_up_is_not_ok():
+    cell = SimulatedCell(CELL, OPEN)
+    narrow = dataclasses.replace(moving(cell.joints, np.full(7, 0.3), steps=40), bounds=Bounds(tracking=1e-4))
+    assert not cell.follow(narrow).ok
+
+
+def test_an_empty_hand_is_no_retrieval():
+    cell = SimulatedCell(CELL, OPEN)
+    done = cell.follow(dataclasses.replace(moving(cell.joints, np.zeros(7), 10), action="retrieve"))
+    assert not done.ok
+    assert not done.retrieved
+
+
+def test_impossible_noise_is_refused():
+    with pytest.raises(InputError, match="missing a share below 1"):
+        SensorNoise(missing=1.0)
