@@ -174,9 +174,10 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
         pixels, _ = project(coarse, transform(T[:, :, None], jnp.asarray(corners)))
         return jnp.max(jnp.max(pixels, axis=2) - jnp.min(pixels, axis=2), axis=(0, 1))
 
-    extent = np.asarray(jax.jit(image_size)(coarse, T)).tolist()
-    window = (_window_side(extent[0]), _window_side(extent[1]))
-    around = (math.ceil(extent[0]) + 2, math.ceil(extent[1]) + 2)
+    rows, columns = np.asarray(jax.jit(image_size)(coarse, T)).tolist()
+    window = _window_side(rows), _window_side(columns)
+    # Whose middle does not depend on how the window's sides are rounded.
+    around = math.ceil(rows) + 2, math.ceil(columns) + 2
 
     def view(coarse, pose):
         one = Superquadrics(
