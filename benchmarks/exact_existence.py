@@ -57,7 +57,7 @@ class FullResolution(ExistenceConfig):
         return grid[np.argsort(np.abs(grid).sum(axis=1), kind="stable")].astype(np.float32)
 
 
-@functools.partial(jax.jit, static_argnames=("camera", "target", "config"))
+@functools.partial(jax.jit, static_argnames=("target", "config"))
 def _possible(
     tables: ExistenceTables, camera: Camera, target: Target, scene: Superquadrics, config: FullResolution
 ) -> Bool[Array, " x"]:

@@ -145,7 +145,7 @@ def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Image:
     """The camera's image of the shelf and everything on it; the robot is out of the way.
 
     Args:
-      camera: the camera.
+      camera: the camera; static.
       world: the bodies.
       shelf: the shelf; the default shelf if None.
     """
@@ -171,7 +171,7 @@ def target_pixels(camera: Camera, world: World, window: int | None = None) -> In
     The shelf hides nothing of what stands on it from this camera and is left out.
 
     Args:
-      camera: the camera.
+      camera: the camera; static.
       world: the bodies.
       window: side of the window in pixels; by default it holds a 0.1 m tall target anywhere on the shelf.
     """

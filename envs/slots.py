@@ -29,6 +29,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.moved_target import nearest_candidate
+from mechsearch_jax.workspace.camera import Camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -218,7 +219,7 @@ class ManySlots:
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
         """See `Slots`."""
         for _, padded in self._chunks(rows):
-            self._state = _look(self._problem, self._state, world, keys, padded, self._recogniser)
+            self._state = _look(self._problem, self._state, world, keys, padded, self._recogniser, self._problem.camera)
         return _known(self._problem, self._state.belief, world)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
@@ -307,14 +308,23 @@ def _note(state: PlannerState, action: Action, rows: Int[Array, " n"]) -> Planne
     return state.replace(action=jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state.action, action))
 
 
-@functools.partial(jax.jit, static_argnames=("recogniser",))
+@functools.partial(jax.jit, static_argnames=("recogniser", "camera"))
 def _look(
-    problem: Problem, state: PlannerState, world: World, keys: Array, rows: Int[Array, " n"], recogniser: Recogniser
+    problem: Problem,
+    state: PlannerState,
+    world: World,
+    keys: Array,
+    rows: Int[Array, " n"],
+    recogniser: Recogniser,
+    camera: Camera,
 ) -> PlannerState:
-    """Recognise and update the belief in the slots `rows`."""
+    """Recognise and update the belief in the slots `rows`.
+
+    The simulated camera, which is the problem's, is static: of what a recogniser sees it decides about shapes.
+    """
 
     def one(mine, here, key):
-        observation = recogniser(key, Snapshot(problem.camera, problem.shelf, here))
+        observation = recogniser(key, Snapshot(camera, problem.shelf, here))
         belief = update_belief(problem, mine.belief, observation, mine.observation, mine.action)
         return PlannerState(belief, observation, no_action())
 

@@ -102,7 +102,7 @@ def _graspable(grasps: TargetGrasps, objects: Superquadrics, pose: Float[Array, 
     return best_grasp(grasps, objects, pose).success
 
 
-@functools.partial(jax.jit, static_argnames="camera")
+@jax.jit
 def _graspable_many(
     sets: Sequence[TargetGrasps], camera: Camera, worlds: World, active: Bool[Array, " n"]
 ) -> list[Bool[Array, " n"]]:

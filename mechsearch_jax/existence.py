@@ -135,6 +135,7 @@ class ExistenceTables(flax.struct.PyTreeNode):
       T_world_target: the places where the target is tried, shape (X, S, 4, 4).
       depth: the target's depth in a window at each place, infinite around it, shape (X, S, h, w) [m].
       corner: first row and column of that window in the coarse image, shape (X, S, 2).
+      middle: row and column of the pixel in the middle of the target's image at the first place, shape (X, 2).
       nearest: the least depth of the target at the first place, shape (X,) [m].
       cloud: surface of the drawn-in target in its own frame as rows of coordinates, shape (3, P) [m].
       radius: radius of a sphere that holds the target [m].
@@ -143,6 +144,7 @@ class ExistenceTables(flax.struct.PyTreeNode):
     T_world_target: jax.Array
     depth: jax.Array
     corner: jax.Array
+    middle: jax.Array
     nearest: jax.Array
     cloud: jax.Array
     radius: jax.Array
@@ -168,14 +170,16 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     half = np.array(target.half_size, np.float32)
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
 
-    def image_size(T):
+    def image_size(coarse, T):
         pixels, _ = project(coarse, transform(T[:, :, None], jnp.asarray(corners)))
         return jnp.max(jnp.max(pixels, axis=2) - jnp.min(pixels, axis=2), axis=(0, 1))
 
-    extent = np.asarray(jax.jit(image_size)(T))
-    window = (int(np.ceil(extent[0])) + 2, int(np.ceil(extent[1])) + 2)
+    rows, columns = np.asarray(jax.jit(image_size)(coarse, T)).tolist()
+    window = _window_side(rows), _window_side(columns)
+    # Whose middle does not depend on how the window's sides are rounded.
+    around = math.ceil(rows) + 2, math.ceil(columns) + 2
 
-    def view(pose):
+    def view(coarse, pose):
         one = Superquadrics(
             size=jnp.asarray(half),
             exponents=jnp.array(target.exponents),
@@ -183,15 +187,27 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
             rotation=pose[:3, :3],
             valid=jnp.array(True),
         )
-        return render.object_window(coarse, one, window)
+        return render.object_window(coarse, one, window), render.window_place(coarse, one, around)[0]
 
-    views = jax.jit(jax.vmap(jax.vmap(view)))(T)
+    each = jax.vmap(jax.vmap(view, in_axes=(None, 0)), in_axes=(None, 0))
+    views, first = jax.jit(each)(coarse, T)
     depth, corner = views.depth, views.corner
+    middle = first[:, 0] + np.array(around, np.int32)[None] // 2
     eroded = jnp.asarray(half - config.erosion)
     sample = jax.jit(superquadric.sample_surface, static_argnames="count")
     cloud = sample(eroded, jnp.array(target.exponents), count=config.points)
     nearest = jnp.min(depth[:, 0], axis=(-1, -2))
-    return ExistenceTables(T, depth, corner, nearest, cloud.T, jnp.float32(np.linalg.norm(half)))
+    return ExistenceTables(T, depth, corner, middle, nearest, cloud.T, jnp.float32(np.linalg.norm(half)))
+
+
+def _window_side(extent: float) -> int:
+    """How many rows or columns of pixels hold an image that is so many pixels long, wherever it begins: an even number.
+
+    A camera that was calibrated again sees the target a little larger or smaller. Were this the least number, such a
+    camera would now and then change a shape, and all that is compiled for it.
+    """
+    # What is measured in single precision may be measured as a little more elsewhere.
+    return 2 * math.ceil((math.ceil(extent + 1e-3) + 1) / 2)
 
 
 def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | None = None) -> ObjectViews:
@@ -225,7 +241,7 @@ def object_views(
 
     Args:
       tables: constants of the problem.
-      camera: the camera at full resolution; static.
+      camera: the camera at full resolution.
       scene: the objects, fields (N, ...).
       exists: poses that matter; collisions at the others are not computed and read False. None if collisions do not
         count at all.
@@ -239,10 +255,10 @@ def object_views(
     coarse = camera.scaled(config.downscale)
     fresh = scene.valid if moved is None else moved & scene.valid
 
-    def view(_, scene, i):
+    def view(coarse, scene, i):
         return render.object_window(coarse, jax.tree.map(lambda a: a[i], scene), config.window)
 
-    windows = _seen(masked_vmap(view, fresh, None, scene, block=8), fresh)
+    windows = _seen(masked_vmap(view, fresh, coarse, scene, block=8), fresh)
     collides = None if exists is None else _collisions(tables, scene, exists, fresh)
     if previous is None or moved is None:
         return ObjectViews(windows, collides)
@@ -301,7 +317,7 @@ def _at_places(
 
     Args:
       tables: constants of the problem.
-      coarse: the camera at the coarse resolution; static.
+      coarse: the camera at the coarse resolution, whose size alone counts.
       image: its depth image of the objects.
       exists: the poses that matter.
       measure: of the target's depth, the depth behind it, and which pixels are in the image; closes over no array.
@@ -366,7 +382,7 @@ def allowances(
 
     Args:
       tables: constants of the problem.
-      camera: the camera at full resolution; static.
+      camera: the camera at full resolution.
       target: static.
       scene: the objects that the camera sees, fields (N, ...).
       views: of them.
@@ -406,13 +422,14 @@ def _counted(
     of_target = math.ceil(h * grown), math.ceil(w * grown)
     scene = scene.replace(size=scene.size + ROUNDED)
 
-    def view(_, scene, i):
+    def view(closer, scene, i):
         return render.object_window(closer, jax.tree.map(lambda a: a[i], scene), of_objects)
 
-    windows = _seen(masked_vmap(view, scene.valid, None, scene, block=1), scene.valid)
+    windows = _seen(masked_vmap(view, scene.valid, closer, scene, block=1), scene.valid)
     image = render.merge_windows(closer, windows)
 
-    def counted(tables, image, i):
+    def counted(shared, image, i):
+        tables, closer = shared
         T = tables.T_world_target.reshape(-1, 4, 4)[i]
         one = Superquadrics(
             size=jnp.float32(target.half_size),
@@ -425,7 +442,7 @@ def _counted(
         behind, inside = _in_window(closer, image, mine.corner, of_target)
         return jnp.sum(inside & (mine.depth + config.depth_margin < behind)) * float(scale**2)
 
-    return masked_vmap(counted, doubtful.reshape(-1), tables, image, block=64).reshape(doubtful.shape)
+    return masked_vmap(counted, doubtful.reshape(-1), (tables, closer), image, block=64).reshape(doubtful.shape)
 
 
 def existence(
@@ -440,7 +457,7 @@ def existence(
 
     Args:
       tables: constants of the problem.
-      camera: the camera at full resolution; static.
+      camera: the camera at full resolution.
       views: of all objects, with the collisions of every pose where `exists` if they count.
       exists: `f_{t-1}`; all True at the start.
       allowed: how many coarse pixels a hidden target may show, see `allowances`.
@@ -465,9 +482,8 @@ def occluders(tables: ExistenceTables, views: ObjectViews) -> Bool[Array, "x n"]
 
     An approximation, for telling which objects matter; what is visible, `existence` says.
     """
-    middle = tables.corner[:, 0] + jnp.array(tables.depth.shape[-2:])[None] // 2
     windows = views.windows
-    pixel = (middle[:, None] - windows.corner[None]) // windows.stride[None, :, None]
+    pixel = (tables.middle[:, None] - windows.corner[None]) // windows.stride[None, :, None]
     size = jnp.array(windows.depth.shape[-2:])
     inside = jnp.all((pixel >= 0) & (pixel < size[None, None]), axis=-1)
     row, column = jnp.moveaxis(jnp.clip(pixel, 0, size[None, None] - 1), -1, 0)

@@ -147,7 +147,8 @@ def test_what_lies_on_the_shelfs_faces_is_the_shelf_whatever_the_mask_says(see, 
 def test_it_is_a_pytree_for_jit_and_vmap(see, images):
     """Shapes only: a batch compiles for long."""
     leaves, structure = jax.tree.flatten(see)
-    assert all(isinstance(leaf, jax.Array) for leaf in leaves)
+    # What the networks have learned, and where the camera is and what of its image is looked at.
+    assert all(isinstance(leaf, jax.Array | float | int) for leaf in leaves)
     again = jax.tree.unflatten(structure, leaves)
     assert jax.tree.structure(again) == jax.tree.structure(Recogniser(setting(images.camera)))
     assert again.camera == images.camera

@@ -13,7 +13,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.recognition import RecognitionConfig
 from mechsearch_jax.networks.segmentation import SegmentationConfig
 from mechsearch_jax.networks.weights import ARCHITECTURES, load_weights, read_card, save_weights
-from mechsearch_jax.perception.cloud import shelf_view, thinned_view
+from mechsearch_jax.perception.cloud import BLOCK, shelf_view, thinned_view
 from mechsearch_jax.perception.plausibility import camera_faults
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.recognition import nearness
@@ -43,8 +43,11 @@ def faults(place):
 def test_the_shipped_cards_say_what_the_networks_were_trained_on():
     for task in (RecognitionTask(), SegmentationTask()):
         assert TRAINED[task.name] == TrainedView(task.view.camera, task.shelf) == TrainedView()
-    # The thinned rays of the default camera are those that were cast.
-    assert thinned_view(Camera(), Shelf()) == shelf_view()
+    # The thinned rays of the default camera are those that were cast, and a few beyond the shelf.
+    shown, cast = thinned_view(Camera(), Shelf()), shelf_view()
+    size = {"height": cast.camera.height, "width": cast.camera.width}
+    assert dataclasses.replace(shown, camera=dataclasses.replace(shown.camera, **size)) == cast
+    assert all(0 <= getattr(shown.camera, name) - least < BLOCK for name, least in size.items())
 
 
 def test_of_six_plausible_places_at_most_one_is_warned_of():

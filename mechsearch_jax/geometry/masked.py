@@ -118,7 +118,7 @@ def merged(run: Callable[[Array, Any, Any], Any], indices: int = 1) -> Callable[
         piece = max((k for k in range(1, axis_size + 1) if axis_size % k == 0 and k <= limit), default=1)
 
         def spread(a, batched):
-            return a if batched else jnp.broadcast_to(a, (axis_size, *a.shape))
+            return a if batched else jnp.broadcast_to(a, (axis_size, *jnp.shape(a)))
 
         if any(jax.tree.leaves(shared_batched)):
             shared, rows = (

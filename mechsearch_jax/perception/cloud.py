@@ -8,6 +8,7 @@ a network is shown later, `view.of(depth)`, is spread over objects in the same w
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import flax.struct
 import jax
@@ -25,18 +26,23 @@ STRIDE = 2
 MARGIN = 0.004
 # How far objects may stick out over the board's front edge [m].
 OVERHANG = 0.06
+# Views that a network is shown have a multiple of so many rows and columns of rays, if the image has them. To a camera
+# that was calibrated again the shelf is a few pixels larger or smaller: for the least view its program would be
+# compiled anew each time.
+BLOCK = 8
 # Pixels in a block of `draw`.
 _BLOCK = 64
 
 
+@functools.partial(jax.tree_util.register_dataclass, data_fields=("camera", "row", "column"), meta_fields=("stride",))
 @dataclasses.dataclass(frozen=True)
 class View:
-    """Every `stride`-th ray of a part of a camera's image.
+    """Every `stride`-th ray of a part of a camera's image: a pytree, of which sizes and stride are static.
 
     Attributes:
       camera: the pinhole camera whose image consists of exactly these rays.
       row, column: of the first ray in the full image.
-      stride: distance of neighbouring rays in the full image, in pixels.
+      stride: distance of neighbouring rays in the full image, in pixels; static.
     """
 
     camera: Camera
@@ -46,9 +52,10 @@ class View:
 
     def of(self, image: Shaped[Array, "height width *channels"]) -> Shaped[Array, "h w *channels"]:
         """The view's pixels of a full image."""
-        rows = slice(self.row, self.row + self.camera.height * self.stride, self.stride)
-        columns = slice(self.column, self.column + self.camera.width * self.stride, self.stride)
-        return image[rows, columns]
+        size = [(count - 1) * self.stride + 1 for count in (self.camera.height, self.camera.width)]
+        corner = (self.row, self.column, *[0] * (image.ndim - 2))
+        part = jax.lax.dynamic_slice(image, corner, (*size, *image.shape[2:]))
+        return part[:: self.stride, :: self.stride]
 
 
 def view(camera: Camera, rows: tuple[int, int], columns: tuple[int, int], stride: int = 1) -> View:
@@ -75,8 +82,13 @@ def view(camera: Camera, rows: tuple[int, int], columns: tuple[int, int], stride
     return View(seen, rows[0], columns[0], stride)
 
 
-def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride: int = STRIDE) -> View:
-    """The part of the image in which things on the board can appear, up to 0.25 m above it.
+def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride: int = STRIDE, block: int = 1) -> View:
+    """The part of the image in which things on the board can appear, up to 0.25 m above it. Not for a traced camera.
+
+    Args:
+      camera, shelf: the defaults if None.
+      stride: distance of neighbouring rays, in pixels.
+      block: the view has as many rows and columns of rays as are a multiple of this, if the image has them.
 
     Raises:
       InputError: the camera does not see the shelf.
@@ -92,7 +104,18 @@ def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride:
     high = np.minimum(np.ceil(pixels.max(axis=0)) + 1, (camera.height, camera.width)).astype(int)
     if (depth <= 0).any() or (low >= high).any():
         raise InputError("shelf_view: the camera does not look into the shelf; check its pose")
-    return view(camera, (int(low[0]), int(high[0])), (int(low[1]), int(high[1])), stride)
+    sizes = (camera.height, camera.width)
+    rows, columns = (_in_blocks(int(low[i]), int(high[i]), sizes[i], stride, block) for i in range(2))
+    return view(camera, rows, columns, stride)
+
+
+def _in_blocks(first: int, end: int, size: int, stride: int, block: int) -> tuple[int, int]:
+    """A range of pixels that holds the given one, with a multiple of `block` rays if an image so long has them."""
+    count = -(-(end - first) // stride)
+    count = min(-(-count // block) * block, -(-size // stride))
+    span = (count - 1) * stride + 1
+    first = min(first, size - span)
+    return first, first + span
 
 
 def middle(shelf: Shelf) -> tuple[float, float, float]:
@@ -113,11 +136,13 @@ def density(camera: Camera, shelf: Shelf) -> float:
 def thinned_view(camera: Camera, shelf: Shelf) -> View:
     """The shelf's part of a camera's image as networks are shown it: thinned to about the density of their training.
 
+    Not for a traced camera: which rays they are decides about shapes.
+
     Raises:
       InputError: the camera does not see the shelf.
     """
     finer = density(camera, shelf) / density(Camera(), Shelf())
-    return shelf_view(camera, shelf, max(1, round(STRIDE * finer)))
+    return shelf_view(camera, shelf, max(1, round(STRIDE * finer)), BLOCK)
 
 
 class PointCloud(flax.struct.PyTreeNode):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from mechsearch_jax.perception.cloud import shelf_view
+from mechsearch_jax.perception.cloud import BLOCK, shelf_view
 from mechsearch_jax.perception.planes import PlaneConfig, find_plane
 from mechsearch_jax.workspace.camera import Camera, back_project, project
 from mechsearch_jax.workspace.shelf import Shelf
@@ -80,7 +80,7 @@ def image_faults(
     Raises:
       InputError: the camera does not see the shelf.
     """
-    view = shelf_view(camera, shelf, 1)
+    view = shelf_view(camera, shelf, 1, BLOCK)
     part = np.asarray(view.of(jnp.asarray(depth)), np.float32)
     measured = np.isfinite(part) & (part > 0)
     if measured.mean() < LEAST_MEASURED:

@@ -20,7 +20,7 @@ from mechsearch_jax.compiled import kept
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.cloud import MARGIN, OVERHANG, above_board, thinned_view
+from mechsearch_jax.perception.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
 from mechsearch_jax.perception.colour import TargetColour
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
@@ -57,13 +57,15 @@ class Recogniser:
     """What a camera's images show: the objects' shapes and poses, and the target where it is seen.
 
     A callable `(key, depth, colour=None, mask=None, target_id=None) -> Observation` for `jit` and `vmap`, and a pytree,
-    so that it can be an argument of either. Networks' weights are its leaves, all else is static.
+    so that it can be an argument of either. Networks' weights are its leaves, and where the camera stands; all else is
+    static. Not to be made inside of either: the camera decides about shapes.
 
     The image is looked at about as densely as in the networks' training, with 400 pixels to a metre at the middle of
     the board: of a finer one every second pixel, or third, and so on, of the part in which the shelf's space appears.
 
     Attributes:
       camera: what took the images; depth and colour are registered to it.
+      view: the part of the images that is looked at.
       shelf: whose space is looked at.
       target: whose pose is fitted.
       segmenter: labels images that come without a mask.
@@ -73,6 +75,7 @@ class Recogniser:
     """
 
     camera: Camera
+    view: View
     shelf: Shelf
     target: Target
     segmenter: Segmenter
@@ -104,9 +107,9 @@ class Recogniser:
           InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
         """
         camera = camera or problem.camera
-        thinned_view(camera, problem.shelf)
         fields = {
             "camera": camera,
+            "view": thinned_view(camera, problem.shelf),
             "shelf": problem.shelf,
             "target": problem.target,
             "segmenter": _as_pytree(segmenter or NetworkSegmenter.of()),
@@ -126,12 +129,13 @@ class Recogniser:
         return {name: view for name, view in views.items() if view is not None}
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        return (self.segmenter, self.shapes, self.detector), (self.camera, self.shelf, self.target, self.refinement)
+        data = (self.segmenter, self.shapes, self.detector, self.camera, self.view)
+        return data, (self.shelf, self.target, self.refinement)
 
     @classmethod
     def tree_unflatten(cls, static: tuple[Any, ...], leaves: tuple[Any, ...]) -> Recogniser:
         made = object.__new__(cls)
-        names = ("segmenter", "shapes", "detector", "camera", "shelf", "target", "refinement")
+        names = ("segmenter", "shapes", "detector", "camera", "view", "shelf", "target", "refinement")
         for name, value in zip(names, (*leaves, *static), strict=True):
             object.__setattr__(made, name, value)
         return made
@@ -172,9 +176,9 @@ class Recogniser:
         _check(self.camera, depth, colour, mask, target_id)
         keys = jax.random.split(key, 3)
         image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
-        camera = thinned_view(self.camera, self.shelf).camera
         # Compiled on its own, whatever the images that the labels come from.
-        found = recognise_image(keys[1:], image, self.shapes, camera, self.shelf, self.target, self.refinement)
+        seen_by = self.view.camera
+        found = recognise_image(keys[1:], image, self.shapes, seen_by, self.shelf, self.target, self.refinement)
         return Observation(found[0], visible, found[1])
 
 
@@ -188,8 +192,7 @@ def _labelled(
     recogniser: Recogniser, key: Array, depth: Any, colour: Any, mask: Any, target_id: Any
 ) -> tuple[LabelledImage, Bool[Array, ""]]:
     """The shelf's part of the image with labels, and whether the target is visible in it."""
-    camera, shelf = recogniser.camera, recogniser.shelf
-    view = thinned_view(camera, shelf)
+    camera, view, shelf = recogniser.camera, recogniser.view, recogniser.shelf
     seen = view.of(jnp.asarray(depth, jnp.float32))
     seen = jnp.where(seen > 0.0, seen, jnp.nan)
     points = back_project(view.camera, seen)

@@ -15,7 +15,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import matmul, transform
 from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import distance, draw
+from mechsearch_jax.perception.cloud import draw, middle
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
 from mechsearch_jax.perception.target_pose import target_pose
@@ -45,16 +45,21 @@ def best_hypothesis(hypotheses: Hypotheses, segments: Segments) -> Superquadrics
     )
 
 
-def nearness(camera: Camera, shelf: Shelf) -> float:
+def nearness(camera: Camera, shelf: Shelf) -> Float[Array, ""]:
     """The share of its distance from an object at which a camera is told to the network.
 
     The network makes little of a camera farther away than that of its training. It is told of one that is not, on the
     same line, from which the points look all but the same.
     """
-    return min(1.0, distance(Camera(), Shelf()) / distance(camera, shelf))
+    return jnp.minimum(1.0, _away(Camera(), Shelf()) / jnp.maximum(_away(camera, shelf), 1e-9))
 
 
-@functools.partial(jax.jit, static_argnames=("network", "camera", "shelf", "count", "config"))
+def _away(camera: Camera, shelf: Shelf) -> Float[Array, ""]:
+    """`cloud.distance`, also of a camera that is traced."""
+    return jnp.linalg.norm(jnp.array(camera.position) - jnp.array(middle(shelf)))
+
+
+@functools.partial(jax.jit, static_argnames=("network", "shelf", "count", "config"))
 def recognise(
     key: Key[Array, ""],
     network: RecognitionNetwork,
@@ -73,7 +78,7 @@ def recognise(
     Args:
       key: PRNG key of the points that are drawn.
       network, parameters: as `networks.weights` loads them; the network is static.
-      camera: the camera of the image, a `View`'s as in training; static.
+      camera: the camera of the image, a `View`'s as in training.
       points: in the world [m]; NaN invalidates the pixel, whose label is then MISSING.
       labels: a segment's number, or one of `perception.labels`.
       shelf: the shelf; static.
@@ -123,7 +128,7 @@ class LabelledImage(flax.struct.PyTreeNode):
     of_target: jax.Array
 
 
-@kept(static_argnames=("camera", "shelf", "target", "refinement"))
+@kept(static_argnames=("shelf", "target", "refinement"))
 def recognise_image(
     keys: Key[Array, "2"],
     image: LabelledImage,
@@ -141,7 +146,7 @@ def recognise_image(
       keys: of the points that are drawn from the objects, and from the target.
       image: its pixels are the camera's.
       shapes: the network.
-      camera: the camera of the image, a `View`'s as in training; static.
+      camera: the camera of the image, a `View`'s as in training.
       shelf, target, refinement: static.
 
     Returns:

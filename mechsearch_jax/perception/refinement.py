@@ -410,7 +410,7 @@ def _supposed(scene_object: Superquadrics, hypothesis: Hypothesis, config: Refin
     )
 
 
-@functools.partial(jax.jit, static_argnames=("camera", "shelf", "config"))
+@functools.partial(jax.jit, static_argnames=("shelf", "config"))
 def refine(
     camera: Camera,
     shelf: Shelf,
@@ -426,7 +426,7 @@ def refine(
     pass through an object, whatever it is that they end on, so no segmentation of the image is asked for.
 
     Args:
-      camera: the camera of the depth image; static.
+      camera: the camera of the depth image.
       shelf: the shelf that the objects are on; static.
       scene: what a recogniser made of the points, fields (N, ...).
       points: observed points in the world [m]; what is not finite is left out.

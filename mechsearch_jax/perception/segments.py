@@ -104,7 +104,7 @@ def edge_marks(
     return jnp.where(hidden, HIDDEN_EDGE, jnp.where(ends, OUTLINE, INNER)).astype(jnp.int8)
 
 
-@functools.partial(jax.jit, static_argnames=("camera", "shelf", "count", "config"))
+@functools.partial(jax.jit, static_argnames=("shelf", "count", "config"))
 def segment_clouds(
     key: Key[Array, ""],
     camera: Camera,
@@ -118,7 +118,7 @@ def segment_clouds(
 
     Args:
       key: PRNG key.
-      camera: the camera of the image; only its position counts; static.
+      camera: the camera of the image; only its position counts.
       points: in the world [m]; those that are MISSING may be NaN.
       labels: a segment's number, or one of `perception.labels`.
       shelf: the shelf; static.

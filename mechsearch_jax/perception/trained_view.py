@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mechsearch_jax.errors import InputError, shown
-from mechsearch_jax.perception.cloud import density, distance, middle, thinned_view
+from mechsearch_jax.perception.cloud import density, distance, middle, shelf_view, thinned_view
 from mechsearch_jax.tables import checked
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -29,7 +29,7 @@ class TrainedView:
       shelf: what it looks at.
     """
 
-    camera: Camera = dataclasses.field(default_factory=lambda: thinned_view(Camera(), Shelf()).camera)
+    camera: Camera = dataclasses.field(default_factory=lambda: shelf_view(Camera(), Shelf()).camera)
     shelf: Shelf = dataclasses.field(default_factory=Shelf)
 
     def numbers(self) -> dict[str, float]:

@@ -51,7 +51,8 @@ class Problem(flax.struct.PyTreeNode):
       existence, grasps, actions: constants of f, of g and of the actions.
       retrieval: a denser set of grasps, for the target once it is found; it has no candidate poses.
       poses: the candidate poses X as x, y [m], yaw [rad], shape (X, 3).
-      camera, shelf, gripper, target, config: static.
+      camera: data, but for its image's size, so that another pose compiles nothing.
+      shelf, gripper, target, config: static.
     """
 
     existence: ExistenceTables
@@ -59,7 +60,7 @@ class Problem(flax.struct.PyTreeNode):
     actions: ActionTables
     retrieval: GraspTables
     poses: jax.Array
-    camera: Camera = flax.struct.field(pytree_node=False)
+    camera: Camera
     shelf: Shelf = flax.struct.field(pytree_node=False)
     gripper: Gripper = flax.struct.field(pytree_node=False)
     target: Target = flax.struct.field(pytree_node=False)

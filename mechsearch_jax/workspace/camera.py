@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -14,15 +17,25 @@ from mechsearch_jax.geometry.transforms import rotate
 # More pixels along a side, or metres from the robot, no camera here has.
 LARGEST = 16384
 FARTHEST = 10.0
+# What of a camera is data under `jit`.
+_DATA = ("fx", "fy", "cx", "cy", "rotation", "position")
 
 
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=_DATA,
+    meta_fields=("width", "height"),
+)
 @dataclasses.dataclass(frozen=True)
 class Camera:
     """A fixed pinhole camera; its frame has x right, y down, z forward. Defaults: docs/method.md,
     "Facts of the scene".
 
+    A pytree: where a jitted function takes it as an argument that is not static, a camera that was calibrated again
+    compiles nothing. Outside of tracing it holds plain numbers, and is hashable.
+
     Attributes:
-      width, height: image size in pixels.
+      width, height: image size in pixels; static.
       fx, fy: focal lengths in pixels.
       cx, cy: principal point in pixels; pixel (row, column) has its centre at (column + 0.5, row + 0.5).
       rotation: rows of `R_world_camera`.
@@ -45,6 +58,9 @@ class Camera:
     def __post_init__(self):
         for name in ("width", "height"):
             check_range(f"Camera: {name}", getattr(self, name), 1, LARGEST, "pixels")
+        # Rebuilt by JAX, the fields that are data hold whatever stands for their leaves, which is not checked.
+        if not all(map(_is_given, jax.tree.leaves([getattr(self, name) for name in _DATA]))):
+            return
         for name in ("fx", "fy"):
             check_range(f"Camera: {name}", getattr(self, name), 1e-3, 100 * LARGEST, "pixels")
         for name in ("cx", "cy"):
@@ -56,6 +72,11 @@ class Camera:
             raise InputError("Camera: rotation mirrors; its columns are the camera's x, y and z, a right-handed frame")
         for axis, value in zip("xyz", self.position, strict=True):
             check_range(f"Camera: position {axis}", value, -FARTHEST, FARTHEST, "m")
+        # Of one type, whatever number they were given as: another type compiles anew.
+        for name in ("fx", "fy", "cx", "cy"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+        object.__setattr__(self, "rotation", tuple(tuple(map(float, row)) for row in self.rotation))
+        object.__setattr__(self, "position", tuple(map(float, self.position)))
 
     def moved(self, shift: tuple[float, float, float]) -> Camera:
         """The same camera elsewhere, by a translation in the world [m]."""
@@ -73,6 +94,11 @@ class Camera:
             cx=self.cx / factor,
             cy=self.cy / factor,
         )
+
+
+def _is_given(leaf: Any) -> bool:
+    """Whether a leaf is what somebody gave, right or wrong, and not what JAX puts in its place."""
+    return isinstance(leaf, int | float | np.number | np.ndarray | str) and not isinstance(leaf, bool)
 
 
 def pixel_rays(

@@ -110,7 +110,7 @@ def render_depth(
     """Depth image of a scene, object by object and then the nearest.
 
     Args:
-      camera: pinhole camera; static.
+      camera: pinhole camera.
       scene: superquadrics with fields (N, ...).
       method: "root" finds the crossing S = 1; "volumetric" integrates equations 9 to 12 (biased by 10 mm, see
         `integrate`); static.
@@ -157,7 +157,7 @@ def window_place(
     return corner.astype(jnp.int32), stride.astype(jnp.int32)
 
 
-@functools.partial(jax.jit, static_argnames=("camera", "window"))
+@functools.partial(jax.jit, static_argnames=("window",))
 def object_window(camera: Camera, scene_object: Superquadrics, window: tuple[int, int]) -> Window:
     """Depth of one object in a window of fixed size around its image; more coarsely where it is larger than that."""
     corner, stride = window_place(camera, scene_object, window)

@@ -1,0 +1,270 @@
+"""A camera that was calibrated again is data: it compiles nothing, and its results are those of a constant."""
+
+import dataclasses
+import functools
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.compiled import Kept, keep_in
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.existence import allowances, existence, existence_tables, object_views
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception import recogniser as recognising
+from mechsearch_jax.perception import recognition
+from mechsearch_jax.perception.cloud import BLOCK, thinned_view, view
+from mechsearch_jax.perception.examples import example_images
+from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
+from mechsearch_jax.planner.rollout import no_sequences
+from mechsearch_jax.planner.state import Decision
+from mechsearch_jax.workspace import render
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+KEY = jax.random.key(0)
+SHELF, TARGET = Shelf(), Target.cylinder()
+OBJECTS = superquadrics(load_scenario(example_scenarios()["first-light"]).objects)
+SEEN = Observation(OBJECTS, jnp.array(False), jnp.zeros(3))
+
+
+def recalibrated(camera, turn=1e-6, shift=1e-4):
+    """The camera as another calibration has it: turned [rad] and moved [m] a little."""
+    turned = Rotation.from_rotvec([turn, -turn, turn]).as_matrix() @ np.array(camera.rotation)
+    rotation = tuple(map(tuple, turned.tolist()))
+    return dataclasses.replace(camera, rotation=rotation, fx=camera.fx + 1e-3).moved((shift, -shift, shift))
+
+
+NEW = recalibrated(Camera())
+
+
+def with_camera(problem, camera):
+    """The problem, built for another camera."""
+    tables = existence_tables(camera, problem.shelf, problem.target, problem.config.existence)
+    return problem.replace(camera=camera, existence=tables)
+
+
+@pytest.fixture(scope="module")
+def two(problem):
+    """The problem with one camera, and with the same one calibrated again."""
+    return problem, with_camera(problem, NEW)
+
+
+@pytest.fixture(scope="module")
+def recognisers():
+    return tuple(Recogniser(types.SimpleNamespace(camera=c, shelf=SHELF, target=TARGET)) for c in (Camera(), NEW))
+
+
+def traced_as(tree):
+    """What a jitted function is traced from."""
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [(jnp.shape(a), jnp.result_type(a), jax.typeof(a).weak_type) for a in leaves]
+
+
+def test_a_camera_survives_jax_and_is_what_it_was_outside():
+    camera = Camera(fx=600, position=(0, 0.25, 0.5))
+    leaves, structure = jax.tree.flatten(camera)
+    assert [type(leaf) for leaf in leaves] == [float] * 16
+    again = jax.tree.unflatten(structure, leaves)
+    assert (again, hash(again), repr(again)) == (camera, hash(camera), repr(camera))
+    assert camera == Camera(fx=600.0, position=(0.0, 0.25, 0.5)) != NEW
+    assert len({camera, again, NEW, Camera()}) == 3
+    assert jax.tree.structure(camera) == jax.tree.structure(NEW)
+    assert jax.tree.structure(camera) != jax.tree.structure(camera.scaled(2))
+    assert Camera(fx=np.float64(600.0), position=(np.float64(0.0), 0.25, 0.5)) == camera
+    # Whatever JAX puts in the place of leaves is not looked at.
+    for other in (None, True, object(), jax.ShapeDtypeStruct((), jnp.float32), jnp.float32(-1.0)):
+        rebuilt = jax.tree.unflatten(structure, [other] * 16)
+        assert rebuilt.fx is other
+        assert rebuilt.position == (other,) * 3
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"width": 0}, "Camera: width (0) must be from 1 to 16384 pixels"),
+        ({"fx": -1.0}, "Camera: fx (-1.0) must be from 0.001 to 1.6384e+06 pixels"),
+        ({"cy": float("nan")}, "Camera: cy (nan) must be from -163840 to 163840 pixels"),
+        ({"rotation": ((1.0, 0.0, 0.0),) * 3}, "Camera: rotation must be a rotation matrix, three orthonormal rows"),
+        (
+            {"rotation": ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))},
+            "Camera: rotation mirrors; its columns are the camera's x, y and z, a right-handed frame",
+        ),
+        ({"position": (0.0, 11.0, 0.0)}, "Camera: position y (11.0) must be from -10 to 10 m"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_an_impossible_camera_is_refused_as_before(wrong, message):
+    with pytest.raises(InputError) as caught:
+        Camera(**wrong)
+    assert str(caught.value) == message
+
+
+def test_all_that_is_jitted_takes_both_cameras_alike(two, recognisers):
+    """So that no program is traced for the second: that of a decision is large, and is not compiled here."""
+    for one, other in (two, recognisers, [r.view for r in recognisers]):
+        assert traced_as(one) == traced_as(other)
+        # What of it is static has to be equal, and data must not be.
+        assert not all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (one, other)), strict=True))
+
+
+def test_a_plan_is_traced_once_for_both_cameras(two):
+    traced = []
+
+    def plan(rollout, key, objects):
+        """Plans nothing, but looks where the target may be."""
+        traced.append("plan")
+        problem = rollout.problem
+        settings, everywhere = problem.config.existence, jnp.ones_like(rollout.belief.exists)
+        views = object_views(problem.existence, problem.camera, objects, None, settings)
+        now = existence(problem.existence, problem.camera, views, everywhere, rollout.belief.allowed, settings)
+        cost, nothing = jnp.sum(now).astype(jnp.float32), no_sequences(rollout.config, objects)
+        return Decision(no_action(), cost, cost, cost, objects, nothing, jnp.int32(0))
+
+    policy = search_for_grasp(PlannerConfig(sequences=2, horizon=1)).replace(plan=plan)
+    belief = initial_belief(two[0])
+    costs = [float(policy(KEY, problem, belief, SEEN).cost) for problem in two]
+    assert traced == ["plan"]
+    assert 0 < costs[0] < len(belief.exists)
+    assert costs[1] == pytest.approx(costs[0], rel=0.1)
+
+
+def cache_size(function):
+    return function.jitted._cache_size() if isinstance(function, Kept) else function._cache_size()
+
+
+def test_a_belief_is_compiled_once_for_both_cameras(two):
+    # Compiled before, as for an episode, whatever ran before.
+    update_belief(two[0], initial_belief(two[0]), SEEN)
+    sizes = [cache_size(f) for f in (initial_belief, update_belief)]
+    found = [update_belief(problem, initial_belief(problem), SEEN) for problem in two]
+    assert [cache_size(f) for f in (initial_belief, update_belief)] == sizes
+    counts = [int(jnp.sum(belief.exists)) for belief in found]
+    assert counts[0] > 0
+    assert counts[1] == pytest.approx(counts[0], rel=0.05)
+
+
+def test_images_are_recognised_by_one_program_for_both_cameras(recognisers):
+    images = example_images()
+    parts = recognising._labelled, recognition.recognise_image
+    first = recognisers[0](KEY, images.depth, mask=images.mask)
+    sizes = [cache_size(part) for part in parts]
+    second = recognisers[1](KEY, images.depth, mask=images.mask)
+    assert [cache_size(part) for part in parts] == sizes
+    np.testing.assert_array_equal(first.objects.valid, second.objects.valid)
+    # The image is the same, and the camera said to be elsewhere: so are the objects.
+    moved = (second.objects.position - first.objects.position)[first.objects.valid]
+    assert 1e-6 < float(jnp.max(jnp.abs(moved))) < 5e-3
+
+
+def test_what_was_kept_on_disk_is_found_for_another_pose(tmp_path):
+    traced = []
+
+    def depths(camera, scene):
+        traced.append("depths")
+        return render.render_depth(camera, scene)
+
+    # As a function of a module, which another process finds.
+    small = [camera.scaled(20) for camera in (Camera(), NEW)]
+    keep_in(tmp_path)
+    first = Kept(depths, ())(small[0], OBJECTS)
+    again = Kept(depths, ())
+    assert again.is_ready(small[1], OBJECTS)
+    second = again(small[1], OBJECTS)
+    assert traced == ["depths"]
+    assert not np.array_equal(first, second)
+
+
+def test_a_camera_that_is_traced_gives_what_a_constant_does(two):
+    def f(camera, tables, scene):
+        settings = two[0].config.existence
+        everywhere = jnp.ones(tables.corner.shape[0], bool)
+        views = object_views(tables, camera, scene, everywhere, settings)
+        allowed = allowances(tables, camera, TARGET, scene, views, settings)
+        return existence(tables, camera, views, everywhere, allowed, settings), views.windows
+
+    for problem in two:
+        constant = jax.jit(functools.partial(f, problem.camera))(problem.existence, OBJECTS)
+        traced = jax.jit(f)(problem.camera, problem.existence, OBJECTS)
+        np.testing.assert_array_equal(constant[0], traced[0])
+        np.testing.assert_array_equal(constant[1].corner, traced[1].corner)
+        np.testing.assert_array_equal(constant[1].stride, traced[1].stride)
+        seen = np.isfinite(constant[1].depth) & np.isfinite(traced[1].depth)
+        assert seen.any()
+        assert (seen == np.isfinite(constant[1].depth)).mean() > 0.9999
+        np.testing.assert_allclose(constant[1].depth[seen], traced[1].depth[seen], atol=2e-5)
+
+
+def test_cameras_of_a_batch_may_differ():
+    """Rendered together and one by one."""
+    cameras = [c.scaled(20) for c in (Camera(), NEW.moved((0.05, 0.0, 0.0)))]
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+    together = jax.vmap(lambda camera: render.render_depth(camera, OBJECTS))(both)
+    for camera, image in zip(cameras, together, strict=True):
+        one = render.render_depth(camera, OBJECTS)
+        same = np.isfinite(one) & np.isfinite(image)
+        assert (np.isfinite(one) == np.isfinite(image)).mean() > 0.999
+        np.testing.assert_allclose(image[same], one[same], atol=1e-4)
+
+
+def test_of_100_calibrations_a_millimetre_apart_nearly_all_share_a_program():
+    rng = np.random.default_rng(0)
+    known = traced_as(thinned_view(Camera(), SHELF))
+    cameras = [recalibrated(Camera(), *rng.normal(scale=1e-3, size=2)) for _ in range(100)]
+    views = [thinned_view(camera, SHELF) for camera in cameras]
+    assert sum(traced_as(seen) == known for seen in views) >= 90
+    for seen in views:
+        assert seen.camera.height % BLOCK == seen.camera.width % BLOCK == 0
+
+
+def test_the_window_of_a_target_is_large_enough_and_even(problem):
+    height, width = problem.existence.depth.shape[-2:]
+    assert (height % 2, width % 2) == (0, 0)
+    # With a window that is twice as large, nothing more is seen of any target.
+    coarse = Camera().scaled(problem.config.existence.downscale)
+
+    def pixels(T, window):
+        one = jax.tree.map(lambda a: a[0], OBJECTS).replace(
+            size=jnp.float32(TARGET.half_size),
+            exponents=jnp.float32(TARGET.exponents),
+            position=T[:3, 3],
+            rotation=T[:3, :3],
+        )
+        return jnp.sum(jnp.isfinite(render.object_window(coarse, one, window).depth))
+
+    T = problem.existence.T_world_target[::7].reshape(-1, 4, 4)
+    counted = [jax.jit(jax.vmap(functools.partial(pixels, window=w)))(T) for w in ((height, width), (64, 64))]
+    np.testing.assert_array_equal(*counted)
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3])
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_a_view_takes_its_rays_from_an_image_wherever_they_begin(stride, channels):
+    image = jnp.arange(72 * 128 * max(1, *channels, 1)).reshape(72, 128, *channels)
+    small = dataclasses.replace(Camera().scaled(10), width=128, height=72)
+    of = jax.jit(lambda seen, image: seen.of(image))
+    for row, column in ((0, 0), (5, 11), (12, 27)):
+        seen = view(small, (row, row + 60), (column, column + 101), stride)
+        expected = image[row : row + 60 : stride, column : column + 101 : stride]
+        np.testing.assert_array_equal(seen.of(image), expected)
+        np.testing.assert_array_equal(of(seen, image), expected)
+    assert of._cache_size() == 1
+
+
+def test_a_view_in_blocks_stays_inside_the_image():
+    # Half of the default's pixels: its view then ends at the image's edge.
+    for camera in (Camera(), Camera().scaled(3), dataclasses.replace(Camera(), width=1090, height=700)):
+        seen = thinned_view(camera, SHELF)
+        for first, count, size in (
+            (seen.row, seen.camera.height, camera.height),
+            (seen.column, seen.camera.width, camera.width),
+        ):
+            assert 0 <= first < size - (count - 1) * seen.stride
+            assert count % BLOCK == 0 or count == -(-size // seen.stride)
