@@ -406,9 +406,7 @@ class Shaky:
     def __call__(self, shelf, scene, pusher, T_world_gripper, displacement, q7):
         told = QuasiStatic()(shelf, scene, pusher, T_world_gripper, displacement, q7)
         feared = jnp.where(told.moved, self.chance, 0.0)
-        residual = told.residual + self.residual
-        resolved = residual <= QuasiStatic().max_penetration
-        return told.replace(topples=jnp.maximum(told.topples, feared), residual=residual, resolved=resolved)
+        return told.replace(topples=jnp.maximum(told.topples, feared), residual=told.residual + self.residual)
 
 
 # The first is executed as ever, and the second nevertheless.

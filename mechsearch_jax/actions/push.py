@@ -292,7 +292,7 @@ class Push:
         moved = pushed.moved
         still = scene.valid & ~moved & pushes
         config = space.config
-        holds = pushed.resolved & jnp.all(pushed.topples <= config.topple)
+        holds = pushed.resolved & jnp.isfinite(pushed.residual) & jnp.all(pushed.topples <= config.topple)
         spoiled = ~holds | jnp.any(moved & untouchable)
         spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
         spoiled |= push_hits_others(space, tables, scene, action, wrist, still)
