@@ -159,7 +159,7 @@ def f_of(problem: Problem, scene: Superquadrics) -> Bool[Array, " x"]:
     everywhere = jnp.ones(problem.poses.shape[0], bool)
     views = object_views(problem.existence, problem.camera, scene, everywhere, problem.config.existence)
     config = problem.config.existence
-    allowed = jnp.full(problem.existence.corner.shape[:2], config.allowed, jnp.int32)
+    allowed = jnp.full(problem.existence.corner.shape[:2], config.allowed(problem.camera), jnp.int32)
     return existence(problem.existence, problem.camera, views, everywhere, allowed, config)
 
 

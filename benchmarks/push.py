@@ -236,7 +236,13 @@ def repeated(
             position=jnp.where(failed[:, None, None], before.position, after.position),
             rotation=jnp.where(failed[:, None, None, None], before.rotation, after.rotation),
         )
-        outcome = PushOutcome(scene, jnp.where(failed, jnp.inf, 0.0), over.astype(jnp.float32))
+        outcome = PushOutcome(
+            scene=scene,
+            moved=some.before.valid & ~failed[:, None],
+            residual=jnp.where(failed, jnp.inf, 0.0),
+            resolved=~failed,
+            topples=over.astype(jnp.float32),
+        )
         parts.append(jax.tree.map(lambda a, index=index: np.asarray(a)[index < count], outcome))
         told(min(start + worlds, count))
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)

@@ -21,7 +21,7 @@ from mechsearch_jax.benchmarks.evaluate import present_code
 from mechsearch_jax.benchmarks.exact_existence import SIDE, exact_existence
 from mechsearch_jax.benchmarks.images import save_rows
 from mechsearch_jax.envs.episodes import target_of
-from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS, target_pixels
+from mechsearch_jax.envs.simulated_camera import target_pixels
 from mechsearch_jax.envs.world import TARGET, World, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
@@ -32,6 +32,7 @@ from mechsearch_jax.planner.cache import cached_problem
 from mechsearch_jax.train.scenes import PIXELS, cast_world
 from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.detector import FOUND_PIXELS
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target

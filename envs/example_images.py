@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.envs.recognisers import true_labels
-from mechsearch_jax.envs.simulated_camera import found_pixels, observe
+from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.world import TARGET, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.examples import Images, save_images
 from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.scenario import Scenario, example_scenarios, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
 

@@ -145,7 +145,9 @@ def _outcome(shelf: Shelf, scene: Superquadrics, world: World, told: Simulated, 
             position=jnp.where(moved[:, None], position[:n], scene.position),
             rotation=jnp.where(moved[:, None, None], rotation[:n], scene.rotation),
         ),
+        moved=moved,
         residual=jnp.where(failed, jnp.inf, 0.0),
+        resolved=~failed,
         topples=jnp.where(moved & over[:n], 1.0, 0.0),
     )
 

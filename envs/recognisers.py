@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.compiled import kept
-from mechsearch_jax.envs.simulated_camera import found_pixels, observe
+from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.errors import InputError
@@ -32,6 +32,7 @@ from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, r
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 

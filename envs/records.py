@@ -61,7 +61,7 @@ class Step:
 
     Attributes:
       belief_size: number of candidate poses where the target can still be.
-      found: whether the target has been found.
+      found: whether the target has been found, and may still be where it was seen last.
       graspable: whether it has been found and a collision-free grasp of it exists in the true state.
       cost: J of the observed state; None where nothing was planned.
       action: what the robot did; None if the episode ended here.

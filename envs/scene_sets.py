@@ -127,8 +127,8 @@ def _generate(layout: str, target: str) -> Callable[[int, int, str], Scenario]:
     """What makes a scene from its seed, its number of objects and its name."""
     # They take long to import and to make, and nothing is made where all files are there.
     from mechsearch_jax.envs.generator import GeneratorConfig, ScenarioGenerator
-    from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS
     from mechsearch_jax.envs.three_objects import LineGenerator
+    from mechsearch_jax.workspace.detector import FOUND_PIXELS
     from mechsearch_jax.workspace.target import Target
 
     config = GeneratorConfig(visible=FOUND_PIXELS, anywhere=True)

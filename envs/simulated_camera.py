@@ -20,10 +20,10 @@ from mechsearch_jax.envs.world import BODIES, TARGET, World
 from mechsearch_jax.geometry.transforms import rotate
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
+from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 
 BACKGROUND, SHELF = -1, BODIES
-FOUND_PIXELS = 100
 
 # Colour of each slot, the target (red, as in the paper) and the shelf.
 PALETTE = np.array(
@@ -186,11 +186,6 @@ def target_pixels(camera: Camera, world: World, window: int | None = None) -> In
 
 
 def is_found(camera: Camera, world: World) -> Bool[Array, ""]:
-    """Whether the detector sees the target: more than 100 pixels of it at 1280 x 720."""
+    """Whether the detector sees the target: more of its pixels than `found_pixels`, 100 at 1280 x 720."""
     # Of no weak type, so that what takes it is compiled once.
     return jnp.asarray(target_pixels(camera, world) > found_pixels(camera), bool)
-
-
-def found_pixels(camera: Camera) -> float:
-    """The detector does not find a target of which no more pixels are seen: 100 at 1280 x 720."""
-    return FOUND_PIXELS * camera.width * camera.height / (1280 * 720)

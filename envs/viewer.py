@@ -209,7 +209,7 @@ class Viewer:
         ]
         for name, (label, shown) in LAYERS.items():
             self._switch(name, gui.add_checkbox(label, shown))
-        bands = drawing.bands(recording.steps[0].scene.capacity)
+        bands = drawing.bands()
         colours = ", ".join(f'<b style="color:{band.colour}">{band.label}</b>' for band in bands)
         gui.add_html(f'<div style="font-size:small;padding:0 1em">{LEGEND}{colours}</div>')
         # What the server itself sets calls back, too, without a client.

@@ -38,17 +38,25 @@ from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
 from mechsearch_jax.options import option
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.detector import FOUND_PIXELS, found_pixels, longer
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 FAR = 1.5
-# The most coarse pixels that a target may show for a closer look to be worth it; no target that the detector misses was
-# seen to show more than 12.
+# The most coarse pixels of an image of 1280 x 720 that a target may show for a closer look to be worth it; no target
+# that the detector misses was seen to show more than 12. They are a sliver along an edge, as many as that is long.
 DOUBTFUL = 16
 # Of a pose's places those that show least are looked at again, this many.
 CLOSER_PLACES = 3
 # A count at a third of the camera's resolution may be off by as much.
 CLOSER_TOLERANCE = 1.5
+# A target shows so many times what the detector needs where it cannot be missed: neither for a sensor that measures a
+# third of its pixels only, nor behind an object that is recognised 5 mm too narrow along one side of it.
+PLAIN = 3.0
+# An object that is recognised a little elsewhere, or touches the target, reaches no deeper into it than this [m].
+TOUCHING = 0.01
+# Of a found target's image and the largest one of a candidate.
+NEARER = 1.25
 # The edges of superquadrics that stand for boxes and cylinders are rounded: what they hide is that of a larger one [m].
 ROUNDED = 1e-3
 
@@ -61,7 +69,8 @@ class ExistenceConfig:
       criterion: what makes the target visible: "detector" counts the pixels it would show at full resolution;
         "depth-mse" is the paper's mean squared difference of the two depth images; "depth-norm" their Euclidean
         distance.
-      found_pixels: more pixels than this at full resolution and the detector finds the target.
+      found_pixels: more pixels than this of an image of 1280 x 720 and the detector finds the target; of others the
+        same share, see `workspace.detector`.
       depth_threshold: threshold of "depth-mse" [m^2] and "depth-norm" [m].
       downscale: how much coarser than the camera f is rendered.
       cell_reach: a target is tried at the middle of its grid cell and this far on the way to each of the cell's corners
@@ -81,7 +90,7 @@ class ExistenceConfig:
         "what makes a target visible: its pixels, as the detector counts them, or the depth image, as in the paper",
         ("detector", "depth-mse", "depth-norm"),
     )
-    found_pixels: int = 100
+    found_pixels: int = FOUND_PIXELS
     depth_threshold: float = 0.001
     downscale: int = 7
     cell_reach: tuple[float, ...] = option(
@@ -118,10 +127,9 @@ class ExistenceConfig:
         corners = [(a, b, a * b * (share == 1.0)) for share in self.cell_reach for a, b in _corners(share)]
         return np.array([(0.0, 0.0, 0.0), *corners], np.float32)
 
-    @property
-    def allowed(self) -> int:
-        """How many coarse pixels a target may show that the detector does not find."""
-        return self.found_pixels // self.downscale**2
+    def allowed(self, camera: Camera) -> int:
+        """How many coarse pixels of a camera's image a target may show that the detector does not find."""
+        return int(found_pixels(camera, self.found_pixels) // self.downscale**2)
 
 
 def _corners(share: float) -> list[tuple[float, float]]:
@@ -211,7 +219,7 @@ def _window_side(extent: float) -> int:
 
 
 def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | None = None) -> ObjectViews:
-    """Views of so many objects that are yet to be looked at.
+    """Views of so many objects that are yet to be looked at: they hide nothing, as empty slots never do.
 
     Args:
       capacity: how many.
@@ -220,7 +228,7 @@ def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | N
     """
     return ObjectViews(
         windows=render.Window(
-            depth=jnp.zeros((capacity, *config.window)),
+            depth=jnp.full((capacity, *config.window), jnp.inf),
             corner=jnp.zeros((capacity, 2), jnp.int32),
             stride=jnp.ones(capacity, jnp.int32),
         ),
@@ -371,8 +379,8 @@ def allowances(
     tables: ExistenceTables,
     camera: Camera,
     target: Target,
-    scene: Superquadrics,
     views: ObjectViews,
+    closer: Float[Array, "h w"],
     config: ExistenceConfig,
 ) -> Int[Array, "x s"]:
     """How many coarse pixels a target that the detector does not find may show at each place.
@@ -384,11 +392,12 @@ def allowances(
       tables: constants of the problem.
       camera: the camera at full resolution.
       target: static.
-      scene: the objects that the camera sees, fields (N, ...).
-      views: of them.
+      views: of the objects that the camera sees.
+      closer: of `closer_image`.
       config: static.
     """
-    bound = jnp.full(tables.corner.shape[:2], config.allowed, jnp.int32)
+    least, doubt = config.allowed(camera), math.ceil(DOUBTFUL * longer(camera))
+    bound = jnp.full(tables.corner.shape[:2], least, jnp.int32)
     if config.criterion != "detector" or not config.closer_look:
         return bound
     everywhere = jnp.ones(tables.corner.shape[0], bool)
@@ -396,12 +405,12 @@ def allowances(
     image = render.merge_windows(coarse, views.windows)
     shown = _shown(tables, coarse, image, everywhere, config)
     free = jnp.ones(shown.shape, bool) if views.collides is None else ~jnp.any(views.collides, axis=-1)
-    settled = jnp.any(free & (shown <= config.allowed), axis=1)
-    doubtful = free & ~settled[:, None] & (shown > config.allowed) & (shown <= DOUBTFUL)
-    order = jnp.argsort(jnp.where(doubtful, shown, DOUBTFUL + 1), axis=1, stable=True)
+    settled = jnp.any(free & (shown <= least), axis=1)
+    doubtful = free & ~settled[:, None] & (shown > least) & (shown <= doubt)
+    order = jnp.argsort(jnp.where(doubtful, shown, doubt + 1), axis=1, stable=True)
     doubtful &= jnp.argsort(order, axis=1) < CLOSER_PLACES
-    counted = _counted(tables, camera, target, scene, doubtful, config)
-    hidden = doubtful & (counted <= CLOSER_TOLERANCE * config.found_pixels)
+    counted = _counted(tables, camera, target, closer, doubtful, config)
+    hidden = doubtful & (counted <= CLOSER_TOLERANCE * found_pixels(camera, config.found_pixels))
     return jnp.where(hidden, shown, bound)
 
 
@@ -409,40 +418,117 @@ def _counted(
     tables: ExistenceTables,
     camera: Camera,
     target: Target,
-    scene: Superquadrics,
+    closer: Float[Array, "h w"],
     doubtful: Bool[Array, "x s"],
     config: ExistenceConfig,
 ) -> Float[Array, "x s"]:
     """Pixels of the full resolution that a target shows at doubtful places, by a closer look; 0 at the others."""
-    scale = config.closer_look
-    closer = camera.scaled(scale)
-    grown = config.downscale / scale
-    (rows, columns), (h, w) = config.window, tables.depth.shape[-2:]
-    of_objects = math.ceil(rows * grown), math.ceil(columns * grown)
-    of_target = math.ceil(h * grown), math.ceil(w * grown)
+
+    def counted(shared, closer, i):
+        tables, camera = shared
+        T = tables.T_world_target.reshape(-1, 4, 4)[i]
+        return _pixels(tables, camera, target, closer, T, config)
+
+    return masked_vmap(counted, doubtful.reshape(-1), (tables, camera), closer, block=64).reshape(doubtful.shape)
+
+
+def _closest(config: ExistenceConfig) -> int:
+    """How much coarser than the camera what is looked at most closely is."""
+    return config.closer_look if config.criterion == "detector" and config.closer_look else config.downscale
+
+
+def closer_image(
+    camera: Camera, scene: Superquadrics, views: ObjectViews, config: ExistenceConfig
+) -> Float[Array, "h w"]:
+    """The depth image of a closer look [m]; the coarse one where the configuration has none.
+
+    Args:
+      camera: the camera at full resolution.
+      scene: the objects that the camera sees, fields (N, ...).
+      views: of them.
+      config: static.
+    """
+    scale = _closest(config)
+    closer, grown = camera.scaled(scale), config.downscale / scale
+    if scale == config.downscale:
+        return render.merge_windows(closer, views.windows)
+    window = math.ceil(config.window[0] * grown), math.ceil(config.window[1] * grown)
     scene = scene.replace(size=scene.size + ROUNDED)
 
     def view(closer, scene, i):
-        return render.object_window(closer, jax.tree.map(lambda a: a[i], scene), of_objects)
+        return render.object_window(closer, jax.tree.map(lambda a: a[i], scene), window)
 
     windows = _seen(masked_vmap(view, scene.valid, closer, scene, block=1), scene.valid)
-    image = render.merge_windows(closer, windows)
+    return render.merge_windows(closer, windows)
 
-    def counted(shared, image, i):
-        tables, closer = shared
-        T = tables.T_world_target.reshape(-1, 4, 4)[i]
-        one = Superquadrics(
-            size=jnp.float32(target.half_size),
-            exponents=jnp.float32(target.exponents),
-            position=T[:3, 3],
-            rotation=T[:3, :3],
-            valid=jnp.array(True),
-        )
-        mine = render.object_window(closer, one, of_target)
-        behind, inside = _in_window(closer, image, mine.corner, of_target)
-        return jnp.sum(inside & (mine.depth + config.depth_margin < behind)) * float(scale**2)
 
-    return masked_vmap(counted, doubtful.reshape(-1), (tables, closer), image, block=64).reshape(doubtful.shape)
+def _pixels(
+    tables: ExistenceTables,
+    camera: Camera,
+    target: Target,
+    closer: Any,
+    T_world_target: Float[Array, "4 4"],
+    config: ExistenceConfig,
+    nearer: float = 1.0,
+) -> Float[Array, ""]:
+    """How many pixels of the full resolution a target would show, counted in the image of a closer look.
+
+    Args:
+      tables: constants of the problem.
+      camera: the camera at full resolution.
+      target: static.
+      closer: of `closer_image`.
+      T_world_target: where the target would stand.
+      config: static.
+      nearer: how many times as large as the largest candidate its image may be; static.
+    """
+    scale = _closest(config)
+    grown = nearer * config.downscale / scale
+    h, w = tables.depth.shape[-2:]
+    window = math.ceil(h * grown), math.ceil(w * grown)
+    one = Superquadrics(
+        size=jnp.float32(target.half_size),
+        exponents=jnp.float32(target.exponents),
+        position=T_world_target[:3, 3],
+        rotation=T_world_target[:3, :3],
+        valid=jnp.array(True),
+    )
+    mine = render.object_window(camera.scaled(scale), one, window)
+    behind, inside = _in_window(camera.scaled(scale), closer, mine.corner, window)
+    return jnp.sum(inside & (mine.depth + config.depth_margin < behind)) * float(scale**2)
+
+
+def plainly_elsewhere(
+    tables: ExistenceTables,
+    camera: Camera,
+    target: Target,
+    scene: Superquadrics,
+    closer: Float[Array, "h w"],
+    T_world_target: Float[Array, "4 4"],
+    config: ExistenceConfig,
+) -> Bool[Array, ""]:
+    """Whether a target that the detector does not see cannot be at a pose: it would be in plain sight there, or an
+    object stands there. In doubt it can.
+
+    Args:
+      tables: constants of the problem.
+      camera: the camera at full resolution.
+      target: static.
+      scene: the objects that the camera sees, fields (N, ...).
+      closer: of `closer_image`.
+      T_world_target: the pose, which need not be a candidate.
+      config: static.
+    """
+    shows = _pixels(tables, camera, target, closer, T_world_target, config, NEARER)
+    slim = jnp.maximum(scene.size - TOUCHING, 0.25 * scene.size)
+    points = transform(T_world_target, tables.cloud.T)
+
+    def reaches(size, exponents, position, rotation):
+        local = transform(inverse(make(rotation, position)), points)
+        return jnp.any(superquadric.gauge(size, exponents, local) < 1.0)
+
+    inside = jax.vmap(reaches)(slim, scene.exponents, scene.position, scene.rotation) & scene.valid
+    return (shows > PLAIN * found_pixels(camera, config.found_pixels)) | jnp.any(inside)
 
 
 def existence(

@@ -41,6 +41,9 @@ WRIST_ORIGIN = math.pi / 4
 # So many grasps of a pose are looked at together, and so many points of a cloud first.
 GROUP = 16
 COARSE = 320
+# What a pose where no grasp is feasible counts for, in objects hit: one more than the eight objects of a scene and its
+# target. It does not depend on how many slots a scene has; whoever hits as many might as well have no grasp.
+INFEASIBLE = 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -407,12 +410,11 @@ def _marked(mask: Bool[Array, "... e"], tables: GraspTables, rows: tuple[FoundGr
 def graspability(rows: Pairs, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:
     """g at all poses from H: 1 minus the least number of objects that a feasible grasp hits (equation 17).
 
-    A pose where no grasp is feasible counts as hitting one object more than there can be.
+    A pose where no grasp is feasible counts as hitting `INFEASIBLE` objects, however many slots there are.
     """
-    worst = hits.shape[1] + 1
-    count = jnp.where(rows.allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), worst)
+    count = jnp.where(rows.allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), INFEASIBLE)
     least = jax.ops.segment_min(count, rows.pose, num_segments=rows.poses, indices_are_sorted=True)
-    return 1 - jnp.minimum(least, worst)
+    return 1 - jnp.minimum(least, INFEASIBLE)
 
 
 def crowding(rows: Pairs, hits: Bool[Array, "k n"]) -> Float[Array, " y"]:

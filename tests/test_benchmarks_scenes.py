@@ -13,10 +13,11 @@ from mechsearch_jax.benchmarks.evaluate import present_code
 from mechsearch_jax.benchmarks.exact_existence import exact_existence
 from mechsearch_jax.benchmarks.scenes import Row, look_at_all, nearest_pose, save_scenes, summary
 from mechsearch_jax.benchmarks.tables import scenes_table
-from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS, observe, target_pixels
+from mechsearch_jax.envs.simulated_camera import observe, target_pixels
 from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.detector import FOUND_PIXELS
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target

@@ -10,8 +10,8 @@ import pytest
 import mechsearch_jax
 from mechsearch_jax.envs.earlier import EARLIER, RENAMED
 from mechsearch_jax.envs.scene_sets import SETS, digest, recorded
-from mechsearch_jax.envs.simulated_camera import FOUND_PIXELS
 from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.workspace.detector import FOUND_PIXELS
 
 ROOT = Path(__file__).parents[1]
 PAGES = ["README.md", "CHANGELOG.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md"))]

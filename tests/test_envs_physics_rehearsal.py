@@ -102,7 +102,7 @@ def told(problem):
     for name, objects in SCENES.items():
         seen, at = known(problem, objects)
         tried = worth_trying(problem, seen, at)
-        found[name] = tried, MODEL(problem, seen, at, True, tried.action, tried.hits <= seen.capacity, GRASPS)
+        found[name] = tried, MODEL(problem, seen, at, True, tried.action, tried.feasible, GRASPS)
     return found
 
 

@@ -454,7 +454,8 @@ def test_a_model_that_knows_the_outcome_scores_best(pushes):
             position=jnp.asarray(after.position)[row],
             rotation=jnp.asarray(after.rotation)[row],
         )
-        return push_model.PushOutcome(known, jnp.zeros(()), jnp.asarray(pushes.toppled)[row].astype(jnp.float32))
+        over = jnp.asarray(pushes.toppled)[row].astype(jnp.float32)
+        return push_model.PushOutcome(known, known.valid, jnp.zeros(()), jnp.array(True), over)
 
     pusher = push_tables(CONFIG).pusher
     best = model_scores(oracle, pushes, pusher, batch=8)["all"]

@@ -13,11 +13,16 @@ from test_workspace_camera_render import reference_superquadric_depth
 from mechsearch_jax import existence, planner
 from mechsearch_jax.envs.generator import ScenarioGenerator
 from mechsearch_jax.envs.scene_sets import find_scene, make_scene
+from mechsearch_jax.envs.simulated_camera import target_pixels
+from mechsearch_jax.envs.world import TARGET, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner.rollout import Rollout
 from mechsearch_jax.workspace import scenario
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.detector import found_pixels
 
 UNSEEN, NOWHERE = jnp.array(False), jnp.zeros(3)
 
@@ -30,7 +35,7 @@ def look(problem, objects, belief=None):
 def coarsely(problem, views, exists, config=None):
     """f by the coarse image alone."""
     config = config or problem.config.existence
-    allowed = jnp.full(problem.existence.corner.shape[:2], config.allowed)
+    allowed = jnp.full(problem.existence.corner.shape[:2], config.allowed(problem.camera))
     return existence.existence(problem.existence, problem.camera, views, exists, allowed, config)
 
 
@@ -131,7 +136,7 @@ def test_a_closer_look_keeps_what_the_coarse_image_loses(problem, slivers):
         same = existence.existence(problem.existence, problem.camera, views, everywhere, fine.allowed, config)
         np.testing.assert_array_equal(same, fine.exists)
         # Only what was looked at again may show more.
-        more = np.asarray(fine.allowed) > config.allowed
+        more = np.asarray(fine.allowed) > config.allowed(problem.camera)
         assert np.any(more)
         assert np.mean(more) < 0.1
         assert np.all(np.asarray(fine.allowed)[more] <= existence.DOUBTFUL)
@@ -142,7 +147,8 @@ def test_without_a_closer_look_every_place_may_show_the_same(problem):
     objects = scenario.superquadrics(scenario.load_scenario(scenario.example_scenarios()["first-light"]).objects)
     config = dataclasses.replace(problem.config.existence, closer_look=0)
     views = existence.object_views(problem.existence, problem.camera, objects, None, config)
-    told = existence.allowances(problem.existence, problem.camera, problem.target, objects, views, config)
+    closer = existence.closer_image(problem.camera, objects, views, config)
+    told = existence.allowances(problem.existence, problem.camera, problem.target, views, closer, config)
     np.testing.assert_array_equal(told, np.full(told.shape, 2))
 
 
@@ -176,7 +182,7 @@ def test_f_is_little_larger_than_what_must_stay_possible(problem):
     exact = ExistenceConfig(cell_reach=(0.5, 1.0), closer_look=0, downscale=3, window=(110, 110))
     tables = existence.existence_tables(problem.camera, problem.shelf, problem.target, exact)
     everywhere = jnp.ones(problem.poses.shape[0], bool)
-    allowed = jnp.full(tables.corner.shape[:2], exact.allowed)
+    allowed = jnp.full(tables.corner.shape[:2], exact.allowed(problem.camera))
 
     @jax.jit
     def exactly(objects):
@@ -222,6 +228,59 @@ def test_an_empty_shelf_hides_nothing(problem):
     belief = look(problem, superquadric.empty(8))
     # There is nothing that it could believe instead.
     assert int(belief.restarts) == 1
+
+
+def camera_of(width, height, focal):
+    return Camera(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
+
+
+@pytest.mark.parametrize("camera", [Camera(), camera_of(640, 480, 525.0), camera_of(640, 360, 457.0)])
+def test_empty_slots_hide_nothing_in_a_plan(problem, camera):
+    """Twelve slots, none or three of which hold objects."""
+    settings, policy = problem.config.existence, planner.search_for_grasp()
+    tables = existence.existence_tables(camera, problem.shelf, problem.target, settings)
+    here = problem.replace(camera=camera, existence=tables)
+    loaded = scenario.superquadrics(scenario.load_scenario(scenario.example_scenarios()["first-light"]).objects)
+    for objects in (superquadric.empty(12), superquadric.pad(loaded, 12)):
+        belief = look(here, objects)
+        root = Rollout(here, belief, policy.config, policy.propose, policy.predict, policy.objective).root(objects)
+        bodies = root.scene.replace(valid=root.scene.valid & ~root.is_target)
+        views = existence.object_views(tables, camera, bodies, None, settings, root.views, root.moved)
+        f = existence.existence(tables, camera, views, root.exists, belief.allowed, settings)
+        # Of an empty shelf nothing is believed, because nothing can be.
+        np.testing.assert_array_equal(f, belief.exists & jnp.any(objects.valid))
+        assert not existence.occluders(tables, views)[:, ~np.asarray(bodies.valid)].any()
+
+
+@pytest.mark.parametrize("width", [640, 1280, 1920])
+def test_f_rules_out_what_the_detector_sees_and_nothing_else(problem, width):
+    """The same view in images of three sizes: the target stands at candidate poses beside a box and behind it."""
+    camera, shelf, target = camera_of(width, width * 9 // 16, Camera().fx * width / 1280), problem.shelf, problem.target
+    config = dataclasses.replace(problem.config.existence, cell_reach=())
+    tables = existence.existence_tables(camera, shelf, target, config)
+    body = scenario.Body("box", (0.048, 0.028, 0.08), (0.55, 0.135, 0.4845), (1.0, 0.0, 0.0, 0.0))
+    hidden = scenario.Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
+    world, objects = from_scenario(scenario.Scenario("one", (body,), hidden)), scenario.superquadrics([body])
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+    views = existence.object_views(tables, camera, objects, everywhere, config)
+    closer = existence.closer_image(camera, objects, views, config)
+    allowed = existence.allowances(tables, camera, target, views, closer, config)
+    f = np.asarray(existence.existence(tables, camera, views, everywhere, allowed, config))
+    free = ~np.asarray(views.collides).any(axis=(1, 2))
+
+    def pixels(pose):
+        at = jnp.append(pose[:2], target.height(shelf))
+        return target_pixels(camera, world.replace(position=world.position.at[TARGET].set(at)))
+
+    near = np.flatnonzero(free & (np.abs(np.asarray(problem.poses)[:, 1] - 0.07) < 0.1))
+    counts = np.asarray(jax.lax.map(pixels, problem.poses[near]))
+    limit = found_pixels(camera)
+    assert limit == {640: 25, 1280: 100, 1920: 225}[width]
+    unseen, plain = counts <= limit, counts > 2 * limit
+    assert ((counts > 0) & unseen).sum() > 5
+    assert plain.sum() > 20
+    assert f[near[unseen]].all()
+    assert not f[near[plain]].any()
 
 
 def test_looking_again_at_moved_objects_alone_gives_the_same_views(problem):

@@ -12,8 +12,8 @@ from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionConfig, ActionKind
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.types import Prediction, Sample
+from mechsearch_jax.dynamics.learned import LearnedPush
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
-from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import masked, superquadric
@@ -106,11 +106,8 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "max_steps": 10,
     }
     # What is no option.
-    assert (ActionConfig().contact_tolerance, ActionConfig().max_penetration, ActionConfig().topple) == (
-        0.003,
-        0.006,
-        0.5,
-    )
+    assert (ActionConfig().contact_tolerance, ActionConfig().topple) == (0.003, 0.5)
+    assert (QuasiStatic().max_penetration, LearnedPush().max_penetration) == (0.006, 0.026)
     assert (GraspConfig().yaws, len(GraspConfig().wrists), GraspConfig.dense().yaws) == (7, 3, 25)
     assert (ExistenceConfig().found_pixels, len(ExistenceConfig().places)) == (100, 5)
 
@@ -172,13 +169,15 @@ def test_what_is_picked_later_stays_where_it_is_in_the_published_code(problem):
 
     def shifts(problem, state, sample, first):
         scene = state.scene
-        return Prediction(scene.replace(position=scene.position + ahead[None]), jnp.array(True), jnp.float32(0.5))
+        after = scene.replace(position=scene.position + ahead[None])
+        return Prediction(after, scene.valid, jnp.array(True), jnp.float32(0.5))
 
     def shift(kind, first):
         action = no_action().replace(kind=jnp.int32(kind))
         sample = Sample(action, jnp.int32(0), jnp.float32(0.0))
         told = LaterPlacementsStay(shifts)(problem, state, sample, jnp.array(first))
         assert bool(told.possible)
+        assert np.any(told.moved) == np.any(told.scene.position != state.scene.position)
         return float(told.scene.position[0, 0] - state.scene.position[0, 0])
 
     assert shift(ActionKind.PICK_AND_PLACE, False) == 0
@@ -199,7 +198,8 @@ def test_later_actions_are_drawn_in_the_present_scene_if_asked_for(problem):
 
     def moves(problem, state, sample, first):
         scene = state.scene
-        return Prediction(scene.replace(position=scene.position + shift[None]), jnp.array(True), jnp.float32(0.0))
+        after = scene.replace(position=scene.position + shift[None])
+        return Prediction(after, scene.valid, jnp.array(True), jnp.float32(0.0))
 
     @dataclasses.dataclass(frozen=True)
     class Drawn(Rollout):
@@ -232,7 +232,7 @@ def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(
         return Sample(no_action(), jnp.int32(0), jax.random.uniform(key))
 
     def seldom(problem, state, sample, first):
-        return Prediction(state.scene, sample.risk < 0.3, sample.risk)
+        return Prediction(state.scene, state.scene.valid, sample.risk < 0.3, sample.risk)
 
     def share(first, **changes):
         config = dataclasses.replace(CONFIG, **changes)
@@ -405,7 +405,7 @@ class Shaky:
 
     def __call__(self, shelf, scene, pusher, T_world_gripper, displacement, q7):
         told = QuasiStatic()(shelf, scene, pusher, T_world_gripper, displacement, q7)
-        feared = jnp.where(moved_objects(scene, told.scene), self.chance, 0.0)
+        feared = jnp.where(told.moved, self.chance, 0.0)
         return told.replace(topples=jnp.maximum(told.topples, feared), residual=told.residual + self.residual)
 
 
@@ -462,7 +462,7 @@ def test_what_may_topple_or_touch_the_target_is_charged_for(decision, root, prob
         POLICY,
         config=dataclasses.replace(CONFIG, topple_charge=2.0, unseen_contact_penalty=0.5, first_draws=1),
         propose=lambda key, *_: Sample(action, jnp.int32(0), jax.random.uniform(key)),
-        predict=lambda problem, state, *_: Prediction(state.scene, jnp.array(True), jnp.float32(0.4)),
+        predict=lambda _, state, *__: Prediction(state.scene, state.scene.valid, jnp.array(True), jnp.float32(0.4)),
     )
     keys = jax.random.split(jax.random.key(0), 5)
     risk = np.array([jax.random.uniform(key) for key in keys])

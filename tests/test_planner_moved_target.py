@@ -12,7 +12,7 @@ from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
-from mechsearch_jax.graspability import crowding, grasp_hits, graspability, pairs
+from mechsearch_jax.graspability import INFEASIBLE, crowding, grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.belief import possible_poses, with_target
 from mechsearch_jax.planner.config import Weights
@@ -65,7 +65,7 @@ def states(problem, belief, objects):
     moving = dataclasses.replace(
         rollout,
         propose=lambda *_: Sample(action, jnp.int32(0), jnp.float32(0.0)),
-        predict=lambda *_: Prediction(pushed, jnp.array(True), jnp.float32(0.0)),
+        predict=lambda *_: Prediction(pushed, root.is_target, jnp.array(True), jnp.float32(0.0)),
     )
     changes, _, _ = moving.act(jnp.array(True), root, jax.random.key(0))
 
@@ -126,7 +126,7 @@ def test_where_a_pushed_target_could_be_hidden_no_grasp_counts(problem, belief, 
     at, hits = jnp.asarray(after.target_at), jnp.zeros(after.hits.shape, bool)
     cost = lambda exists: float(objective.cost(problem, belief, exists, at, hits, Weights(crowding=0.02)))  # noqa: E731
     assert cost(jnp.zeros_like(at)) == objective.reached
-    assert cost(at) == objective.reached + 1.0 + hits.shape[1]
+    assert cost(at) == objective.reached + INFEASIBLE
 
 
 def test_the_target_may_be_pushed_once_but_not_picked(states):

@@ -59,20 +59,19 @@ def to_either_side(key, problem, belief, objective, guided_fraction, state):
 
 def moves(problem, state, sample, first):
     scene = state.scene
-    return Prediction(
-        scene.replace(position=scene.position + sample.action.displacement[None]), jnp.array(True), jnp.float32(0.0)
-    )
+    after = scene.replace(position=scene.position + sample.action.displacement[None])
+    return Prediction(after, scene.valid, jnp.array(True), jnp.float32(0.0))
 
 
 def never(problem, state, sample, first):
-    return Prediction(state.scene, jnp.array(False), jnp.float32(0.0))
+    return Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False), jnp.float32(0.0))
 
 
 def only_left(problem, state, sample, first):
     told = moves(problem, state, sample, first)
     possible = sample.action.displacement[1] < 0
     scene = jax.tree.map(lambda a, b: jnp.where(possible, a, b), told.scene, state.scene)
-    return Prediction(scene, possible, jnp.float32(0.0))
+    return Prediction(scene, told.moved & possible, possible, jnp.float32(0.0))
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.transforms import make, translate
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.moved_target import nearest_candidate
-from mechsearch_jax.planner.unseen_motion import reopened
+from mechsearch_jax.planner.unseen_motion import reopened, same_objects
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
 LEFT = jnp.float32([0.0, 0.1, 0.0])
@@ -92,6 +92,51 @@ def test_objects_may_be_seen_in_another_order(problem, opened):
     everywhere = jnp.ones(problem.poses.shape[0], bool)
     swapped = boxes((0.6, 0.3), (0.6, 0.09))
     np.testing.assert_array_equal(*(opened(everywhere, BEFORE, after, push()) for after in (AFTER, swapped)))
+
+
+def shuffled(objects, order):
+    return jax.tree.map(lambda a: a[np.asarray(order)], objects)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.004])
+def test_only_what_is_seen_says_which_object_is_which(problem, opened, noise):
+    """In whatever slots the objects are, before the push and after it, the same poses are opened."""
+    rng = np.random.default_rng(7)
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+    before = boxes((0.6, 0.0), (0.6, 0.06), (0.55, 0.3), (0.68, 0.02))
+    sets = []
+    # The first is pushed, by as much as it should be, or less, and pushes the second on.
+    for way, on in ((0.1, 0.09), (0.04, 0.03), (0.08, 0.075)):
+        after = boxes((0.6, way), (0.6, 0.06 + on), (0.55, 0.3), (0.68, 0.02))
+        after = after.replace(
+            position=after.position + noise * jnp.float32(rng.normal(size=(8, 3))) * after.valid[:, None],
+            size=after.size + noise * jnp.float32(rng.uniform(-1, 1, size=(8, 3))) * after.valid[:, None],
+        )
+        expected = opened(everywhere, before, after, push())
+        assert expected.any()
+        sets.append(expected)
+        for _ in range(3):
+            again = opened(everywhere, before, shuffled(after, rng.permutation(8)), push())
+            np.testing.assert_array_equal(again, expected)
+        order = rng.permutation(8)
+        pushed = push().replace(object=jnp.int32(int(np.flatnonzero(order == 0)[0])))
+        np.testing.assert_array_equal(opened(everywhere, shuffled(before, order), after, pushed), expected)
+    assert not np.array_equal(sets[0], sets[1])
+
+
+def test_no_object_is_taken_for_two():
+    before, after = boxes((0.6, 0.0), (0.6, 0.06), (0.5, 0.3)), boxes((0.5, 0.3), (0.6, 0.055), (0.6, 0.12))
+    meant = before.position.at[0].add(LEFT)
+    same, known = same_objects(before, after, meant)
+    assert same[:3].tolist() == [2, 1, 0]
+    assert known.tolist() == [True] * 3 + [False] * 5
+    # One is not seen any more.
+    same, known = same_objects(before, after.replace(valid=after.valid.at[2].set(False)), meant)
+    assert known.tolist() == [False, True, True] + [False] * 5
+    assert same[1:3].tolist() == [1, 0]
+    # Any number of slots will do, and one that is seen from another side is the same.
+    many, turned = (superquadric.pad(a, 12) for a in (before, after.replace(size=after.size[:, jnp.array([2, 0, 1])])))
+    assert same_objects(many, turned, jnp.pad(meant, ((0, 4), (0, 0))))[0][:3].tolist() == [2, 1, 0]
 
 
 def test_a_picked_object_may_have_touched_the_target_at_both_ends(problem, opened):

@@ -12,6 +12,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, Polygon
 from mechsearch_jax.actions import ActionKind, kind_of, no_action, retrieve_action
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.graspability import INFEASIBLE
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.viz.blockers import MARK, Moment, blockers_figure
 from mechsearch_jax.viz.filmstrip import Frame, filmstrip
@@ -225,7 +226,7 @@ def test_a_map_puts_every_pose_where_it_is(target):
     shown = np.zeros(rows * columns * target.yaws, bool)
     index = np.ravel_multi_index((3, 7, 0), (rows, columns, target.yaws))
     shown[index] = True
-    image = drawing.map_image(shown, np.ones(len(shown), int), target, 8)
+    image = drawing.map_image(shown, np.ones(len(shown), int), target)
     assert image.shape == (rows, columns, 4)
     assert np.argwhere(image[..., 3] > 0).tolist() == [[3, 7]]
     np.testing.assert_allclose(image[3, 7, :3], drawing.rgb(drawing.GRASPABLE))
@@ -237,16 +238,16 @@ def test_a_map_shows_the_best_of_the_possible_yaw_angles():
     shown, g = np.zeros(shape, bool), np.full(shape, 1)
     shown[0, 0, :2] = True
     g[0, 0, :2] = (-1, 0)
-    image = drawing.map_image(shown.reshape(-1), g.reshape(-1), target, 8)
+    image = drawing.map_image(shown.reshape(-1), g.reshape(-1), target)
     np.testing.assert_allclose(image[0, 0, :3], drawing.rgb(drawing.BLOCKED[0]))
     assert image[0, 0, 3] < 0.9
 
 
 def test_every_value_of_g_has_one_colour():
-    bands = drawing.bands(8)
+    bands = drawing.bands()
     for g in range(-30, 2):
         assert sum(band.low <= g <= band.high for band in bands) == 1
-    assert next(band.label for band in bands if band.low <= -8 <= band.high) == "out of reach"
+    assert next(band.label for band in bands if band.low <= 1 - INFEASIBLE <= band.high) == "out of reach"
 
 
 def test_the_window_holds_the_shelf():

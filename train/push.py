@@ -15,7 +15,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Key
 
-from mechsearch_jax.dynamics.learned import LIKELY, NAME, SLACK, predicted
+from mechsearch_jax.dynamics.learned import LIKELY, MAX_PENETRATION, NAME, predicted
 from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs import pushes as generator
@@ -266,14 +266,14 @@ class PushTask:
         held_out = jax.tree.map(lambda a: a[:scenes], self.held_out)
         network = PushNetwork(self.network)
         models: dict[str, PushModel] = {
-            "network": functools.partial(predicted, network, parameters, LIKELY, SLACK),
+            "network": functools.partial(predicted, network, parameters, LIKELY, MAX_PENETRATION),
             "quasi-static": QuasiStatic(),
             "no motion": no_motion,
         }
         return {name: model_scores(model, held_out, self.pusher, self.shelf) for name, model in models.items()}
 
     def save(self, path: Path, parameters: Any, card: dict[str, Any]) -> None:
-        card = card | {"scored_with": {"likely": LIKELY, "slack": SLACK}}
+        card = card | {"scored_with": {"likely": LIKELY, "max_penetration": MAX_PENETRATION}}
         save_weights(path, self.name, self.network, parameters, card)
 
 
@@ -340,7 +340,8 @@ def no_motion(
     shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
 ) -> PushOutcome:
     """The `PushModel` that predicts nothing."""
-    return PushOutcome(scene, jnp.zeros(()), jnp.zeros(scene.capacity))
+    nowhere = jnp.zeros(scene.capacity)
+    return PushOutcome(scene, nowhere > 0, jnp.zeros(()), jnp.array(True), nowhere)
 
 
 @functools.partial(jax.jit, static_argnames=("model", "shelf"))

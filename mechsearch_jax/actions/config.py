@@ -55,7 +55,6 @@ class ActionConfig:
       clearance: distance to keep from neighbours when placing [m].
       contact_tolerance: an object may brush others this deep on its way out [m]: those that touch each other are
         recognised as overlapping as often as not, and would lock each other in.
-      max_penetration: deepest unresolved penetration of a predicted push that is still executed [m].
       avoid_unseen: whether an object's actions that enter space where the target may be are sampled only if it has no
         others; the paper does not look at that.
       cloud_points: points on the swept gripper.
@@ -90,7 +89,6 @@ class ActionConfig:
     place_yaw: float = math.radians(30)
     clearance: float = 0.005
     contact_tolerance: float = 0.003
-    max_penetration: float = 0.006
     avoid_unseen: bool = option(
         True, "whether actions that enter space where the target may be come last; the paper's do not"
     )

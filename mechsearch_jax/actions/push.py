@@ -18,7 +18,6 @@ from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.types import Action, Draft, Prediction, Ways
 from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
 from mechsearch_jax.dynamics.push_model import PushModel
-from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import back_off, make, transform, translate
@@ -290,10 +289,10 @@ class Push:
         # A model that simulates has less to do where nothing is pushed.
         way = jnp.where(pushes, action.displacement, 0.0)
         pushed = push_model(space.shelf, scene, tables.pusher, action.T_world_gripper, way, action.q7)
-        moved = moved_objects(scene, pushed.scene)
+        moved = pushed.moved
         still = scene.valid & ~moved & pushes
         config = space.config
-        holds = (pushed.residual <= config.max_penetration) & jnp.all(pushed.topples <= config.topple)
+        holds = pushed.resolved & jnp.isfinite(pushed.residual) & jnp.all(pushed.topples <= config.topple)
         spoiled = ~holds | jnp.any(moved & untouchable)
         spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
         spoiled |= push_hits_others(space, tables, scene, action, wrist, still)
@@ -304,7 +303,7 @@ class Push:
             return motion_free(space, *jax.tree.map(lambda a: a[...], row))
 
         follows = masked_vmap(free, (pushes & ~spoiled)[None], None, (scene, pushed.scene, still, action))[0]
-        return Prediction(pushed.scene, ~spoiled & follows, jnp.sum(pushed.topples))
+        return Prediction(pushed.scene, moved, ~spoiled & follows, jnp.sum(pushed.topples))
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
         """See `motion.push_reference`."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.actions.candidates import Candidates, free_ways
 from mechsearch_jax.actions.config import ActionSpace, ActionTables
@@ -17,11 +18,28 @@ from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
 
+# Random numbers are drawn for so many objects at a time: a scene's eight and the target, which is the last of a scene.
+BLOCK = 9
 
-def _choose(key, weight):
-    """A random index in proportion to weights, and whether any weight is positive."""
+
+def _numbers(key: Array, kinds: int, capacity: int, width: int) -> Float[Array, "kinds capacity width"]:
+    """Random numbers (Gumbel) of all ways of all objects by all kinds; an object's do not depend on the capacity.
+
+    The last object of a scene, which may be the target, has those of the last of the first `BLOCK`.
+    """
+    blocks = math.ceil(capacity / BLOCK)
+    keys = [key, *(jax.random.fold_in(key, i) for i in range(1, blocks))]
+    drawn = [jax.random.gumbel(k, (kinds * BLOCK * width,)).reshape(kinds, BLOCK, width) for k in keys]
+    if capacity == BLOCK:
+        return drawn[0]
+    others = jnp.concatenate([drawn[0][:, :-1], *drawn[1:]], axis=1)[:, : capacity - 1]
+    return jnp.concatenate([others, drawn[0][:, -1:]], axis=1)
+
+
+def _choose(weight: Float[Array, " w"], numbers: Float[Array, " w"]) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """A random index in proportion to weights, from random numbers, and whether any weight is positive."""
     logits = jnp.where(weight > 0, jnp.log(jnp.where(weight > 0, weight, 1.0)), -jnp.inf)
-    return jnp.argmax(logits + jax.random.gumbel(key, weight.shape)), jnp.any(weight > 0)
+    return jnp.argmax(logits + numbers), jnp.any(weight > 0)
 
 
 def _shares(clean, dirty, weight):
@@ -68,7 +86,8 @@ def sample_action(
     beside = _stacked([jnp.broadcast_to(w.weight[..., None], w.reached.shape) for w in options])
     weights = jnp.ones(n) if weights is None else weights
     weight = jnp.tile(weights, len(SAMPLED_KINDS))[:, None] * _shares(ways & ~enters, ways, beside)
-    choice, possible_at_all = _choose(key_choice, weight.reshape(-1))
+    numbers = _numbers(key_choice, len(SAMPLED_KINDS), n, ways.shape[1])
+    choice, possible_at_all = _choose(weight.reshape(-1), numbers.reshape(-1))
     row, way = choice // ways.shape[1], choice % ways.shape[1]
     chosen, index = row // n, row % n
 

@@ -68,11 +68,13 @@ class Prediction(flax.struct.PyTreeNode):
 
     Attributes:
       scene: the objects afterwards.
+      moved: which of them the action moves, shape (N,).
       possible: whether it can be executed as predicted.
       topples: how many objects are expected to fall over.
     """
 
     scene: Superquadrics
+    moved: jax.Array
     possible: jax.Array
     topples: jax.Array
 

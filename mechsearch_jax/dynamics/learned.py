@@ -27,8 +27,9 @@ NAME = "push"
 # but 3 in 100 where there is one object and the target.
 LIKELY = 0.75
 # The hand gives way and ends short of where it was sent: what simulated pushes come to overlaps in 1 of 20 cases by
-# about this with the hand where it was sent or with a neighbour [m]. Next to a wall, predictions are as far off.
-SLACK = 0.02
+# 2 cm with the hand where it was sent or with a neighbour, and predictions next to a wall are as far off. Deeper by
+# more than 6 mm is jammed [m].
+MAX_PENETRATION = 0.026
 
 
 @functools.cache
@@ -44,8 +45,8 @@ class LearnedPush:
     Attributes:
       path: of the weights; those that ship with the package if left out.
       likely: an object is moved if it moves with a probability above this, and else left exactly where it is.
-      slack: so much overlap, with the hand, a wall or another object, is taken off the residual [m]: what a push really
-        comes to overlaps with the hand where it was sent, too.
+      max_penetration: a push is not resolved if it leaves more overlap than this, with the hand, a wall or another
+        object [m]: what a push really comes to overlaps with the hand where it was sent, too.
       digest: of the weights, read from their card.
 
     Raises:
@@ -54,13 +55,14 @@ class LearnedPush:
 
     path: Path | None = dataclasses.field(default=None, compare=False)
     likely: float = LIKELY
-    slack: float = SLACK
+    max_penetration: float = MAX_PENETRATION
     digest: str = dataclasses.field(default="", init=False)
 
     def __post_init__(self):
-        if not 0.0 <= self.likely <= 1.0 or not self.slack >= 0.0:
+        if not 0.0 <= self.likely <= 1.0 or not self.max_penetration >= 0.0:
             raise InputError(
-                f"LearnedPush: likely {self.likely} must be from 0 to 1, and slack {self.slack} m must not be negative"
+                f"LearnedPush: likely {self.likely} must be from 0 to 1, and max_penetration {self.max_penetration} m"
+                " must not be negative"
             )
         shipped = self.path is None
         path = self.path or Path(str(importlib.resources.files("mechsearch_jax") / "networks" / f"{NAME}.npz"))
@@ -83,7 +85,7 @@ class LearnedPush:
         weights = _weights(self.path, self.digest)
         network = weights.network
         assert isinstance(network, PushNetwork)
-        predict = functools.partial(predicted, network, weights.parameters, self.likely, self.slack)
+        predict = functools.partial(predicted, network, weights.parameters, self.likely, self.max_penetration)
         return predict(shelf, scene, pusher, T_world_gripper, displacement, q7)
 
 
@@ -91,7 +93,7 @@ def predicted(
     network: PushNetwork,
     parameters: Any,
     likely: float,
-    slack: float,
+    max_penetration: float,
     shelf: Shelf,
     scene: Superquadrics,
     pusher: Array,
@@ -108,12 +110,15 @@ def predicted(
         position=before.position + jnp.where(moves[:, None], told.shift, 0.0),
         yaw=before.yaw + jnp.where(moves, told.turn, 0.0),
     )
-    moved = rigid_motion(scene, before.position, prints.position, told.turn)
-    after = jax.tree.map(lambda new, old: jnp.where(moves.reshape(-1, *[1] * (new.ndim - 1)), new, old), moved, scene)
+    shifted = rigid_motion(scene, before.position, prints.position, told.turn)
+    after = jax.tree.map(lambda new, old: jnp.where(moves.reshape(-1, *[1] * (new.ndim - 1)), new, old), shifted, scene)
     # Of the gripper, as much as the network sees: with all points, overlaps are deeper by half a millimetre.
     end = start.points + displacement[None]
+    residual = unresolved(shelf, before, prints, end)
     return PushOutcome(
         scene=after,
-        residual=jnp.maximum(unresolved(shelf, before, prints, end) - slack, 0.0),
+        moved=moves,
+        residual=residual,
+        resolved=residual <= max_penetration,
         topples=jnp.where(scene.valid, jax.nn.sigmoid(told.topples), 0.0),
     )

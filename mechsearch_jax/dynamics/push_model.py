@@ -25,12 +25,18 @@ class PushOutcome(flax.struct.PyTreeNode):
 
     Attributes:
       scene: the objects afterwards.
-      residual: deepest penetration that the model could not resolve [m]: objects jammed against a wall or one another.
+      moved: which of them the push moved; the others are exactly where they were, shape (N,).
+      residual: deepest penetration that is left at the end [m]: with the hand where it was sent, of what is jammed
+        against a wall, or of objects with one another. Not finite where the model failed.
+      resolved: whether the push comes to an end as predicted: no more is left than the model is off by anyway, which
+        each model knows of itself (`QuasiStatic.max_penetration`, `LearnedPush.max_penetration`).
       topples: probability that an object falls over, shape (N,).
     """
 
     scene: Superquadrics
+    moved: jax.Array
     residual: jax.Array
+    resolved: jax.Array
     topples: jax.Array
 
 

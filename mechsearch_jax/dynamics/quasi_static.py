@@ -19,6 +19,7 @@ from mechsearch_jax.dynamics.contacts import (
 )
 from mechsearch_jax.dynamics.push_model import LEVERAGE, LOW_CONTACT, TOUCH, PushOutcome
 from mechsearch_jax.dynamics.rigid import rigid_motion
+from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.footprints import dot, extents, footprints, turned
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
@@ -105,6 +106,10 @@ class QuasiStatic:
       sweeps: how often contacts are resolved in each.
       gripper_friction, object_friction: coefficients at contacts with the gripper and between objects.
       leverage: how high the gripper may touch an object without tipping it; see `LEVERAGE`.
+      max_penetration: a push of which more is left than this is not resolved [m].
+
+    Raises:
+      InputError: `max_penetration` is negative.
     """
 
     steps: int = 16
@@ -112,6 +117,11 @@ class QuasiStatic:
     gripper_friction: float = 0.8
     object_friction: float = 0.4
     leverage: tuple[float, float] = LEVERAGE
+    max_penetration: float = 0.006
+
+    def __post_init__(self):
+        if not self.max_penetration >= 0.0:
+            raise InputError(f"QuasiStatic: max_penetration {self.max_penetration} m must not be negative")
 
     def __call__(
         self, shelf: Shelf, scene: Superquadrics, pusher: Array, T_world_gripper: Array, displacement: Array, q7: Array
@@ -140,4 +150,4 @@ class QuasiStatic:
         pick = lambda new, old: jnp.where(moved.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
         scene = jax.tree.map(pick, moved_scene, scene)
         high = _touched_high(scene, after, start + displacement[None], heading, self.leverage)
-        return PushOutcome(scene, residual, jnp.where(high, 1.0, 0.0))
+        return PushOutcome(scene, moved, residual, residual <= self.max_penetration, jnp.where(high, 1.0, 0.0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mechsearch_jax.geometry.footprints import QUARTER_TURN, footprints, turned
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -44,11 +44,4 @@ def pick_and_place(
     rotation = matmul(motion[:3, :3], in_hand(scene, index, T_world_grasp))
     return scene.replace(
         position=scene.position.at[index].set(position), rotation=scene.rotation.at[index].set(rotation)
-    )
-
-
-def moved_objects(before: Superquadrics, after: Superquadrics) -> Bool[Array, " n"]:
-    """Which objects differ in pose between two scenes."""
-    return jnp.any(before.position != after.position, axis=-1) | jnp.any(
-        before.rotation != after.rotation, axis=(-1, -2)
     )

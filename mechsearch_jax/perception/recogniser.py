@@ -28,11 +28,9 @@ from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
-
-# Pixels of a 1280 x 720 image that make the target visible.
-VISIBLE_PIXELS = 100
 
 # Which pixels are the target's, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
 TargetDetector = Callable[[Array], Array]
@@ -214,8 +212,7 @@ def _labelled(
         labels = _labels(instances, freed, shelf, points)
         labels = jnp.where(of_target & (labels != MISSING) & (labels != FREE), OTHER, labels)
 
-    share = camera.width * camera.height / (1280 * 720)
-    visible = jnp.sum(of_target) * view.stride**2 > VISIBLE_PIXELS * share
+    visible = jnp.sum(of_target) * view.stride**2 > found_pixels(camera)
     # With a weak type, all that takes the observation would be compiled once more than for another recogniser's.
     visible = visible.astype(bool)
     return LabelledImage(points, seen, labels, of_target & above_board(shelf, points)), visible

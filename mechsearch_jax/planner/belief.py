@@ -11,7 +11,7 @@ from mechsearch_jax.actions.types import Action
 from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.existence import allowances, existence, object_views
+from mechsearch_jax.existence import allowances, closer_image, existence, object_views, plainly_elsewhere
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import FoundGrasps, grasp_hits, graspability, pairs
@@ -26,7 +26,8 @@ class Belief(flax.struct.PyTreeNode):
 
     Attributes:
       exists: f_t, shape (X,). It grows only where an action may have moved the target: see `update_belief`.
-      found: c_t, whether the target has been seen.
+      found: c_t, whether the target has been seen and may still be where it was seen last: it is not found any more
+        once it is neither seen nor can be there unseen.
       found_pose: where, as x, y [m], yaw [rad].
       allowed: how many coarse pixels the target may show at each place of its candidate poses while it is hidden, shape
         (X, S); see `existence.allowances`.
@@ -45,11 +46,12 @@ class Belief(flax.struct.PyTreeNode):
 @kept()
 def initial_belief(problem: Problem) -> Belief:
     """Nothing is known: the target can be at every candidate pose."""
+    allowed = problem.config.existence.allowed(problem.camera)
     return Belief(
         exists=jnp.ones(problem.poses.shape[0], bool),
         found=jnp.array(False),
         found_pose=jnp.zeros(3),
-        allowed=jnp.full(problem.existence.corner.shape[:2], problem.config.existence.allowed, jnp.int32),
+        allowed=jnp.full(problem.existence.corner.shape[:2], allowed, jnp.int32),
         grasps=no_grasps(problem.target_grasps),
         restarts=jnp.int32(0),
     )
@@ -66,7 +68,11 @@ def update_belief(
     """Fold an observation into the belief: `f_t = f_{t-1} * f_hat(s_t)` (equation 4), or the target's pose once it is
     seen.
 
-    A target that is found and then hidden again stays found, at the pose where it was seen last, wherever it is now.
+    A target that is found and then hidden again stays found, at the pose where it was seen last. Where it is not seen
+    although it would be in plain sight there, or an object stands there now, it was shoved away or never was there:
+    then it is not found any more, and f starts anew from what the objects allow now. One look is enough, so that a
+    detector that misses all of the target once, or a sensor that measures less than a third of it, costs one decision.
+
     Where the action since then may have moved a target that nobody sees, f is opened again before the observation is
     folded in; see `unseen_motion.reopened`. Where f becomes empty nevertheless, which is a contradiction, it starts
     anew from what the objects allow now, and `restarts` counts it.
@@ -85,16 +91,22 @@ def update_belief(
         raise InputError("update_belief: give what was seen before the action and the action, or neither")
     everywhere = jnp.ones_like(belief.exists)
     settings, found = problem.config.existence, jnp.asarray(observation.target_visible)
-    views = object_views(problem.existence, problem.camera, observation.objects, everywhere, settings)
-    allowed = allowances(problem.existence, problem.camera, problem.target, observation.objects, views, settings)
-    now = existence(problem.existence, problem.camera, views, everywhere, allowed, settings)
-    exists = belief.exists
+    tables, camera, target, objects = problem.existence, problem.camera, problem.target, observation.objects
+    views = object_views(tables, camera, objects, everywhere, settings)
+    closer = closer_image(camera, objects, views, settings)
+    allowed = allowances(tables, camera, target, views, closer, settings)
+    now = existence(tables, camera, views, everywhere, allowed, settings)
+    T_last = upright_pose(belief.found_pose, target.height(problem.shelf))
+    lost = belief.found & ~found & plainly_elsewhere(tables, camera, target, objects, closer, T_last, settings)
+    # Where a false detection kept f from being known, or an action took the target anywhere, nothing is ruled out yet.
+    known = belief.exists | lost
+    exists = known
     if before is not None and action is not None and settings.reopen:
-        exists |= reopened(problem, exists, before.objects, observation.objects, action)
+        exists |= reopened(problem, exists, before.objects, objects, action)
     both = exists & now
-    seen = belief.found | found
+    seen = (belief.found & ~lost) | found
     contradiction = ~jnp.any(both) & ~seen
-    exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, belief.exists), both)
+    exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, known), both)
     pose = jnp.where(found, observation.target_pose, belief.found_pose)
     T_world_target = upright_pose(pose, problem.target.height(problem.shelf))
     return Belief(

@@ -8,7 +8,7 @@ from typing import Protocol
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.graspability import crowding, graspability, pairs
+from mechsearch_jax.graspability import INFEASIBLE, crowding, graspability, pairs
 from mechsearch_jax.planner.belief import Belief, possible_poses
 from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.problem import Problem
@@ -63,7 +63,7 @@ def _where_and_how_graspable(problem, belief, exists, target_at, hits, weights):
     f = possible_poses(belief, exists, target_at).astype(jnp.float32)
     rows = pairs(problem.grasps, belief.grasps)
     hidden = jnp.append(exists & belief.found, False)
-    g = jnp.minimum(graspability(rows, hits), jnp.where(hidden, -hits.shape[1], 1)).astype(jnp.float32)
+    g = jnp.minimum(graspability(rows, hits), jnp.where(hidden, 1 - INFEASIBLE, 1)).astype(jnp.float32)
     return f, weights.hindrance * (1.0 - g), weights.crowding * crowding(rows, hits)
 
 

@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool
 from mechsearch_jax.actions.registry import KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.dynamics.push_model import PushModel
-from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.planner.moved_target import beyond_candidates
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.state import State
@@ -62,7 +61,8 @@ class LaterPlacementsStay:
             jnp.logical_or, [sample.action.kind == code for code, kind in KINDS.items() if kind.holds_object]
         )
         stays = held & ~first
-        return told.replace(scene=jax.tree.map(lambda old, new: jnp.where(stays, old, new), state.scene, told.scene))
+        scene = jax.tree.map(lambda old, new: jnp.where(stays, old, new), state.scene, told.scene)
+        return told.replace(scene=scene, moved=told.moved & ~stays)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,11 +84,11 @@ class PredictByKind:
         action, scene = sample.action, state.scene
         # What is sampled may move the target only by pushing it itself.
         untouchable = state.is_target & (jnp.arange(scene.capacity) != action.object)
-        found = Prediction(scene, jnp.array(False), jnp.float32(0.0))
+        found = Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False), jnp.float32(0.0))
         for code, kind in KINDS.items():
             told = kind.predict(problem.space, problem.actions, push_model, scene, untouchable, action, sample.wrist)
             found = jax.tree.map(lambda a, b, code=code: jnp.where(action.kind == code, a, b), told, found)
-        lost = state.is_target & moved_objects(scene, found.scene) & beyond_candidates(problem, found.scene.position)
+        lost = state.is_target & found.moved & beyond_candidates(problem, found.scene.position)
         found = found.replace(possible=found.possible & ~jnp.any(lost))
         after = jax.tree.map(lambda new, old: jnp.where(found.possible, new, old), found.scene, scene)
-        return found.replace(scene=after)
+        return found.replace(scene=after, moved=found.moved & found.possible)

@@ -21,6 +21,8 @@ from mechsearch_jax.planner.state import State
 ALONE = 4.0
 # How many objects deep what is in the way of moving an object is looked for.
 DEPTH = 2
+# What is drawn evenly is shared as if by so many, a scene's eight objects and the target, however many slots there are.
+EVEN = 9
 
 
 class Propose(Protocol):
@@ -94,7 +96,7 @@ def sampling_weights(
     hides = blame(occluders(problem.existence, state.views), state.exists & ~belief.found)
     share = passed_on(state, blocks + hides)
     share = share / jnp.maximum(jnp.sum(share), 1e-12)
-    return (1.0 - guided_fraction) / state.scene.capacity + guided_fraction * share
+    return (1.0 - guided_fraction) / EVEN + guided_fraction * share
 
 
 def guided_draw(

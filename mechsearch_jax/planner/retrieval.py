@@ -22,7 +22,7 @@ from mechsearch_jax.actions.types import Action
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, upright_pose
-from mechsearch_jax.graspability import grasp_hits
+from mechsearch_jax.graspability import INFEASIBLE, grasp_hits
 from mechsearch_jax.planner.found_target import found_grasps, found_hits
 from mechsearch_jax.planner.problem import Problem, TargetGrasps
 from mechsearch_jax.planner.rehearsal import TRIES, Rehearsal, Rehearsed
@@ -43,12 +43,14 @@ class GraspChoice(flax.struct.PyTreeNode):
     Attributes:
       success: whether there is a grasp with which neither gripper, target nor arm hits anything on the whole way from
         outside the shelf and out again, or, as `take_out` tells it, one that succeeded in a rehearsal.
-      hits: number of objects that the grasp hits; one more than there can be if no grasp is feasible.
+      feasible: whether arm and shelf allow the grasp.
+      hits: number of objects that the grasp hits; `graspability.INFEASIBLE` if it is not feasible.
       action: takes it out with the best grasp: the first that succeeded in a rehearsal, or of those that hit fewest the
         one whose straight way keeps furthest from the objects.
     """
 
     success: jax.Array
+    feasible: jax.Array
     hits: jax.Array
     action: Action
 
@@ -73,9 +75,8 @@ def take_out(
         return graspable_at(problem, scene, pose, *active)
     tried = worth_trying(problem, scene, pose, *active)
     here = active[0] if active else True
-    asked = tried.hits <= scene.capacity
-    told = rehearsal(problem, scene, pose, here, tried.action, asked, (ActionKind.RETRIEVE,))
-    return _first_that_works(tried, asked, told)
+    told = rehearsal(problem, scene, pose, here, tried.action, tried.feasible, (ActionKind.RETRIEVE,))
+    return _first_that_works(tried, tried.feasible, told)
 
 
 @kept()
@@ -106,9 +107,7 @@ def worth_trying(
         alike = (jnp.sum(way * way[i][None], axis=-1) > math.cos(ALIKE)) & (jnp.abs(q7 - q7[i]) < ALIKE_WRIST)
         return (order + jnp.where(alike, FAR, 0)).at[i].add(100 * FAR), i
 
-    # What arm or shelf do not allow comes after all that is alike.
-    order = ranked.order + jnp.where(ranked.hits > scene.capacity, 10 * FAR, 0)
-    _, best = jax.lax.scan(pick, order, length=min(TRIES, len(q7)))
+    _, best = jax.lax.scan(pick, ranked.order, length=min(TRIES, len(q7)))
     return jax.vmap(lambda i: _choice(grasps, ranked, i))(best)
 
 
@@ -140,7 +139,7 @@ def best_grasp(
     # Not of the best: who asks for these alone need not know how near others are.
     fewest = jnp.min(ranked.hits)
     choice = _choice(grasps, ranked, jnp.argmin(ranked.order))
-    return choice.replace(success=fewest == 0, hits=fewest.astype(jnp.int32))
+    return choice.replace(success=fewest == 0, feasible=jnp.any(ranked.feasible), hits=fewest.astype(jnp.int32))
 
 
 @functools.partial(jax.jit, static_argnames=("count",))
@@ -157,9 +156,11 @@ def best_grasps(grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "
 
 
 class _Ranked(NamedTuple):
-    """All grasps: where the gripper closes, how many objects each hits, and by what they are ranked, least first."""
+    """All grasps: where the gripper closes, whether each is feasible, how many objects it hits, and by what they are
+    ranked, least first."""
 
     T_world_gripper: Float[Array, "f 4 4"]
+    feasible: Bool[Array, " f"]
     hits: Int[Array, " f"]
     order: Int[Array, " f"]
 
@@ -181,7 +182,6 @@ def _ranked(
     tables = grasps.tables
     found = found_grasps(grasps, T_world_target, active)
     here = jnp.asarray(active)[None]
-    worst = scene.capacity + 1
 
     def near(clearance):
         return jnp.sum(grasp_hits(tables, found, scene.replace(size=scene.size + clearance), here), axis=1)
@@ -191,16 +191,18 @@ def _ranked(
         return jnp.sum(found_hits(grasps, found, slim, active), axis=1)
 
     all_hits, *deeper = jax.lax.map(hit, jnp.float32((0.0, *depths)))
-    hits = jnp.where(found.feasible, all_hits, worst)
+    hits = jnp.where(found.feasible, all_hits, INFEASIBLE)
     crowd = jnp.sum(jax.lax.map(near, jnp.float32(CLEARANCES)), axis=0)
-    order = 1000 * sum(deeper, jnp.zeros_like(hits)) + 100 * hits + crowd
-    return _Ranked(compose(T_world_target[None], tables.T_target_gripper), hits, order)
+    # What arm or shelf do not allow comes last, after all that is alike.
+    order = jnp.where(found.feasible, 1000 * sum(deeper, jnp.zeros_like(hits)) + 100 * hits + crowd, 10 * FAR)
+    return _Ranked(compose(T_world_target[None], tables.T_target_gripper), found.feasible, hits, order)
 
 
 def _choice(grasps: TargetGrasps, ranked: _Ranked, i: Int[Array, ""]) -> GraspChoice:
     T, q7 = ranked.T_world_gripper[i], grasps.tables.q7[i]
     return GraspChoice(
-        success=ranked.hits[i] == 0,
+        success=ranked.feasible[i] & (ranked.hits[i] == 0),
+        feasible=ranked.feasible[i],
         hits=ranked.hits[i].astype(jnp.int32),
         action=retrieve_action(T, q7, jnp.float32(grasps.gripper.max_opening)),
     )

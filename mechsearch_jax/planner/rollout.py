@@ -18,7 +18,6 @@ from mechsearch_jax.actions.candidates import candidates, no_candidates
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.types import Action, Prediction, Sample
-from mechsearch_jax.dynamics.rigid import moved_objects
 from mechsearch_jax.existence import existence, no_views, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import grasp_hits, no_hits, pairs, split_found
@@ -150,7 +149,7 @@ class Rollout:
             return attempt(key)
         draws = jnp.where(first, most, self.config.draws)
         shapes, _ = jax.eval_shape(attempt, key)
-        nothing = Prediction(state.scene, jnp.array(False), jnp.float32(0.0))
+        nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False), jnp.float32(0.0))
         blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
 
         def again(carry):
@@ -172,7 +171,7 @@ class Rollout:
         acted = told.possible & state.alive
         action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
         spent = (jnp.arange(state.scene.capacity) == action.object) & (not self.config.move_again)
-        moved = moved_objects(state.scene, told.scene) & acted
+        moved = told.moved & acted
         target_at = state.target_at
         if self.config.move_target:
             at = candidate_of(self.problem, told.scene, state.is_target)

@@ -3,8 +3,9 @@
 A target slides only while something that moves touches it, and comes to rest at once. So if it was moved, it stood
 beside the space that hand and objects swept, and stands beside that space now, no farther away than they travelled, and
 not behind where it stood, as seen along a straight way in or out. What swept it is known: the hand's way from the
-action, and the objects' ways from where they were seen before and after it. Whether the action succeeded does not
-matter: one that failed swept no more than it was meant to, and what it moved is seen.
+action, and the objects' ways from where they were seen before and after it. Which object is which afterwards is found
+out by what is seen, where they are and how large, and never by the slots that they are in. Whether the action succeeded
+does not matter: one that failed swept no more than it was meant to, and what it moved is seen.
 
 Only what the camera allows now stays open: the belief folds the new observation in afterwards.
 """
@@ -14,6 +15,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -36,8 +38,8 @@ STRIDE = 0.03
 DROPPED = 0.03
 # Places on the way of an object.
 OBJECT_PLACES = 12
-# By how much two objects must differ in place and size to be taken for one another rather than keep their numbers [m].
-RENUMBERED = 0.02
+# By how much two objects of different exponents seem to differ in size, for each unit of that difference [m].
+SHAPE = 0.02
 
 
 def reopened(
@@ -93,10 +95,16 @@ def _sweeps(problem: Problem, before: Superquadrics, after: Superquadrics, actio
     """
     n, shelf, approach = before.capacity, problem.shelf, problem.gripper.approach
     holds = jnp.any(jnp.stack([action.kind == code for code, kind in KINDS.items() if kind.holds_object]))
-    start, end, same, known = _bodies(problem, before, after, action)
     own = (jnp.arange(n) == action.object) & before.valid
+    carry = compose(action.T_world_place, inverse(action.T_world_gripper))
+    meant = jnp.where(holds, transform(carry, before.position), before.position + action.displacement[None])
+    same, known = same_objects(before, after, jnp.where(own[:, None], meant, before.position))
+    start, end = _bodies(problem, before, after, same)
+    into = transform(carry, start)
+    # What the action moves is known to move even where it is not seen afterwards.
+    unseen = jnp.where(holds, into, start + action.displacement[None, None])
+    end = jnp.where((own & ~known)[:, None, None], unseen, end)
     # What is held arrives at its place, or was dropped or pushed on the way there.
-    into = transform(compose(action.T_world_place, inverse(action.T_world_gripper)), start)
     arrived = jnp.sum((jnp.mean(end, axis=1) - jnp.mean(into, axis=1)) ** 2, axis=-1) < DROPPED**2
     carried = own & holds & arrived
     apart = jnp.sqrt(jnp.sum((after.position[same] - before.position)[:, :2] ** 2, axis=-1))
@@ -150,27 +158,45 @@ def _hand(problem: Problem, action: Action) -> tuple[Float[Array, "p 3"], Float[
 
 
 def _bodies(
-    problem: Problem, before: Superquadrics, after: Superquadrics, action: Action
-) -> tuple[Float[Array, "n p 3"], Float[Array, "n p 3"], Int[Array, " n"], Bool[Array, " n"]]:
-    """Points of the objects before and after the action [m], which each is afterwards, and whether that is known."""
+    problem: Problem, before: Superquadrics, after: Superquadrics, same: Int[Array, " n"]
+) -> tuple[Float[Array, "n p 3"], Float[Array, "n p 3"]]:
+    """Points of the objects before the action, and of those that they are afterwards [m]."""
     size = jnp.where(before.valid[:, None], before.size, 1.0)
     clouds = jnp.swapaxes(object_clouds(before.replace(size=size), problem.config.actions.object_points), -1, -2)
     start = transform(make(before.rotation, before.position)[:, None], clouds)
-    same, known = _same(before, after)
-    end = transform(make(after.rotation[same], after.position[same])[:, None], clouds)
-    own = (jnp.arange(before.capacity) == action.object) & before.valid
-    # What is pushed is known to move even where it is not seen afterwards.
-    end = jnp.where((own & ~known)[:, None, None], start + action.displacement[None, None], end)
-    return start, end, same, known
+    return start, transform(make(after.rotation[same], after.position[same])[:, None], clouds)
 
 
-def _same(before: Superquadrics, after: Superquadrics) -> tuple[Int[Array, " n"], Bool[Array, " n"]]:
-    """Which object of `after` each of `before` is, by place and size, and whether there is any.
+def same_objects(
+    before: Superquadrics, after: Superquadrics, meant: Float[Array, "n 3"]
+) -> tuple[Int[Array, " n"], Bool[Array, " n"]]:
+    """Which object of `after` each of `before` is, and whether it is any.
 
-    An approximation: each by itself, so that two may be taken for the same.
+    Those that are most alike in place, size and shape are taken for the same first, and no two for one. The slots that
+    they are in do not count.
+
+    Args:
+      before, after: the objects, fields (N, ...) and (M, ...).
+      meant: where each may be, too, if an action was to move it; elsewhere where it was, shape (N, 3) [m].
     """
-    apart = [a[:, None] - b[None] for a, b in ((before.position, after.position), (before.size, after.size))]
-    cost = sum(jnp.sqrt(jnp.sum(a**2, axis=-1)) for a in apart)
-    cost += RENUMBERED * (jnp.arange(before.capacity)[:, None] != jnp.arange(after.capacity)[None])
-    same = jnp.argmin(jnp.where(after.valid[None], cost, jnp.inf), axis=1)
-    return same, before.valid & jnp.any(after.valid)
+
+    def apart(a, b):
+        return jnp.sqrt(jnp.sum((a[:, None] - b[None]) ** 2, axis=-1))
+
+    place = jnp.minimum(apart(before.position, after.position), apart(meant, after.position))
+    # Recognised from another side, width and depth may have changed their names.
+    size = apart(jnp.sort(before.size, axis=-1), jnp.sort(after.size, axis=-1))
+    cost = place + size + SHAPE * apart(before.exponents, after.exponents)
+    cost = jnp.where(before.valid[:, None] & after.valid[None], cost, jnp.inf)
+    rows, columns = jnp.arange(before.capacity), jnp.arange(after.capacity)
+
+    def pair(_, found):
+        cost, same, known = found
+        best = jnp.argmin(cost)
+        i, j = best // columns.size, best % columns.size
+        here = (rows == i) & jnp.isfinite(cost[i, j])
+        cost = jnp.where((rows == i)[:, None] | (columns == j)[None], jnp.inf, cost)
+        return cost, jnp.where(here, j, same), known | here
+
+    nothing = jnp.zeros(rows.size, jnp.int32), jnp.zeros(rows.size, bool)
+    return jax.lax.fori_loop(0, min(rows.size, columns.size), pair, (cost, *nothing))[1:]

@@ -234,6 +234,8 @@ class Searcher:
             warnings.append(
                 "f became empty and was started anew: something moved that was not seen, or a shape is wrong"
             )
+        if bool(now.belief.found) and not bool(belief.found):
+            warnings.append("the target is not where it was found any more: it is searched for anew")
         decision = self._policy(deciding, problem, belief, observation)
         arm = self.workcell.arm
         done = motion(problem, belief, observation, decision, depth, joints, arm, self._trajectories)

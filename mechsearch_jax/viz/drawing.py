@@ -21,6 +21,7 @@ from scipy.spatial import ConvexHull
 
 from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.graspability import INFEASIBLE
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.shelf import Shelf
@@ -57,15 +58,17 @@ class Band:
     high: int
 
 
-def bands(capacity: int) -> tuple[Band, ...]:
-    """The colours of g for scenes of `capacity` slots, from the best to the worst value."""
+def bands() -> tuple[Band, ...]:
+    """The colours of g, from the best to the worst value."""
+    # One object less than `INFEASIBLE` counts, too: so it is in maps and recordings of earlier versions.
+    worst = 2 - INFEASIBLE
     return (
         Band(GRASPABLE, "graspable", 1, 1),
         Band(BLOCKED[0], "1 object in the way", 0, 0),
         Band(BLOCKED[1], "2 objects", -1, -1),
         Band(BLOCKED[2], "3 objects", -2, -2),
-        Band(BLOCKED[3], "more", 1 - capacity, -3),
-        Band(NO_GRASP, "out of reach", -(10**6), -capacity),
+        Band(BLOCKED[3], "more", worst + 1, -3),
+        Band(NO_GRASP, "out of reach", -(10**6), worst),
     )
 
 
@@ -122,7 +125,6 @@ def map_image(
     shown: Bool[np.ndarray, " x"],
     graspability: Int[np.ndarray, " x"],
     target: Target,
-    capacity: int,
 ) -> Float[np.ndarray, "rows columns 4"]:
     """Colours of the candidate positions as an image: rows along x, columns along y, see-through where not `shown`.
 
@@ -133,7 +135,7 @@ def map_image(
     shown, g = (a.reshape(rows, columns, target.yaws) for a in (shown, graspability))
     best = np.max(np.where(shown, g, -(10**6)), axis=-1)
     image = np.zeros((rows, columns, 4))
-    for band in bands(capacity):
+    for band in bands():
         image[(best >= band.low) & (best <= band.high), :3] = rgb(band.colour)
     share = np.mean(shown, axis=-1)
     image[..., 3] = np.where(share > 0, 0.35 + 0.6 * share, 0.0)
@@ -329,9 +331,9 @@ def draw_numbers_in_view(axes: Axes, owner: Int[np.ndarray, "h w"], count: int) 
             number(axes, (float(np.median(columns)), float(np.median(rows))), i)
 
 
-def draw_legend(figure: Figure, capacity: int, y: float, size: float = LETTER) -> None:
+def draw_legend(figure: Figure, y: float, size: float = LETTER) -> None:
     """What the colours of the map mean, in one line at the height `y` of the figure (0 to 1), in type of a size."""
-    marks = [patches.Patch(facecolor=(*rgb(b.colour), 0.95), label=b.label) for b in bands(capacity)]
+    marks = [patches.Patch(facecolor=(*rgb(b.colour), 0.95), label=b.label) for b in bands()]
     marks.append(patches.Patch(facecolor=TARGET, label="target, found"))
     marks.append(patches.Patch(facecolor="none", edgecolor=TARGET, linestyle=(0, (2, 1.5)), label="target, hidden"))
     title = "Where the target can be, and what a grasp there would meet"

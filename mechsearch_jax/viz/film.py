@@ -133,7 +133,7 @@ class Page:
         left, size = _GAP * self._layout.size[0] / WIDTH, 72.0 * (WIDTH - 1.0)
         self._text(left, 0.2, frame.title, min(12.0, size / (0.62 * len(frame.title))), drawing.INK, weight="bold")
         self._text(left, 0.42, frame.caption, min(9.0, size / (0.56 * len(frame.caption))), drawing.MUTED)
-        drawing.draw_legend(self._figure, frame.scene.capacity, 0.5 * _FOOTER / self._figure.get_figheight(), 7.2)
+        drawing.draw_legend(self._figure, 0.5 * _FOOTER / self._figure.get_figheight(), 7.2)
 
     def _text(self, x: float, down: float, text: str, size: float, colour: str, **style):
         """Text at pixel `x` and `down` inches from the top."""

@@ -103,7 +103,7 @@ def filmstrip(
             for a, b, w, h in (layout.view, layout.above)
         )
         _draw(view, above, frame, camera, shelf, target, room)
-    drawing.draw_legend(figure, frames[0].scene.capacity, 0.62 * _LEGEND / height)
+    drawing.draw_legend(figure, 0.62 * _LEGEND / height)
     drawing.draw_action_legend(figure, 0.17 * _LEGEND / height)
     return figure
 
@@ -188,7 +188,7 @@ def draw_believed(axes: Axes, frame: Frame, shelf: Shelf, target: Target) -> Non
       shelf, target: of the problem.
     """
     drawing.draw_shelf(axes, shelf)
-    image = drawing.map_image(frame.existence, frame.graspability, target, frame.scene.capacity)
+    image = drawing.map_image(frame.existence, frame.graspability, target)
     drawing.draw_map(axes, image, shelf, target)
     _act(axes, sketches.from_above, frame, shelf, target)
 

@@ -58,20 +58,19 @@ def maps_figure(
         return figure.add_axes((x / width, y / height, w / width, h / height))
 
     low = 0.6
-    capacity = maps.scene.capacity
     everywhere = np.ones_like(maps.existence)
     view = panel(_GAP, low, view_width, view_height, "What the camera sees")
     drawing.draw_view(view, image, camera, shelf)
-    drawing.draw_numbers_in_view(view, owner, capacity)
+    drawing.draw_numbers_in_view(view, owner, maps.scene.capacity)
 
     first, second = 2 * _GAP + view_width, 3 * _GAP + view_width + _WIDTH
     upper = low + map_height + 0.4
     possible = int(maps.existence.sum())
     both = int((maps.existence & (maps.graspability == 1)).sum())
-    where_f = drawing.map_image(maps.existence, np.ones_like(maps.graspability), target, capacity)
+    where_f = drawing.map_image(maps.existence, np.ones_like(maps.graspability), target)
     where_f[..., :3] = drawing.rgb(drawing.ACTION)
-    everywhere_g = drawing.map_image(everywhere, maps.graspability, target, capacity)
-    where_both = drawing.map_image(maps.existence, maps.graspability, target, capacity)
+    everywhere_g = drawing.map_image(everywhere, maps.graspability, target)
+    where_both = drawing.map_image(maps.existence, maps.graspability, target)
     panels = (
         (first, upper, f"f: the target can be at {possible} of {len(maps.poses)} poses", where_f),
         (first, low, "g: what a grasp would meet at every pose", everywhere_g),
@@ -84,13 +83,13 @@ def maps_figure(
         drawing.draw_objects(axes, maps.scene)
         drawing.draw_target(axes, target_pose, target, certain=False)
     _draw_counts(panel(second, low, _WIDTH, map_height, "How many objects are in the way, where f = 1"), maps)
-    drawing.draw_legend(figure, capacity, 0.3 / height)
+    drawing.draw_legend(figure, 0.3 / height)
     return figure
 
 
 def _draw_counts(axes: Axes, maps: Maps) -> None:
     """Number of possible poses by colour of the map."""
-    bands = drawing.bands(maps.scene.capacity)
+    bands = drawing.bands()
     g = maps.graspability[maps.existence]
     counts = [int(((g >= band.low) & (g <= band.high)).sum()) for band in bands]
     colours = [drawing.rgb(band.colour) for band in bands]

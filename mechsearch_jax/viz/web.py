@@ -137,7 +137,7 @@ class Cells(NamedTuple):
 
 def map_cells(frame: Frame, shelf: Shelf, target: Target) -> Cells:
     """f and g at a step in the colours of the filmstrip."""
-    image = drawing.map_image(frame.existence, frame.graspability, target, frame.scene.capacity)
+    image = drawing.map_image(frame.existence, frame.graspability, target)
     shown = image[..., 3] > 0
     rows, columns = target.grid
     level = target.candidate_poses(shelf).reshape(rows, columns, target.yaws, 3)[shown][:, 0, :2]
