@@ -117,6 +117,8 @@ class Searcher:
     @functools.cached_property
     def recogniser(self) -> Any:
         """What sees."""
+        if self._make_recogniser is Recogniser:
+            return Recogniser(self.problem, detector=self.workcell.detector)
         return self._make_recogniser(self.problem)
 
     @property
