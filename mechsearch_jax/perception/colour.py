@@ -132,7 +132,7 @@ class TargetColour:
                 f"TargetColour: color {tuple(rgb)} is white, grey or black, or nearly so: it has no hue that tells the "
                 "target from other things; give masks with target_id instead"
             )
-        return cls(tuple(rgb), threshold=1.0, difference=hue_difference)
+        return cls(rgb, threshold=1.0, difference=hue_difference)
 
     def __call__(self, colours: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
         """Which colours, of single pixels for example, are the target's; a `recogniser.TargetDetector`."""

@@ -303,7 +303,7 @@ def colour_faults(
     seen = jnp.asarray(np.where(seen > 0, seen, np.nan))
     points = back_project(view.camera, seen)
     pixels = np.asarray(view.of(jnp.asarray(colour)))
-    image = np.float32(pixels) / (255 if pixels.dtype == np.uint8 else 1)
+    image = pixels.astype(np.float32) / (255.0 if pixels.dtype == np.uint8 else 1.0)
     inside = above_board(shelf, points)
     least = SOMETHING * camera.width * camera.height / (1280 * 720 * view.stride**2)
 
