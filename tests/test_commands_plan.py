@@ -9,7 +9,15 @@ from stage import HIDDEN, OPEN, grab
 from test_mutated_files import program
 from test_search import IMAGES, TRUSTING, seen
 
-from mechsearch_jax.perception.image_files import load_camera, load_colour, load_depth, load_mask
+from mechsearch_jax.commands import plan
+from mechsearch_jax.perception.image_files import (
+    load_camera,
+    load_colour,
+    load_depth,
+    load_mask,
+    save_depth,
+    save_mask,
+)
 from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.search import searcher as searchers
 
@@ -48,6 +56,17 @@ def test_what_does_not_fit_together_is_refused(arguments, words, tmp_path, monke
     assert len(told.splitlines()) == 1
 
 
+def test_a_number_of_the_target_that_the_mask_file_does_not_have_is_said(tmp_path):
+    depth, mask = tmp_path / "depth.png", tmp_path / "mask.png"
+    save_depth(IMAGES.depth, depth)
+    save_mask(IMAGES.mask, mask, 255)
+    for number, words in ((200, "no pixel holds the target's number 200"), (-1, ""), (0, "")):
+        images, said = plan._images(depth, None, mask, 255, number)
+        assert images["target_id"] == (0 if number == 0 else -1)
+        assert words in " ".join(said)
+        assert bool(said) == bool(words)
+
+
 @pytest.mark.slow
 def test_the_example_is_planned_on_and_written_as_files_like_a_users(see, tmp_path, monkeypatch):
     see(OPEN)
@@ -70,7 +89,10 @@ def test_the_example_is_planned_on_and_written_as_files_like_a_users(see, tmp_pa
     files = ("--depth", str(out / "depth.png"), "--color", str(out / "color.png"), "--mask", str(out / "mask.png"))
     asked = (*files, "--target-id", "200", "--camera", str(out / "camera.json"), "--out", str(again))
     assert program(monkeypatch, "plan", *asked)[0] == 0
-    assert json.loads((again / "step.json").read_text()) == step
+    said = json.loads((again / "step.json").read_text())
+    # A number that the mask does not have may be a slip.
+    assert "no pixel holds the target's number 200" in said["warnings"][0]
+    assert {**said, "warnings": []} == step
 
 
 @pytest.mark.slow

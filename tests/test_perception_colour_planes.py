@@ -61,6 +61,30 @@ def test_chromaticity_tells_the_target_from_brown_in_any_light():
     assert not colour.detect_target(*colours_of(red, brown), 2, TargetColour(minimum_pixels=2)).found
 
 
+@pytest.mark.parametrize("rgb", [(255, 0, 0), (200, 0, 0), (220, 20, 20), (186, 40, 54)])
+def test_every_red_is_the_target_by_default(rgb):
+    for light in (0.45, 0.7, 1.0):
+        assert TargetColour.lit()(light * jnp.array(rgb) / 255)
+    others = np.delete(PALETTE, 8, axis=0)
+    assert not TargetColour.lit()(jnp.asarray(others)).any()
+    assert not TargetColour.lit()(jnp.asarray(0.45 * others)).any()
+
+
+def test_a_target_has_the_hue_of_its_colour_and_may_be_purer():
+    blue = TargetColour.lit((0.2, 0.3, 0.8))
+    assert blue(jnp.array([0.0, 0.0, 1.0]))
+    assert not blue(jnp.array([0.6, 0.65, 0.8]))
+    assert not blue(jnp.array([0.0, 0.0, 0.05]))
+    assert not blue(jnp.array(TargetColour().rgb))
+
+
+@pytest.mark.parametrize("rgb", [(1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.5, 0.5, 0.5), (0.8, 0.75, 0.7), (0.1, 0.0, 0.0)])
+def test_a_target_without_a_hue_is_refused_in_a_line(rgb):
+    with pytest.raises(InputError, match="give masks with target_id") as refused:
+        TargetColour.lit(rgb)
+    assert "\n" not in str(refused.value)
+
+
 def test_target_is_detected_in_a_rendered_image(seen):
     labels = seen.segmentation.reshape(-1).astype(jnp.int32)
     pixels = seen.colour.reshape(-1, 3)

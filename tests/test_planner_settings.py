@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import types
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episodes import target_of
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.perception.colour import TargetColour
 from mechsearch_jax.planner import OPTIONS, PRESETS, settings
 from mechsearch_jax.planner.settings import Settings, load_settings
 from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.search.searcher import Searcher
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -93,7 +96,22 @@ def test_a_robot_that_stands_elsewhere_sees_camera_and_shelf_from_there(tmp_path
     assert load(tmp_path, "[base]\nposition = [0, 0, 0]").workcell == Workcell()
 
 
+def test_the_colour_of_the_target_is_the_recognisers_and_not_the_problems(tmp_path):
+    found = load(tmp_path, '[target]\nshape = "box"\ncolor = [0, 0.2, 1]').workcell
+    assert found == Workcell(target=Target.box(), colour=(0.0, 0.2, 1.0))
+    assert found.detector == TargetColour.lit((0.0, 0.2, 1.0))
+    assert load(tmp_path, "[target]\ncolor = [0, 0.2, 1]").workcell.target == Target()
+    setting = types.SimpleNamespace(camera=Camera(), shelf=Shelf(), target=Target())
+    searcher = Searcher(found)
+    searcher.problem = setting
+    assert searcher.recogniser.detector.func == found.detector
+
+
 WRONG = {
+    "[target]\ncolor = [255, 0, 0]": ":2: [target] color (255.0, 0.0, 0.0) must be red, green and blue, each",
+    "[target]\n\ncolor = [1, 1, 1]": ":3: [target] color (1.0, 1.0, 1.0) is white, grey or black, or nearly so",
+    "[target]\ncolor = [1, 1]": ":2: [target] color must be a list of 3, not of 2",
+    "[target]\ncolour = [1, 0, 0]": ":2: [target] colour is unknown; did you mean color?",
     "[base]\nposition = [0, 11, 0]": ":2: [base] position y (11.0) must be from -10 to 10 m",
     "[base]\nposition = [9.9, 0, 0]\n[camera]\nposition = [-5, 0, 0]": ":1: [base]: position x (-14.9) must be from",
     "[camera]\nwidth = 0": ":2: [camera] width (0) must be from 1 to",

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from stage import HIDDEN, OPEN, grab, idle
 
+from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
@@ -105,7 +106,28 @@ def test_without_an_action_it_says_why(problem):
     nothing = seen(HIDDEN).replace(objects=empty(8))
     step = searcher_of(problem, nothing, policy=idle).next(IMAGES.depth)
     assert step.kind == "none"
-    assert "nothing that could be moved is recognised" in step.reason
+    assert "something stands on the shelf, but no object and no target is recognised" in step.reason
+    assert any("started anew" in warning for warning in step.warnings)
+
+
+def test_an_empty_shelf_is_said_to_be_empty(problem):
+    """And not that something moved, or a shape is wrong."""
+    nothing = seen(HIDDEN).replace(objects=empty(8))
+    bare = observe(Camera(), from_scenario(HIDDEN).replace(valid=jnp.zeros(9, bool)))
+    searcher = searcher_of(problem, nothing, policy=idle)
+    step = searcher.next(np.asarray(bare.depth))
+    assert int(step.belief.restarts) == 1
+    assert (step.kind, step.trajectory) == ("none", None)
+    assert step.reason == "the shelf is empty: no object and no target is seen"
+    assert step.warnings == (step.reason,)
+
+
+def test_an_image_without_any_depth_is_refused_and_nothing_is_forgotten(problem):
+    searcher = searcher_of(problem, HIDDEN, policy=idle)
+    before = searcher.next(IMAGES.depth).belief
+    with pytest.raises(InputError, match="depth image: nothing was measured"):
+        searcher.next(np.zeros_like(IMAGES.depth))
+    assert searcher.belief is before
 
 
 def test_where_all_that_was_tried_out_does_harm_it_says_so_and_draws_others_when_asked_again(problem):
@@ -233,6 +255,6 @@ def test_a_board_5_mm_off_is_not():
 
 def test_images_that_show_nothing_are_told():
     (fault,) = image_faults(CAMERA, SHELF, np.zeros_like(IMAGES.depth))
-    assert "0% of the pixels" in fault
+    assert "nothing was measured" in fault
     (fault,) = image_faults(CAMERA, SHELF, IMAGES.depth, np.full_like(IMAGES.mask, -1))
     assert "names no object" in fault

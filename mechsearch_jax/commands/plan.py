@@ -71,10 +71,11 @@ def plan(
     check_writable(out)
     if example:
         images, seen_by = _example(out)
+        missing = ()
     else:
         assert depth is not None
         seen_by = workcell.camera if camera is None else load_camera(camera)
-        images = _images(depth, color, mask, background, target_id)
+        images, missing = _images(depth, color, mask, background, target_id)
     keep_compilations()
     console = Console(highlight=False)
     with console.status("preparing") as status:
@@ -88,6 +89,7 @@ def plan(
             return
         status.update("looking and planning; the first time in a workcell this takes minutes")
         step = searcher.next(**images, joints=joints or None)
+        step = dataclasses.replace(step, warnings=(*missing, *step.warnings))
         status.update("writing")
         files = _write(step, out)
         if state is not None:
@@ -100,12 +102,13 @@ def plan(
 
 def _images(
     depth: Path, color: Path | None, mask: Path | None, background: int, target_id: int | None
-) -> dict[str, Any]:
-    """The arguments of `Searcher.next` from files."""
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """The arguments of `Searcher.next` from files, and what is to be said of them."""
     from mechsearch_jax.perception import image_files
     from mechsearch_jax.perception.labels import INSTANCES
 
     images: dict[str, Any] = {"depth": image_files.load_depth(depth)}
+    missing = ()
     if color is not None:
         images["colour"] = image_files.load_colour(color)
     if mask is not None:
@@ -113,11 +116,16 @@ def _images(
         if target_id is not None:
             # A number that the mask does not show: the target is not seen.
             images["target_id"] = numbers.get(target_id, -1)
+            if target_id >= 0 and target_id not in numbers:
+                missing = (
+                    f"{mask}: no pixel holds the target's number {target_id}, and the target counts as not seen; give "
+                    "the number that the mask has for it, or a negative one where it does not show it",
+                )
         elif color is None and len(numbers) == INSTANCES:
             raise InputError(
                 f"{mask}: names {INSTANCES} objects; say with --target-id which is the target, or leave one out"
             )
-    return images
+    return images, missing
 
 
 def _example(out: Path) -> tuple[dict[str, Any], Camera]:

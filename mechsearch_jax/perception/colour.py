@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 
 import flax.struct
@@ -19,6 +20,18 @@ from mechsearch_jax.perception.labels import OTHER
 
 # Maps colours (..., 3) and a reference colour (3,) to dissimilarities (...).
 ColourDifference = Callable[[Array, Array], Array]
+
+# The target's colour, if none is given: the paper's red.
+RED = (0.7282, 0.1558, 0.2099)
+# How far apart two hues may be that count as one [rad]: a fourth of the way from red to yellow.
+HUE = math.radians(15.0)
+# A colour of the same hue counts as the target's if it has this share of the target's saturation, or more.
+SATURATION = 0.7
+# Least difference between the largest and the smallest of red, green and blue of a pixel: below it the hue is noise.
+LEAST_CHROMA = 0.08
+# The same of a target's colour, and its least saturation: white, grey, black and what is nearly so have no hue.
+LEAST_TARGET_CHROMA = 0.15
+LEAST_TARGET_SATURATION = 0.3
 
 
 def mean_square(colours: Float[Array, "*batch 3"], reference: Float[Array, "3"]) -> Float[Array, "*batch"]:
@@ -38,12 +51,43 @@ def chromatic(colours: Float[Array, "*batch 3"], reference: Float[Array, "3"]) -
     return mean_square(chromaticity(colours), chromaticity(reference))
 
 
+def chroma(colours: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
+    """The largest less the smallest of red, green and blue: 0 for grey."""
+    return jnp.max(colours, axis=-1) - jnp.min(colours, axis=-1)
+
+
+def saturation(colours: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
+    """Chroma over the largest of red, green and blue, which a light's strength leaves alone; 0 for black."""
+    return chroma(colours) / jnp.maximum(jnp.max(colours, axis=-1), 1e-6)
+
+
+def _opponents(colours: Float[Array, "*batch 3"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    """Coordinates in the plane across the axis of greys, whose angle is the hue: 0 for red, pi/3 for yellow."""
+    red, green, blue = (colours[..., i] for i in range(3))
+    return red - 0.5 * (green + blue), (0.5 * math.sqrt(3.0)) * (green - blue)
+
+
+def hue_difference(colours: Float[Array, "*batch 3"], reference: Float[Array, "3"]) -> Float[Array, "*batch"]:
+    """How far a hue is from the reference's, or a saturation below it; 1 where either is as far as it may be.
+
+    The hue is the angle between the two in the plane across the axis of greys, as a share of `HUE`. A saturation above
+    the reference's is no difference; one below it is, by its lack as a share of the largest. Neither depends on how
+    brightly a thing is lit. What has hardly any chroma is infinitely different.
+    """
+    a, b = _opponents(colours)
+    x, y = _opponents(reference.reshape([1] * (colours.ndim - 1) + [3]))
+    turn = jnp.abs(jnp.arctan2(a * y - b * x, a * x + b * y))
+    own = saturation(reference)
+    lack = (own - saturation(colours)) / ((1.0 - SATURATION) * own)
+    return jnp.where(chroma(colours) < LEAST_CHROMA, jnp.inf, jnp.maximum(jnp.maximum(turn / HUE, lack), 0.0))
+
+
 @dataclasses.dataclass(frozen=True)
 class TargetColour:
     """How the target is told from other things by its colour.
 
     The paper's threshold of 0.1 on the mean square also takes in brown and dark red things, and "exactly one" segment
-    then means none. `TargetColour.lit` compares chromaticities, which tells a red target from them in any light.
+    then means none. `TargetColour.lit` compares hues and saturations, which tell a red target from them in any light.
 
     Attributes:
       rgb: the target's colour, each in 0 to 1.
@@ -52,7 +96,7 @@ class TargetColour:
       minimum_pixels: a segment with fewer is not looked at.
     """
 
-    rgb: tuple[float, float, float] = (0.7282, 0.1558, 0.2099)
+    rgb: tuple[float, float, float] = RED
     threshold: float = 0.1
     difference: ColourDifference = mean_square
     minimum_pixels: int = 1
@@ -67,9 +111,28 @@ class TargetColour:
             )
 
     @classmethod
-    def lit(cls, rgb: tuple[float, float, float] = (0.7282, 0.1558, 0.2099)) -> TargetColour:
-        """A measure that does not depend on the light: chromaticities, and a threshold between red and brown."""
-        return cls(rgb, threshold=0.01, difference=chromatic)
+    def lit(cls, rgb: tuple[float, float, float] = RED) -> TargetColour:
+        """A measure that does not depend on the light: the target has the hue of `rgb`, to 15 degrees, and at least 0.7
+        of its saturation; the shade may be purer, brighter or darker.
+
+        Args:
+          rgb: the target's colour as a camera shows it, each in 0 to 1.
+
+        Raises:
+          InputError: a number is outside 0 to 1, or the colour has no hue.
+        """
+        if len(rgb) != 3 or not all(0 <= c <= 1 for c in rgb):
+            raise InputError(
+                f"TargetColour: color {tuple(rgb)} must be red, green and blue, each from 0 to 1; divide 8-bit values "
+                "by 255"
+            )
+        spread = max(rgb) - min(rgb)
+        if spread < LEAST_TARGET_CHROMA or spread < LEAST_TARGET_SATURATION * max(rgb):
+            raise InputError(
+                f"TargetColour: color {tuple(rgb)} is white, grey or black, or nearly so: it has no hue that tells the "
+                "target from other things; give masks with target_id instead"
+            )
+        return cls(rgb, threshold=1.0, difference=hue_difference)
 
     def __call__(self, colours: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
         """Which colours, of single pixels for example, are the target's; a `recogniser.TargetDetector`."""

@@ -88,7 +88,7 @@ class Doubt(NamedTuple):
         return None
 
 
-class _Thing(NamedTuple):
+class Thing(NamedTuple):
     """What was recognised: its name, half-extents [m], whether it is round about z, and the world in its frame."""
 
     name: str
@@ -130,7 +130,7 @@ def recognition_doubt(
     origin = np.array(camera.position, float)
     points = origin + depths[finite, None] * rays[finite]
     points = points[_on_the_board(shelf, points)]
-    things = _things(shelf, setting.target, observation)
+    things = things_of(shelf, setting.target, observation)
 
     apart = np.full(len(points), np.inf)
     for thing in things:
@@ -180,25 +180,26 @@ def _on_the_board(shelf: Shelf, points: np.ndarray) -> np.ndarray:
     return deep & wide & (z > shelf.board + FACES) & (z < shelf.ceiling - FACES)
 
 
-def _things(shelf: Shelf, target: Target, observation: Observation) -> list[_Thing]:
+def things_of(shelf: Shelf, target: Target, observation: Observation) -> list[Thing]:
+    """What was recognised, without batch axes: the objects, and the target where it is seen."""
     objects = observation.objects
     sizes, exponents, positions, rotations, valid = (
         np.asarray(a, float)
         for a in (objects.size, objects.exponents, objects.position, objects.rotation, objects.valid)
     )
     things = [
-        _Thing(f"object {i}", sizes[i], bool(exponents[i, 1] > 0.5), rotations[i], positions[i])
+        Thing(f"object {i}", sizes[i], bool(exponents[i, 1] > 0.5), rotations[i], positions[i])
         for i in np.flatnonzero(valid)
     ]
     if bool(observation.target_visible):
         x, y, yaw = np.asarray(observation.target_pose, float)
         turned = np.array([[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]])
         place, is_round = np.array([x, y, target.height(shelf)]), target.exponents[1] > 0.5
-        things.append(_Thing("the target", np.array(target.half_size), is_round, turned, place))
+        things.append(Thing("the target", np.array(target.half_size), is_round, turned, place))
     return things
 
 
-def _surface_distance(thing: _Thing, points: np.ndarray) -> np.ndarray:
+def _surface_distance(thing: Thing, points: np.ndarray) -> np.ndarray:
     """About how far points in its own frame are from its surface [m], inside or outside."""
     past = np.abs(points) - thing.size
     if thing.is_round:
@@ -207,7 +208,7 @@ def _surface_distance(thing: _Thing, points: np.ndarray) -> np.ndarray:
     return np.abs(np.linalg.norm(np.maximum(past, 0.0), axis=1) + np.minimum(past.max(axis=1), 0.0))
 
 
-def _passed(thing: _Thing, origin: np.ndarray, rays: np.ndarray, depths: np.ndarray, tolerance: float) -> float:
+def _passed(thing: Thing, origin: np.ndarray, rays: np.ndarray, depths: np.ndarray, tolerance: float) -> float:
     """Share of the rays that reach the inner part of an object and are measured beyond it."""
     inner = np.maximum(thing.size - tolerance, 0.3 * thing.size)
     if thing.is_round:

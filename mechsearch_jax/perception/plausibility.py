@@ -5,15 +5,24 @@ Looked at on the host, before anything is recognised: wrong units, poses and mas
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from mechsearch_jax.perception.cloud import BLOCK, shelf_view
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.cloud import BLOCK, above_board, shelf_view, thinned_view
 from mechsearch_jax.perception.planes import PlaneConfig, find_plane
+from mechsearch_jax.perception.target_pixels import coloured_pixels, fitted_pose
+from mechsearch_jax.perception.target_pose import distance
 from mechsearch_jax.workspace.camera import Camera, back_project, project
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 # The board is looked for so far above and below where it should be [m], among at most so many points, and is believed
 # to be seen where so many lie on one plane.
@@ -25,6 +34,52 @@ FLOOR_TOLERANCE = 0.01
 # Least share of the board that the image must show, and least share of its pixels with a measured depth.
 LEAST_SEEN = 0.5
 LEAST_MEASURED = 0.5
+# Walls are looked for so far before and behind where they should be [m], among at most `FLOOR_POINTS` points that are
+# so far from the other faces [m]. So many of them, and such a share, make a wall of what they lie on.
+WALL_SEARCH = 0.06
+WALL_MARGIN = 0.035
+WALL_SUPPORT = 150
+WALL_SHARE = 0.05
+# A face that is narrower than this share of its wall may be an object's [m]; the widest objects measure 0.16 m.
+WALL_SPAN = 0.4
+LEAST_WALL_SPAN = 0.2
+# Of how many strips across the board, of how many, its front edge must be seen.
+EDGE_STRIPS, LEAST_STRIPS = 64, 32
+# So many points above the board are something [pixels of the whole image].
+SOMETHING = 100
+# How well a patch must lie on the target for it to be one: share of its points, and how near [m].
+PATCH_SHARE, PATCH_DISTANCE = 0.8, 0.005
+
+
+NOTHING_MEASURED = (
+    "depth image: nothing was measured where it shows the shelf; it must hold metres along the camera's axis, and the "
+    "sensor must be able to see the shelf"
+)
+EMPTY_SHELF = "the shelf is empty: no object and no target is seen"
+
+
+@dataclasses.dataclass(frozen=True)
+class Wall:
+    """A vertical face of a shelf.
+
+    Attributes:
+      name: what it is called.
+      face: name of the number of the shelf that says where it is.
+      axis: of that number: 0 for x, 1 for y.
+      outward: 1 where larger numbers are outside the shelf, -1 where smaller ones are.
+    """
+
+    name: str
+    face: str
+    axis: int
+    outward: int
+
+
+WALLS = (
+    Wall("the back wall", "back", 0, 1),
+    Wall("the right side wall", "right", 1, -1),
+    Wall("the left side wall", "left", 1, 1),
+)
 
 
 def camera_faults(camera: Camera, shelf: Shelf) -> tuple[str, ...]:
@@ -83,13 +138,17 @@ def image_faults(
     view = shelf_view(camera, shelf, 1, BLOCK)
     part = np.asarray(view.of(jnp.asarray(depth)), np.float32)
     measured = np.isfinite(part) & (part > 0)
+    if not measured.any():
+        return (NOTHING_MEASURED,)
     if measured.mean() < LEAST_MEASURED:
         return (
             f"depth image: {100 * measured.mean():.0f}% of the pixels that show the shelf have a depth; it must be in "
             "metres along the camera's axis, and the sensor must be able to see the shelf",
         )
     points = np.asarray(back_project(view.camera, jnp.asarray(np.where(measured, part, np.nan))))[measured]
-    faults = [_floor_fault(shelf, points)]
+    floor = _floor_fault(shelf, points)
+    # Where the board is not where it should be, walls are looked for in the wrong place, too.
+    faults = [floor] if floor else [_edge_fault(shelf, points), *(_wall_fault(shelf, wall, points) for wall in WALLS)]
     x, y, z = points.T
     within = (x > shelf.front) & (x < shelf.back) & (y > shelf.right) & (y < shelf.left) & (z < shelf.ceiling)
     if mask is not None and (z[within] > shelf.board + 2 * FLOOR_TOLERANCE).any() and not (mask >= 0).any():
@@ -122,3 +181,184 @@ def _floor_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
         f"depth image: the board appears up to {100 * abs(worst):.1f} cm too {'high' if worst > 0 else 'low'}; check "
         "the pose of the camera and the height of the board"
     )
+
+
+def _wall_fault(shelf: Shelf, wall: Wall, points: Float[np.ndarray, "n 3"]) -> str | None:
+    """What is wrong with a wall that the points show; nothing is where they show too little of it.
+
+    The wall is the farthest plane on which many points lie, over a wider range than any object is wide.
+    """
+    past, sideways = wall.outward * (points[:, wall.axis] - getattr(shelf, wall.face)), points[:, 1 - wall.axis]
+    low, high = (shelf.right, shelf.left) if wall.axis == 0 else (shelf.front, shelf.back)
+    between = (sideways > low + WALL_MARGIN) & (sideways < high - WALL_MARGIN)
+    upright = (points[:, 2] > shelf.board + WALL_MARGIN) & (points[:, 2] < shelf.ceiling - WALL_MARGIN)
+    near = np.flatnonzero(between & upright & (np.abs(past) < WALL_SEARCH))
+    near = near[np.random.default_rng(0).permutation(len(near))[:FLOOR_POINTS]]
+    if len(near) < WALL_SUPPORT:
+        return None
+    counts, edges = np.histogram(past[near], bins=math.ceil(2 * WALL_SEARCH / 0.004), range=(-WALL_SEARCH, WALL_SEARCH))
+    # A wall may share its points between two bins.
+    many = np.flatnonzero(counts + np.append(counts[1:], 0) >= max(WALL_SUPPORT, WALL_SHARE * len(near)))
+    if not len(many):
+        return None
+    at = edges[many[-1] + 1]
+    near = near[np.abs(past[near] - at) < 1.5 * FLOOR_TOLERANCE]
+    if abs(np.median(past[near])) < 0.5 * FLOOR_TOLERANCE:
+        return None
+    # In a frame in which the wall is a floor, so that both are found by one program.
+    local = np.stack([points[near, 2], sideways[near], -past[near]], axis=1)
+    padded = np.zeros((FLOOR_POINTS, 3), np.float32)
+    padded[: len(local)] = local
+    valid = jnp.arange(FLOOR_POINTS) < len(local)
+    plane = find_plane(jax.random.key(0), jnp.asarray(padded), valid, config=PlaneConfig())
+    on = np.abs(np.asarray(plane.height(jnp.asarray(local, jnp.float32)))) <= PlaneConfig.tolerance
+    if int(plane.support) < WALL_SUPPORT:
+        return None
+    first, last = np.percentile(local[on, 1], (5, 95))
+    if last - first < max(LEAST_WALL_SPAN, WALL_SPAN * (high - low)):
+        return None
+    off = -float(np.median(local[on, 2]))
+    if abs(off) <= FLOOR_TOLERANCE:
+        return None
+    return (
+        f"depth image: {wall.name} appears {100 * abs(off):.1f} cm {_way(wall, off)} than shelf.{wall.face} says; "
+        f"check the place of the shelf in {'xy'[wall.axis]} and the pose of the camera"
+    )
+
+
+def _way(wall: Wall, off: float) -> str:
+    if wall.axis == 0:
+        return "farther" if off > 0 else "nearer"
+    return "farther out" if off > 0 else "farther in"
+
+
+def _edge_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
+    """What is wrong with the front edge of the board that the points show; nothing where they show too little of it."""
+    x, y, z = points.T
+    board = (np.abs(z - shelf.board) < 0.008) & (np.abs(x - shelf.front) < 2 * WALL_SEARCH)
+    across = (y > shelf.right + WALL_MARGIN) & (y < shelf.left - WALL_MARGIN)
+    strip = ((y - shelf.right) / (shelf.left - shelf.right) * EDGE_STRIPS).astype(int)
+    firsts = []
+    for i in range(EDGE_STRIPS):
+        own = x[board & across & (strip == i)]
+        if len(own) >= 10:
+            # Not the very first: at an edge a sensor may measure a mixture of what is before and behind it.
+            firsts.append(np.percentile(own, 2))
+    if len(firsts) < LEAST_STRIPS:
+        return None
+    off = float(np.median(firsts)) - shelf.front
+    # Things that stand at the edge hide it, and then the board seems to begin behind them.
+    if abs(off) <= FLOOR_TOLERANCE or (off > 0 and np.percentile(firsts, 10) - shelf.front <= FLOOR_TOLERANCE):
+        return None
+    return (
+        f"depth image: the board's front edge appears {100 * abs(off):.1f} cm {'farther' if off > 0 else 'nearer'} "
+        "than shelf.front says; check the place of the shelf in x and the pose of the camera"
+    )
+
+
+def identity_faults(
+    colour: np.ndarray | None, mask: Int[np.ndarray, "h w"] | None, target_id: int | None
+) -> tuple[str, ...]:
+    """What keeps images from saying which thing is the target; empty if nothing does.
+
+    Args:
+      colour: the colour image, if there is one.
+      mask: the number of the object that a pixel shows, if there is one.
+      target_id: the target's number in the mask, if it is given; negative where the mask does not show it.
+    """
+    if colour is None and target_id is None:
+        return (
+            "images: the target cannot be told from the objects; give a colour image, or a mask with target_id "
+            "(negative where it does not show the target)",
+        )
+    if mask is not None and target_id is not None and int(target_id) >= 0 and not (mask == int(target_id)).any():
+        return (
+            f"mask: no pixel holds the target's number {int(target_id)}, and the target counts as not seen; give the "
+            "number that the mask has for it, or a negative one where it does not show it",
+        )
+    return ()
+
+
+def colour_faults(
+    camera: Camera,
+    shelf: Shelf,
+    target: Target,
+    detector: Callable[[jax.Array], jax.Array],
+    depth: Float[np.ndarray, "h w"],
+    colour: np.ndarray,
+) -> tuple[str, ...]:
+    """What in a colour image does not fit the target; empty if everything does.
+
+    Args:
+      camera, shelf, target: what took the image, what it sees and what is searched.
+      detector: which pixels of an image are the target's.
+      depth: as in `image_faults`.
+      colour: (h, w, 3), floats in 0 to 1 or uint8.
+
+    Raises:
+      InputError: the camera does not see the shelf.
+    """
+    view = thinned_view(camera, shelf)
+    seen = np.asarray(view.of(jnp.asarray(depth, jnp.float32)))
+    seen = jnp.asarray(np.where(seen > 0, seen, np.nan))
+    points = back_project(view.camera, seen)
+    pixels = np.asarray(view.of(jnp.asarray(colour)))
+    image = pixels.astype(np.float32) / (255.0 if pixels.dtype == np.uint8 else 1.0)
+    inside = above_board(shelf, points)
+    least = SOMETHING * camera.width * camera.height / (1280 * 720 * view.stride**2)
+
+    def patch(image: np.ndarray) -> Bool[np.ndarray, "h w"]:
+        return np.asarray(coloured_pixels(detector, jnp.asarray(image), seen) & inside)
+
+    if patch(image).sum() > least:
+        return ()
+    swapped = patch(image[..., ::-1])
+    if swapped.sum() <= least:
+        return ()
+    pose, _ = fitted_pose(jax.random.key(0), target, shelf, view.camera, points, jnp.asarray(swapped))
+    away = np.abs(np.asarray(distance(target, shelf, pose, points[swapped])))
+    if (away < PATCH_DISTANCE).mean() < PATCH_SHARE:
+        return ()
+    return (
+        "colour image: looks like blue, green, red: nothing has the target's colour, but with red and blue exchanged "
+        "something of the target's shape has; give red, green, blue",
+    )
+
+
+def check_measured(camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> None:
+    """Refuse a depth image in which nothing was measured where it shows the shelf.
+
+    Args:
+      camera, shelf, depth: as in `image_faults`.
+
+    Raises:
+      InputError: nothing was measured, or the camera does not see the shelf.
+    """
+    part = np.asarray(shelf_view(camera, shelf, 1).of(jnp.asarray(depth)))
+    if not (np.isfinite(part) & (part > 0)).any():
+        raise InputError(NOTHING_MEASURED)
+
+
+def shows_nothing(observation: Observation) -> bool:
+    """Whether neither an object nor the target was recognised; without batch axes."""
+    return not (bool(jnp.any(observation.objects.valid)) or bool(observation.target_visible))
+
+
+def sight_faults(
+    camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"], observation: Observation
+) -> tuple[str, ...]:
+    """What is to be said of an observation of nothing; empty where anything was recognised.
+
+    Args:
+      camera, shelf, depth: as in `image_faults`.
+      observation: what was recognised; without batch axes.
+    """
+    if not shows_nothing(observation):
+        return ()
+    view = thinned_view(camera, shelf)
+    part = np.asarray(view.of(jnp.asarray(depth, jnp.float32)))
+    points = back_project(view.camera, jnp.asarray(np.where(part > 0, part, np.nan)))
+    standing = int(jnp.sum(above_board(shelf, points, FLOOR_TOLERANCE))) * view.stride**2
+    if standing > SOMETHING * camera.width * camera.height / (1280 * 720):
+        return ("recognition: something stands on the shelf, but no object and no target is recognised",)
+    return (EMPTY_SHELF,)

@@ -112,7 +112,9 @@ def _checked(camera: Camera, depth: np.ndarray, colour: np.ndarray, mask: np.nda
         raise InputError(f"mask image: must hold whole numbers, -1 for no object, not {mask.dtype}")
     measured = np.isfinite(depth) & (depth > 0)
     if not measured.any():
-        raise InputError("depth image: holds no positive depth; it must be in metres along the camera's axis")
+        raise InputError(
+            "depth image: nothing was measured: it holds no positive depth; it must be in metres along the camera's axis"
+        )
     if np.median(depth[measured]) > 20:
         raise InputError(
             f"depth image: its median is {np.median(depth[measured]):.0f}; it must be in metres, not millimetres"

@@ -26,6 +26,7 @@ from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
+from mechsearch_jax.perception.target_pixels import coloured_pixels, fitted_pose, near_target
 from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.detector import found_pixels
@@ -201,9 +202,14 @@ def _labelled(
     if colour is not None:
         pixels = view.of(jnp.asarray(colour))
         scale = 255.0 if pixels.dtype == jnp.uint8 else 1.0
-        coloured = recogniser.detector(pixels.astype(jnp.float32) / scale) & near
+        coloured = coloured_pixels(recogniser.detector, pixels.astype(jnp.float32) / scale, seen) & near
+    # With a weak type, all that takes the observation would be compiled once more than for another recogniser's.
+    enough = found_pixels(camera) / view.stride**2
+    visible = (jnp.sum(coloured) > enough).astype(bool)
     if mask is None:
-        of_target = coloured
+        pose, _ = fitted_pose(jax.random.fold_in(key, 0), recogniser.target, shelf, view.camera, points, coloured)
+        on_it = near_target(recogniser.target, shelf, pose, points) & near & visible
+        of_target = coloured | on_it
         labels = recogniser.segmenter(key, shelf, points, of_target)
     else:
         instances = _instances(view.of(jnp.asarray(mask)))
@@ -211,11 +217,8 @@ def _labelled(
         of_target &= near
         labels = _labels(instances, freed, shelf, points)
         labels = jnp.where(of_target & (labels != MISSING) & (labels != FREE), OTHER, labels)
-
-    visible = jnp.sum(of_target) * view.stride**2 > found_pixels(camera)
-    # With a weak type, all that takes the observation would be compiled once more than for another recogniser's.
-    visible = visible.astype(bool)
-    return LabelledImage(points, seen, labels, of_target & above_board(shelf, points)), visible
+        visible = (jnp.sum(of_target) > enough).astype(bool)
+    return LabelledImage(points, seen, labels, of_target & above_board(shelf, points) & visible), visible
 
 
 def _instances(mask: Int[Array, "h w"]) -> Int[Array, "h w"]:

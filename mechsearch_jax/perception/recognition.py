@@ -15,17 +15,14 @@ from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import matmul, transform
 from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import draw, middle
+from mechsearch_jax.perception.cloud import middle
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
-from mechsearch_jax.perception.target_pose import target_pose
+from mechsearch_jax.perception.target_pixels import fitted_pose, near_target, without_phantoms
 from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
-
-# Points of the target that its pose is fitted to.
-TARGET_POINTS = 256
 
 
 def best_hypothesis(hypotheses: Hypotheses, segments: Segments) -> Superquadrics:
@@ -140,7 +137,8 @@ def recognise_image(
 ) -> tuple[Superquadrics, Float[Array, " 3"]]:
     """The objects of a labelled image, and the target's pose: network, refinement, `superquadric.standard_edges`.
 
-    Every recogniser of images comes down to this.
+    Every recogniser of images comes down to this. No object is recognised in the target or on it: a segment most of
+    which is there is none.
 
     Args:
       keys: of the points that are drawn from the objects, and from the target.
@@ -154,11 +152,9 @@ def recognise_image(
       finite, where no pixel is its.
     """
     drawing, choosing = keys
-    scene = recognise(drawing, shapes.network, shapes.parameters, camera, image.points, image.labels, shelf)
-    points, labels = image.points.reshape(-1, 3), image.labels.reshape(-1)
-    refined = refine(camera, shelf, scene, points, labels, image.depth, refinement)
-
-    index, count = draw(choosing, image.of_target.reshape(-1), TARGET_POINTS)
-    seen = jnp.broadcast_to(count > 0, TARGET_POINTS)
-    pose = target_pose(target, shelf, jnp.array(camera.position), points[index], seen)
+    pose, found = fitted_pose(choosing, target, shelf, camera, image.points, image.of_target)
+    inside = near_target(target, shelf, pose, image.points) & found
+    labels = without_phantoms(image.labels, inside)
+    scene = recognise(drawing, shapes.network, shapes.parameters, camera, image.points, labels, shelf)
+    refined = refine(camera, shelf, scene, image.points.reshape(-1, 3), labels.reshape(-1), image.depth, refinement)
     return standard_edges(refined.scene), pose

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.errors import InputError, check_range, nearest
 from mechsearch_jax.files import PathLike
+from mechsearch_jax.perception.colour import RED, TargetColour
 from mechsearch_jax.planner.config import OPTIONS, Config, Option
 from mechsearch_jax.planner.presets import DEFAULT_PRESET, PRESETS, expanded
 from mechsearch_jax.planner.workcell import Workcell
@@ -72,9 +73,12 @@ class Settings:
         return told
 
 
+# The key of the target's table that is not of its shape: the workcell's `colour`.
+COLOR = "color"
+
 # The tables of a file beside the planner's, and what they are without it.
 _PARTS: Mapping[str, Any] = {
-    **{field.name: getattr(Workcell(), field.name) for field in dataclasses.fields(Workcell)},
+    **{field.name: getattr(Workcell(), field.name) for field in dataclasses.fields(Workcell) if field.name != "colour"},
     "base": Base(),
     "objects": ObjectSizes(),
 }
@@ -86,6 +90,7 @@ def tables() -> dict[str, dict[str, Any]]:
         name: {field.name: getattr(usual, field.name) for field in dataclasses.fields(usual)}
         for name, usual in _PARTS.items()
     }
+    parts["target"][COLOR] = Workcell().colour
     return {**parts, PLANNER: {"preset": DEFAULT_PRESET, **PRESETS[DEFAULT_PRESET]().options()}}
 
 
@@ -106,6 +111,9 @@ def load_settings(path: PathLike) -> Settings:
     for key in document.tables[""]:
         begin = ", ".join(f"[{table}]" for table in known)
         raise InputError(f"{document.where('', key)} stands in no table; begin one of {begin}")
+    colour = _colour(document)
+    of_shape = {key: value for key, value in document.tables.get("target", {}).items() if key != COLOR}
+    document = dataclasses.replace(document, tables={**document.tables, "target": of_shape})
     parts = {name: with_table(document, name, usual) for name, usual in _PARTS.items() if name != "target"}
     objects, base = parts.pop("objects"), parts.pop("base")
     x, y, z = base.position
@@ -116,9 +124,20 @@ def load_settings(path: PathLike) -> Settings:
         document,
         "target",
         {"inset": target.inset},
-        lambda given: Workcell(target=target if given else Target(), **parts),
+        lambda given: Workcell(target=target if given else Target(), colour=colour, **parts),
     )
     return _with_planner(document, Settings(workcell, objects))
+
+
+def _colour(document: Document) -> tuple[float, float, float]:
+    """The target's colour."""
+    table = document.tables.get("target", {})
+    if "colour" in table:
+        raise InputError(f"{document.where('target', 'colour')} is unknown; did you mean {COLOR}?")
+    if COLOR not in table:
+        return Workcell().colour
+    given = checked(table[COLOR], tuple[float, float, float], document.where("target", COLOR))
+    return apply(document, "target", {COLOR: given}, lambda said: TargetColour.lit(said.get(COLOR, RED))).rgb
 
 
 def _target(document: Document) -> Target:

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.perception.colour import RED, TargetColour
 from mechsearch_jax.planner.cache import cached_problem, is_cached
 from mechsearch_jax.planner.config import ProblemConfig
 from mechsearch_jax.planner.problem import Problem
@@ -26,6 +27,8 @@ class Workcell:
       gripper: what grasps them.
       target: what is searched; of a scenario, which has its own, how finely it is searched.
       arm: how the arm is used.
+      colour: of the target, by which it is seen in colour images: red, green and blue in 0 to 1. What is compiled for a
+        problem does not depend on it.
     """
 
     camera: Camera = dataclasses.field(default_factory=Camera)
@@ -33,8 +36,10 @@ class Workcell:
     gripper: Gripper = dataclasses.field(default_factory=Gripper)
     target: Target = dataclasses.field(default_factory=Target)
     arm: ArmConfig = dataclasses.field(default_factory=ArmConfig)
+    colour: tuple[float, float, float] = RED
 
     def __post_init__(self):
+        TargetColour.lit(self.colour)
         room = min(self.shelf.back - self.shelf.front, self.shelf.left - self.shelf.right)
         if not 2 * self.target.inset < room:
             raise InputError(
@@ -48,6 +53,11 @@ class Workcell:
           InputError: the target cannot be grasped by the gripper.
         """
         return cached_problem(target or self.target, config, **self._around)
+
+    @property
+    def detector(self) -> TargetColour:
+        """What tells the target's pixels from others in a colour image: a `detector` of a `Recogniser`."""
+        return TargetColour.lit(self.colour)
 
     def is_cached(self, target: Target, config: ProblemConfig) -> bool:
         """Whether the problem of a target was built before, and need only be read."""

@@ -28,7 +28,16 @@ from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.plausibility import camera_faults, image_faults
+from mechsearch_jax.perception.overlaps import overlap_faults
+from mechsearch_jax.perception.plausibility import (
+    EMPTY_SHELF,
+    camera_faults,
+    check_measured,
+    colour_faults,
+    identity_faults,
+    image_faults,
+    sight_faults,
+)
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.trained_view import view_faults
 from mechsearch_jax.planner.belief import Belief, initial_belief, update_belief
@@ -117,6 +126,8 @@ class Searcher:
     @functools.cached_property
     def recogniser(self) -> Any:
         """What sees."""
+        if self._make_recogniser is Recogniser:
+            return Recogniser(self.problem, detector=self.workcell.detector)
         return self._make_recogniser(self.problem)
 
     @property
@@ -212,7 +223,7 @@ class Searcher:
           The step. Its trajectory is to be followed as it is; then `acted` is to be told.
 
         Raises:
-          InputError: an image's shape, type or unit is not as said, or the search is finished.
+          InputError: an image's shape, type or unit is not as said, nothing was measured, or the search is finished.
         """
         problem, now = self.problem, self._now
         if now.finished:
@@ -225,12 +236,14 @@ class Searcher:
             joints = np.asarray(joints, float)
             check_joints("joints", joints)
         observation = self.recogniser(seeing, depth, colour, mask, target_id)
-        warnings = [*self._camera_faults]
-        warnings += image_faults(problem.camera, problem.shelf, depth, None if mask is None else np.asarray(mask))
-        warnings += crowd_faults(observation)
+        check_measured(problem.camera, problem.shelf, depth)
+        warnings = [*self._camera_faults, *self._faults(depth, colour, mask, target_id)]
+        nothing = sight_faults(problem.camera, problem.shelf, depth, observation)
+        warnings += [*nothing, *crowd_faults(observation), *overlap_faults(problem, observation)]
         last = (now.observation, now.action) if now.acted else (None, None)
         belief = update_belief(problem, now.belief, observation, *last)
-        if int(belief.restarts) > int(now.belief.restarts):
+        # Of an empty shelf f is empty because the target is not there.
+        if int(belief.restarts) > int(now.belief.restarts) and EMPTY_SHELF not in nothing:
             warnings.append(
                 "f became empty and was started anew: something moved that was not seen, or a shape is wrong"
             )
@@ -307,6 +320,19 @@ class Searcher:
         if faults or not isinstance(recogniser, Recogniser):
             return faults
         return view_faults(recogniser.camera, recogniser.shelf, recogniser.trained)
+
+    def _faults(self, depth: np.ndarray, colour: Any, mask: Any, target_id: int | None) -> list[str]:
+        """What in the images does not fit camera, shelf and target."""
+        problem, recogniser = self.problem, self.recogniser
+        mask, colour = (None if image is None else np.asarray(image) for image in (mask, colour))
+        faults = list(image_faults(problem.camera, problem.shelf, depth, mask))
+        # What else recognises may know the target in another way.
+        if isinstance(recogniser, Recogniser):
+            faults += identity_faults(colour, mask, target_id)
+            if colour is not None and target_id is None:
+                detector = recogniser.detector
+                faults += colour_faults(problem.camera, problem.shelf, problem.target, detector, depth, colour)
+        return faults
 
     @functools.cached_property
     def _digest(self) -> str:

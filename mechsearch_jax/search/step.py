@@ -16,6 +16,7 @@ from mechsearch_jax.actions.registry import ActionKind, kind_of
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.plausibility import sight_faults
 from mechsearch_jax.planner.belief import Belief, graspability_map
 from mechsearch_jax.planner.impasse import impasse
 from mechsearch_jax.planner.problem import Problem
@@ -114,6 +115,8 @@ def motion(
     found = bool(belief.found)
     known = "the target is found" if found else f"the target can be at {int(jnp.sum(belief.exists))} poses"
     if kind.code == ActionKind.NONE:
+        if faults := sight_faults(problem.camera, problem.shelf, depth, observation):
+            return Motion(nothing, "; ".join(faults), None)
         refused = int(decision.refused)
         why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
         return Motion(nothing, f"{known}; {why if refused else impasse(problem, belief, observation.objects)}", None)

@@ -1,0 +1,150 @@
+"""Images that do not fit shelf and target: shifted walls, exchanged colours, missing numbers, nothing to see."""
+
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from published import published_scenarios
+
+from mechsearch_jax.envs.simulated_camera import observe
+from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.colour import RED, TargetColour
+from mechsearch_jax.perception.examples import example_images
+from mechsearch_jax.perception.plausibility import (
+    EMPTY_SHELF,
+    NOTHING_MEASURED,
+    check_measured,
+    colour_faults,
+    identity_faults,
+    image_faults,
+    sight_faults,
+)
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, Scenario, example_scenarios, load_scenario
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+CAMERA, SHELF, TARGET = Camera().scaled(2), Shelf(), Target()
+SCENE = load_scenario(example_scenarios()["crowded-shelf"])
+IMAGES = example_images()
+IN_SIGHT = dataclasses.replace(SCENE, target=dataclasses.replace(SCENE.target, position=(0.46, 0.3, 0.4545)))
+
+
+def elsewhere(body, by):
+    return dataclasses.replace(body, position=tuple(np.add(body.position, by).tolist()))
+
+
+@functools.cache
+def sensed(scene, by=(0.0, 0.0, 0.0), camera=CAMERA):
+    """Depth with 1 mm of noise, and colour with 4/255, of a scene whose shelf, with all on it, is `by` off [m]."""
+    shown = Scenario(scene.name, tuple(elsewhere(body, by) for body in scene.objects), elsewhere(scene.target, by))
+    image = observe(camera, from_scenario(shown), SHELF.moved(by))
+    rng = np.random.default_rng(0)
+    depth = np.asarray(image.depth) + rng.normal(0, 0.001, image.depth.shape).astype(np.float32)
+    depth = np.where(np.isfinite(depth) & (rng.random(depth.shape) > 0.005), depth, 0.0).astype(np.float32)
+    colour = np.asarray(image.colour) + rng.normal(0, 4 / 255, image.colour.shape)
+    return depth, np.round(255 * np.clip(colour, 0, 1)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("by", "words"),
+    [
+        ((0.02, 0, 0), ("front edge appears", "back wall appears 2.0 cm farther than shelf.back")),
+        ((-0.02, 0, 0), ("front edge appears", "back wall appears 2.0 cm nearer than shelf.back")),
+        ((0, 0.02, 0), ("right side wall appears 2.0 cm farther in than", "left side wall appears 2.0 cm farther out")),
+        (
+            (0, -0.02, 0),
+            ("right side wall appears 2.0 cm farther out than", "left side wall appears 2.0 cm farther in"),
+        ),
+    ],
+)
+def test_a_shelf_elsewhere_is_said(by, words):
+    faults = image_faults(CAMERA, SHELF, sensed(SCENE, by)[0])
+    assert len(faults) == len(words)
+    for fault, said in zip(faults, words, strict=True):
+        assert fault.startswith("depth image: ")
+        assert said in fault
+
+
+def test_one_millimetres_off_or_hardly_seen_is_not():
+    assert image_faults(CAMERA, SHELF, sensed(SCENE)[0]) == ()
+    assert image_faults(CAMERA, SHELF, sensed(SCENE, (0.004, -0.004, 0.0))[0]) == ()
+    # Walls of which nothing was measured are not looked for.
+    depth = sensed(SCENE, (0.02, 0.0, 0.0))[0].copy()
+    assert len(image_faults(CAMERA, SHELF, depth)) == 2
+    points_of_the_wall = depth > 0.84
+    depth[points_of_the_wall] = 0.0
+    assert all("front edge" in fault for fault in image_faults(CAMERA, SHELF, depth))
+
+
+def test_a_row_of_boxes_before_the_back_wall_is_not_the_wall():
+    row = tuple(Body("box", (0.03, 0.078, 0.096), (0.735, y, 0.5005), (1.0, 0.0, 0.0, 0.0)) for y in (-0.1, 0.1, 0.3))
+    assert image_faults(CAMERA, SHELF, sensed(Scenario("row", row, SCENE.target))[0]) == ()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not published_scenarios(), reason="the published scenes are not there")
+def test_no_published_scene_is_said_to_be_wrong():
+    for file in published_scenarios()[::5]:
+        scene = load_scenario(file)
+        depth, colour = sensed(scene)
+        assert image_faults(CAMERA, SHELF, depth) == ()
+        assert colour_faults(CAMERA, SHELF, TARGET, TargetColour.lit(), depth, colour) == ()
+
+
+def test_blue_green_red_is_said():
+    depth, colour = sensed(IN_SIGHT)
+    detector = TargetColour.lit()
+    assert colour_faults(CAMERA, SHELF, TARGET, detector, depth, colour) == ()
+    (fault,) = colour_faults(CAMERA, SHELF, TARGET, detector, depth, colour[..., ::-1])
+    assert fault.startswith("colour image: looks like blue, green, red")
+    floats = np.float32(colour[..., ::-1] / 255)
+    assert len(colour_faults(CAMERA, SHELF, TARGET, detector, depth, floats)) == 1
+    # A hidden target leaves nothing to tell by, and another thing of the exchanged colour is not of its shape.
+    hidden = sensed(SCENE)
+    assert colour_faults(CAMERA, SHELF, TARGET, detector, *hidden) == ()
+    other = hidden[1].astype(np.float32) / 255
+    image = np.asarray(observe(CAMERA, from_scenario(SCENE)).segmentation)
+    for slot in range(len(SCENE.objects)):
+        painted = np.where((image == slot)[..., None], RED[::-1], other).astype(np.float32)
+        if SCENE.objects[slot].half_size[0] > 0.03:
+            assert colour_faults(CAMERA, SHELF, TARGET, detector, hidden[0], painted) == ()
+
+
+def test_what_keeps_the_target_from_being_told_is_said():
+    mask = np.full((4, 4), -1)
+    mask[0] = 3
+    (fault,) = identity_faults(None, None, None)
+    assert "give a colour image, or a mask with target_id" in fault
+    assert len(identity_faults(None, mask, None)) == 1
+    assert identity_faults(np.zeros((4, 4, 3)), None, None) == ()
+    assert identity_faults(None, mask, 3) == identity_faults(None, mask, -1) == ()
+    (fault,) = identity_faults(None, mask, 5)
+    assert "no pixel holds the target's number 5" in fault
+
+
+def nothing_seen():
+    return Observation(empty(8), jnp.array(False), jnp.zeros(3))
+
+
+def test_an_empty_shelf_is_told_from_one_on_which_nothing_is_recognised():
+    bare = observe(CAMERA, from_scenario(SCENE).replace(valid=jnp.zeros(9, bool)))
+    depth = np.asarray(bare.depth) + np.random.default_rng(0).normal(0, 0.001, bare.depth.shape).astype(np.float32)
+    assert sight_faults(CAMERA, SHELF, depth, nothing_seen()) == (EMPTY_SHELF,)
+    (fault,) = sight_faults(CAMERA, SHELF, sensed(SCENE)[0], nothing_seen())
+    assert "something stands on the shelf, but no object and no target is recognised" in fault
+    assert sight_faults(CAMERA, SHELF, depth, nothing_seen().replace(target_visible=jnp.array(True))) == ()
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+def test_an_image_without_a_measurement_is_said_and_refused(value):
+    depth = np.full((CAMERA.height, CAMERA.width), value, np.float32)
+    assert image_faults(CAMERA, SHELF, depth) == (NOTHING_MEASURED,)
+    with pytest.raises(InputError, match="depth image: nothing was measured"):
+        check_measured(CAMERA, SHELF, depth)
+    check_measured(CAMERA, SHELF, sensed(SCENE)[0])
