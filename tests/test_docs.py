@@ -236,7 +236,8 @@ def test_the_rates_of_the_readme_are_the_stored_ones():
         episode for name in ("standard-cpu.json", "standard-h200.json") for episode in stored_runs(name)[0]["episodes"]
     ]
     new = new_scenes(stored_runs("standard-h200.json")[1]["episodes"])
-    header = "| objects | published, 150 episodes: found | graspable | retrieved | new, 90 episodes: found | graspable | retrieved |"
+    columns = [f"{scenes} episodes: found | graspable | retrieved" for scenes in ("published, 150", "new, 90")]
+    header = f"| objects | {' | '.join(columns)} |"
     told = {row[0]: row[1:] for row in rows("README.md", header)}
     assert list(told) == ["2", "4", "6", "8"]
     for objects, figures in told.items():
@@ -288,11 +289,9 @@ def test_scenes_that_nothing_was_chosen_on_are_told_apart():
     groups = [with_objects(new, objects) for objects in "2468"]
     found = ", ".join(share("found", each, 2) for each in groups)
     retrieved = ", ".join(with_interval("retrieved", each) for each in groups)
-    assert (
-        f"numbers 090 to 179 of `c2`, 90 episodes each, with 2, 4, 6 and 8 objects (95% intervals): found {found}, "
-        in page
-    )
-    assert f"retrieved {retrieved}." in page
+    scenes = "numbers 090 to 179 of `c2`, 90 episodes each, with 2, 4, 6 and 8 objects (95% intervals)"
+    assert f"{scenes}: found {found}, retrieved {retrieved}." in page
+    assert set(map(len, groups)) == {90}
 
 
 def header_above(page, row):
