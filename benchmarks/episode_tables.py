@@ -27,6 +27,9 @@ def print_summary(console: Console, summary: Sequence[Rates], key: Key) -> None:
     """Print rates, and what the labels of variants stand for."""
     console.print(summary_table(summary, key))
     console.print("plan, act: seconds per action", style="dim")
+    if any(rates.graspable is None for rates in summary):
+        said = "graspable -: not known; in an earlier version a retrieval counted as graspable, too"
+        console.print(said, style="dim", soft_wrap=True)
     if key.numbered:
         console.print()
         for label, short in key.short.items():
@@ -164,4 +167,9 @@ def guard_table(comparisons: Sequence[guard.Comparison], code: str) -> Group:
         f"nothing else changes, of {beside:.1f} where {100 * guard.FLIPS:.0f}% of the episodes end otherwise by "
         "chance, as with another seed."
     )
-    return Group(table, Text(explanation, style="dim"))
+    left_out = [name for name in guard.MEASURES if name not in {one.measure for one in comparisons}]
+    why = (
+        f"{' and '.join(left_out)}: not compared, since in the reference a retrieval counts as graspable, too; write a "
+        "new one with --write"
+    )
+    return Group(table, *([Text(why)] if left_out else []), Text(explanation, style="dim"))

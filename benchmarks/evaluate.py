@@ -133,6 +133,7 @@ class Tally:
     Attributes:
       wanted: how many there are.
       ended, found, graspable, retrieved, errors: how many of them are over, and so on.
+      graspable_known: of how many it is known whether the target was graspable: see `Row`.
     """
 
     wanted: int
@@ -141,6 +142,7 @@ class Tally:
     graspable: int = 0
     retrieved: int = 0
     errors: int = 0
+    graspable_known: int = 0
 
     def plus(self, row: Row) -> Tally:
         """With one more episode."""
@@ -151,6 +153,7 @@ class Tally:
             graspable=self.graspable + (row.graspable_step is not None),
             retrieved=self.retrieved + row.retrieved,
             errors=self.errors + row.is_error,
+            graspable_known=self.graspable_known + row.graspable_known,
         )
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mechsearch_jax.benchmarks.evaluate import present_code
+from mechsearch_jax.benchmarks.rates import says
 from mechsearch_jax.benchmarks.rows import Row, episode_key, options_of
 from mechsearch_jax.benchmarks.variants import label_variants
 from mechsearch_jax.errors import InputError
@@ -183,7 +184,8 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
     )
     save_figure(filmstrip(watcher.frames, problem.camera, problem.shelf, problem.target, verdict(episode)), file)
     again = Row.of_episode(episode)
-    if all(getattr(row, name) == getattr(again, name) for name in _END):
+    # What an earlier version's row does not say cannot differ.
+    if all(getattr(row, name) == getattr(again, name) for name in _END if says(row, name.removesuffix("_step"))):
         return ""
     simulator = options_of(row).get("simulator")
     why = "in another simulator" if simulator != "NativeSimulator" else ""

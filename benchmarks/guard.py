@@ -18,7 +18,7 @@ import scipy.stats
 
 from mechsearch_jax.benchmarks.evaluate import present_code
 from mechsearch_jax.benchmarks.images import save_rows
-from mechsearch_jax.benchmarks.rows import Row
+from mechsearch_jax.benchmarks.rows import Row, set_by_retrievals
 from mechsearch_jax.envs.scene_sets import SETS, Block
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
@@ -35,6 +35,8 @@ ALPHA = 0.05
 # (benchmarks/results/motion-h200.json, P: 0.10 to 0.13). A change of random numbers alone does the same.
 FLIPS = 0.12
 POWER = 0.8
+# What a reference says since graspable is told apart from retrieved.
+_APART = "graspable_apart_from_retrieved"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +45,8 @@ class Outcome:
 
     Attributes:
       scenario, content_hash, objects, seed: which episode it is.
-      found, graspable, retrieved, steps, failure: as in `Row`, the first two whether there was such a step.
+      found, graspable, retrieved, steps, failure: as in `Row`, the first two whether there was such a step; None for
+        `graspable` where that is not known (see `Row.graspable_known`).
     """
 
     scenario: str
@@ -51,7 +54,7 @@ class Outcome:
     objects: int
     seed: int
     found: bool
-    graspable: bool
+    graspable: bool | None
     retrieved: bool
     steps: int
     failure: str | None
@@ -65,7 +68,7 @@ class Outcome:
             objects=row.objects,
             seed=row.seed,
             found=row.found_step is not None,
-            graspable=row.graspable_step is not None,
+            graspable=row.graspable_step is not None if row.graspable_known else None,
             retrieved=row.retrieved,
             steps=row.steps,
             failure=row.failure,
@@ -125,6 +128,8 @@ def sign_test(gains: int, losses: int) -> float:
 def compare(before: Sequence[Outcome], now: Sequence[Outcome]) -> list[Comparison]:
     """How each measure changed from a reference, episode by episode; the reference may hold more episodes.
 
+    A measure that some of the episodes do not say is left out.
+
     Raises:
       InputError: there is nothing to compare, or the reference lacks an episode.
     """
@@ -136,6 +141,8 @@ def compare(before: Sequence[Outcome], now: Sequence[Outcome]) -> list[Compariso
     changes = []
     for measure in MEASURES:
         pairs = [(getattr(known[one.episode], measure), getattr(one, measure)) for one in now]
+        if any(None in pair for pair in pairs):
+            continue
         gains, losses = (sum(pair == change for pair in pairs) for change in ((False, True), (True, False)))
         before_held, now_held = (sum(column) for column in zip(*pairs, strict=True))
         changes.append(
@@ -192,11 +199,14 @@ def save_reference(rows: Sequence[Row], command: str, path: PathLike) -> None:
     if errors or not rows:
         told = f"{errors[0].scenario} ended with {errors[0].failure!r}" if errors else "there are no episodes"
         raise InputError(f"bench guard: {told}; nothing is stored")
+    if not all(row.graspable_known for row in rows):
+        raise InputError("bench guard: an earlier version wrote these rows; nothing is stored; use another folder")
     head = {
         "command": command,
         "code": present_code(),
         "versions": versions(),
         "configuration": json.loads(rows[0].configuration or "{}"),
+        _APART: True,
         "retrieved": {str(n): share for n, share in _shares(rows, "retrieved").items()},
         "graspable": {str(n): share for n, share in _shares(rows, "graspable").items()},
     }
@@ -220,6 +230,8 @@ class Reference(NamedTuple):
 def read_reference(path: PathLike) -> Reference:
     """What `save_reference` stored.
 
+    In files of earlier versions a retrieval counted as graspable: whether a retrieved target was is not known.
+
     Raises:
       InputError: the file cannot be read, or is something else.
     """
@@ -233,6 +245,8 @@ def read_reference(path: PathLike) -> Reference:
         raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
     try:
         outcomes = [Outcome(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
+        if not value.get(_APART) and set_by_retrievals(json.dumps(value.get("configuration"))):
+            outcomes = [dataclasses.replace(one, graspable=None) if one.retrieved else one for one in outcomes]
         return Reference(value["code"], outcomes)
     except (TypeError, KeyError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is no reference of bench guard ({error})") from error

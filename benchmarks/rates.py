@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import collections
 import dataclasses
-import functools
 import itertools
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-import scipy.stats
-
+from mechsearch_jax.benchmarks.intervals import Interval, mean_interval, share_interval
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.benchmarks.variants import VARIANT, canonical, grouped
 
@@ -26,9 +22,6 @@ EVENTS = {
 }
 # What an episode may reach, in the words of pictures.
 GOALS = {"found": "found", "graspable": "found and graspable", "retrieved": "retrieved"}
-# How often steps are drawn again for their interval, and the seed of that.
-RESAMPLES, SEED = 2000, 0
-Interval = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,15 +33,16 @@ class Rates:
         with the options that tell it from the others (see `label_variants`), and "objects", their number.
       episodes: how many episodes.
       errors: how many of them could not be run to their end; they count as failures.
-      found, graspable, retrieved: shares of them.
-      found_interval, graspable_interval, retrieved_interval: what the true shares may be: see `wilson`.
+      found, graspable, retrieved: shares of them; None for `graspable` where some of them do not say it (see
+        `Row.graspable_known`), since those that do are not like the others.
+      found_interval, graspable_interval, retrieved_interval: what the true shares may be: see `share_interval`.
       paper_episodes: how many of the episodes say whether the target could be grasped with the paper's grasps alone.
       paper_graspable, paper_graspable_interval: share of those in which it could, None where there are none, and what
         the true share may be.
       found_steps, graspable_steps, retrieved_steps: mean number of actions until then, of the episodes that got there;
-        None where none did.
+        None where none did, or that is not known.
       found_steps_interval, graspable_steps_interval, retrieved_steps_interval: what the true means may be: see
-        `bootstrap`.
+        `mean_interval`.
       steps: mean number of actions, attempts to take the target out among them.
       planning_seconds, simulation_seconds: mean wall time per action [s].
     """
@@ -57,7 +51,7 @@ class Rates:
     episodes: int
     errors: int
     found: float
-    graspable: float
+    graspable: float | None
     retrieved: float
     found_interval: Interval
     graspable_interval: Interval
@@ -123,28 +117,14 @@ def step_of(row: Row, goal: str) -> int | None:
     return row.found_step if goal == "found" else row.graspable_step
 
 
-@functools.lru_cache(maxsize=65_536)
-def wilson(successes: int, count: int) -> Interval:
-    """Wilson's 95% confidence interval of a share: low and high; (0, 1) if nothing was counted."""
-    if count == 0:
-        return 0.0, 1.0
-    interval = scipy.stats.binomtest(successes, count).proportion_ci(method="wilson")
-    return float(interval.low), float(interval.high)
+def scene_of(row: Row) -> tuple[str, str | None]:
+    """What an episode was run on: the scenario, by its name and content."""
+    return row.scenario, row.content_hash
 
 
-def bootstrap(steps: Sequence[int]) -> Interval | None:
-    """Percentile bootstrap's 95% confidence interval of the mean of whole numbers; None where there are none.
-
-    The same for the same numbers. Drawing numbers again with replacement is drawing how often each of them comes.
-    """
-    if not steps:
-        return None
-    counts = collections.Counter(steps)
-    values = np.array(sorted(counts))
-    shares = np.array([counts[value] for value in values.tolist()]) / len(steps)
-    drawn = np.random.default_rng(SEED).multinomial(len(steps), shares, size=RESAMPLES)
-    low, high = np.percentile(drawn @ values / len(steps), (2.5, 97.5))
-    return float(low), float(high)
+def says(row: Row, goal: str) -> bool:
+    """Whether a row tells if its episode reached one of `GOALS`: those of earlier versions need not for "graspable"."""
+    return goal != "graspable" or row.graspable_known
 
 
 def summarise(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")) -> list[Rates]:
@@ -160,15 +140,11 @@ def summarise(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")
 
 def _rates(group: Mapping[str, Hashable], rows: Sequence[Row]) -> Rates:
     count, actions = len(rows), max(sum(row.steps for row in rows), 1)
-    said = [row.paper_graspable for row in rows if row.paper_graspable is not None]
-    steps = {goal: [step for row in rows if (step := step_of(row, goal)) is not None] for goal in GOALS}
-    reached = {goal: len(steps[goal]) for goal in GOALS}
-    told: dict[str, Any] = {
-        **{goal: reached[goal] / count for goal in GOALS},
-        **{f"{goal}_interval": wilson(reached[goal], count) for goal in GOALS},
-        **{f"{goal}_steps": sum(steps[goal]) / reached[goal] if reached[goal] else None for goal in GOALS},
-        **{f"{goal}_steps_interval": bootstrap(steps[goal]) for goal in GOALS},
-    }
+    by_paper = [row for row in rows if row.paper_graspable is not None]
+    said = [bool(row.paper_graspable) for row in by_paper]
+    told: dict[str, Any] = {}
+    for goal in GOALS:
+        told |= _goal(rows, goal)
     return Rates(
         group=group,
         episodes=count,
@@ -176,11 +152,28 @@ def _rates(group: Mapping[str, Hashable], rows: Sequence[Row]) -> Rates:
         **told,
         paper_episodes=len(said),
         paper_graspable=sum(said) / len(said) if said else None,
-        paper_graspable_interval=wilson(sum(said), len(said)),
+        paper_graspable_interval=share_interval(said, list(map(scene_of, by_paper))),
         steps=sum(row.steps for row in rows) / count,
         planning_seconds=sum(row.planning_seconds for row in rows) / actions,
         simulation_seconds=sum(row.simulation_seconds for row in rows) / actions,
     )
+
+
+def _goal(rows: Sequence[Row], goal: str) -> dict[str, Any]:
+    """The fields of `Rates` that tell of a goal."""
+    names = goal, f"{goal}_interval", f"{goal}_steps", f"{goal}_steps_interval"
+    if not all(says(row, goal) for row in rows):
+        return dict(zip(names, (None, (0.0, 1.0), None, None), strict=True))
+    scenes, after = list(map(scene_of, rows)), [step_of(row, goal) for row in rows]
+    got = [(float(step), scene) for step, scene in zip(after, scenes, strict=True) if step is not None]
+    steps, own = [step for step, _ in got], [scene for _, scene in got]
+    values = (
+        len(steps) / len(rows),
+        share_interval([step is not None for step in after], scenes),
+        sum(steps) / len(steps) if steps else None,
+        mean_interval(steps, own),
+    )
+    return dict(zip(names, values, strict=True))
 
 
 def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")) -> list[Events]:

@@ -22,6 +22,7 @@ from mechsearch_jax.benchmarks.report_figures import curve_figure, curve_rates, 
 from mechsearch_jax.benchmarks.rows import Row, identity, options_of
 from mechsearch_jax.benchmarks.shards import result_tables
 from mechsearch_jax.benchmarks.variants import VARIANT, Key, canonical, label_variants, natural
+from mechsearch_jax.envs.scene_sets import CHOSEN_ON, is_chosen_on
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike, check_writable, replacing
 from mechsearch_jax.viz.drawing import save_figure
@@ -74,6 +75,26 @@ def told_of_changes(rows: Sequence[Row]) -> str:
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
     named = f"{', '.join(names[:5])}{more}"
     return f"Scenarios whose content is not the same, or not known, in all rows count as several: {named}."
+
+
+def told_of_choices(rows: Sequence[Row]) -> str:
+    """A sentence that says how many episodes are on scenes that settings were chosen on; empty if none is."""
+    count = sum(is_chosen_on(row.scenario) for row in rows)
+    if not count:
+        return ""
+    which = "All" if count == len(rows) else f"{count} of the {len(rows)}"
+    return f"{which} episodes are on scenes that settings were chosen on ({CHOSEN_ON}): on others rates may be lower."
+
+
+def told_of_unknown(rows: Sequence[Row]) -> str:
+    """A sentence that says of how many episodes it is not known whether the target was graspable; empty if of none."""
+    count = sum(not row.graspable_known for row in rows)
+    if not count:
+        return ""
+    return (
+        f"An earlier version ran {count} of the episodes, in which a retrieval counted as *graspable*, too: whether a "
+        'grasp was free is not known of them, and no share that they belong to is told ("-").'
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,8 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from mechsearch_jax.benchmarks.rates import GOALS, Rates, step_of, summarise, wilson
+from mechsearch_jax.benchmarks.intervals import share_interval
+from mechsearch_jax.benchmarks.rates import GOALS, Rates, says, scene_of, step_of, summarise
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.benchmarks.variants import Key, canonical, label_variants, natural
 from mechsearch_jax.errors import InputError
@@ -36,6 +37,11 @@ def reached(rows: Sequence[Row], goal: str, actions: int) -> list[int]:
     return list(itertools.accumulate(after[k] for k in range(actions + 1)))
 
 
+def _say(rows: Sequence[Row], goal: str) -> bool:
+    """Whether all of the rows tell if their episodes reached a goal."""
+    return all(says(row, goal) for row in rows)
+
+
 def _plain(axes: Axes) -> None:
     axes.grid(color=MUTED, alpha=0.2)
     axes.spines[["top", "right"]].set_visible(False)
@@ -44,8 +50,10 @@ def _plain(axes: Axes) -> None:
 
 def _curve(axes: Axes, rows: Sequence[Row], goal: str, actions: int, colour: str, label: str) -> None:
     counts = reached(rows, goal, actions)
-    x = np.arange(actions + 1)
-    low, high = np.array([wilson(n, len(rows)) for n in counts]).T
+    x, after, scenes = np.arange(actions + 1), [step_of(row, goal) for row in rows], list(map(scene_of, rows))
+    low, high = np.array(
+        [share_interval([step is not None and step <= k for step in after], scenes) for k in x.tolist()]
+    ).T
     axes.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
     axes.plot(x, np.array(counts) / len(rows), color=colour, marker="o", markersize=3, label=label)
 
@@ -81,12 +89,13 @@ def success_figure(rows: Sequence[Row], baseline: str | None = None) -> Figure:
             axes: Axes = grid[i][j]
             # Not found out anew for every one of a hundred curves.
             axes.set(xlim=(-0.05 * actions, 1.05 * actions), ylim=(-0.03, 1.03))
+            told = {label: rows for (label, n), rows in groups.items() if n == count and _say(rows, goal)}
             for label in key.short:
-                if label not in shown and (group := groups.get((label, count))):
+                if label not in shown and (group := told.get(label)):
                     share = np.array(reached(group, goal, actions)) / len(group)
                     axes.plot(range(actions + 1), share, color=MUTED, alpha=0.25, linewidth=0.7)
             for colour, (label, short) in zip(COLOURS, shown.items(), strict=False):
-                if group := groups.get((label, count)):
+                if group := told.get(label):
                     _curve(axes, group, goal, actions, colour, short)
             _plain(axes)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -124,8 +133,7 @@ def rates_figure(summary: Sequence[Rates], key: Key) -> Figure:
     figure = Figure(figsize=(width, 3.2 if few else 2.0 * len(GOALS) + 0.8), layout="constrained")
     grid = figure.subplots(*shape, sharex=True, sharey=few, squeeze=False)
     for axes, colour, (goal, title) in zip(grid.flat, COLOURS, GOALS.items(), strict=False):
-        share = np.array([getattr(rates, goal) for rates in ranked])
-        low, high = np.array([getattr(rates, f"{goal}_interval") for rates in ranked]).T
+        share, low, high = _drawn(ranked, goal)
         axes.vlines(x, low, high, color=colour, alpha=0.45, linewidth=2)
         axes.plot(x, share, "o", color=colour, markersize=3.5)
         _plain(axes)
@@ -136,6 +144,12 @@ def rates_figure(summary: Sequence[Rates], key: Key) -> Figure:
         axes.set_xticks(x, labels, **turned)
         axes.set_xlim(-0.6, len(ranked) - 0.4)
     return figure
+
+
+def _drawn(rates: Sequence[Rates], goal: str) -> np.ndarray:
+    """Shares, their lower and upper bounds, shape (3, n); NaN, which is not drawn, where a share is not known."""
+    known = [(getattr(one, goal), *getattr(one, f"{goal}_interval")) for one in rates]
+    return np.array([(np.nan,) * 3 if told[0] is None else told for told in known]).T
 
 
 def curve_rates(rows: Sequence[Row], columns: Sequence[str]) -> list[Rates]:
@@ -180,9 +194,8 @@ def curve_figure(found: Sequence[Rates], columns: Sequence[str], short: Mapping[
     for axes, (goal, title) in zip(grid.flat, GOALS.items(), strict=True):
         for colour, (line, members) in zip(colours, lines.items(), strict=False):
             x = [places[rates.group[first]] for rates in members]
-            low, high = np.array([getattr(rates, f"{goal}_interval") for rates in members]).T
+            share, low, high = _drawn(members, goal)
             axes.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
-            share = [getattr(rates, goal) for rates in members]
             axes.plot(x, share, color=colour, marker="o", markersize=3, label=short.get(str(line), str(line)))
         _plain(axes)
         axes.set_title(title, fontsize=10, color=INK)

@@ -8,7 +8,7 @@ from collections.abc import Hashable, Sequence
 from mechsearch_jax.benchmarks.pages import Block, Heading, Paragraph, Picture, Table
 from mechsearch_jax.benchmarks.paired import Difference, by_variant
 from mechsearch_jax.benchmarks.rates import EVENTS, GOALS, Events, Rates
-from mechsearch_jax.benchmarks.report import Report, reason_of, told_of_changes
+from mechsearch_jax.benchmarks.report import Report, reason_of, told_of_changes, told_of_choices, told_of_unknown
 from mechsearch_jax.benchmarks.variants import MOST_IN_FULL, VARIANT, Key
 
 # The shares in `Rates` that a report lists, in its words.
@@ -22,20 +22,21 @@ SHARES = {
 
 def blocks(report: Report) -> list[Block]:
     """The page of a report."""
-    changes = told_of_changes(report.episodes)
+    remarks = [told(report.episodes) for told in (told_of_changes, told_of_choices, told_of_unknown)]
     return [
         Heading("Results", 1),
         Paragraph(
             f"{len(report.episodes)} episodes of {len(report.key.short)} variant"
             f"{'' if len(report.key.short) == 1 else 's'}"
             f"{f', all of them {report.key.common}' if report.key.common else ''}. "
-            "Shares with Wilson's 95% confidence interval. Actions until then are means over the episodes that got "
-            "there, with a 95% bootstrap interval; actions in all are the mean number per episode, attempts to take "
-            "the target out among them; times are means per action. An episode that ended in an error of the program "
-            "counts as a failure. *With the paper's grasps*: graspable with those alone before the episode ended, of "
-            "the episodes that say so."
+            "Shares with Wilson's 95% confidence interval, for as many independent episodes as those of the same "
+            "scenes are worth. Actions until then are means over the episodes that got there, with a 95% interval from "
+            "drawing scenes again; actions in all are the mean number per episode, attempts to take the target out "
+            "among them; times are means per action. An episode that ended in an error of the program "
+            "counts as a failure. *Graspable*: found, and a grasp exists that touches nothing. *With the paper's "
+            "grasps*: graspable with those alone before the episode ended, of the episodes that say so."
         ),
-        *([Paragraph(changes)] if changes else []),
+        *(Paragraph(text) for text in remarks if text),
         *_key(report.key),
         *_rates(report),
         *([Picture("rates.png", "Rates of all variants, the best first")] if len(report.key.short) > 1 else []),
@@ -73,7 +74,9 @@ def _share(value: float | None, interval: tuple[float, float]) -> str:
 
 
 def _steps(value: float | None, interval: tuple[float, float] | None) -> str:
-    return "-" if value is None or interval is None else f"{value:.1f} ({interval[0]:.1f} to {interval[1]:.1f})"
+    if value is None:
+        return "-"
+    return f"{value:.1f}" if interval is None else f"{value:.1f} ({interval[0]:.1f} to {interval[1]:.1f})"
 
 
 def _rates_table(rates: Sequence[Rates], key: Key, spelt: bool = False) -> Table:
@@ -150,8 +153,9 @@ def _differences(report: Report) -> list[Block]:
     return [
         Heading(f"Paired differences from {short[report.baseline]}"),
         Paragraph(
-            f"Each variant less {report.baseline}, over the pairs of episodes that both have, ± one standard error. "
-            "Shares in percentage points; actions over the pairs in which both got there."
+            f"Each variant less {report.baseline}, over the pairs of episodes that both have, ± one standard error; a "
+            "scene's pairs are averaged first. Shares in percentage points; actions over the pairs in which both got "
+            "there."
         ),
         Table(header, lines),
     ]

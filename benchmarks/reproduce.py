@@ -14,12 +14,12 @@ from rich.console import Group
 from rich.table import Table
 
 from mechsearch_jax.benchmarks.evaluate import Job
+from mechsearch_jax.benchmarks.intervals import RESAMPLES, SEED, share_interval
 from mechsearch_jax.benchmarks.paper_tables import BOTH, Figures, PaperTable, paper_figures
-from mechsearch_jax.benchmarks.rates import step_of, wilson
+from mechsearch_jax.benchmarks.rates import says, scene_of, step_of
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.files import PathLike, check_writable, replacing
 
-RESAMPLES = 2000
 # What cells differ in, and in the words of tables. Differences are told against the first value of each.
 FACTORS = {
     "method": "method",
@@ -51,6 +51,9 @@ class Mean(NamedTuple):
     count: int
 
 
+_UNKNOWN = Mean(None, (None, None), 0)
+
+
 @dataclasses.dataclass(frozen=True)
 class Cell:
     """A cell of a table.
@@ -60,7 +63,8 @@ class Cell:
       objects: number of surrounding objects; None for all.
       episodes: how many there are.
       errors: how many of them could not be run to their end; they count as failures.
-      find, grasp: share of the episodes in which the target was found, and found and graspable; Wilson's interval.
+      find, grasp: share of the episodes in which the target was found, and found and graspable, with the interval of
+        `share_interval`; no value of what rows of an earlier version do not say.
       find_steps, grasp_steps: number of actions until then, of the episodes that got there; bootstrapped over scenes.
       paper: what the paper says; None where nothing.
     """
@@ -108,8 +112,8 @@ def bootstrap(total: Float[np.ndarray, " n"], count: Float[np.ndarray, " n"]) ->
     """
     n = int(count.sum())
     if n == 0:
-        return Mean(None, (None, None), 0)
-    rng = np.random.default_rng(0)
+        return _UNKNOWN
+    rng = np.random.default_rng(SEED)
     drawn = rng.multinomial(len(total), np.full(len(total), 1.0 / len(total)), size=RESAMPLES)
     totals, counts = drawn @ total, drawn @ count
     low, high = np.percentile(totals[counts > 0] / counts[counts > 0], [2.5, 97.5])
@@ -128,9 +132,12 @@ def _by_scene(values: Sequence[tuple[str, float]]) -> Mean:
 def _cell(setting: Setting, objects: int | None, rows: Sequence[Row], paper: Figures | None) -> Cell:
     n, told = len(rows), {}
     for goal, said in GOALS.items():
+        known = all(says(row, said) for row in rows)
+        reached = [step_of(row, said) is not None for row in rows]
         steps = [(row.scenario, float(s)) for row in rows if (s := step_of(row, said)) is not None]
-        told[goal] = Mean(len(steps) / n, wilson(len(steps), n), n)
-        told[f"{goal}_steps"] = _by_scene(steps)
+        share = Mean(sum(reached) / n, share_interval(reached, list(map(scene_of, rows))), n)
+        told[goal] = share if known else _UNKNOWN
+        told[f"{goal}_steps"] = _by_scene(steps) if known else _UNKNOWN
     return Cell(setting, objects, n, sum(row.is_error for row in rows), **told, paper=paper)
 
 
@@ -189,6 +196,9 @@ def _difference(
 ) -> Difference:
     told = {}
     for goal, said in GOALS.items():
+        if not all(says(row, said) for pair in pairs for row in pair):
+            told |= {goal: _UNKNOWN, f"{goal}_steps": _UNKNOWN}
+            continue
         steps = [(row.scenario, step_of(row, said), step_of(other, said)) for row, other in pairs]
         told[goal] = _by_scene([(scene, float(a is not None) - float(b is not None)) for scene, a, b in steps])
         told[f"{goal}_steps"] = _by_scene(
@@ -291,9 +301,9 @@ def markdown(results: Results, command: str) -> str:
         "",
         f"{results.table.about}. The paper's figures are of scenes of its own, in PyBullet. `{command}`",
         "",
-        "Shares with Wilson's 95% interval, of all episodes; steps are the mean number of actions in the episodes that",
-        "got there, with a 95% interval from resampling scenes. The paper's R stands beside `masks`, its own setting,",
-        "and `full`.",
+        "Shares of all episodes, with Wilson's 95% interval for as many independent episodes as those of the same",
+        "scenes are worth; steps are the mean number of actions in the episodes that got there, with a 95% interval",
+        "from resampling scenes. The paper's R stands beside `masks`, its own setting, and `full`.",
     ]
     for (preset, protocol), cells in _parts(results.cells()).items():
         text += ["", f"## Preset {preset}, protocol {protocol}", "", *_markdown_table(COLUMNS, list(map(_line, cells)))]

@@ -39,6 +39,8 @@ EVENTS = (
 ERROR = "error: "
 # Between kinds of action in their column.
 ACTIONS_BETWEEN = "+"
+# Options since which, until rows said `graspable_known`, a retrieval set the step at which the target was graspable.
+_RETRIEVALS_SET_GRASPABLE = ("retrieval_model", "rehearsal")
 # Where the metadata of earlier tables say what ran the episodes.
 _CODE = b"mechsearch_code"
 
@@ -71,6 +73,8 @@ class Row:
       paper_graspable: whether the target could be grasped with the paper's grasps alone at some step; None in files of
         earlier versions, which do not say.
       paper_graspable_step: as in `Episode`.
+      graspable_known: whether `graspable_step` says anything. False, with None for the step, where a file of an earlier
+        version says the step of the retrieval, which then set it whether or not a grasp was free of collisions.
       compile_seconds: wall time that its steps waited for compilations [s]; in a batch, its share of it.
       code: what ran it, as `evaluate.present_code` says it.
       device: that computed it, as `versions` says it.
@@ -110,6 +114,7 @@ class Row:
     unsettled: int | None = None
     paper_graspable: bool | None = None
     paper_graspable_step: int | None = None
+    graspable_known: bool = True
     compile_seconds: float | None = None
     code: str | None = None
     device: str | None = None
@@ -332,12 +337,33 @@ def _present_row(fields: dict[str, Any]) -> Row:
     """
     fields["actions"] = _present_actions(fields["actions"])
     known = fields.get("configuration")
+    # A column that a table of another version lacks, or that a table made of several lacks in some of its rows.
+    if fields.get("graspable_known") is None:
+        fields |= _earlier_graspable(fields)
     if known is not None:
         try:
             fields["configuration"] = _present(known)
         except ValueError as error:
             raise ValueError(f"the configuration of {fields['scenario']!r} is not a JSON object") from error
     return Row(**fields)
+
+
+def _earlier_graspable(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """What the fields of an earlier version's row say of whether the target could be grasped."""
+    step = fields["graspable_step"]
+    by_retrieval = step is not None and fields["retrieved"] and step >= fields["steps"] - 1
+    known = not (by_retrieval and set_by_retrievals(fields.get("configuration")))
+    return {"graspable_known": known, "graspable_step": step if known else None}
+
+
+@functools.lru_cache(maxsize=4096)
+def set_by_retrievals(known: str | None) -> bool:
+    """Whether a retrieval set the graspable step of an earlier version's row with this `Row.configuration`."""
+    try:
+        options = json.loads(known or "{}")
+    except ValueError:
+        return False
+    return isinstance(options, dict) and any(name in options for name in _RETRIEVALS_SET_GRASPABLE)
 
 
 @functools.lru_cache(maxsize=4096)

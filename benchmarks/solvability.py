@@ -17,7 +17,7 @@ from typing import Any
 from mechsearch_jax.benchmarks import unsolved
 from mechsearch_jax.benchmarks.evaluate import present_code
 from mechsearch_jax.benchmarks.images import save_rows
-from mechsearch_jax.benchmarks.rates import wilson
+from mechsearch_jax.benchmarks.intervals import wilson
 from mechsearch_jax.benchmarks.shards import result_tables
 from mechsearch_jax.envs.episodes import target_of
 from mechsearch_jax.envs.known_search import Found, KnownSearchConfig, Node, known_search

@@ -300,8 +300,11 @@ class EpisodeProgress:
 
     def ended(self, row: Row, tally: Tally) -> None:
         """Take note of one more episode, of this process or another, and of what is known of all that are wanted."""
-        shares = (count / tally.ended for count in (tally.found, tally.graspable, tally.retrieved))
-        rates = "found {:.2f}  graspable {:.2f}  retrieved {:.2f}".format(*shares)
+        counts = {"found": tally.found, "graspable": tally.graspable, "retrieved": tally.retrieved}
+        # Episodes of an earlier version do not say it, and those that do are not like the others.
+        counts |= {} if tally.graspable_known == tally.ended else {"graspable": None}
+        shares = {name: "-" if count is None else f"{count / tally.ended:.2f}" for name, count in counts.items()}
+        rates = "  ".join(f"{name} {share}" for name, share in shares.items())
         errors = f"  errors {tally.errors}" if tally.errors else ""
         self._bar.update(self._task, completed=tally.ended, total=tally.wanted, description=rates + errors)
         if not self._console.is_terminal:

@@ -239,8 +239,6 @@ class EpisodeLog:
             self._note(result)
         error = trouble is not None and trouble.startswith("error")
         self._retrieved = result is not None and result.retrieved and not error and self.spoilt is None
-        if self._retrieved and self._graspable_step is None:
-            self._graspable_step = self._index
         self._failure = None if self._retrieved else trouble or self._end(result is not None and result.final)
         if self._failure and self.spoilt and not error:
             self._failure = self.spoilt

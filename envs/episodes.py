@@ -5,12 +5,13 @@ so that short episodes do not wait for long ones. The random numbers of an episo
 neither on its slot nor on its neighbours. An episode alone is a pool of one slot, which calls the functions of a single
 scene, and which can be watched.
 
-Three verdicts are passed on an episode, all on the true state: `graspable` (the target is in sight and a collision-free
-grasp exists, or it is retrieved), `paper_graspable` (a collision-free one among the paper's grasps) and `retrieved`
-(the hand took it out of the shelf, and no object fell, neither then nor before). An action that fails costs a step and
-leaves the world as it made it. Once an object has left the board nothing can be retrieved any more: the episode goes on
-until it is known whether the target is found and graspable, and takes nothing out. No episode goes on for the sake of
-`paper_graspable`.
+Three verdicts are passed on an episode, all on the true state: `graspable` (the target is found and a collision-free
+grasp exists), `paper_graspable` (a collision-free one among the paper's grasps) and `retrieved` (the hand took it out
+of the shelf, and no object fell, neither then nor before). A retrieval does not make a target graspable: a grasp that
+touches something may take it out where no collision-free one exists. An action that fails costs a step and leaves the
+world as it made it. Once an object has left the board nothing can be retrieved any more: the episode goes on until the
+target is found and graspable, or would be taken out, and takes nothing out. An episode ends with its retrieval,
+graspable or not, and none goes on for the sake of `paper_graspable`.
 """
 
 from __future__ import annotations

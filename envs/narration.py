@@ -140,7 +140,8 @@ def verdict(episode: Episode) -> str:
     else:
         graspable, by_paper = episode.graspable_step, episode.paper_graspable_step
         parts.append(f"found {after(episode.found_step)}")
-        parts.append("never graspable" if graspable is None else f"graspable {after(graspable)}")
+        never = "never graspable without touching something"
+        parts.append(never if graspable is None else f"graspable {after(graspable)}")
         if graspable != by_paper:
             when = "never" if by_paper is None else after(by_paper)
             known = by_paper is not None or all(step.paper_graspable is not None for step in episode.steps)

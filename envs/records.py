@@ -115,8 +115,7 @@ class Episode:
       versions: as `versions` returns them.
       steps: one for each observation.
       found_step: number of actions before the target was found; None where it never was.
-      graspable_step: number of actions before it could also be grasped, at the latest before the one that retrieved it;
-        None where it never could.
+      graspable_step: number of actions before a step said `graspable`, whatever was retrieved; None where none did.
       retrieved: whether the hand took the target out of the shelf and no object fell, neither then nor before.
       failure: why the episode ended without a retrieval; None after one. Where an object left the board, this is the
         reason, with the number of the action.
@@ -152,6 +151,8 @@ def save_episode(episode: Episode, path: PathLike) -> None:
 def load_episode(path: PathLike) -> Episode:
     """Read `episode.json`; options of earlier versions are as `earlier.present_options` has them.
 
+    In files of earlier versions a retrieval may have set `graspable_step`: it is read from the steps instead.
+
     Raises:
       InputError: the file cannot be read or is not the record of an episode.
     """
@@ -163,7 +164,9 @@ def load_episode(path: PathLike) -> Episode:
         raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
     try:
         steps = tuple(_step(step) for step in value["steps"])
-        return Episode(**{**value, "steps": steps, "config": present_options(value["config"])})
+        graspable = next((i for i, step in enumerate(steps) if step.graspable), None)
+        config = present_options(value["config"])
+        return Episode(**{**value, "steps": steps, "config": config, "graspable_step": graspable})
     except (TypeError, KeyError) as error:
         raise InputError(f"{path}: is not the record of an episode ({error})") from error
 

@@ -104,6 +104,16 @@ SETS: Mapping[str, SceneSet] = _with_parts()
 _BLOCKS: Mapping[str, Block] = {block.name: block for whole in _EXPERIMENTS for block in whole.blocks}
 
 
+# The scenes that settings of the package were chosen on, in words: rates on them are not those on new scenes.
+CHOSEN_ON = "the published ones, the sets `development*`, and numbers 000 to 089 of `c2`"
+_CHOSEN_ON = re.compile(r"published-\d-\d\d|development(?:-box)?-\d-\d{3}|c2-\d-0[0-8]\d")
+
+
+def is_chosen_on(scenario: str) -> bool:
+    """Whether a scenario has the name of a scene that settings were chosen on: see `CHOSEN_ON`."""
+    return _CHOSEN_ON.fullmatch(scenario) is not None
+
+
 def find_set(name: str) -> SceneSet:
     """The set of a name.
 

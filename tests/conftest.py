@@ -1,13 +1,13 @@
 """What all tests share: annotations checked at run time, strict broadcasting, kept compilations, one problem.
 
-`--slow-share K/N` selects the K-th of N parts of the slow tests, `--slow-share auto/N` the part whose turn it is today.
+`--slow-share K/N` selects the K-th of N parts of the slow tests, `--slow-share auto/N` the one that the commit's hash
+falls into, so that the same commit is always the same run.
 """
 
 import os
 import subprocess
 import sys
 import tempfile
-import time
 import zlib
 from pathlib import Path
 
@@ -69,7 +69,7 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
 def pytest_addoption(parser):
-    parser.addoption("--slow-share", metavar="K/N", help="of the slow tests only the K-th of N parts; auto/N: today's")
+    parser.addoption("--slow-share", metavar="K/N", help="of the slow tests only one of N parts; auto/N: the commit's")
 
 
 def share_of(text):
@@ -78,7 +78,19 @@ def share_of(text):
     known = parts.isdigit() and (part == "auto" or part.isdigit())
     if not known or int(parts) < 1 or not (part == "auto" or 1 <= int(part) <= int(parts)):
         raise pytest.UsageError(f'--slow-share "{text}" is neither K/N with K from 1 to N nor auto/N')
-    return (int(time.time() // 86400) % int(parts) + 1 if part == "auto" else int(part)), int(parts)
+    return (int(commit(), 16) % int(parts) + 1 if part == "auto" else int(part)), int(parts)
+
+
+def commit(folder=Path(__file__).parent):
+    """The hexadecimal digits of the commit that is checked out."""
+    try:
+        asked = subprocess.run(["git", "rev-parse", "HEAD"], cwd=folder, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        why = "there is no git" if isinstance(error, OSError) else error.stderr.strip().partition("\n")[0]
+        raise pytest.UsageError(
+            f"--slow-share auto/N: {folder} tells no commit to choose a part by ({why}); give K/N"
+        ) from error
+    return asked.stdout.strip()
 
 
 def part_of(nodeid, parts):

@@ -138,6 +138,21 @@ def test_the_command_fails_after_a_loss_and_passes_noise(run, capsys):
     assert "0.004" in told
 
 
+def test_a_reference_in_which_a_retrieval_counts_as_graspable_says_so(run, capsys):
+    run(BEFORE, "--write")
+    stored = json.loads(run.reference.read_text())
+    assert stored.pop("graspable_apart_from_retrieved") is True
+    stored["configuration"] = {"rehearsal": "physics"}
+    run.reference.write_text(json.dumps(stored))
+    known = guard.read_reference(run.reference).outcomes
+    assert [one.graspable for one in known] == [None if flag else False for flag in BEFORE]
+    assert [one.measure for one in compare(known, outcomes(BEFORE))] == ["retrieved"]
+    run(BEFORE)
+    told = " ".join(capsys.readouterr().out.split())
+    assert "graspable: not compared, since in the reference a retrieval counts as graspable, too" in told
+    assert "write a new one with --write" in told
+
+
 def test_what_is_no_reference_is_refused(run):
     for text in ("{", "[]", '{"columns": ["a"], "rows": [[1]]}'):
         run.reference.write_text(text)
@@ -147,7 +162,11 @@ def test_what_is_no_reference_is_refused(run):
 
 def test_episodes_that_could_not_be_run_are_no_reference(tmp_path):
     broken = dataclasses.replace(ROW, failure="error: ValueError: no")
-    for given, complaint in (([ROW, broken], "one ended with 'error: ValueError: no'"), ([], "there are no episodes")):
+    for given, complaint in (
+        ([ROW, broken], "one ended with 'error: ValueError: no'"),
+        ([], "there are no episodes"),
+        ([dataclasses.replace(ROW, graspable_known=False)], "an earlier version wrote these rows"),
+    ):
         with pytest.raises(InputError, match=complaint):
             guard.save_reference(given, "mechsearch", tmp_path / "guard.json")
     assert not (tmp_path / "guard.json").exists()

@@ -11,7 +11,8 @@ from rich.console import Console
 
 from mechsearch_jax.benchmarks import report
 from mechsearch_jax.benchmarks.episode_tables import events_table, rates_table
-from mechsearch_jax.benchmarks.rates import summarise, wilson
+from mechsearch_jax.benchmarks.intervals import wilson
+from mechsearch_jax.benchmarks.rates import summarise
 from mechsearch_jax.benchmarks.report_figures import reached, success_figure
 from mechsearch_jax.benchmarks.rows import EVENTS, Row, write_rows
 from mechsearch_jax.errors import InputError
@@ -67,7 +68,7 @@ def test_a_report_holds_what_the_rows_say(tmp_path):
 
 def test_a_report_tells_the_papers_grasps_of_the_episodes_that_say_so(tmp_path):
     said = [dataclasses.replace(WON, paper_graspable=True, paper_graspable_step=2), LOST]
-    report.write_report([*said, dataclasses.replace(LOST, seed=1, paper_graspable=False), OTHER], tmp_path)
+    report.write_report([*said, dataclasses.replace(LOST, scenario="c", paper_graspable=False), OTHER], tmp_path)
     text = (tmp_path / "report.md").read_text()
     low, high = wilson(1, 2)
     assert f"| 0.33 (0.06 to 0.79) | 0.50 ({low:.2f} to {high:.2f}) | 0.33 (0.06 to 0.79) |" in text

@@ -3,19 +3,19 @@
 import csv
 import dataclasses
 import itertools
+import json
 import math
 import re
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-import scipy.stats
 from matplotlib import image
 
 from mechsearch_jax.benchmarks import films
 from mechsearch_jax.benchmarks.pages import Heading, Paragraph, Table, as_html, as_latex, as_markdown
 from mechsearch_jax.benchmarks.paired import paired
-from mechsearch_jax.benchmarks.rates import bootstrap, summarise
+from mechsearch_jax.benchmarks.rates import summarise
 from mechsearch_jax.benchmarks.report import ASKED_FILES, FILES, Asked, Report, write_report
 from mechsearch_jax.benchmarks.report_figures import COLOURS, curve_figure, rates_figure, success_figure
 from mechsearch_jax.benchmarks.report_page import blocks
@@ -96,19 +96,13 @@ def test_rates_are_told_by_any_columns():
         summarise(rows, ["gama"])
 
 
-def test_steps_have_a_bootstrap_interval():
-    steps = [1, 1, 2, 3, 3, 3, 5, 8, 2, 2]
-    low, high = bootstrap(steps)
-    expected = scipy.stats.bootstrap(
-        (steps,), np.mean, n_resamples=20_000, method="percentile", rng=np.random.default_rng(1)
-    ).confidence_interval
-    assert (low, high) == pytest.approx((expected.low, expected.high), abs=0.12)
-    assert bootstrap(steps[::-1]) == (low, high)
-    assert bootstrap([4, 4]) == (4.0, 4.0)
-    assert bootstrap([]) is None
-    (rates, _) = summarise([WON, dataclasses.replace(WON, steps=5, found_step=4), LOST], ["seed"])
+def test_steps_have_an_interval_from_drawing_scenes_again():
+    second = dataclasses.replace(WON, scenario="b", steps=5, found_step=4)
+    (rates, _) = summarise([WON, second, LOST], ["seed"])
     assert (rates.found_steps, rates.graspable_steps, rates.retrieved_steps) == (2.5, 2.0, 4.0)
     assert rates.retrieved_steps_interval == (3.0, 5.0)
+    # Another seed of the same scene says nothing of how scenes differ.
+    assert summarise([WON, dataclasses.replace(second, scenario="a")])[0].retrieved_steps_interval is None
     assert summarise([LOST])[0].found_steps_interval is None
 
 
@@ -142,6 +136,48 @@ def test_differences_are_paired():
     assert {each.goal: each.pairs for each in paired([*base, *other], label)}["found"] == 4
     with pytest.raises(InputError, match="no other variant shares seed with the baseline"):
         paired([*base, *(dataclasses.replace(row, seed=9) for row in other)], label, ["seed"])
+
+
+def test_the_seeds_of_a_scene_are_no_pairs_of_their_own():
+    """Three seeds of a, which all end alike, and one of b and c: three scenes, not five."""
+    episodes = [*(("a", seed) for seed in range(3)), ("b", 0), ("c", 0)]
+    base = [dataclasses.replace(LOST if name == "a" else WON, scenario=name, seed=seed) for name, seed in episodes]
+    other = [dataclasses.replace(WON, scenario=name, seed=seed, gamma=0.5) for name, seed in episodes]
+    label = label_variants([*base, *other])[0]
+    found = {each.goal: each for each in paired([*base, *other], label)}["retrieved"]
+    values = [1.0, 0.0, 0.0]
+    assert (found.pairs, found.scenes, found.gains, found.losses) == (5, 3, 3, 0)
+    assert found.difference == pytest.approx(np.mean(values))
+    assert found.standard_error == pytest.approx(np.std(values, ddof=1) / math.sqrt(3))
+    # Where pairs are not told apart by their scenes, each of them counts.
+    by_seed = {each.goal: each for each in paired([*base, *other], label, ["seed"])}["retrieved"]
+    assert (by_seed.pairs, by_seed.scenes, by_seed.difference) == (3, 3, pytest.approx((1 / 3 + 1 + 1) / 3))
+    # What an episode does not say makes no difference.
+    silent = [dataclasses.replace(row, graspable_known=False, graspable_step=None) for row in base]
+    goals = {each.goal: each for each in paired([*silent, *other], label)}
+    assert (goals["graspable"].pairs, goals["graspable"].difference, goals["graspable_steps"].difference) == (
+        0,
+        None,
+        None,
+    )
+    assert goals["retrieved"] == found
+
+
+def test_a_report_says_which_scenes_were_chosen_on_and_what_is_not_known(tmp_path):
+    names = ("published-4-01", "development-box-4-003", "c2-8-089", "c2-8-090", "mine")
+    rows = [dataclasses.replace(WON, scenario=name) for name in names]
+    rows[0] = dataclasses.replace(rows[0], graspable_known=False, graspable_step=None)
+    write_report(rows, tmp_path)
+    said = (tmp_path / "report.md").read_text()
+    assert "3 of the 5 episodes are on scenes that settings were chosen on (the published ones," in said
+    assert "An earlier version ran 1 of the episodes, in which a retrieval counted as *graspable*, too" in said
+    line = next(line for line in said.splitlines() if line.startswith("| search-for-grasp | 2 | 5 | 0 |"))
+    assert line.split(" | ")[5] == "-"
+    assert json.loads((tmp_path / "rates.json").read_text())["rates"][0]["graspable"] is None
+    write_report(rows[3:], tmp_path)
+    said = (tmp_path / "report.md").read_text()
+    assert "chosen on" not in said
+    assert "An earlier version ran" not in said
 
 
 @pytest.mark.parametrize("variants", [2, 96])

@@ -11,8 +11,8 @@ from rich.console import Console
 
 from mechsearch_jax.benchmarks import evaluate as evaluation
 from mechsearch_jax.benchmarks.evaluate import present_code
+from mechsearch_jax.benchmarks.intervals import wilson
 from mechsearch_jax.benchmarks.paper_tables import BOTH, METHODS, PUSH, TABLES, Figures, paper_figures, table_scenes
-from mechsearch_jax.benchmarks.rates import wilson
 from mechsearch_jax.benchmarks.reproduce import Mean, Results, Setting, bootstrap, markdown, screen
 from mechsearch_jax.benchmarks.rows import Row
 from mechsearch_jax.benchmarks.shards import ShardWriter

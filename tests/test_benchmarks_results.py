@@ -12,7 +12,8 @@ import pyarrow.parquet
 import pytest
 
 from mechsearch_jax.actions import ActionKind, no_action
-from mechsearch_jax.benchmarks.rates import summarise, wilson
+from mechsearch_jax.benchmarks.intervals import wilson
+from mechsearch_jax.benchmarks.rates import summarise
 from mechsearch_jax.benchmarks.rows import (
     EVENTS,
     SCHEMA,
@@ -20,12 +21,14 @@ from mechsearch_jax.benchmarks.rows import (
     configuration,
     episode_key,
     identity,
+    parse_row,
     read_rows,
     write_rows,
 )
 from mechsearch_jax.benchmarks.variants import label_variants
 from mechsearch_jax.envs.earlier import EARLIER, RENAMED
 from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.narration import verdict
 from mechsearch_jax.envs.records import Episode, Step, load_episode, record_action, save_episode
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import check_writable, replacing
@@ -214,7 +217,7 @@ def test_rows_are_read_back(tmp_path):
 
 
 BY_PAPER = ["paper_graspable", "paper_graspable_step"]
-BESIDES = ["compile_seconds", "code", "device", "versions"]
+BESIDES = ["graspable_known", "compile_seconds", "code", "device", "versions"]
 EARLIER_LACKED = [
     BESIDES,
     [*BY_PAPER, *BESIDES],
@@ -242,7 +245,8 @@ def test_rows_of_earlier_versions_are_read(tmp_path, columns):
     table = pyarrow.parquet.read_table(tmp_path / "rows.parquet")
     more = [name for name in table.column_names if name not in vars(row)]
     pyarrow.parquet.write_table(table.drop_columns([*columns, *more]), tmp_path / "rows.parquet")
-    assert read_rows(tmp_path / "rows.parquet") == [dataclasses.replace(row, **dict.fromkeys(columns))]
+    lacked = {**dict.fromkeys(columns), "graspable_known": True}
+    assert read_rows(tmp_path / "rows.parquet") == [dataclasses.replace(row, **lacked)]
 
 
 def test_what_a_scenario_holds_tells_rows_apart():
@@ -406,7 +410,7 @@ def test_confidence_intervals_are_those_of_the_formula():
 
 def test_the_columns_are_those_of_earlier_tables_but_for_names():
     since = [pyarrow.string(), *[pyarrow.int64()] * len(EVENTS), pyarrow.bool_(), pyarrow.int64()]
-    besides = [pyarrow.float64(), *[pyarrow.string()] * 3]
+    besides = [pyarrow.bool_(), pyarrow.float64(), *[pyarrow.string()] * 3]
     names = [field.name for field in dataclasses.fields(Row)]
     assert SCHEMA.types[: len(names)] == [*OLD_SCHEMA.types, *since, *besides]
     known = [RENAMED.get(name, name) for name in OLD_SCHEMA.names]
@@ -465,3 +469,61 @@ def test_rows_are_summarised_by_method_and_number_of_objects():
     assert (two.found, two.graspable, two.retrieved, two.steps) == (1.0, 0.5, 0.5, 3.0)
     assert two.planning_seconds == pytest.approx(0.5)
     assert [(r.paper_episodes, r.paper_graspable) for r in summary[1:]] == [(0, None), (1, 1.0), (1, 0.0), (2, 0.5)]
+
+
+# Rows as earlier versions wrote them: since there were rehearsals, a retrieval set `graspable_step`.
+REHEARSED, BEFORE_REHEARSALS = json.dumps({"rehearsal": "physics"}), json.dumps({"focus": 0.7})
+
+
+@pytest.mark.parametrize(
+    ("configuration", "graspable_step", "retrieved", "steps", "known"),
+    [
+        (REHEARSED, 3, True, 4, False),
+        (json.dumps({"retrieval_model": "physics"}), 0, True, 1, False),
+        # The judge said it before the retrieval, nothing was retrieved, or there was nothing to say.
+        (REHEARSED, 2, True, 4, True),
+        (REHEARSED, 3, False, 4, True),
+        (REHEARSED, None, False, 4, True),
+        # Nor did a retrieval set it in rows that are older still.
+        (BEFORE_REHEARSALS, 3, True, 4, True),
+        (None, 3, True, 4, True),
+    ],
+)
+def test_an_earlier_row_whose_retrieval_may_have_set_graspable_does_not_say_it(
+    tmp_path, configuration, graspable_step, retrieved, steps, known
+):
+    row = dataclasses.replace(
+        ROW, configuration=configuration, graspable_step=graspable_step, retrieved=retrieved, steps=steps
+    )
+    fields = {name: value for name, value in vars(row).items() if name != "graspable_known"}
+    write_rows([row], tmp_path / "rows.parquet")
+    table = pyarrow.parquet.read_table(tmp_path / "rows.parquet").drop_columns(["graspable_known"])
+    pyarrow.parquet.write_table(table, tmp_path / "rows.parquet")
+    expected = (known, graspable_step if known else None)
+    for read in (parse_row(json.dumps(fields)), *read_rows(tmp_path / "rows.parquet")):
+        assert (read.graspable_known, read.graspable_step) == expected
+        # It stays so when it is written again.
+        write_rows([read], tmp_path / "again.parquet")
+        assert read_rows(tmp_path / "again.parquet") == [parse_row(json.dumps(vars(read)))] == [read]
+    # Today's rows say it.
+    assert parse_row(json.dumps(vars(row))).graspable_step == graspable_step
+
+
+def test_an_earlier_episode_is_graspable_where_a_step_says_so_whatever_was_retrieved(tmp_path):
+    steps = (STEPS[0], dataclasses.replace(STEPS[1], graspable=False))
+    save_episode(dataclasses.replace(EPISODE, steps=steps, graspable_step=1), tmp_path / "episode.json")
+    episode = load_episode(tmp_path / "episode.json")
+    assert (episode.retrieved, episode.graspable_step) == (True, None)
+    assert "never graspable without touching something, retrieved" in verdict(episode)
+    config = {**OLD, "policy": "random", "actions": ["push"], "target": "box", "seed": 3}
+    row = Row.of_episode(dataclasses.replace(episode, config=config))
+    assert (row.retrieved, row.graspable_step, row.graspable_known) == (True, None, True)
+
+
+def test_a_share_of_which_some_episodes_do_not_say_it_is_none():
+    """Those that say it did not retrieve the target, so that they are not like the others."""
+    known = dataclasses.replace(ROW, graspable_step=None, failure="found, but not graspable")
+    unknown = dataclasses.replace(ROW, scenario="other", retrieved=True, graspable_known=False, objects=8)
+    two, eight, every = summarise([known, unknown])
+    assert (two.graspable, eight.graspable, every.graspable) == (0.0, None, None)
+    assert (every.found, every.retrieved, every.graspable_interval, every.graspable_steps) == (1, 0.5, (0, 1), None)

@@ -15,7 +15,7 @@ from stage import HIDDEN, OPEN, TWO
 from mechsearch_jax.actions import KINDS, Action
 from mechsearch_jax.benchmarks import solvability, unsolved
 from mechsearch_jax.benchmarks.episode_tables import ceiling_table
-from mechsearch_jax.benchmarks.rates import wilson
+from mechsearch_jax.benchmarks.intervals import wilson
 from mechsearch_jax.benchmarks.rows import Row as EpisodeRow
 from mechsearch_jax.benchmarks.rows import write_rows
 from mechsearch_jax.benchmarks.shards import ShardWriter

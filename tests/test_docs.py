@@ -3,13 +3,16 @@
 import json
 import math
 import re
+import statistics
 from pathlib import Path
 
 import pytest
 
 import mechsearch_jax
+from mechsearch_jax.benchmarks.intervals import share_interval
+from mechsearch_jax.benchmarks.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.envs.earlier import EARLIER, RENAMED
-from mechsearch_jax.envs.scene_sets import SETS, digest, recorded
+from mechsearch_jax.envs.scene_sets import SETS, digest, is_chosen_on, recorded
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.workspace.detector import FOUND_PIXELS
 
@@ -203,6 +206,18 @@ def share(name, episodes, digits):
     return f"{sum(bool(RATES[name](episode)) for episode in episodes) / len(episodes):.{digits}f}"
 
 
+def share_of_graspable(episodes):
+    """As a table has it that keeps graspable and retrieved apart: "–" where an episode does not."""
+    apart = all(episode.get("graspable_known") for episode in episodes)
+    return share("graspable", episodes, 2) if apart else "–"
+
+
+def with_interval(name, episodes):
+    reached = [bool(RATES[name](episode)) for episode in episodes]
+    low, high = share_interval(reached, [episode["scenario"] for episode in episodes])
+    return f"{share(name, episodes, 2)} ({low:.2f} to {high:.2f})"
+
+
 def mean_steps(episodes):
     return f"{sum(episode['steps'] or 0 for episode in episodes) / len(episodes):.1f}"
 
@@ -211,18 +226,82 @@ def with_objects(episodes, count):
     return [episode for episode in episodes if episode["scenario"].split("-")[1] == count]
 
 
+def new_scenes(episodes):
+    """Those of `c2` that nothing was chosen on."""
+    return [e for e in episodes if e["scenario"].startswith("c2-") and not is_chosen_on(e["scenario"])]
+
+
 def test_the_rates_of_the_readme_are_the_stored_ones():
     published = [
         episode for name in ("standard-cpu.json", "standard-h200.json") for episode in stored_runs(name)[0]["episodes"]
     ]
-    told = re.findall(
-        r"^\| (\d) \| ([\d.]+) \| ([\d.]+) \| ([\d.]+) \| [\d.]+ \| [\d.]+ \|$", read("README.md"), re.MULTILINE
-    )
+    new = new_scenes(stored_runs("standard-h200.json")[1]["episodes"])
+    columns = [f"{scenes} episodes: found | graspable | retrieved" for scenes in ("published, 150", "new, 90")]
+    header = f"| objects | {' | '.join(columns)} |"
+    told = {row[0]: row[1:] for row in rows("README.md", header)}
+    assert list(told) == ["2", "4", "6", "8"]
+    for objects, figures in told.items():
+        groups = [with_objects(each, objects) for each in (published, new)]
+        assert list(map(len, groups)) == [150, 90]
+        parts = [
+            (share("found", each, 2), share_of_graspable(each), with_interval("retrieved", each)) for each in groups
+        ]
+        assert figures == [*parts[0], *parts[1]]
+        assert all(is_chosen_on(episode["scenario"]) for episode in groups[0])
+
+
+# Of its O-Search-for-Grasp.
+PAPER = {objects: paper_figures(TABLES["table1"], "oracle", METHODS[1], BOTH, int(objects)) for objects in "2468"}
+
+
+def test_preset_paper_stands_beside_the_papers_figures():
+    run = stored_runs("published-paper-h200.json")[0]
+    assert (run["preset"], run["policy"]) == ("paper", "search-for-grasp")
+    # A retrieval did not count as graspable yet.
+    assert "rehearsal" not in run["configuration"]
+    header = "| objects | preset `paper`: found | graspable | retrieved | the paper: found | graspable |"
+    told = rows("README.md", header)
     assert [objects for objects, *_ in told] == ["2", "4", "6", "8"]
     for objects, *figures in told:
-        episodes = with_objects(published, objects)
-        assert len(episodes) == 150
-        assert figures == [share(rate, episodes, 2) for rate in ("found", "graspable", "retrieved")]
+        episodes = with_objects(run["episodes"], objects)
+        ours = [share(rate, episodes, 2) for rate in ("found", "graspable", "retrieved")]
+        assert figures == [*ours, f"{PAPER[objects].find:.2f}", f"{PAPER[objects].grasp:.2f}"]
+
+
+def stored_median(name):
+    stored = json.loads((ROOT / "benchmarks/results" / name).read_text())
+    return (stored["runs"][0] if "runs" in stored else stored)["median_seconds"]
+
+
+def test_the_times_of_a_decision_are_the_stored_ones():
+    readme = " ".join(read("README.md").split())
+    assert f"[{stored_median('plan-first-draws-cpu.json'):.1f} s on two CPU cores](" in readme
+    alone = stored_median("plan-standard-h200.json")
+    assert f"without that it takes [{1000 * alone:.0f} ms on one H200](" in readme
+    # A GPU's time with what is tried out is told once it is stored.
+    for file in (ROOT / "benchmarks/results").glob("plan-rehearsal-*.json"):
+        assert f"[{1000 * stored_median(file.name):.0f} ms on" in readme
+        assert f"](benchmarks/results/{file.name})" in readme
+
+
+def test_scenes_that_nothing_was_chosen_on_are_told_apart():
+    new, page = new_scenes(stored_runs("standard-h200.json")[1]["episodes"]), " ".join(read("docs/results.md").split())
+    groups = [with_objects(new, objects) for objects in "2468"]
+    found = ", ".join(share("found", each, 2) for each in groups)
+    retrieved = ", ".join(with_interval("retrieved", each) for each in groups)
+    scenes = "numbers 090 to 179 of `c2`, 90 episodes each, with 2, 4, 6 and 8 objects (95% intervals)"
+    assert f"{scenes}: found {found}, retrieved {retrieved}." in page
+    assert set(map(len, groups)) == {90}
+
+
+def header_above(page, row):
+    """The header of the table that a row is in."""
+    return re.findall(r"^(\|.*\|)\n\|[-|]+\|$", page[: page.index(row)], re.MULTILINE)[-1]
+
+
+def counts_retrievals(run):
+    """Whether the graspable step of a run's episodes may be that of the retrieval."""
+    return not all(episode.get("graspable_known") for episode in run["episodes"])
 
 
 @pytest.mark.parametrize(
@@ -250,7 +329,9 @@ def test_the_rates_of_the_results_by_number_of_objects_are_the_stored_ones(name,
             rates = [share(rate, episodes, 2) for rate in ("found", "graspable", "retrieved")]
             rest = [share(rate, episodes, n) for rate, n in (("left", 3), ("fell", 3), ("held", 2), ("ruled out", 3))]
             cells = [label, objects, str(len(episodes)), *rates, *rest, mean_steps(episodes)]
-            assert f"| {' | '.join(cells)} |" in page
+            line = f"| {' | '.join(cells)} |"
+            assert line in page
+            assert ("| graspable or retrieved |" in header_above(page, line)) == counts_retrievals(run)
 
 
 def test_the_rates_of_the_experiments_are_the_stored_ones():
@@ -258,13 +339,58 @@ def test_the_rates_of_the_experiments_are_the_stored_ones():
     for run in stored_runs("first-draws-h200.json"):
         shares = [(rate, 2) for rate in ("found", "graspable", "retrieved", "left")]
         cells = [share(rate, run["episodes"], n) for rate, n in (*shares, ("ruled out", 3))]
-        assert f"| {' | '.join(cells)} | {mean_steps(run['episodes'])} |" in page
+        line = f"| {' | '.join(cells)} | {mean_steps(run['episodes'])} |"
+        assert line in page
+        assert ("| graspable or retrieved |" in header_above(page, line)) == counts_retrievals(run)
     for run in stored_runs("rehearsal-frictions-cpu.json"):
-        found, graspable, retrieved, held = (
-            share(rate, run["episodes"], 2) for rate in ("found", "graspable", "retrieved", "held")
-        )
-        assert graspable == retrieved
+        found, retrieved, held = (share(rate, run["episodes"], 2) for rate in ("found", "retrieved", "held"))
         assert f"| {found} | {retrieved} | {held} | {mean_steps(run['episodes'])} |" in page
+
+
+def points(name, pairs):
+    """A difference in percentage points with its error, the seeds of a scene averaged first."""
+    scenes = {}
+    for one, other in pairs:
+        before = {(episode["scenario"], episode["seed"]): bool(RATES[name](episode)) for episode in other}
+        for episode in one:
+            if (pair := (episode["scenario"], episode["seed"])) in before:
+                scenes.setdefault(episode["scenario"], []).append(bool(RATES[name](episode)) - before[pair])
+    means = [statistics.fmean(values) for values in scenes.values()]
+    mean = round(100 * statistics.fmean(means), 1)
+    told = f"{mean:+.1f}" if mean else "0.0"
+    return f"{told} ± {100 * statistics.stdev(means) / math.sqrt(len(means)):.1f}"
+
+
+# In words of docs/results.md: the file and the runs, by their names or places, and the rate.
+DIFFERENCES = {
+    "nothing was gained (found {} points": ("opened-cpu.json", [(1, 0)], "found"),
+    "points, retrieved {}, [opened-cpu": ("opened-cpu.json", [(1, 0)], "retrieved"),
+    "the first gains found {},": ("opened-h200.json", [("B", "C"), ("D", "E")], "found"),
+    "graspable +3.6 ± 1.3, retrieved {}, and costs": ("opened-h200.json", [("B", "C"), ("D", "E")], "retrieved"),
+    "that leave the board ({})": ("opened-h200.json", [("B", "C"), ("D", "E")], "left"),
+    "gains nothing: found {},": ("opened-h200.json", [("B", "D"), ("C", "E")], "found"),
+    "3.2 ± 1.3, retrieved {}, against": ("motion-h200.json", [("P", "Q")], "retrieved"),
+    "with 8 objects: found +1.3 ± 5.6, retrieved {}.": ("rehearsal-cpu.json", [(3, 2)], "retrieved"),
+    "gains found {} and retrieved 0.0": ("standard-h200.json", [(2, 0)], "found"),
+    "**`masks`**: retrieved {} points": ("standard-h200.json", [(3, 0)], "retrieved"),
+    "**`full`**: {}, found": ("standard-h200.json", [(4, 0)], "retrieved"),
+    "the true pose {} points more often": ("standard-h200.json", [(4, 0)], "ruled out"),
+    "shares on gains retrieved {},": ("draws-h200.json", [("B1", "A1"), ("B3", "A3"), ("B0", "A0")], "retrieved"),
+    "at all loses retrieved {}.": ("draws-h200.json", [("A0", "A1"), ("B0", "B1")], "retrieved"),
+    "passed on {} retrieved;": ("draws-cpu.json", [(3, 0)], "retrieved"),
+    "none {}. The charge": ("draws-cpu.json", [(2, 0)], "retrieved"),
+    "and retrieved {} points, draws of all": ("first-draws-h200.json", [("GF", "G0")], "retrieved"),
+    "is opened loses retrieved {}:": ("first-draws-h200.json", [("GP", "G0")], "retrieved"),
+}
+
+
+@pytest.mark.parametrize("words", DIFFERENCES)
+def test_differences_are_those_of_scenes(words):
+    name, pairs, rate = DIFFERENCES[words]
+    runs = stored_runs(name)
+    known = {run.get("name"): run["episodes"] for run in runs} | {i: run["episodes"] for i, run in enumerate(runs)}
+    told = points(rate, [(known[one], known[other]) for one, other in pairs])
+    assert words.format(told) in " ".join(read("docs/results.md").split())
 
 
 def test_stored_scenes_are_those_on_record():

@@ -173,14 +173,15 @@ def test_a_success_that_cannot_be_trusted_is_none():
     assert (episode.retrieved, episode.failure) == (False, "error: no")
 
 
-def test_what_is_taken_out_could_be_grasped():
+def test_a_retrieval_does_not_make_a_target_graspable():
+    """The hand took it out with a grasp that touches something; no other was there."""
     log = EpisodeLog(3)
     log.decide(record(True, 1, Verdict(), None))
     assert not log.act(None, None, {})
     log.decide(record(True, 1, Verdict(), None))
     assert log.act(WON, None, {})
     episode = log.episode(OPEN, {})
-    assert (episode.retrieved, episode.graspable_step, episode.paper_graspable_step) == (True, 1, None)
+    assert (episode.retrieved, episode.graspable_step, episode.paper_graspable_step) == (True, None, None)
 
 
 def test_a_retrieval_does_not_count_once_an_object_has_left_the_board():

@@ -38,6 +38,17 @@ def test_the_sets_are_those_of_the_paper():
     assert {"c2-2", "c2-8", "d2-4", "d3-4", "development-4", "development-box-8"} < set(SETS)
 
 
+def test_scenes_that_settings_were_chosen_on_are_known_by_name():
+    chosen = {b.name: sum(map(scene_sets.is_chosen_on, b.scene_names)) for b in BLOCKS}
+    whole = {b.name: b.scenes for b in BLOCKS if b.name.startswith("development")}
+    assert {name: count for name, count in chosen.items() if count} == {
+        **whole,
+        **{f"c2-{n}": 90 for n in (2, 4, 6, 8)},
+    }
+    assert scene_sets.is_chosen_on("published-8-24")
+    assert not scene_sets.is_chosen_on("first-light")
+
+
 def test_no_two_experiments_share_a_seed():
     seeds = {name: {b.first_seed + i for b in SETS[name].blocks for i in range(b.scenes)} for name in WHOLE}
     for one, other in itertools.combinations(WHOLE, 2):

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import time
 import types
 from collections import defaultdict
 from pathlib import Path
@@ -55,20 +56,46 @@ def test_every_slow_test_is_in_one_part(parts):
     assert max(map(len, shares)) < len(every) or parts == 1
 
 
-def test_other_tests_are_in_every_part():
+def test_other_tests_are_in_every_part(monkeypatch):
     others = {item.nodeid for item in collected() if not item.slow}
+    monkeypatch.setattr(conftest, "commit", lambda: "0f")
     for share in (None, "1/3", "2/3", "auto/3"):
         assert {item.nodeid for item in selected(share) if not item.slow} == others
 
 
-def test_the_part_changes_from_day_to_day(monkeypatch):
-    parts = []
-    for day in range(20000, 20008):
-        monkeypatch.setattr(conftest.time, "time", lambda day=day: 86400.0 * day + 5)
-        config = Config("auto/4")
-        conftest.pytest_configure(config)
-        parts.append(config.option.slow_share)
-    assert parts == [f"{k}/4" for k in (1, 2, 3, 4) * 2]
+def git(folder, *arguments):
+    identity = ("-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false")
+    ran = subprocess.run(["git", *identity, *arguments], cwd=folder, capture_output=True, text=True, check=True)
+    return ran.stdout.strip()
+
+
+def test_the_same_commit_has_the_same_part_and_other_commits_have_others(tmp_path, monkeypatch):
+    git(tmp_path, "init", "--quiet")
+    parts = {}
+    for i in range(12):
+        git(tmp_path, "commit", "--quiet", "--allow-empty", "-m", f"number {i}")
+        head = git(tmp_path, "rev-parse", "HEAD")
+        assert conftest.commit(tmp_path) == head
+        monkeypatch.setattr(conftest, "commit", lambda head=head: head)
+        # On whatever day.
+        for day in (20000, 20001):
+            monkeypatch.setattr(time, "time", lambda day=day: 86400.0 * day + 5)
+            config = Config("auto/4")
+            conftest.pytest_configure(config)
+            parts.setdefault(head, set()).add(config.option.slow_share)
+        monkeypatch.undo()
+    assert {len(chosen) for chosen in parts.values()} == {1}
+    # All twelve in one of four parts has a chance of one in four million.
+    assert len(set.union(*parts.values())) > 1
+
+
+def test_where_there_is_no_commit_that_is_said(tmp_path, monkeypatch):
+    monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
+    with pytest.raises(pytest.UsageError, match=r"tells no commit to choose a part by \(fatal: not a git .*give K/N"):
+        conftest.commit(tmp_path)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(pytest.UsageError, match=r"\(there is no git\); give K/N"):
+        conftest.commit(tmp_path)
 
 
 @pytest.mark.parametrize("wrong", ["", "3", "0/4", "5/4", "auto/0", "auto", "1/many", "-1/4"])

@@ -5,10 +5,11 @@
     python tests/goldens/net.py compare --only maps losses
 
 The parts are `episodes` (whole native episodes: the shipped scenarios and every eighth of the published ones, where
-those are beside the checkout, with both methods and all three recognitions), `simulator` (a batch with one action of
-every kind in the batch simulator), `maps` (f and g), `shapes` (what is recognised), `losses` (one of each network),
-`weights` (the shipped files' digests) and `report` (what is written of the episodes). Kinds, indices, verdicts and
-texts have to be the same, and numbers within 1e-5 (absolute, or relative where they are above 1).
+those are beside the checkout, with both methods and all three recognitions, trying actions out as the default does, and
+from true shapes without that, too), `simulator` (a batch with one action of every kind in the batch simulator), `maps`
+(f and g), `shapes` (what is recognised), `losses` (one of each network), `weights` (the shipped files' digests) and
+`report` (what is written of the episodes). Kinds, indices, verdicts and texts have to be the same, and numbers within
+1e-5 (absolute, or relative where they are above 1).
 
 Numbers of floating-point arithmetic belong to the machine that computed them: compare where you wrote, or write anew at
 the commit before the change.
@@ -43,6 +44,8 @@ TOLERANCE = 1e-5
 NUMBER = re.compile(r"-?\d+\.\d+(?:e-?\d+)?")
 METHODS = ("search-for-grasp", "search-and-grasp")
 RECOGNITIONS = ("oracle", "masks", "full")
+# What sees the world, and what tries actions out before one is made.
+EYES_AND_TRIALS = (*((recognition, "physics") for recognition in RECOGNITIONS), ("oracle", "none"))
 
 
 def scenario_files():
@@ -54,30 +57,32 @@ def scenario_files():
 # --- what is computed ------------------------------------------------------------------------------------------------
 
 
-def run_episode(path, method, recognition, seed=0):
+def run_episode(path, method, recognition, rehearsal="physics", seed=0):
     from mechsearch_jax.envs import episodes
     from mechsearch_jax.envs.method import Method
     from mechsearch_jax.envs.native import NativeSimulator
     from mechsearch_jax.envs.recognisers import recogniser
+    from mechsearch_jax.planner import PRESETS
     from mechsearch_jax.planner.cache import cached_problem
     from mechsearch_jax.workspace.scenario import load_scenario
 
     scenario = load_scenario(path)
     target = episodes.target_of(scenario)
-    chosen, see = Method(method, recognition=recognition), recogniser(recognition, target)
+    chosen = Method(method, PRESETS["standard"](rehearsal=rehearsal), recognition)
+    see = recogniser(recognition, target)
     simulator = NativeSimulator(threads=1)
     return episodes.run_episode(
         seed, scenario, cached_problem(target), chosen.policy(), simulator, see, options=chosen.options()
     )
 
 
-def episode_answer(path, method, recognition):
-    episode = run_episode(path, method, recognition)
+def episode_answer(path, method, recognition, rehearsal):
+    episode = run_episode(path, method, recognition, rehearsal)
     value = dataclasses.asdict(episode)
     for step in value["steps"]:
         del step["timings"]
     names = ("scenario", "objects", "found_step", "graspable_step", "retrieved", "failure", "steps")
-    return {name: value[name] for name in names}
+    return {name: value[name] for name in names} | {"rehearsal": episode.config["rehearsal"]}
 
 
 def some_episodes(share):
@@ -85,17 +90,22 @@ def some_episodes(share):
 
     keep_compilations()
     found = {}
-    for path, method, recognition in share:
-        found[f"{Path(path).stem} {method} {recognition}"] = episode_answer(path, method, recognition)
+    for path, method, recognition, rehearsal in share:
+        name = f"{Path(path).stem} {method} {recognition}, rehearsal {rehearsal}"
+        found[name] = episode_answer(path, method, recognition, rehearsal)
         print(".", end="", flush=True)
     return found
 
 
-def episodes():
-    """By scenario, method and recognition; in two processes, each with whole recognitions so that they share code."""
+def episode_jobs():
+    """The file, method, recognition and rehearsal of each episode."""
     files = [str(file) for file in scenario_files()]
-    jobs = [(file, m, r) for r in RECOGNITIONS for m in METHODS for file in files]
-    found = {}
+    return [(file, method, *both) for both in EYES_AND_TRIALS for method in METHODS for file in files]
+
+
+def episodes():
+    """By scenario, method, recognition and rehearsal; in two processes."""
+    jobs, found = episode_jobs(), {}
     with concurrent.futures.ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
         # Half of the recognitions' jobs each: the one's episodes with masks take as long as the other's.
         for part in pool.map(some_episodes, (jobs[0::2], jobs[1::2])):

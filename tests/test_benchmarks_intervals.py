@@ -1,0 +1,75 @@
+"""Intervals of rates: they hold the true share as often as they say, whether or not the seeds of a scene are alike."""
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from mechsearch_jax.benchmarks.intervals import mean_interval, share_interval, wilson
+
+DRAWS = 2000
+
+
+def coverage(interval, share, scenes, seeds, correlation):
+    """How often an interval holds the share that episodes were drawn with; scenes differ by a beta distribution."""
+    rng = np.random.default_rng(scenes * seeds)
+    each = np.full((DRAWS, scenes), share)
+    if correlation:
+        a, b = (part * (1 - correlation) / correlation for part in (share, 1 - share))
+        each = rng.beta(a, b, (DRAWS, scenes))
+    reached = rng.random((DRAWS, scenes, seeds)) < each[..., None]
+    names = np.repeat(np.arange(scenes), seeds).tolist()
+    bounds = [interval(episodes, names) for episodes in reached.reshape(DRAWS, -1).tolist()]
+    return np.mean([low <= share <= high for low, high in bounds])
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.3])
+@pytest.mark.parametrize(
+    ("share", "scenes", "seeds"),
+    [(0.5, 25, 4), (0.7, 25, 4), (0.85, 25, 2), (0.85, 100, 4), (0.9, 50, 8), (0.95, 100, 4)],
+)
+def test_an_interval_holds_the_true_share_as_often_as_it_says(share, scenes, seeds, correlation):
+    # Of 2,000 draws a chance of 0.95 makes 0.94 to 0.96.
+    assert 0.92 <= coverage(share_interval, share, scenes, seeds, correlation) <= 0.98
+
+
+def test_independent_episodes_would_say_more_than_they_hold():
+    """What share_interval is there to mend."""
+    assert coverage(lambda reached, names: wilson(sum(reached), len(reached)), 0.85, 25, 8, 0.3) < 0.8
+
+
+def test_where_each_scene_has_one_episode_it_is_wilsons():
+    for successes in range(9):
+        assert share_interval([i < successes for i in range(8)], range(8)) == wilson(successes, 8)
+    assert share_interval([], []) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("reached", [True, False])
+def test_where_all_end_alike_each_scene_counts_once(reached):
+    for scenes, seeds in ((25, 4), (6, 30), (1, 16)):
+        names = [i for i in range(scenes) for _ in range(seeds)]
+        expected = wilson(scenes if reached else 0, scenes)
+        assert share_interval([reached] * len(names), names) == pytest.approx(expected)
+
+
+def test_the_same_seeds_again_are_not_twice_as_much():
+    once = [i % 4 > 0 for i in range(24)]
+    assert share_interval(once * 8, list(range(24)) * 8) == pytest.approx(share_interval(once, range(24)))
+    # Nor less, whatever the order.
+    mixed = share_interval([True, True, False, True, True, False], ["a", "b", "a", "a", "b", "b"])
+    assert mixed == share_interval([False, True, False, True, True, True], ["a", "b", "b", "a", "b", "a"])
+    low, high = mixed
+    assert low < wilson(4, 6)[0] < wilson(4, 6)[1] < high
+
+
+def test_a_mean_is_of_scenes_drawn_again():
+    steps = [1, 1, 2, 3, 3, 3, 5, 8, 2, 2]
+    names = list(range(len(steps)))
+    low, high = mean_interval(steps, names)
+    expected = scipy.stats.bootstrap(
+        (steps,), np.mean, n_resamples=20_000, method="percentile", rng=np.random.default_rng(1)
+    ).confidence_interval
+    assert (low, high) == pytest.approx((expected.low, expected.high), abs=0.12)
+    assert mean_interval(steps[::-1], names) == (low, high)
+    assert mean_interval(steps * 3, names * 3) == (low, high)
+    assert mean_interval([4, 4], "ab") == (4.0, 4.0)
+    assert mean_interval([4, 5], "aa") is mean_interval([], []) is None

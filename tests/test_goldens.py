@@ -1,0 +1,32 @@
+"""The safety net for refactoring: what its episodes cover."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.planner import PRESETS
+
+
+@pytest.fixture
+def net(monkeypatch):
+    # It sets what is not set, for the processes that it starts.
+    monkeypatch.setenv("PJRT_NPROC", "1")
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    spec = importlib.util.spec_from_file_location("net", Path(__file__).parent / "goldens" / "net.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_goldens_cover_rehearsals_as_the_default_has_them(net):
+    jobs = net.episode_jobs()
+    assert len({(Path(file).stem, *rest) for file, *rest in jobs}) == len(jobs)
+    default = Method().config.rehearsal
+    for recognition in net.RECOGNITIONS:
+        for method in net.METHODS:
+            rehearsed = {r for _, m, seen, r in jobs if (m, seen) == (method, recognition)}
+            assert default in rehearsed
+            assert rehearsed == ({default, "none"} if recognition == "oracle" else {default})
+    assert PRESETS["standard"](rehearsal="none") != PRESETS["standard"](rehearsal=default)
