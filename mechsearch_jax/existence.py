@@ -166,14 +166,7 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     T = jax.jit(upright_pose)(jnp.asarray(places), target.height(shelf))
     coarse = camera.scaled(config.downscale)
     half = np.array(target.half_size, np.float32)
-    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
-
-    def image_size(T):
-        pixels, _ = project(coarse, transform(T[:, :, None], jnp.asarray(corners)))
-        return jnp.max(jnp.max(pixels, axis=2) - jnp.min(pixels, axis=2), axis=(0, 1))
-
-    extent = np.asarray(jax.jit(image_size)(T))
-    window = (int(np.ceil(extent[0])) + 2, int(np.ceil(extent[1])) + 2)
+    window = target_window(coarse, half, T)
 
     def view(pose):
         one = Superquadrics(
@@ -192,6 +185,28 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     cloud = sample(eroded, jnp.array(target.exponents), count=config.points)
     nearest = jnp.min(depth[:, 0], axis=(-1, -2))
     return ExistenceTables(T, depth, corner, nearest, cloud.T, jnp.float32(np.linalg.norm(half)))
+
+
+def target_window(
+    coarse: Camera, half: Float[np.ndarray, "3"], T_world_target: Float[Array, "*batch 4 4"]
+) -> tuple[int, int]:
+    """Rows and columns of a window that holds what a camera sees of a target at each of some poses.
+
+    No larger than the image with one pixel around it, wherever the camera is.
+
+    Args:
+      coarse: the camera at the resolution of the windows.
+      half: half-extents of the target [m].
+      T_world_target: the poses.
+    """
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
+    pixels = np.asarray(project(coarse, transform(T_world_target[..., None, :, :], jnp.asarray(corners)))[0], float)
+    # As far as `render.window_place` follows what is outside of the image.
+    limit = np.array([coarse.height, coarse.width])
+    low, high = (np.clip(bound, -1, limit) for bound in (pixels.min(axis=-2), pixels.max(axis=-2)))
+    extent = np.ceil((high - low).reshape(-1, 2).max(axis=0)).astype(int)
+    rows, columns = np.minimum(extent, limit) + 2
+    return int(rows), int(columns)
 
 
 def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | None = None) -> ObjectViews:

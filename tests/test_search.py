@@ -15,13 +15,14 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.examples import example_images
-from mechsearch_jax.perception.plausibility import camera_faults, image_faults
+from mechsearch_jax.perception.plausibility import image_faults
 from mechsearch_jax.planner import initial_belief, update_belief
 from mechsearch_jax.planner.impasse import impasse
 from mechsearch_jax.search.searcher import Searcher
 from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.sight import camera_faults
 
 IMAGES = example_images()
 CAMERA, SHELF = IMAGES.camera, Shelf()

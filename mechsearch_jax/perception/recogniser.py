@@ -29,6 +29,7 @@ from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
 
 # Pixels of a 1280 x 720 image that make the target visible.
@@ -104,6 +105,7 @@ class Recogniser:
           InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
         """
         camera = camera or problem.camera
+        check_camera(camera, problem.shelf)
         thinned_view(camera, problem.shelf)
         fields = {
             "camera": camera,

@@ -28,14 +28,14 @@ from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.plausibility import camera_faults, image_faults
+from mechsearch_jax.perception.plausibility import image_faults
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.trained_view import view_faults
 from mechsearch_jax.planner.belief import Belief, initial_belief, update_belief
 from mechsearch_jax.planner.config import Config
 from mechsearch_jax.planner.policies import Policy, search_for_grasp
 from mechsearch_jax.planner.presets import standard
-from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.problem import NOWHERE, Problem
 from mechsearch_jax.planner.rehearsal import Rehearsal
 from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.robot.free_motion import check_joints
@@ -43,6 +43,7 @@ from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.search.state import State, beginning, load_state, save_state
 from mechsearch_jax.search.step import SearchStep, motion, shown
 from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
+from mechsearch_jax.workspace.sight import camera_faults, check_camera
 
 # Share of the candidate poses below which a target that is found would often be out of reach.
 LEAST_REACH = 0.5
@@ -102,6 +103,7 @@ class Searcher:
         if policy is not None and rehearsal is not None:
             raise InputError("Searcher: a policy rehearses by itself; give it the rehearsal, and leave the keyword out")
         self.workcell = workcell or Workcell()
+        check_camera(self.workcell.camera, self.workcell.shelf)
         self.config = config or standard()
         self._seed = seed
         self._policy = policy or search_for_grasp(self.config.planner, rehearsal=rehearsal)
@@ -146,7 +148,7 @@ class Searcher:
         reach = len(np.unique(np.asarray(self.problem.grasps.pair_pose))) / poses
         warnings = list(self._camera_faults)
         if reach == 0.0:
-            warnings.insert(0, "shelf: the arm reaches the target nowhere; check the shelf's place before the robot")
+            warnings.insert(0, NOWHERE)
         elif reach < LEAST_REACH:
             warnings.append(f"shelf: the arm can grasp the target at {100 * reach:.0f}% of its possible poses only")
         return Check(reach, tuple(warnings))
