@@ -78,6 +78,11 @@ def camera_faults(camera: Camera, shelf: Shelf) -> tuple[str, ...]:
     return (_mistake(camera, shelf) or _little(sight),) if sight.seen < LEAST_SEEN else ()
 
 
+def share_seen(camera: Camera, shelf: Shelf) -> float:
+    """The share of the board that a camera sees, without the objects on it."""
+    return _sight(camera, _pose(camera), shelf).seen
+
+
 class Sight(NamedTuple):
     """What a camera sees of the board, without the objects on it.
 
@@ -131,8 +136,8 @@ def _little(sight: Sight) -> str:
     if sight.framed < LEAST_SEEN:
         return f"camera: its image shows {100 * sight.framed:.0f}% of the board only; check its pose and focal lengths"
     return (
-        f"camera: {100 * (1.0 - sight.seen):.0f}% of the board are outside of its image or behind the shelf's walls and "
-        "ceiling; check its pose and the shelf"
+        f"camera: {100 * (1.0 - sight.seen):.0f}% of the board are outside of its image or behind walls and ceiling; "
+        "check its pose and the shelf"
     )
 
 
