@@ -105,7 +105,7 @@ def test_a_cell_that_cannot_work_is_broken(problem, monkeypatch):
     (told,) = cell_of(problem, monkeypatch, away)["camera"]
     assert (told.state, "OpenGL" in told.says, "[camera]" in told.remedy) == (State.BROKEN, True, True)
 
-    wide = Settings(Workcell(target=Target.box((0.06, 0.06, 0.05))))
+    wide = Settings(Workcell(target=Target.of("box", (0.06, 0.06, 0.05))))
     (told,) = cell_of(problem, monkeypatch, wide)["target"]
     assert (told.state, "0.120 m wide" in told.says) == (State.BROKEN, True)
 

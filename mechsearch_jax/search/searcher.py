@@ -230,7 +230,7 @@ class Searcher:
 
     def _looking(self, observation: Observation, images: Images) -> SearchStep:
         """The next step where images show what is said, whatever they show."""
-        self.__dict__["recogniser"] = lambda *_: observation
+        self.__dict__["recogniser"] = warming.saying(self.recogniser, observation)
         return self.next(*images)
 
     def next(

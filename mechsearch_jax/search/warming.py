@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +17,7 @@ from mechsearch_jax.actions.types import Action
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig
+from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.rehearsal import PLANNED, TRIES, Rehearsal
 from mechsearch_jax.robot.motion import MotionConfig
@@ -82,6 +87,23 @@ def in_the_open(problem: Problem, seen: Observation) -> Observation:
     return seen.replace(
         objects=objects, target_visible=jnp.array(True), target_pose=jnp.asarray(pose, seen.target_pose.dtype)
     )
+
+
+class _Saying(Recogniser):
+    """Another recogniser in all but what it recognises, which is always the same."""
+
+    def __init__(self, like: Recogniser, observation: Observation):
+        for field in dataclasses.fields(like):
+            object.__setattr__(self, field.name, getattr(like, field.name))
+        object.__setattr__(self, "_observation", observation)
+
+    def __call__(self, *images: Any) -> Observation:
+        return self.__dict__["_observation"]
+
+
+def saying(recogniser: Any, observation: Observation) -> Callable[..., Observation]:
+    """What recognises the same in all images, and is otherwise like a recogniser."""
+    return _Saying(recogniser, observation) if isinstance(recogniser, Recogniser) else lambda *images: observation
 
 
 def motions(problem: Problem, action: Action, config: MotionConfig | None) -> None:
