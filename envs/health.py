@@ -6,8 +6,7 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import enum
+import functools
 import importlib.metadata
 import importlib.util
 import io
@@ -20,6 +19,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mechsearch_jax.envs.finding import Finding, State
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,45 +38,27 @@ with mujoco.Renderer(model, 8, 8) as renderer:
 """
 
 
-class State(enum.Enum):
-    """How usable something is."""
-
-    FINE = "fine"
-    MISSING = "missing"  # The main job, one search on a CPU, does without.
-    BROKEN = "BROKEN"
-
-
-@dataclasses.dataclass(frozen=True)
-class Finding:
-    """What was found out about one thing.
-
-    Attributes:
-      subject: what it is.
-      state: how usable it is.
-      says: one line.
-      remedy: what to do about it; empty where nothing is to be done.
-    """
-
-    subject: str
-    state: State
-    says: str
-    remedy: str = ""
-
-
 Check = Callable[[], Iterator[Finding]]
 
 
-def checks(scenario: Scenario, settings: Settings) -> Mapping[str, Check]:
+def checks(scenario: Scenario | None, settings: Settings, cell: bool = False) -> Mapping[str, Check]:
     """All that can be looked at, by subject.
 
     Args:
-      scenario: whose problem is looked for in the cache.
+      scenario: whose problem is looked for in the cache; None for none.
       settings: that it would be built with.
+      cell: whether the cell of the settings is looked at, for which its problem is built.
     """
-    return {
-        **CHECKS,
-        "problem": lambda: _problem(scenario, settings),
-    }
+    found = dict(CHECKS)
+    if cell:
+        # What recognises takes long to import.
+        from mechsearch_jax.envs import cell_health
+
+        parts = {part: getattr(cell_health, part) for part in CELL}
+        found |= {part: functools.partial(check, settings) for part, check in parts.items()}
+    if scenario is not None:
+        found["problem"] = lambda: _problem(scenario, settings)
+    return found
 
 
 def examine(subject: str, check: Check) -> Iterator[Finding]:
@@ -240,5 +222,6 @@ CHECKS: Mapping[str, Check] = {
     "cache": _cache,
     "meshes": _meshes,
 }
-# Without these nothing can be searched.
-NEEDED = ("versions", "devices", "simulator", "weights")
+# What is looked at of a cell, and without what nothing can be searched.
+CELL = ("camera", "target", "shelf", "networks", "planner")
+NEEDED = ("versions", "devices", "simulator", "weights", *CELL)

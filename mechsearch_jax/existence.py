@@ -176,16 +176,7 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     T = jax.jit(upright_pose)(jnp.asarray(places), target.height(shelf))
     coarse = camera.scaled(config.downscale)
     half = np.array(target.half_size, np.float32)
-    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
-
-    def image_size(coarse, T):
-        pixels, _ = project(coarse, transform(T[:, :, None], jnp.asarray(corners)))
-        return jnp.max(jnp.max(pixels, axis=2) - jnp.min(pixels, axis=2), axis=(0, 1))
-
-    rows, columns = np.asarray(jax.jit(image_size)(coarse, T)).tolist()
-    window = _window_side(rows), _window_side(columns)
-    # Whose middle does not depend on how the window's sides are rounded.
-    around = math.ceil(rows) + 2, math.ceil(columns) + 2
+    window, around = target_window(coarse, half, T)
 
     def view(coarse, pose):
         one = Superquadrics(
@@ -208,14 +199,39 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     return ExistenceTables(T, depth, corner, middle, nearest, cloud.T, jnp.float32(np.linalg.norm(half)))
 
 
-def _window_side(extent: float) -> int:
+def _window_side(extent: int, limit: int) -> int:
     """How many rows or columns of pixels hold an image that is so many pixels long, wherever it begins: an even number.
 
     A camera that was calibrated again sees the target a little larger or smaller. Were this the least number, such a
     camera would now and then change a shape, and all that is compiled for it.
     """
+    return 2 * math.ceil((min(extent, limit) + 1) / 2)
+
+
+def target_window(
+    coarse: Camera, half: Float[np.ndarray, "3"], T_world_target: Float[Array, "*batch 4 4"]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Rows and columns of a window that holds what a camera sees of a target at each of some poses, and of the least
+    such window, whose middle does not depend on how the other's sides are rounded.
+
+    Hardly larger than the image with one pixel around it, wherever the camera is.
+
+    Args:
+      coarse: the camera at the resolution of the windows.
+      half: half-extents of the target [m].
+      T_world_target: the poses.
+    """
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
+    pixels = np.asarray(project(coarse, transform(T_world_target[..., None, :, :], jnp.asarray(corners)))[0], float)
+    # As far as `render.window_place` follows what is outside of the image.
+    limit = np.array([coarse.height, coarse.width])
+    low, high = (np.clip(bound, -1, limit) for bound in (pixels.min(axis=-2), pixels.max(axis=-2)))
+    extent = (high - low).reshape(-1, 2).max(axis=0)
     # What is measured in single precision may be measured as a little more elsewhere.
-    return 2 * math.ceil((math.ceil(extent + 1e-3) + 1) / 2)
+    rows, columns = np.ceil(extent + 1e-3).astype(int).tolist()
+    window = _window_side(rows, coarse.height), _window_side(columns, coarse.width)
+    least = tuple((np.minimum(np.ceil(extent), limit) + 2).astype(int).tolist())
+    return window, least
 
 
 def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | None = None) -> ObjectViews:

@@ -1,25 +1,31 @@
 """`mechsearch plan`: from image files to a step, from call to call."""
 
 import csv
-import functools
+import dataclasses
 import json
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from stage import HIDDEN, OPEN, grab
 from test_mutated_files import program
 from test_search import IMAGES, TRUSTING, seen
 
 from mechsearch_jax.commands import plan
+from mechsearch_jax.envs import cell
 from mechsearch_jax.perception.image_files import (
     load_camera,
     load_colour,
     load_depth,
     load_mask,
+    save_camera,
     save_depth,
     save_mask,
 )
+from mechsearch_jax.planner import problem as problems
+from mechsearch_jax.planner.problem import NOWHERE
 from mechsearch_jax.planner.workcell import Workcell
-from mechsearch_jax.search import searcher as searchers
+from mechsearch_jax.search.searcher import Searcher
 
 WRITTEN = {"step.json", "step.png", "trajectory.csv", "trajectory.json"}
 FILES = {"depth.png", "color.png", "mask.png", "camera.json"}
@@ -30,11 +36,14 @@ def see(problem, monkeypatch):
     """Let the command's searcher see a scenario, whatever the images show, and keep nothing on disk."""
     monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
     monkeypatch.setattr(Workcell, "problem", lambda self, target=None, config=None: problem)
-    whole = searchers.Searcher
 
     def seeing(scenario):
         given = {"policy": grab, "trajectories": TRUSTING, "recogniser": lambda problem: lambda *images: seen(scenario)}
-        monkeypatch.setattr(searchers, "Searcher", functools.partial(whole, **given))
+
+        def made(settings, *, camera, seed):
+            return Searcher(dataclasses.replace(settings.workcell, camera=camera), settings.config, seed=seed, **given)
+
+        monkeypatch.setattr(cell, "searcher_of", made)
 
     return seeing
 
@@ -67,6 +76,30 @@ def test_a_number_of_the_target_that_the_mask_file_does_not_have_is_said(tmp_pat
         assert bool(said) == bool(words)
 
 
+def files_of_a_user(folder, camera=IMAGES.camera):
+    """The arguments for images as a user has them."""
+    save_depth(IMAGES.depth, folder / "depth.png")
+    save_camera(camera, folder / "camera.json")
+    return "--depth", str(folder / "depth.png"), "--camera", str(folder / "camera.json"), "--out", str(folder / "out")
+
+
+def test_a_camera_that_does_not_see_the_shelf_ends_it_with_one_line(tmp_path, monkeypatch):
+    R, p = np.array(IMAGES.camera.rotation), np.array(IMAGES.camera.position)
+    turned = tuple(map(tuple, R.T.tolist()))
+    inverted = dataclasses.replace(IMAGES.camera, rotation=turned, position=tuple((-R.T @ p).tolist()))
+    status, told = program(monkeypatch, "plan", *files_of_a_user(tmp_path, inverted))
+    assert (status, len(told.splitlines())) == (2, 1)
+    assert "T_world_camera looks inverted: its inverse sees the shelf" in told
+
+
+def test_a_shelf_out_of_reach_ends_it_with_one_line(problem, tmp_path, monkeypatch):
+    monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
+    nothing = problem.grasps.replace(pair_pose=jnp.zeros(0, jnp.int32), pair_grasp=jnp.zeros(0, jnp.int32))
+    monkeypatch.setattr(problems, "grasp_tables", lambda *args, **kwargs: nothing)
+    status, told = program(monkeypatch, "plan", *files_of_a_user(tmp_path))
+    assert (status, told.strip()) == (2, f"mechsearch: {NOWHERE}")
+
+
 @pytest.mark.slow
 def test_the_example_is_planned_on_and_written_as_files_like_a_users(see, tmp_path, monkeypatch):
     see(OPEN)
@@ -79,6 +112,8 @@ def test_the_example_is_planned_on_and_written_as_files_like_a_users(see, tmp_pa
     step = json.loads((out / "step.json").read_text())
     assert step["kind"] == "retrieve"
     assert step["motion"]["duration"] > 0
+    assert (step["action"]["kind"], step["target"]["found"], len(step["objects"])) == ("retrieve", True, 1)
+    assert step["cell"]["reach"] > 0.5
     with open(out / "trajectory.csv", newline="") as file:
         header, *rows = csv.reader(file)
     points = json.loads((out / "trajectory.json").read_text())["arm"]["points"]

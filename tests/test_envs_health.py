@@ -1,5 +1,6 @@
 """`mechsearch doctor`: what it finds, what it advises, and when it says that nothing works."""
 
+import dataclasses
 import importlib.metadata
 import subprocess
 
@@ -8,14 +9,17 @@ import pytest
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs import health
 from mechsearch_jax.envs.episodes import target_of
-from mechsearch_jax.envs.health import State
+from mechsearch_jax.envs.finding import State
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks import weights
 from mechsearch_jax.planner import cache
+from mechsearch_jax.planner.problem import NOWHERE
 from mechsearch_jax.planner.settings import Settings
 from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
 
 SCENE = load_scenario(example_scenarios()["first-light"])
 
@@ -76,6 +80,65 @@ def test_a_problem_is_looked_for_in_the_cache(tmp_path, monkeypatch):
     cache._file(tmp_path, key).touch()
     assert found("problem")[0].state is State.FINE
     assert found("problem", Settings(Workcell(shelf=Shelf(back=0.8))))[0].state is State.MISSING
+
+
+def cell_of(problem, monkeypatch, settings=None):
+    """What is found of a cell, by subject, whose problem is there already."""
+    monkeypatch.setattr(Workcell, "problem", lambda self, target=None, config=None: problem)
+    found = health.checks(None, settings or Settings(), cell=True)
+    return {part: list(health.examine(part, found[part])) for part in health.CELL}
+
+
+def test_the_default_cell_is_fine(problem, monkeypatch):
+    found = cell_of(problem, monkeypatch)
+    assert {finding.state for part in found.values() for finding in part} == {State.FINE}
+    assert "sees 100% of the board" in found["camera"][0].says
+    assert "can grasp the target at 95% of its 792" in found["shelf"][0].says
+    assert "recognition and segmentation" in found["networks"][0].says
+    assert "rehearsal physics, push model learned, at most 10 actions" in found["planner"][0].says
+
+
+def test_a_cell_that_cannot_work_is_broken(problem, monkeypatch):
+    camera = Camera()
+    flipped = tuple((a, -b, -c) for a, b, c in camera.rotation)
+    away = Settings(Workcell(camera=dataclasses.replace(camera, rotation=flipped)))
+    (told,) = cell_of(problem, monkeypatch, away)["camera"]
+    assert (told.state, "OpenGL" in told.says, "[camera]" in told.remedy) == (State.BROKEN, True, True)
+
+    wide = Settings(Workcell(target=Target.of("box", (0.06, 0.06, 0.05))))
+    (told,) = cell_of(problem, monkeypatch, wide)["target"]
+    assert (told.state, "0.120 m wide" in told.says) == (State.BROKEN, True)
+
+    def nowhere(self, target=None, config=None):
+        raise InputError(NOWHERE)
+
+    monkeypatch.setattr(Workcell, "problem", nowhere)
+    (told,) = health.examine("shelf", health.checks(None, Settings(), cell=True)["shelf"])
+    assert (told.state, told.says) == (State.BROKEN, NOWHERE)
+
+
+def test_a_cell_that_works_less_well_is_doubtful(problem, monkeypatch):
+    near = Settings(Workcell(camera=dataclasses.replace(Camera(), fx=1900.0, fy=1900.0)))
+    found = cell_of(problem, monkeypatch, near)
+    assert [finding.state for finding in found["camera"]] == [State.DOUBTFUL, State.FINE]
+    assert found["networks"][0].state is State.DOUBTFUL
+
+
+def test_doctor_looks_at_the_cell_that_is_given(problem, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(health, "CHECKS", {})
+    monkeypatch.setattr(Workcell, "problem", lambda self, target=None, config=None: problem)
+    monkeypatch.setenv(cache.VARIABLE, "")
+    file = tmp_path / "mine.toml"
+    file.write_text("[shelf]\nfront = 1.414\nback = 1.788\nspawn_x = [1.45, 1.73]\n")
+    cli.parse(["doctor", "--config", str(file)])()
+    told = capsys.readouterr().out
+    assert [line.split()[0] for line in told.splitlines() if line[0] != " "][:3] == ["camera", "target", "shelf"]
+    assert "first-light" not in told
+    file.write_text("[camera]\nposition = [3.0, 0.0, 0.6]\n")
+    with pytest.raises(SystemExit) as end:
+        cli.parse(["doctor", "--config", str(file)])()
+    assert end.value.code == 1
+    assert "camera     BROKEN   camera: looks away from the shelf" in capsys.readouterr().out
 
 
 def test_what_cannot_be_rendered_is_no_harm(monkeypatch):

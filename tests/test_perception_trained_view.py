@@ -14,7 +14,6 @@ from mechsearch_jax.networks.recognition import RecognitionConfig
 from mechsearch_jax.networks.segmentation import SegmentationConfig
 from mechsearch_jax.networks.weights import ARCHITECTURES, load_weights, read_card, save_weights
 from mechsearch_jax.perception.cloud import BLOCK, shelf_view, thinned_view
-from mechsearch_jax.perception.plausibility import camera_faults
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.recognition import nearness
 from mechsearch_jax.perception.trained_view import TOLERANCES, TrainedView, read_view, view_faults
@@ -24,6 +23,7 @@ from mechsearch_jax.train.recognition import RecognitionTask
 from mechsearch_jax.train.segmentation import SegmentationTask
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.sight import camera_faults
 
 HERE = Path(__file__).resolve().parents[1]
 PLACES = {file.stem: load_settings(file).workcell for file in sorted((HERE / "benchmarks" / "views").glob("*.toml"))}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,11 @@ import numpy as np
 import pytest
 from stage import HIDDEN, OPEN, grab, idle
 
+from mechsearch_jax.dynamics.named import own_push_model
+from mechsearch_jax.dynamics.quasi_static import QuasiStatic
+from mechsearch_jax.envs.cell import load_searcher
+from mechsearch_jax.envs.compile_clock import CompileClock
+from mechsearch_jax.envs.physics_rehearsal import NativeRehearsal
 from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import from_scenario
@@ -16,13 +22,18 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.examples import example_images
-from mechsearch_jax.perception.plausibility import camera_faults, image_faults
+from mechsearch_jax.perception.plausibility import image_faults
 from mechsearch_jax.planner import initial_belief, update_belief
 from mechsearch_jax.planner.impasse import impasse
+from mechsearch_jax.planner.presets import standard
+from mechsearch_jax.robot.kinematics import FINGER_TIPS
+from mechsearch_jax.search.images import alike
 from mechsearch_jax.search.searcher import Searcher
+from mechsearch_jax.search.step import Motion
 from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.sight import camera_faults
 
 IMAGES = example_images()
 CAMERA, SHELF = IMAGES.camera, Shelf()
@@ -148,6 +159,119 @@ def test_where_all_that_was_tried_out_does_harm_it_says_so_and_draws_others_when
 def test_a_policy_is_given_its_rehearsal_itself(problem):
     with pytest.raises(InputError, match="give it the rehearsal"):
         Searcher(policy=idle, rehearsal=lambda *args: None)
+    with pytest.raises(InputError, match="push_model would have no effect"):
+        Searcher(policy=idle, push_model=QuasiStatic())
+
+
+def test_an_option_that_would_have_no_effect_is_refused():
+    with pytest.raises(InputError, match=r'config names the rehearsal "physics", and none is given.*load_searcher'):
+        Searcher(config=standard())
+    with pytest.raises(InputError, match='config names the push model "physics"'):
+        Searcher(config=standard(rehearsal="none", push_model="physics"))
+    with pytest.raises(InputError, match='config names the push model "quasi-static", and another is given'):
+        Searcher(config=standard(rehearsal="none", push_model="quasi-static"), push_model=own_push_model("learned"))
+
+
+def test_what_a_configuration_names_and_a_slot_holds_decides():
+    simulated = NativeRehearsal()
+    searcher = Searcher(config=standard(gamma=0.5, push_model="quasi-static"), rehearsal=simulated)
+    assert searcher._policy.rehearsal is simulated
+    assert searcher._policy.config.gamma == 0.5
+    assert searcher._policy.predict.first is own_push_model("quasi-static")
+
+
+def test_where_nothing_is_tried_out_it_says_so(problem):
+    plain, bold = Searcher(), Searcher(rehearsal=NativeRehearsal())
+    for searcher in (plain, bold):
+        searcher.problem, searcher.recogniser = problem, lambda *images: seen(OPEN)
+    assert "no action is tried out before it is made" in plain.check().notices[0]
+    assert bold.check().notices == ()
+    # Of a policy of one's own nothing is known.
+    assert searcher_of(problem, OPEN).check().notices == ()
+    done = Motion("retrieve", "it is found", object())
+    assert plain._allowed(done).reason == "it is found; not tried out before"
+    assert bold._allowed(done).reason == "it is found"
+
+
+def test_after_all_actions_only_the_target_is_taken_out(problem):
+    searcher = searcher_of(problem, OPEN, config=standard(max_steps=1))
+    push, take = Motion("push", "to push object 1", object()), Motion("retrieve", "to take it", object())
+    assert searcher._allowed(push) == push
+    searcher._state = dataclasses.replace(searcher._now, index=1)
+    kept = searcher._allowed(push)
+    assert (kept.kind, kept.trajectory) == ("none", None)
+    assert kept.reason.startswith("to push object 1; not done: all 1 actions of max_steps are used up")
+    assert searcher._allowed(take) == take
+
+
+def test_a_step_is_told_as_json(problem):
+    step = searcher_of(problem, OPEN).next(IMAGES.depth, IMAGES.colour)
+    told = json.loads(json.dumps(step.to_json(), allow_nan=False))
+    assert (told["kind"], told["found"], told["warnings"]) == ("retrieve", True, [])
+    assert told["motion"]["duration"] > 0
+    (box,) = told["objects"]
+    assert box["position"] == pytest.approx(OPEN.objects[0].position, abs=1e-5)
+    assert box["size"] == pytest.approx(OPEN.objects[0].half_size, abs=1e-5)
+    assert (np.shape(box["rotation"]), box["slot"], len(box["exponents"])) == ((3, 3), 0, 2)
+    assert box["quaternion"] == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-5)
+    target = told["target"]
+    assert target["visible"]
+    assert target["found_pose"][:2] == pytest.approx(OPEN.target.position[:2], abs=1e-5)
+    assert np.array(target["T_world_target"])[:3, 3] == pytest.approx(OPEN.target.position, abs=1e-3)
+    action, hand = told["action"], told["hand"]
+    assert (action["kind"], action["object"], action["displacement"]) == ("retrieve", None, [0.0, 0.0, 0.0])
+    T = np.array(action["T_world_gripper"])
+    assert np.linalg.norm(T[:3, 3] - OPEN.target.position) < 0.05
+    assert np.array(hand["T_world_hand"])[:3, 3] == pytest.approx(T[:3, 3] - FINGER_TIPS * T[:3, 2])
+
+
+def test_a_step_without_a_motion_has_neither_action_nor_hand(problem):
+    told = searcher_of(problem, HIDDEN).next(IMAGES.depth).to_json()
+    assert (told["kind"], told["motion"], told["action"], told["hand"]) == ("none", None, None, None)
+    assert (told["target"]["visible"], told["target"]["pose"], told["target"]["found_pose"]) == (False, None, None)
+    assert told["target"]["belief_size"] == told["poses"] > 0
+
+
+@pytest.mark.parametrize("colour", [IMAGES.colour, (IMAGES.colour / 255.0).astype(np.float32), IMAGES.colour / 255.0])
+def test_images_of_any_type_are_made_alike(colour):
+    depth, red, mask, target_id = alike(IMAGES.depth.astype(float), colour, IMAGES.mask.astype(np.int64), np.int64(3))
+    assert (depth.dtype, red.dtype, mask.dtype, type(target_id)) == (np.float32, np.uint8, np.int32, int)
+    np.testing.assert_array_equal(red, IMAGES.colour)
+    np.testing.assert_array_equal(mask, IMAGES.mask)
+
+
+def test_images_that_are_wrong_stay_wrong():
+    depth, colour, mask, _ = alike(np.ones((2, 2), np.uint16), np.full((2, 2, 3), 255.0), np.full((2, 2), 2**40), None)
+    assert (depth.dtype, colour.max(), mask.min() > 8) == (np.uint16, 255.0, True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rehearsal", ["none", "physics"])
+def test_after_warming_up_nothing_is_compiled(problem, rehearsal, monkeypatch):
+    monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
+    searcher = load_searcher(keep=False, rehearsal=rehearsal, sequences=4, horizon=1, trajectories=TRUSTING)
+    searcher.problem = problem
+    stages = []
+    searcher.warm_up(lambda what, left: stages.append((what, left)))
+    assert [left for _, left in stages] == [5, 4, 3, 2, 1, 0]
+    assert (searcher._now.index, searcher.moving) == (0, False)
+    sees = searcher.recogniser
+    with CompileClock() as clock:
+        searcher.next(IMAGES.depth.astype(float), IMAGES.colour)
+        assert clock.seconds == 0.0
+        for scenario in (HIDDEN, OPEN):
+            # What is seen is of one type, whatever it comes from.
+            there = jax.tree.map(np.asarray, seen(scenario))
+            searcher.recogniser = lambda *images, there=there: jax.device_put(there)
+            step = searcher.next(IMAGES.depth, IMAGES.colour)
+            step.to_json()
+            _ = step.picture
+            if searcher.moving:
+                searcher.acted(ok=False)
+            assert clock.seconds == 0.0
+        searcher.recogniser = sees
+        searcher.next(IMAGES.depth, IMAGES.colour)
+        assert clock.seconds == 0.0
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from mechsearch_jax.commands.options import ConfigFile, find_scenario, settings_
 
 
 def doctor(
-    scenario: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")] = "first-light",
+    scenario: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")] = None,
     /,
     *,
     config: ConfigFile = None,
@@ -18,19 +18,24 @@ def doctor(
     """Tell what is usable on this machine, and what to do about what is not; status 1 if nothing can be searched.
 
     Args:
-      scenario: whose problem is looked for in the cache; first-light if not given.
-      config: a file of settings, that it would be built with.
+      scenario: whose problem is looked for in the cache; first-light if neither this nor a file is given.
+      config: a file of settings, whose cell is looked at: camera, target, the arm's reach, the networks' view.
     """
     from rich.console import Console
 
-    from mechsearch_jax.envs.health import State, checks, examine
+    from mechsearch_jax.envs.finding import State
+    from mechsearch_jax.envs.health import checks, examine
+    from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import load_scenario
 
     settings = settings_of(config)
-    scene = load_scenario(find_scenario(scenario), settings.workcell.shelf)
+    name = scenario or (None if config else "first-light")
+    scene = None if name is None else load_scenario(find_scenario(name), settings.workcell.shelf)
+    if config is not None:
+        keep_compilations()
     console = Console(highlight=False, markup=False)
     broken = False
-    for subject, check in checks(scene, settings).items():
+    for subject, check in checks(scene, settings, cell=config is not None).items():
         for finding in examine(subject, check):
             broken |= finding.state is State.BROKEN
             console.print(f"{finding.subject:<10} {finding.state.value:<8} {finding.says}", soft_wrap=True)

@@ -11,6 +11,7 @@ import tyro
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
+    from mechsearch_jax.search.searcher import Check
     from mechsearch_jax.search.step import SearchStep
     from mechsearch_jax.workspace.camera import Camera
 
@@ -55,10 +56,10 @@ def plan(
     from rich.console import Console
 
     from mechsearch_jax.commands.options import settings_of
+    from mechsearch_jax.envs.cell import searcher_of
     from mechsearch_jax.files import check_writable, is_file
     from mechsearch_jax.perception.image_files import load_camera
     from mechsearch_jax.planner.cache import keep_compilations
-    from mechsearch_jax.search.searcher import Searcher
 
     if example == (depth is not None):
         raise InputError("plan: give either --depth IMAGE or --example, not both")
@@ -67,19 +68,19 @@ def plan(
     if target_id is not None and mask is None:
         raise InputError("plan: --target-id names a number of a mask; give --mask, too")
     settings = settings_of(config)
-    workcell = settings.workcell
     check_writable(out)
     if example:
         images, seen_by = _example(out)
         missing = ()
     else:
         assert depth is not None
-        seen_by = workcell.camera if camera is None else load_camera(camera)
+        seen_by = settings.workcell.camera if camera is None else load_camera(camera)
         images, missing = _images(depth, color, mask, background, target_id)
     keep_compilations()
     console = Console(highlight=False)
     with console.status("preparing") as status:
-        searcher = Searcher(dataclasses.replace(workcell, camera=seen_by), settings.config, seed=seed)
+        searcher = searcher_of(settings, camera=seen_by, seed=seed)
+        check = searcher.check()
         if state is not None and is_file(state):
             searcher.load(state)
             if searcher.moving:
@@ -91,10 +92,12 @@ def plan(
         step = searcher.next(**images, joints=joints or None)
         step = dataclasses.replace(step, warnings=(*missing, *step.warnings))
         status.update("writing")
-        files = _write(step, out)
+        files = _write(step, check, out)
         if state is not None:
             searcher.save(state)
-    for warning in step.warnings:
+    for notice in check.notices:
+        console.print(f"note: {notice}", soft_wrap=True)
+    for warning in dict.fromkeys((*check.warnings, *step.warnings)):
         console.print(f"[yellow]warning[/yellow]: {warning}", soft_wrap=True)
     console.print(f"[bold]{step.kind}[/bold]: {step.reason}", soft_wrap=True)
     console.print("\n".join(str(file) for file in files), soft_wrap=True)
@@ -141,28 +144,21 @@ def _example(out: Path) -> tuple[dict[str, Any], Camera]:
     return {"depth": images.depth, "colour": images.colour}, images.camera
 
 
-def _write(step: SearchStep, out: Path) -> list[Path]:
-    """Write a step; the files. Without a trajectory those of an earlier one are removed: nobody is to follow it."""
+def _write(step: SearchStep, check: Check, out: Path) -> list[Path]:
+    """Write a step and what is known of the cell; the files.
+
+    Without a trajectory those of an earlier one are removed: nobody is to follow it.
+    """
     from mechsearch_jax.files import save_json
     from mechsearch_jax.robot.trajectory_files import save_csv, save_ros
     from mechsearch_jax.viz.drawing import save_figure
 
-    told = {
-        "index": step.index,
-        "kind": step.kind,
-        "reason": step.reason,
-        "warnings": list(step.warnings),
-        "motion": None if step.trajectory is None else dataclasses.asdict(step.trajectory.report()),
-        "cost": float(step.decision.cost),
-        "poses": int(step.belief.exists.sum()),
-        "found": bool(step.belief.found),
-    }
     files = {"trajectory.csv": save_csv, "trajectory.json": save_ros}
     for name, save in files.items():
         if step.trajectory is None:
             (out / name).unlink(missing_ok=True)
         else:
             save(step.trajectory, out / name, overwrite=True)
-    save_json(told, out / "step.json")
+    save_json({**step.to_json(), "cell": dataclasses.asdict(check)}, out / "step.json")
     save_figure(step.picture, out / "step.png")
     return [out / "step.json", out / "step.png", *(out / name for name in files if step.trajectory is not None)]

@@ -20,7 +20,7 @@ from mechsearch_jax.perception.cloud import BLOCK, above_board, shelf_view, thin
 from mechsearch_jax.perception.planes import PlaneConfig, find_plane
 from mechsearch_jax.perception.target_pixels import coloured_pixels, fitted_pose
 from mechsearch_jax.perception.target_pose import distance
-from mechsearch_jax.workspace.camera import Camera, back_project, project
+from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -31,8 +31,7 @@ FLOOR_POINTS = 4096
 FLOOR_SUPPORT = 200
 # How far the board that is seen may be from the one that is known [m].
 FLOOR_TOLERANCE = 0.01
-# Least share of the board that the image must show, and least share of its pixels with a measured depth.
-LEAST_SEEN = 0.5
+# Least share of the pixels that show the shelf with a measured depth.
 LEAST_MEASURED = 0.5
 # Walls are looked for so far before and behind where they should be [m], among at most `FLOOR_POINTS` points that are
 # so far from the other faces [m]. So many of them, and such a share, make a wall of what they lie on.
@@ -80,42 +79,6 @@ WALLS = (
     Wall("the right side wall", "right", 1, -1),
     Wall("the left side wall", "left", 1, 1),
 )
-
-
-def camera_faults(camera: Camera, shelf: Shelf) -> tuple[str, ...]:
-    """What is wrong with a camera's pose, as seen from the shelf; empty if nothing is.
-
-    Args:
-      camera: with x right, y down and z forward.
-      shelf: what it is to see.
-    """
-    rotation, position = np.array(camera.rotation), np.array(camera.position)
-    middle = np.array(
-        [(shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, (shelf.board + shelf.ceiling) / 2]
-    )
-    if (middle - position) @ rotation[:, 2] <= 0.0:
-        return (
-            "camera: looks away from the shelf; its frame must have x right, y down and z forward (OpenGL's has y up "
-            "and z backward: negate the second and third column of the rotation)",
-        )
-    if rotation[2, 1] > 0.5:
-        return (
-            "camera: is upside down: the rows of its image run upwards in the world; negate the first two columns of "
-            "the rotation, or turn the image",
-        )
-    share = _board_in_image(camera, shelf)
-    if share < LEAST_SEEN:
-        return (f"camera: its image shows {100 * share:.0f}% of the board only; check its pose and focal lengths",)
-    return ()
-
-
-def _board_in_image(camera: Camera, shelf: Shelf) -> float:
-    """The share of the board that lies within the image, whatever stands before it."""
-    x, y = np.linspace(shelf.front, shelf.back, 21), np.linspace(shelf.right, shelf.left, 21)
-    board = np.stack(np.meshgrid(x, y, [shelf.board], indexing="ij"), axis=-1).reshape(-1, 3)
-    pixels, depth = (np.asarray(a) for a in project(camera, jnp.asarray(board, jnp.float32)))
-    inside = (pixels >= -0.5).all(axis=1) & (pixels < np.array([camera.height, camera.width]) - 0.5).all(axis=1)
-    return float(np.mean(inside & (depth > 0)))
 
 
 def image_faults(

@@ -31,6 +31,7 @@ from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
 
 # Which pixels are the target's, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
@@ -106,6 +107,7 @@ class Recogniser:
           InputError: the camera does not see the shelf, or weights are missing, damaged or of another network.
         """
         camera = camera or problem.camera
+        check_camera(camera, problem.shelf)
         fields = {
             "camera": camera,
             "view": thinned_view(camera, problem.shelf),

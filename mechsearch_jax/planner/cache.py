@@ -27,6 +27,7 @@ from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.versions import source_digest
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
 
 VARIABLE = "MECHSEARCH_CACHE_DIR"
@@ -76,9 +77,10 @@ def cached_problem(
     that is damaged or of something else is built anew, and a folder that cannot be written to is done without.
 
     Raises:
-      InputError: the target cannot be grasped by the gripper.
+      InputError: as `build_problem`.
     """
     parts = _parts(target, config, camera, shelf, gripper)
+    check_camera(parts["camera"], parts["shelf"])
     folder = cache_folder()
     if folder is None:
         return problems.build_problem(**parts)

@@ -16,7 +16,11 @@ from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
+
+# What is said of a shelf in which no grasp of the target is feasible.
+NOWHERE = "shelf: the arm reaches the target nowhere; check the shelf's place before the robot"
 
 
 class TargetGrasps(flax.struct.PyTreeNode):
@@ -96,16 +100,20 @@ def build_problem(
     Takes seconds; what is left out takes its default. Not to be called inside `jit`.
 
     Raises:
-      InputError: the target cannot be grasped by the gripper, a kind of action cannot be sampled, the gripper's places
-        outside the shelf are not, or `config` is of something else.
+      InputError: the camera does not see the shelf, the target cannot be grasped by the gripper, or nowhere on the
+        shelf, a kind of action cannot be sampled, the gripper's places outside the shelf are not, or `config` is of
+        something else.
     """
     target, camera, shelf = target or Target(), camera or Camera(), shelf or Shelf()
     gripper, config = gripper or Gripper(), ProblemConfig() if config is None else config
     if not isinstance(config, ProblemConfig):
         raise InputError(f"config: is a {type(config).__name__}; give a ProblemConfig, such as paper().problem")
+    check_camera(camera, shelf)
     check_outside(gripper, shelf)
     check_kinds(config.actions.actions)
     grasps = grasp_tables(shelf, gripper, target, config.grasps)
+    if grasps.pair_pose.shape[0] == 0:
+        raise InputError(NOWHERE)
     return Problem(
         existence=existence_tables(camera, shelf, target, config.existence),
         grasps=grasps,

@@ -1,6 +1,6 @@
 """The search as a robot programmer runs it: images in, the next motion out, told again when it is over.
 
-    searcher = ms.Searcher(ms.Workcell(camera=..., shelf=..., target=...))
+    searcher = ms.Searcher(ms.Workcell(camera=..., shelf=..., target=...))  # or envs.cell.load_searcher("mine.toml")
     while True:
         step = searcher.next(depth, colour)         # kind, reason, warnings, trajectory
         ...                                         # move along step.trajectory
@@ -12,6 +12,7 @@ and says in words what the arrays say. It is the only part of the library that h
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import hashlib
@@ -23,15 +24,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions.nothing import no_action
-from mechsearch_jax.actions.registry import KINDS, kind_of
-from mechsearch_jax.actions.trajectory import reference_motion
+from mechsearch_jax.actions.registry import KINDS, ActionKind, kind_of
+from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import PathLike
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.overlaps import overlap_faults
 from mechsearch_jax.perception.plausibility import (
     EMPTY_SHELF,
-    camera_faults,
     check_measured,
     colour_faults,
     identity_faults,
@@ -42,19 +42,25 @@ from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.trained_view import view_faults
 from mechsearch_jax.planner.belief import Belief, initial_belief, update_belief
 from mechsearch_jax.planner.config import Config
-from mechsearch_jax.planner.policies import Policy, search_for_grasp
+from mechsearch_jax.planner.impasse import impasse
+from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.presets import standard
-from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.problem import NOWHERE, Problem
 from mechsearch_jax.planner.rehearsal import Rehearsal
 from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.robot.free_motion import check_joints
-from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.search import warming
+from mechsearch_jax.search.images import Images, alike
+from mechsearch_jax.search.slots import UNTRIED, filled, tries_nothing
 from mechsearch_jax.search.state import State, beginning, load_state, save_state
-from mechsearch_jax.search.step import SearchStep, motion, shown
+from mechsearch_jax.search.step import Motion, SearchStep, motion, shown
 from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
+from mechsearch_jax.workspace.sight import camera_faults, check_camera
 
 # Share of the candidate poses below which a target that is found would often be out of reach.
 LEAST_REACH = 0.5
+# Names of the kinds that leave the target where it is, or put it back.
+KEEPS_TARGET = frozenset(kind.name for kind in KINDS.values() if not kind.takes_target and kind.code != ActionKind.NONE)
 # What `warm_up` compiles, in this order.
 STAGES = ("the problem", "recognition", "the belief", "the plan", "the grasp", "the motion")
 
@@ -66,10 +72,12 @@ class Check:
     Attributes:
       reach: share of the target's candidate poses at which the arm could grasp it in an empty shelf.
       warnings: what should be looked at, a line each.
+      notices: what is as it was asked for and may surprise all the same, a line each.
     """
 
     reach: float
     warnings: tuple[str, ...]
+    notices: tuple[str, ...] = ()
 
 
 class Searcher:
@@ -85,6 +93,8 @@ class Searcher:
         *,
         seed: int = 0,
         policy: Policy | None = None,
+        push_model: PushModel | None = None,
+        later_push_model: PushModel | None = None,
         rehearsal: Rehearsal | None = None,
         recogniser: Callable[[Problem], Any] = Recogniser,
         trajectories: TrajectoryConfig | None = None,
@@ -93,27 +103,35 @@ class Searcher:
 
         Args:
           workcell: camera, shelf, gripper and target; the defaults if left out.
-          config: how the problem is built and how the planner decides; preset `standard` if left out. The names of its
-            models are not used.
+          config: how the problem is built and how the planner decides, and how many actions it may take; preset
+            `standard` without a rehearsal if left out. What it names and needs a simulator has to be given beside it:
+            `envs.cell.load_searcher` makes all of that from a file.
           seed: of all random numbers.
-          policy: what decides; by default search-for-grasp with the planner's part of `config`.
+          policy: what decides; by default search-for-grasp with the planner's part of `config`. One that is given has
+            that part, its models and its rehearsal itself.
+          push_model, later_push_model: predict pushes, the latter those that are not the first action of a sequence; by
+            default what `config` names.
           rehearsal: tries that policy's actions out before one is made, such as
             `envs.physics_rehearsal.NativeRehearsal()`. If left out, nothing does, and the target is only taken out
-            where nothing is touched.
+            where nothing is touched; `check` and each step's reason say so.
           recogniser: makes what recognises of a problem, with the signature of `Recogniser`.
           trajectories: how motions are made, where a controller should stop, and when recognition is too doubtful to
             move; the default if left out.
 
         Raises:
-          InputError: the target cannot be grasped by the gripper, the camera does not see the shelf, or a policy is
-            given beside a rehearsal.
+          InputError: the target cannot be grasped by the gripper, the camera does not see the shelf, a policy is given
+            beside what it should have itself, or `config` names what is not given.
         """
-        if policy is not None and rehearsal is not None:
-            raise InputError("Searcher: a policy rehearses by itself; give it the rehearsal, and leave the keyword out")
+        slots: dict[str, Any] = {
+            "push_model": push_model,
+            "later_push_model": later_push_model,
+            "rehearsal": rehearsal,
+        }
         self.workcell = workcell or Workcell()
-        self.config = config or standard()
+        check_camera(self.workcell.camera, self.workcell.shelf)
+        self.config = config or standard(rehearsal="none")
         self._seed = seed
-        self._policy = policy or search_for_grasp(self.config.planner, rehearsal=rehearsal)
+        self._policy = filled(policy, self.config, slots)
         self._make_recogniser = recogniser
         self._trajectories = trajectories
         self._state: State | None = None
@@ -157,47 +175,73 @@ class Searcher:
         reach = len(np.unique(np.asarray(self.problem.grasps.pair_pose))) / poses
         warnings = list(self._camera_faults)
         if reach == 0.0:
-            warnings.insert(0, "shelf: the arm reaches the target nowhere; check the shelf's place before the robot")
+            warnings.insert(0, NOWHERE)
         elif reach < LEAST_REACH:
             warnings.append(f"shelf: the arm can grasp the target at {100 * reach:.0f}% of its possible poses only")
-        return Check(reach, tuple(warnings))
+        return Check(reach, tuple(warnings), (UNTRIED,) if tries_nothing(self._policy) else ())
 
-    def warm_up(self, progress: Callable[[str, int], None] = lambda what, left: None) -> None:
-        """Compile and load all that the first steps need, so that they take as long as later ones.
+    def warm_up(
+        self,
+        progress: Callable[[str, int], None] = lambda what, left: None,
+        *,
+        colour: bool = True,
+        mask: bool = False,
+        target_id: bool = False,
+    ) -> None:
+        """Compile and load all that `next` needs with such images, so that nothing is left to compile.
 
         Args:
           progress: told what comes next, and how many things come after it.
+          colour, mask, target_id: which of them `next` is given beside the depth image. Who uses several combinations
+            calls this once for each.
+
+        Raises:
+          InputError: as `next`, or target_id is used without a mask.
         """
-        camera = self.workcell.camera
-        depth = np.full((camera.height, camera.width), np.nan, np.float32)
-        colour = np.zeros((camera.height, camera.width, 3), np.uint8)
-        key = jax.random.key(0)
-        left = len(STAGES)
+        stages = iter(STAGES)
 
-        def stage(what: str) -> None:
-            nonlocal left
-            left -= 1
-            progress(what, left)
+        def stage() -> None:
+            name = next(stages)
+            progress(name, len(STAGES) - 1 - STAGES.index(name))
 
-        stage(STAGES[0])
-        problem = self.problem
-        stage(STAGES[1])
-        seen = jax.block_until_ready(self.recogniser(key, depth, colour))
-        stage(STAGES[2])
-        nothing = no_action()
-        belief = jax.block_until_ready(update_belief(problem, initial_belief(problem), seen, seen, nothing))
-        belief = update_belief(problem, belief, seen)
-        stage(STAGES[3])
-        jax.block_until_ready(self._policy(key, problem, belief, seen))
-        stage(STAGES[4])
-        middle = jnp.mean(problem.poses, axis=0)
-        found = seen.replace(target_visible=jnp.array(True), target_pose=middle)
-        belief = update_belief(problem, belief, found)
-        decision = jax.block_until_ready(self._policy(key, problem, belief, found))
-        stage(STAGES[5])
-        for kind in KINDS.values():
-            reference_motion(kind, decision.action, MotionConfig(gripper=problem.gripper))
-        motion(problem, belief, found, decision, depth, None, self.workcell.arm, self._trajectories)
+        stage()
+        problem, key = self.problem, jax.random.key(0)
+        images = warming.images(self.workcell.camera, self.workcell.shelf, colour, mask, target_id)
+        stage()
+        seen = jax.block_until_ready(self.recogniser(key, *images))
+        hidden, found = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
+        stage()
+        belief = update_belief(problem, initial_belief(problem), hidden)
+        jax.block_until_ready(update_belief(problem, belief, hidden, hidden, no_action()))
+        stage()
+        twin = self._twin()
+        step = twin._looking(hidden, images)
+        stage()
+        twin._state = dataclasses.replace(twin._now, handed=False, acted=True)
+        taken = twin._looking(found, images)
+        stage()
+        impasse(problem, step.belief, hidden.objects)
+        action = taken.decision.action
+        warming.motions(problem, action, twin._trajectories.motion if twin._trajectories else None)
+        rehearsal = getattr(self._policy, "rehearsal", None)
+        if rehearsal is not None:
+            warming.trials(rehearsal, problem, hidden, action)
+        for each in (step, taken):
+            each.to_json()
+            _ = each.picture
+
+    def _twin(self) -> Searcher:
+        """A searcher at the beginning of a search, that shares all but how far it is, and makes any motion."""
+        _ = self._camera_faults
+        twin = copy.copy(self)
+        twin._state = beginning(self.problem)
+        twin._trajectories = dataclasses.replace(self._trajectories or TrajectoryConfig(), doubt=warming.TRUSTING)
+        return twin
+
+    def _looking(self, observation: Observation, images: Images) -> SearchStep:
+        """The next step where images show what is said, whatever they show."""
+        self.__dict__["recogniser"] = warming.saying(self.recogniser, observation)
+        return self.next(*images)
 
     def next(
         self,
@@ -231,7 +275,7 @@ class Searcher:
         here = jax.random.fold_in(jax.random.key(self._seed), now.index)
         # What was refused would be drawn again.
         seeing, deciding = jax.random.split(jax.random.fold_in(here, now.refusals))
-        depth = np.asarray(depth)
+        depth, colour, mask, target_id = alike(depth, colour, mask, target_id)
         if joints is not None:
             joints = np.asarray(joints, float)
             check_joints("joints", joints)
@@ -251,7 +295,7 @@ class Searcher:
             warnings.append("the target is not where it was found any more: it is searched for anew")
         decision = self._policy(deciding, problem, belief, observation)
         arm = self.workcell.arm
-        done = motion(problem, belief, observation, decision, depth, joints, arm, self._trajectories)
+        done = self._allowed(motion(problem, belief, observation, decision, depth, joints, arm, self._trajectories))
         step = SearchStep(
             index=now.index,
             kind=done.kind,
@@ -277,6 +321,18 @@ class Searcher:
             refusals=refusals,
         )
         return step
+
+    def _allowed(self, done: Motion) -> Motion:
+        """What is done, where there are actions left; afterwards only the target is taken out, as in an episode."""
+        most = self.config.max_steps
+        if self._now.index >= most and done.kind in KEEPS_TARGET:
+            why = (
+                f"all {most} actions of max_steps are used up; only a found target is still taken out (raise max_steps "
+                "to go on)"
+            )
+            return Motion(kind_of(ActionKind.NONE).name, f"{done.reason}; not done: {why}", None)
+        untried = "; not tried out before" if tries_nothing(self._policy) and done.trajectory is not None else ""
+        return done._replace(reason=done.reason + untried)
 
     def acted(self, ok: bool = True) -> None:
         """Say that the last step's motion is over.

@@ -23,6 +23,7 @@ from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
+from mechsearch_jax.search.step_json import step_json
 from mechsearch_jax.search.whole_trajectory import TrajectoryConfig, whole_trajectory
 from mechsearch_jax.viz.filmstrip import Frame, filmstrip
 
@@ -53,6 +54,13 @@ class SearchStep:
     decision: Decision
     problem: Problem
     image: np.ndarray
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as JSON values but the trajectory's rows: objects, target, action, and where the hand goes.
+
+        Metres and radians in the frame of the robot's base; docs/commands.md, "A step's file", tells of each key.
+        """
+        return step_json(self)
 
     @functools.cached_property
     def picture(self) -> Figure:

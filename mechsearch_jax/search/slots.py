@@ -1,0 +1,55 @@
+"""What a searcher decides with: a policy that it is given, or one with the models that it is given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mechsearch_jax.dynamics.named import own_push_model
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner.config import Config
+from mechsearch_jax.planner.policies import Policy, Search, search_for_grasp
+
+# What is said of a policy that has no rehearsal.
+UNTRIED = (
+    "rehearsal: no action is tried out before it is made, so that less is found and retrieved than the results say; "
+    "envs.cell.load_searcher, or rehearsal=NativeRehearsal(), tries them in simulation"
+)
+
+
+def tries_nothing(policy: Policy) -> bool:
+    """Whether it is known that a policy tries no action out before it is made."""
+    return isinstance(policy, Search) and policy.rehearsal is None
+
+
+def filled(policy: Policy | None, config: Config, slots: dict[str, Any]) -> Policy:
+    """The policy that is given, or search-for-grasp with what is given for it.
+
+    Raises:
+      InputError: a slot is given beside a policy, or the configuration names what no slot holds.
+    """
+    given = [name for name, value in slots.items() if value is not None]
+    if policy is not None:
+        if given:
+            raise InputError(
+                f"Searcher: {' and '.join(given)} would have no effect beside a policy, which has its own; give it the "
+                f"{given[0]} when it is made, and leave the keyword out"
+            )
+        return policy
+    if config.rehearsal != "none" and slots["rehearsal"] is None:
+        raise InputError(
+            f'Searcher: config names the rehearsal "{config.rehearsal}", and none is given; use '
+            "mechsearch_jax.envs.cell.load_searcher, give rehearsal=NativeRehearsal() (envs.physics_rehearsal), or a "
+            'config with rehearsal="none"'
+        )
+    if slots["push_model"] is None:
+        if config.push_model == "physics":
+            raise InputError(
+                'Searcher: config names the push model "physics", and none is given; use '
+                'mechsearch_jax.envs.cell.load_searcher, give push_model, or a config with push_model="learned"'
+            )
+        slots = {**slots, "push_model": own_push_model(config.push_model)}
+    elif config.push_model == "quasi-static":
+        raise InputError(
+            'Searcher: config names the push model "quasi-static", and another is given; leave out one of them'
+        )
+    return search_for_grasp(config.planner, **slots)

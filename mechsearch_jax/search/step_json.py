@@ -1,0 +1,105 @@
+"""A step as JSON values: for who drives a robot with another program.
+
+Lengths in metres, angles in radians, everything in the frame of the robot's base (x into the shelf, y to the left, z
+up). Poses are rows of 4 x 4 matrices.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.actions.registry import kind_of
+from mechsearch_jax.actions.types import Action
+from mechsearch_jax.geometry.transforms import upright_pose
+from mechsearch_jax.robot.kinematics import FINGER_TIPS
+
+if TYPE_CHECKING:
+    from mechsearch_jax.search.step import SearchStep
+
+
+def step_json(step: SearchStep) -> dict[str, Any]:
+    """All that a step says but its trajectory's rows; there is no NaN in it."""
+    acts = step.trajectory is not None
+    return {
+        "index": step.index,
+        "kind": step.kind,
+        "reason": step.reason,
+        "warnings": list(step.warnings),
+        "motion": dataclasses.asdict(step.trajectory.report()) if step.trajectory is not None else None,
+        "cost": _number(step.decision.cost),
+        "predicted_cost": _number(step.decision.predicted_cost),
+        "poses": int(np.sum(np.asarray(step.belief.exists))),
+        "found": bool(step.belief.found),
+        "objects": _objects(step),
+        "target": _target(step),
+        "action": _action(step.decision.action) if acts else None,
+        "hand": _hand(step.decision.action) if acts else None,
+    }
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if math.isfinite(float(value)) else None
+
+
+def _list(array: Any) -> list[Any]:
+    return np.asarray(array, float).tolist()
+
+
+def _objects(step: SearchStep) -> list[dict[str, Any]]:
+    """The recognised objects; `slot` is what an action's `object` refers to."""
+    scene = step.observation.objects
+    return [
+        {
+            "slot": i,
+            "size": _list(scene.size[i]),
+            "exponents": _list(scene.exponents[i]),
+            "position": _list(scene.position[i]),
+            "rotation": _list(scene.rotation[i]),
+            "quaternion": np.roll(Rotation.from_matrix(np.asarray(scene.rotation[i], float)).as_quat(), 1).tolist(),
+        }
+        for i in np.flatnonzero(np.asarray(scene.valid)).tolist()
+    ]
+
+
+def _target(step: SearchStep) -> dict[str, Any]:
+    """What is known of the target; poses are x, y [m] and yaw [rad]."""
+    visible, found = bool(step.observation.target_visible), bool(step.belief.found)
+    target, shelf = step.problem.target, step.problem.shelf
+    place = np.asarray(step.belief.found_pose, np.float32)
+    return {
+        "shape": target.shape,
+        "half_size": list(target.half_size),
+        "visible": visible,
+        "pose": _list(step.observation.target_pose) if visible else None,
+        "found": found,
+        "found_pose": _list(place) if found else None,
+        "T_world_target": _list(upright_pose(place, target.height(shelf))) if found else None,
+        "belief_size": 0 if found else int(np.sum(np.asarray(step.belief.exists))),
+    }
+
+
+def _action(action: Action) -> dict[str, Any]:
+    """The action, as episodes record it."""
+    kind = kind_of(int(action.kind))
+    return {
+        "kind": kind.name,
+        "object": int(action.object) if kind.moves_object else None,
+        "T_world_gripper": _list(action.T_world_gripper),
+        "displacement": _list(action.displacement),
+        "T_world_place": _list(action.T_world_place),
+        "q7": float(action.q7),
+        "opening": float(action.opening),
+    }
+
+
+def _hand(action: Action) -> dict[str, Any]:
+    """Where the Panda's hand frame goes: its origin lies behind the gripper's, along their common z."""
+    back = np.eye(4)
+    back[2, 3] = -FINGER_TIPS
+    first, last = (np.asarray(T, float) @ back for T in (action.T_world_gripper, action.T_world_place))
+    return {"T_world_hand": first.tolist(), "T_world_hand_end": last.tolist()}

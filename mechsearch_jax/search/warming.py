@@ -1,0 +1,122 @@
+"""Images and scenes that stand for those that are yet to come, so that what they need can be compiled beforehand."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.actions.registry import KINDS
+from mechsearch_jax.actions.trajectory import reference_motion
+from mechsearch_jax.actions.types import Action
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.doubt import DoubtConfig
+from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.rehearsal import PLANNED, TRIES, Rehearsal
+from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.search.images import Images
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+# The size of what stands for an object, as half-extents [m]; and a depth that is measured everywhere else [m].
+BOX = (0.03, 0.03, 0.06)
+FAR = 3.0
+# Nothing that is recognised is too doubtful.
+TRUSTING = DoubtConfig(missing=1.0, unexplained=1.0, passed=1.0)
+
+
+def images(camera: Camera, shelf: Shelf, colour: bool, mask: bool, target_id: bool) -> Images:
+    """Images of an empty shelf.
+
+    Args:
+      camera, shelf: what sees what.
+      colour, mask, target_id: which of them there are.
+
+    Raises:
+      InputError: there is a target's number without a mask.
+    """
+    if target_id and not mask:
+        raise InputError("warm_up: target_id names a number of a mask; say mask=True, too")
+    size = (camera.height, camera.width)
+    return Images(
+        depth=board_depth(camera, shelf),
+        colour=np.full((*size, 3), 128, np.uint8) if colour else None,
+        mask=np.full(size, -1, np.int32) if mask else None,
+        target_id=0 if target_id else None,
+    )
+
+
+def board_depth(camera: Camera, shelf: Shelf) -> Float[np.ndarray, "h w"]:
+    """The depth image of a board without end [m], float32; `FAR` where it is not, or farther away."""
+    rows, columns = np.meshgrid(np.arange(camera.height), np.arange(camera.width), indexing="ij")
+    x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
+    up = np.array(camera.rotation)[2]
+    falls = -(up[0] * x + up[1] * y + up[2])
+    depth = (camera.position[2] - shelf.board) / np.where(falls > 1e-6, falls, np.inf)
+    return np.where((depth > 0.0) & (depth < FAR), depth, FAR).astype(np.float32)
+
+
+def hidden(problem: Problem, seen: Observation) -> Observation:
+    """One object on the shelf, and no target."""
+    x, y, _ = np.asarray(problem.poses)[len(problem.poses) // 2].tolist()
+    slots = seen.objects.capacity
+    one = np.arange(slots) == 0
+    place = np.where(one[:, None], [x, y, problem.shelf.board + BOX[2]], 0.0)
+    objects = seen.objects.replace(
+        size=jnp.asarray(np.broadcast_to(BOX, (slots, 3)), jnp.float32),
+        exponents=jnp.full((slots, 2), 0.2, jnp.float32),
+        position=jnp.asarray(place, jnp.float32),
+        rotation=jnp.asarray(np.broadcast_to(np.eye(3), (slots, 3, 3)), jnp.float32),
+        valid=jnp.asarray(one),
+    )
+    return seen.replace(objects=objects, target_visible=jnp.array(False))
+
+
+def in_the_open(problem: Problem, seen: Observation) -> Observation:
+    """The target alone, where most of its grasps are feasible."""
+    counts = np.bincount(np.asarray(problem.grasps.pair_pose), minlength=len(problem.poses))
+    pose = np.asarray(problem.poses)[int(np.argmax(counts))]
+    objects = seen.objects.replace(valid=jnp.zeros(seen.objects.capacity, bool))
+    return seen.replace(
+        objects=objects, target_visible=jnp.array(True), target_pose=jnp.asarray(pose, seen.target_pose.dtype)
+    )
+
+
+class _Saying(Recogniser):
+    """Another recogniser in all but what it recognises, which is always the same."""
+
+    def __init__(self, like: Recogniser, observation: Observation):
+        for field in dataclasses.fields(like):
+            object.__setattr__(self, field.name, getattr(like, field.name))
+        object.__setattr__(self, "_observation", observation)
+
+    def __call__(self, *images: Any) -> Observation:
+        return self.__dict__["_observation"]
+
+
+def saying(recogniser: Any, observation: Observation) -> Callable[..., Observation]:
+    """What recognises the same in all images, and is otherwise like a recogniser."""
+    return _Saying(recogniser, observation) if isinstance(recogniser, Recogniser) else lambda *images: observation
+
+
+def motions(problem: Problem, action: Action, config: MotionConfig | None) -> None:
+    """Compile the motions of all kinds of action."""
+    for kind in KINDS.values():
+        reference_motion(kind, action, config or MotionConfig(gripper=problem.gripper))
+
+
+def trials(rehearsal: Rehearsal, problem: Problem, observation: Observation, action: Action) -> None:
+    """Have one action of each kind that is planned tried out; where it is none that the arm can make, that fails."""
+    many: Action = jax.tree.map(lambda a: jnp.broadcast_to(a[None], (TRIES, *a.shape)), action)
+    kinds = np.resize(np.array([int(kind) for kind in PLANNED], np.int32), TRIES)
+    many = many.replace(kind=jnp.asarray(kinds), object=jnp.zeros(TRIES, jnp.int32))
+    pose = jnp.zeros(3, jnp.float32)
+    asked = jnp.ones(TRIES, bool)
+    rehearsal(problem, observation.objects, pose, jnp.array(False), many, asked, PLANNED)

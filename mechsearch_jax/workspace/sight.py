@@ -1,0 +1,175 @@
+"""Whether a camera sees the shelf at all, and what is probably wrong with its pose where it does not.
+
+Pure geometry of a pose, on the host: it is looked at before anything is computed from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+# Shares of the board that the image must show: with less nothing can be searched, or it is worth a warning.
+LEAST_USABLE = 0.2
+LEAST_SEEN = 0.5
+# The rows of an image run upwards in the world where its y axis points up by more than this.
+UPSIDE_DOWN = 0.5
+# How far a line of sight may pass into a wall, whose place is not known better [m].
+SLACK = 0.02
+# Axes of a camera's frame in a frame with x forward, y left and z up, and in OpenGL's, as columns.
+BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+OPENGL = np.diag([1.0, -1.0, -1.0])
+AXES = "its frame must have x right, y down and z forward"
+
+Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
+
+
+def check_camera(camera: Camera, shelf: Shelf) -> None:
+    """Refuse a camera that does not see the shelf.
+
+    Args:
+      camera: with x right, y down and z forward.
+      shelf: what it is to see.
+
+    Raises:
+      InputError: the shelf is behind it, nearly all of the board outside of its image, or it looks through a wall and
+        would not without a usual mistake; the line names the likely mistake.
+    """
+    fault = blindness(camera, shelf)
+    if fault is not None:
+        raise InputError(fault)
+
+
+def blindness(camera: Camera, shelf: Shelf) -> str | None:
+    """Why nothing can be searched with a camera, in one line; None where it sees enough of the shelf."""
+    sight = _sight(camera, _pose(camera), shelf)
+    if sight.ahead and sight.seen >= LEAST_USABLE:
+        return None
+    if (mistake := _mistake(camera, shelf)) is not None:
+        return mistake
+    if not sight.ahead:
+        return f"camera: looks away from the shelf; {AXES}, and its pose be that in the robot's frame"
+    # A wall or a ceiling may be given where there is none.
+    return _little(sight) if sight.framed < LEAST_USABLE else None
+
+
+def camera_faults(camera: Camera, shelf: Shelf) -> tuple[str, ...]:
+    """What is wrong with a camera's pose, as seen from the shelf; empty if nothing is.
+
+    Args:
+      camera: with x right, y down and z forward.
+      shelf: what it is to see.
+    """
+    fault = blindness(camera, shelf)
+    if fault is not None:
+        return (fault,)
+    if np.array(camera.rotation)[2, 1] > UPSIDE_DOWN:
+        return (
+            "camera: is upside down: the rows of its image run upwards in the world; negate the first two columns of "
+            "the rotation, or turn the image",
+        )
+    sight = _sight(camera, _pose(camera), shelf)
+    return (_mistake(camera, shelf) or _little(sight),) if sight.seen < LEAST_SEEN else ()
+
+
+def share_seen(camera: Camera, shelf: Shelf) -> float:
+    """The share of the board that a camera sees, without the objects on it."""
+    return _sight(camera, _pose(camera), shelf).seen
+
+
+class Sight(NamedTuple):
+    """What a camera sees of the board, without the objects on it.
+
+    Attributes:
+      central: cosine of the angle between its axis and the way to the middle of the shelf's space.
+      framed: share of the board within its image, whatever stands between.
+      seen: share of the board within its image that walls, ceiling and back leave in sight.
+    """
+
+    central: float
+    framed: float
+    seen: float
+
+    @property
+    def ahead(self) -> bool:
+        """Whether the middle of the shelf's space is before it."""
+        return self.central > 0.0
+
+
+def _sight(camera: Camera, pose: Pose, shelf: Shelf) -> Sight:
+    """What a camera would see from a pose."""
+    rotation, position = pose
+    x, y = np.linspace(shelf.front, shelf.back, 21), np.linspace(shelf.right, shelf.left, 21)
+    board = np.stack(np.meshgrid(x, y, [shelf.board], indexing="ij"), axis=-1).reshape(-1, 3)
+    middle = board.mean(axis=0) + np.array([0.0, 0.0, (shelf.ceiling - shelf.board) / 2])
+    right, down, depth = ((board - position) @ rotation).T
+    safe = np.maximum(depth, 1e-6)
+    row, column = camera.fy * down / safe + camera.cy, camera.fx * right / safe + camera.cx
+    framed = (row >= 0.0) & (row < camera.height) & (column >= 0.0) & (column < camera.width) & (depth > 0)
+    # Where the line of sight passes the plane of the front, it has to pass the opening.
+    way = board - position
+    share = (shelf.front - position[0]) / np.where(way[:, 0] > 1e-9, way[:, 0], np.inf)
+    crossing = position + share[:, None] * way
+    opening = (crossing[:, 1] > shelf.right - SLACK) & (crossing[:, 1] < shelf.left + SLACK)
+    opening &= (crossing[:, 2] > shelf.board - SLACK) & (crossing[:, 2] < shelf.ceiling + SLACK)
+    inside = _in_space(position, shelf)
+    seen = framed & (inside | (opening & (position[0] <= shelf.front)))
+    away = middle - position
+    central = away @ rotation[:, 2] / max(float(np.linalg.norm(away)), 1e-9)
+    return Sight(float(central), float(framed.mean()), float(seen.mean()))
+
+
+def _in_space(position: Float[np.ndarray, "3"], shelf: Shelf) -> bool:
+    """Whether a place is in the shelf's own space."""
+    x, y, z = position
+    high, wide = shelf.board <= z <= shelf.ceiling, shelf.right <= y <= shelf.left
+    return bool(shelf.front <= x <= shelf.back and wide and high)
+
+
+def _little(sight: Sight) -> str:
+    if sight.framed < LEAST_SEEN:
+        return f"camera: its image shows {100 * sight.framed:.0f}% of the board only; check its pose and focal lengths"
+    return (
+        f"camera: {100 * (1.0 - sight.seen):.0f}% of the board are outside of its image or behind walls and ceiling; "
+        "check its pose and the shelf"
+    )
+
+
+def _mistake(camera: Camera, shelf: Shelf) -> str | None:
+    """The mistake with which a camera that sees the shelf would have this pose; None if no known one explains it."""
+    sights = {line: (pose, _sight(camera, pose, shelf)) for line, pose in _mended(_pose(camera)).items()}
+    # The right way up, not in the shelf, and of several one whose images are level and show the shelf in their middle.
+    doubts = {
+        line: (round(abs(pose[0][2, 0]), 2), -sight.central)
+        for line, (pose, sight) in sights.items()
+        if sight.ahead and sight.seen >= LEAST_SEEN and pose[0][2, 1] < UPSIDE_DOWN and not _in_space(pose[1], shelf)
+    }
+    return min(doubts, key=lambda line: doubts[line], default=None)
+
+
+def _mended(pose: Pose) -> Mapping[str, Pose]:
+    """What a pose would be without each of the usual mistakes, by what is said of it; the usual ones first."""
+    rotation, position = pose
+    back = rotation.T, -rotation.T @ position
+    inverted = "camera: T_world_camera looks inverted: its inverse sees the shelf"
+    transposed = "camera: its rotation looks transposed: the shelf is seen with its rows as columns"
+    opengl = "OpenGL's axes (y up, z backward): negate the second and third columns"
+    return {
+        f"{inverted}; give the camera's pose in the robot's frame": back,
+        f"{transposed}; give the rows of R_world_camera": (rotation.T, position),
+        f"camera: looks away from the shelf, as with {opengl} of the rotation": (rotation @ OPENGL, position),
+        f"{inverted}, with {opengl} of its rotation, and give that": (back[0] @ OPENGL, back[1]),
+        f"{transposed} and {opengl} of the transposed": (rotation.T @ OPENGL, position),
+        f"camera: looks elsewhere, as with the axes of a robot's body (x forward, y left, z up); {AXES}, as the "
+        "optical frame of ROS has": (rotation @ BODY, position),
+    }
+
+
+def _pose(camera: Camera) -> Pose:
+    return np.array(camera.rotation, float), np.array(camera.position, float)

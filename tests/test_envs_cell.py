@@ -1,0 +1,70 @@
+"""One call makes a searcher from a configuration file, and it plans as `mechsearch search` does with that file."""
+
+import os
+
+import jax
+import pytest
+
+from mechsearch_jax.compiled import _KEEPING
+from mechsearch_jax.envs import cell
+from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.rehearsals import rehearsal
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.perception.examples import example_images
+from mechsearch_jax.planner.settings import Settings, load_settings
+
+FILE = """
+[camera]
+width = 848
+height = 480
+fx = 404.0
+fy = 404.0
+cx = 424.0
+cy = 240.0
+
+[planner]
+gamma = 0.8
+max_steps = 3
+push_model = "quasi-static"
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(FILE)
+    return path
+
+
+def test_a_file_says_workcell_and_planner(file):
+    settings = load_settings(file)
+    searcher = cell.load_searcher(file, keep=False)
+    assert searcher.workcell == settings.workcell
+    assert searcher.config == settings.config
+    theirs = Method(config=settings.config, workcell=settings.workcell).policy()
+    mine = searcher._policy
+    assert mine.config == theirs.config
+    assert mine.rehearsal is theirs.rehearsal is rehearsal("physics")
+    assert (mine.predict, mine.objective, mine.plan) == (theirs.predict, theirs.objective, theirs.plan)
+
+
+def test_what_is_given_goes_before_the_file(file):
+    camera = example_images().camera
+    searcher = cell.load_searcher(file, camera=camera, keep=False, rehearsal="none", max_steps=7, seed=3)
+    assert searcher.workcell.camera == camera
+    assert (searcher.config.max_steps, searcher.config.planner.gamma) == (7, 0.8)
+    assert searcher._policy.rehearsal is None
+    with pytest.raises(InputError, match="option speed is unknown"):
+        cell.load_searcher(file, keep=False, speed=1.0)
+
+
+def test_without_a_file_all_is_as_by_default():
+    assert cell.load_searcher(keep=False).config == Settings().config
+
+
+def test_compilations_are_kept(file, tmp_path, monkeypatch):
+    monkeypatch.setenv("MECHSEARCH_CACHE_DIR", str(tmp_path / "cache"))
+    assert os.environ.get("JAX_COMPILATION_CACHE_DIR") or jax.config.read("jax_compilation_cache_dir")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", os.environ.get("JAX_COMPILATION_CACHE_DIR", str(tmp_path)))
+    cell.load_searcher(file)
+    assert _KEEPING.executables.folder == tmp_path / "cache" / "executables"
