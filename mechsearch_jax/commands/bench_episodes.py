@@ -156,4 +156,53 @@ def bench_guard(
         raise SystemExit(1)
 
 
-COMMANDS = {"ceiling": bench_ceiling, "guard": bench_guard}
+def bench_cell(
+    config: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")],
+    /,
+    *,
+    out: Path,
+    objects: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (2, 4, 6),
+    searches: int = 20,
+    seed: int = 0,
+    depth_noise: float = 0.001,
+    color_noise: float = 4 / 255,
+) -> None:
+    """Search from images in a simulated cell, through a Searcher alone; status 1 where a search ended with an error.
+
+    Args:
+      config: what the cell is like: camera, shelf, target, base and planner.
+      out: folder for a row of every search, pictures of those that were lost, and cell.json. Searches that have a
+        row of the same code and configuration are not run again.
+      objects: numbers of objects, taken in turn.
+      searches: how many, each of a scene of its own.
+      seed: of the first scene; the others follow.
+      depth_noise: standard deviation of the depth [m].
+      color_noise: standard deviation of every channel, as a share of full brightness.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks import cell
+    from mechsearch_jax.envs.simulated_cell import SensorNoise
+    from mechsearch_jax.files import check_writable
+
+    at_least_one("bench cell", searches=searches, **{f"objects {n}": n for n in objects})
+    noise = SensorNoise(depth=depth_noise, colour=color_noise)
+    check_writable(out)
+    console = Console(highlight=False)
+    with console.status("preparing") as status:
+
+        def progress(done: int, what: str) -> None:
+            line = f"{done}/{searches} {what}"
+            status.update(line)
+            if not console.is_terminal:
+                console.print(line, soft_wrap=True)
+
+        rows = cell.run_cell(config, out, objects, searches, seed, noise, progress)
+    cell.save_rows(rows, config, noise, _command(), out / "cell.json")
+    console.print(cell.cell_table(rows))
+    console.print(str(out / "cell.json"), soft_wrap=True)
+    if any(row.error for row in rows):
+        raise SystemExit(1)
+
+
+COMMANDS = {"ceiling": bench_ceiling, "guard": bench_guard, "cell": bench_cell}
