@@ -183,13 +183,15 @@ def _inside(
 
 
 def scenes(settings: Settings, objects: Sequence[int], searches: int, seed: int) -> list[tuple[int, Scenario]]:
-    """Scenes with a hidden target in a cell, the numbers of objects in turn: their seeds, and what stands in them.
+    """Scenes with a hidden target in a cell: their seeds, and what stands in them.
+
+    A seed has the same number of objects in every run, so that parts of a run may be run apart.
 
     Raises:
       InputError: nothing can be hidden there.
     """
     generator = ScenarioGenerator.of(settings)
-    return [(seed + i, generator.generate(seed + i, objects[i % len(objects)])) for i in range(searches)]
+    return [(s, generator.generate(s, objects[s % len(objects)])) for s in range(seed, seed + searches)]
 
 
 def run_cell(
