@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from stage import HIDDEN, OPEN, grab, idle
 
+from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs.cell import load_searcher
@@ -28,7 +29,7 @@ from mechsearch_jax.planner.impasse import impasse
 from mechsearch_jax.planner.presets import standard
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 from mechsearch_jax.search.images import alike
-from mechsearch_jax.search.searcher import Searcher
+from mechsearch_jax.search.searcher import DRAWS, Searcher
 from mechsearch_jax.search.step import Motion
 from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
@@ -154,6 +155,29 @@ def test_where_all_that_was_tried_out_does_harm_it_says_so_and_draws_others_when
         assert (step.kind, step.trajectory, step.index) == ("none", None, 0)
         assert "each of the 8 best actions does harm" in step.reason
     assert drawn[0] != drawn[1]
+
+
+def test_where_the_arm_cannot_do_what_was_decided_on_others_are_drawn(problem):
+    drawn = []
+
+    def fickle(blocked):
+        def policy(key, problem, belief, observation):
+            drawn.append(jax.random.key_data(key).tolist())
+            far = grab(key, problem, belief, observation)
+            push = far.action.replace(kind=jnp.int32(ActionKind.PUSH), object=jnp.int32(0))
+            return far.replace(action=push) if len(drawn) <= blocked else idle(key, problem, belief, observation)
+
+        return policy
+
+    searcher_of(problem, HIDDEN, policy=fickle(2)).next(IMAGES.depth)
+    assert len(drawn) == 3
+    drawn.clear()
+    searcher = searcher_of(problem, HIDDEN, policy=fickle(100))
+    step = searcher.next(IMAGES.depth)
+    assert (step.kind, step.trajectory) == ("none", None)
+    assert "does not reach" in step.reason
+    searcher.next(IMAGES.depth)
+    assert len(drawn) == 2 * DRAWS == len({str(key) for key in drawn})
 
 
 def test_a_policy_is_given_its_rehearsal_itself(problem):

@@ -22,6 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import KINDS, ActionKind, kind_of
@@ -47,6 +48,7 @@ from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.presets import standard
 from mechsearch_jax.planner.problem import NOWHERE, Problem
 from mechsearch_jax.planner.rehearsal import Rehearsal
+from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.robot.free_motion import check_joints
 from mechsearch_jax.search import warming
@@ -61,6 +63,8 @@ from mechsearch_jax.workspace.sight import camera_faults, check_camera
 LEAST_REACH = 0.5
 # Names of the kinds that leave the target where it is, or put it back.
 KEEPS_TARGET = frozenset(kind.name for kind in KINDS.values() if not kind.takes_target and kind.code != ActionKind.NONE)
+# How often is decided anew in one step where the arm cannot do what was decided on.
+DRAWS = 4
 # What `warm_up` compiles, in this order.
 STAGES = ("the problem", "recognition", "the belief", "the plan", "the grasp", "the motion")
 
@@ -254,7 +258,7 @@ class Searcher:
         """Look, and decide what to do next.
 
         Asked again without `acted` in between, it looks again: nothing was done since. Where all that was tried out did
-        harm, it then draws other actions.
+        harm, or the arm could do none of what was decided on, it then draws other actions.
 
         Args:
           depth: float (H, W), metres along the camera's z; 0 or NaN where nothing was measured.
@@ -293,9 +297,7 @@ class Searcher:
             )
         if bool(now.belief.found) and not bool(belief.found):
             warnings.append("the target is not where it was found any more: it is searched for anew")
-        decision = self._policy(deciding, problem, belief, observation)
-        arm = self.workcell.arm
-        done = self._allowed(motion(problem, belief, observation, decision, depth, joints, arm, self._trajectories))
+        decision, done = self._decided(deciding, belief, observation, depth, joints)
         step = SearchStep(
             index=now.index,
             kind=done.kind,
@@ -309,7 +311,7 @@ class Searcher:
             image=shown(depth, colour),
         )
         handed = done.trajectory is not None
-        refusals = now.refusals + bool(decision.refused and not handed)
+        refusals = now.refusals + bool((decision.refused or done.blocked) and not handed)
         self._state = State(
             now.index,
             belief,
@@ -321,6 +323,22 @@ class Searcher:
             refusals=refusals,
         )
         return step
+
+    def _decided(
+        self, key: Array, belief: Belief, observation: Observation, depth: np.ndarray, joints: np.ndarray | None
+    ) -> tuple[Decision, Motion]:
+        """What is decided on, and its motion; decided anew, a few times, where the arm cannot do it.
+
+        Which grasp takes the target out does not hang on chance, so that there another draw finds no other.
+        """
+        problem, arm = self.problem, self.workcell.arm
+        for draw in range(DRAWS):
+            # The first is that of a policy by itself.
+            decision = self._policy(jax.random.fold_in(key, draw) if draw else key, problem, belief, observation)
+            done = motion(problem, belief, observation, decision, depth, joints, arm, self._trajectories)
+            if not done.blocked or kind_of(int(decision.action.kind)).takes_target:
+                break
+        return decision, self._allowed(done)
 
     def _allowed(self, done: Motion) -> Motion:
         """What is done, where there are actions left; afterwards only the target is taken out, as in an episode."""

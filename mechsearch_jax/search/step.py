@@ -16,6 +16,7 @@ from mechsearch_jax.actions.registry import ActionKind, kind_of
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.doubt import check_recognition
 from mechsearch_jax.perception.plausibility import sight_faults
 from mechsearch_jax.planner.belief import Belief, graspability_map
 from mechsearch_jax.planner.impasse import impasse
@@ -93,11 +94,13 @@ class Motion(NamedTuple):
       kind: name of the kind of action; that of doing nothing where the action cannot be executed.
       reason: why it is done, or why nothing is.
       trajectory: the motion, if anything is done.
+      blocked: whether something was decided on that the arm cannot do; it may be able to do something else.
     """
 
     kind: str
     reason: str
     trajectory: RobotTrajectory | None
+    blocked: bool = False
 
 
 def motion(
@@ -129,6 +132,11 @@ def motion(
         why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
         return Motion(nothing, f"{known}; {why if refused else impasse(problem, belief, observation.objects)}", None)
     does = kind.describe(decision.action, observation.objects.capacity)
+    config = config or TrajectoryConfig()
+    try:
+        check_recognition(problem, observation, depth, config.doubt)
+    except InputError as error:
+        return Motion(nothing, f"{known}; to {does} is not possible: {error}", None)
     try:
         trajectory = whole_trajectory(
             problem,
@@ -137,11 +145,10 @@ def motion(
             joints=joints,
             home=np.array(arm.home),
             speed=arm.speed,
-            depth=depth,
             config=config,
         )
     except InputError as error:
-        return Motion(nothing, f"{known}; to {does} is not possible: {error}", None)
+        return Motion(nothing, f"{known}; to {does} is not possible: {error}", None, blocked=True)
     if kind.takes_target:
         return Motion(kind.name, f"{known}; {does}: a grasp that takes it out is known", trajectory)
     cost = f"cost {float(decision.cost):.0f}, {float(decision.predicted_cost):.0f} expected afterwards"
