@@ -148,7 +148,7 @@ class PoseEstimate(flax.struct.PyTreeNode):
     corrected: jax.Array
 
     def camera(self, camera: Camera) -> Camera:
-        """The same camera at the corrected pose; not for use under `jit`, where cameras are constants."""
+        """The same camera at the corrected pose; not for use under `jit`, since it is one of plain numbers."""
         return with_pose(camera, np.asarray(self.T_world_camera))
 
 

@@ -59,7 +59,8 @@ class Camera:
         for name in ("width", "height"):
             check_range(f"Camera: {name}", getattr(self, name), 1, LARGEST, "pixels")
         # Rebuilt by JAX, the fields that are data hold whatever stands for their leaves, which is not checked.
-        if not all(map(_is_given, jax.tree.leaves([getattr(self, name) for name in _DATA]))):
+        data = [getattr(self, name) for name in _DATA]
+        if not all(map(_is_given, jax.tree.leaves(data, is_leaf=lambda part: part is None))):
             return
         for name in ("fx", "fy"):
             check_range(f"Camera: {name}", getattr(self, name), 1e-3, 100 * LARGEST, "pixels")
