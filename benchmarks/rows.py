@@ -350,8 +350,9 @@ def _present_row(fields: dict[str, Any]) -> Row:
 
 def _earlier_graspable(fields: Mapping[str, Any]) -> dict[str, Any]:
     """What the fields of an earlier version's row say of whether the target could be grasped."""
-    step = fields["graspable_step"]
-    by_retrieval = step is not None and fields["retrieved"] and step >= fields["steps"] - 1
+    step, actions = fields["graspable_step"], fields["steps"]
+    numbers = isinstance(step, int) and isinstance(actions, int)
+    by_retrieval = numbers and fields["retrieved"] and step >= actions - 1
     known = not (by_retrieval and set_by_retrievals(fields.get("configuration")))
     return {"graspable_known": known, "graspable_step": step if known else None}
 
