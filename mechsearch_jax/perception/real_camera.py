@@ -113,7 +113,7 @@ def _checked(camera: Camera, depth: np.ndarray, colour: np.ndarray, mask: np.nda
     measured = np.isfinite(depth) & (depth > 0)
     if not measured.any():
         raise InputError(
-            "depth image: nothing was measured: it holds no positive depth; it must be in metres along the camera's axis"
+            "depth image: nothing was measured: no positive depth; it must be in metres along the camera's axis"
         )
     if np.median(depth[measured]) > 20:
         raise InputError(
