@@ -47,8 +47,8 @@ LEAST_WALL_SPAN = 0.2
 EDGE_STRIPS, LEAST_STRIPS = 64, 32
 # So many points above the board are something [pixels of the whole image].
 SOMETHING = 100
-# How well a patch must lie on the target for it to be one: share of its points, and how near [m]; and how many pixels it
-# must have, as shares of those that an unhidden target has. Of other things most are larger, and few lie on its shape.
+# How well a patch must lie on the target for it to be one: share of its points, and how near [m]; and how many pixels
+# it must have, as shares of those of an unhidden target. Other things mostly have more, and few of them on its shape.
 PATCH_SHARE, PATCH_DISTANCE = 0.85, 0.003
 PATCH_PIXELS = (0.4, 1.6)
 
