@@ -137,6 +137,17 @@ def test_segments_are_the_objects(images, seed, masked):
     assert np.all((points > low) & (points < high))
 
 
+def test_noise_in_the_colours_splits_nothing(images):
+    depth, _ = sensed(CAMERA, *images[:2], 0)
+    colour = images[1] + np.random.default_rng(0).normal(0, 8 / 255, images[1].shape)
+    colour = np.float32(np.round(255 * np.clip(colour, 0, 1)) / 255)
+    prepared = real_camera.prepare(jax.random.key(0), CAMERA, Shelf(), depth, colour, None, JOINTS, OPENING)
+    segmentation = np.array(prepared.segmentation)
+    assert segmentation.max() == 3
+    assert prepared.detection.found
+    assert np.mean(segmentation[(images[2] == TARGET) & (depth > 0)] == int(prepared.target_id)) > 0.9
+
+
 def test_labels_are_those_that_a_recogniser_takes(images):
     """The shelf is FREE, the robot OTHER, and what was not measured MISSING."""
     owners = images[2]
@@ -214,7 +225,7 @@ def test_bad_images_are_refused_in_one_line(images):
         ({"mask": mask[1:]}, "mask image: its shape"),
         ({"colour": (colour * 255).astype(np.uint8)}, "divide 8-bit"),
         ({"mask": mask * 1.0}, "whole numbers"),
-        ({"depth": depth * 0}, "no positive depth"),
+        ({"depth": depth * 0}, "depth image: nothing was measured: no positive depth"),
         ({"depth": depth * 1000}, "not millimetres"),
     ):
         with pytest.raises(InputError, match=word):

@@ -46,8 +46,10 @@ LEAST_WALL_SPAN = 0.2
 EDGE_STRIPS, LEAST_STRIPS = 64, 32
 # So many points above the board are something [pixels of the whole image].
 SOMETHING = 100
-# How well a patch must lie on the target for it to be one: share of its points, and how near [m].
-PATCH_SHARE, PATCH_DISTANCE = 0.8, 0.005
+# How well a patch must lie on the target for it to be one: share of its points, and how near [m]; and how many pixels
+# it must have, as shares of those of an unhidden target. Other things mostly have more, and few of them on its shape.
+PATCH_SHARE, PATCH_DISTANCE = 0.85, 0.003
+PATCH_PIXELS = (0.4, 1.6)
 
 
 NOTHING_MEASURED = (
@@ -280,7 +282,10 @@ def colour_faults(
         return ()
     pose, _ = fitted_pose(jax.random.key(0), target, shelf, view.camera, points, jnp.asarray(swapped))
     away = np.abs(np.asarray(distance(target, shelf, pose, points[swapped])))
-    if (away < PATCH_DISTANCE).mean() < PATCH_SHARE:
+    across, _, height = target.half_size
+    whole = 4 * across * height * (view.camera.fx / float(np.median(np.asarray(seen)[swapped]))) ** 2
+    alike = PATCH_PIXELS[0] * whole < swapped.sum() < PATCH_PIXELS[1] * whole
+    if not alike or (away < PATCH_DISTANCE).mean() < PATCH_SHARE:
         return ()
     return (
         "colour image: looks like blue, green, red: nothing has the target's colour, but with red and blue exchanged "

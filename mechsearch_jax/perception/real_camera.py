@@ -24,8 +24,11 @@ from mechsearch_jax.perception.camera_pose import PoseConfig, PoseEstimate, esti
 from mechsearch_jax.perception.colour import ClusterConfig, Detection, TargetColour, cluster_by_colour, detect_target
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.planes import Plane, PlaneConfig, find_plane
+from mechsearch_jax.perception.target_pixels import evened
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.shelf import Shelf
+
+_evened = jax.jit(evened)
 
 # The plane of the floor and the camera's pose are found from at most so many points.
 FLOOR_POINTS = ROBOT_POINTS = 4096
@@ -113,7 +116,7 @@ def _checked(camera: Camera, depth: np.ndarray, colour: np.ndarray, mask: np.nda
     measured = np.isfinite(depth) & (depth > 0)
     if not measured.any():
         raise InputError(
-            "depth image: nothing was measured; it must hold metres along the camera's axis, above 0 where it measured"
+            "depth image: nothing was measured: no positive depth; it must be in metres along the camera's axis"
         )
     if np.median(depth[measured]) > 20:
         raise InputError(
@@ -212,6 +215,8 @@ def prepare(
         seen = np.asarray(back_project(camera, jnp.asarray(depth)))[np.isfinite(depth)]
         pose = _correct_pose(rng, camera, shelf, seen, angles, fingers, config)
         camera = pose.camera(camera)
+    # Noise would split a thing into several, or leave out of the target what would then be an object in it.
+    colour = np.asarray(_evened(jnp.asarray(colour, jnp.float32), jnp.asarray(depth)))
     points = np.asarray(back_project(camera, jnp.asarray(depth)))
     inside = _inside(shelf, points, config)
     floor = _find_floor(key, rng, shelf, points, inside, config)
