@@ -195,7 +195,19 @@ def target_window(
     No larger than the image with one pixel around it, wherever the camera is.
 
     Args:
-      coarse: the camera at the resolution of the windows.
+      coarse, half, T_world_target: as of `target_extent`.
+    """
+    rows, columns = target_extent(coarse, half, T_world_target)
+    return math.ceil(rows) + 2, math.ceil(columns) + 2
+
+
+def target_extent(
+    coarse: Camera, half: Float[np.ndarray, "3"], T_world_target: Float[Array, "*batch 4 4"]
+) -> tuple[float, float]:
+    """Rows and columns that the largest image of a target at some poses takes, at most those of the camera's image.
+
+    Args:
+      coarse: the camera at the resolution that is meant.
       half: half-extents of the target [m].
       T_world_target: the poses.
     """
@@ -204,9 +216,8 @@ def target_window(
     # As far as `render.window_place` follows what is outside of the image.
     limit = np.array([coarse.height, coarse.width])
     low, high = (np.clip(bound, -1, limit) for bound in (pixels.min(axis=-2), pixels.max(axis=-2)))
-    extent = np.ceil((high - low).reshape(-1, 2).max(axis=0)).astype(int)
-    rows, columns = np.minimum(extent, limit) + 2
-    return int(rows), int(columns)
+    rows, columns = np.minimum((high - low).reshape(-1, 2).max(axis=0), limit)
+    return float(rows), float(columns)
 
 
 def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | None = None) -> ObjectViews:

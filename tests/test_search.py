@@ -273,7 +273,6 @@ def test_after_warming_up_nothing_is_compiled(problem, rehearsal, monkeypatch):
             step = searcher.next(IMAGES.depth.astype(float), IMAGES.colour)
             step.to_json()
             _ = step.picture
-            print(rehearsal, scenario and scenario.name, step.kind, step.reason)
             moves += searcher.moving
             if searcher.moving:
                 searcher.acted(ok=False)
