@@ -265,11 +265,11 @@ def test_after_warming_up_nothing_is_compiled(problem, rehearsal, monkeypatch):
     assert [left for _, left in stages] == [5, 4, 3, 2, 1, 0]
     assert (searcher._now.index, searcher.moving) == (0, False)
     sees, moves = searcher.recogniser, 0
+    # Whatever it comes from, what is seen is of one type.
+    looks = [lambda *images, there=jax.device_put(jax.tree.map(np.asarray, seen(s))): there for s in (HIDDEN, OPEN)]
     with CompileClock() as clock:
-        for scenario in (None, HIDDEN, OPEN, None):
-            # Whatever it comes from, what is seen is of one type.
-            there = None if scenario is None else jax.device_put(jax.tree.map(np.asarray, seen(scenario)))
-            searcher.recogniser = sees if there is None else lambda *images, there=there: there
+        for looking in (sees, *looks, sees):
+            searcher.recogniser = looking
             step = searcher.next(IMAGES.depth.astype(float), IMAGES.colour)
             step.to_json()
             _ = step.picture
