@@ -199,13 +199,14 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     return ExistenceTables(T, depth, corner, middle, nearest, cloud.T, jnp.float32(np.linalg.norm(half)))
 
 
-def _window_side(extent: int, limit: int) -> int:
+def _window_side(extent: float) -> int:
     """How many rows or columns of pixels hold an image that is so many pixels long, wherever it begins: an even number.
 
     A camera that was calibrated again sees the target a little larger or smaller. Were this the least number, such a
     camera would now and then change a shape, and all that is compiled for it.
     """
-    return 2 * math.ceil((min(extent, limit) + 1) / 2)
+    # What is measured in single precision may be measured as a little more elsewhere.
+    return 2 * math.ceil((math.ceil(extent + 1e-3) + 1) / 2)
 
 
 def target_window(
@@ -217,7 +218,19 @@ def target_window(
     Hardly larger than the image with one pixel around it, wherever the camera is.
 
     Args:
-      coarse: the camera at the resolution of the windows.
+      coarse, half, T_world_target: as of `target_extent`.
+    """
+    rows, columns = target_extent(coarse, half, T_world_target)
+    return (_window_side(rows), _window_side(columns)), (math.ceil(rows) + 2, math.ceil(columns) + 2)
+
+
+def target_extent(
+    coarse: Camera, half: Float[np.ndarray, "3"], T_world_target: Float[Array, "*batch 4 4"]
+) -> tuple[float, float]:
+    """Rows and columns that the largest image of a target at some poses takes, at most those of the camera's image.
+
+    Args:
+      coarse: the camera at the resolution that is meant.
       half: half-extents of the target [m].
       T_world_target: the poses.
     """
@@ -226,12 +239,8 @@ def target_window(
     # As far as `render.window_place` follows what is outside of the image.
     limit = np.array([coarse.height, coarse.width])
     low, high = (np.clip(bound, -1, limit) for bound in (pixels.min(axis=-2), pixels.max(axis=-2)))
-    extent = (high - low).reshape(-1, 2).max(axis=0)
-    # What is measured in single precision may be measured as a little more elsewhere.
-    rows, columns = np.ceil(extent + 1e-3).astype(int).tolist()
-    window = _window_side(rows, coarse.height), _window_side(columns, coarse.width)
-    least = tuple((np.minimum(np.ceil(extent), limit) + 2).astype(int).tolist())
-    return window, least
+    rows, columns = np.minimum((high - low).reshape(-1, 2).max(axis=0), limit)
+    return float(rows), float(columns)
 
 
 def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | None = None) -> ObjectViews:

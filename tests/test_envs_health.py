@@ -121,6 +121,7 @@ def test_a_cell_that_works_less_well_is_doubtful(problem, monkeypatch):
     near = Settings(Workcell(camera=dataclasses.replace(Camera(), fx=1900.0, fy=1900.0)))
     found = cell_of(problem, monkeypatch, near)
     assert [finding.state for finding in found["camera"]] == [State.DOUBTFUL, State.FINE]
+    found = cell_of(problem, monkeypatch, Settings(Workcell(camera=Camera().moved((-0.5, 0.27, 0.2)))))
     assert found["networks"][0].state is State.DOUBTFUL
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from stage import HIDDEN, OPEN, grab, idle
 
-from mechsearch_jax.actions.registry import ActionKind
+from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs.cell import load_searcher
@@ -21,12 +21,14 @@ from mechsearch_jax.envs.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.geometry.transforms import compose
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.perception.plausibility import image_faults
-from mechsearch_jax.planner import initial_belief, update_belief
+from mechsearch_jax.planner import Decision, initial_belief, update_belief
 from mechsearch_jax.planner.impasse import impasse
 from mechsearch_jax.planner.presets import standard
+from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 from mechsearch_jax.search.images import alike
 from mechsearch_jax.search.searcher import DRAWS, Searcher
@@ -201,7 +203,7 @@ def test_what_a_configuration_names_and_a_slot_holds_decides():
     searcher = Searcher(config=standard(gamma=0.5, push_model="quasi-static"), rehearsal=simulated)
     assert searcher._policy.rehearsal is simulated
     assert searcher._policy.config.gamma == 0.5
-    assert searcher._policy.predict.first is own_push_model("quasi-static")
+    assert searcher._policy.predict.push_model is own_push_model("quasi-static")
 
 
 def test_where_nothing_is_tried_out_it_says_so(problem):
@@ -269,33 +271,59 @@ def test_images_that_are_wrong_stay_wrong():
     assert (depth.dtype, colour.max(), mask.min() > 8) == (np.uint16, 255.0, True)
 
 
+def one_push(rollout, key, objects):
+    """A plan of one push that the arm can make, which compiles in no time."""
+    grasps = rollout.problem.grasps
+    T = compose(grasps.T_world_target[grasps.pair_pose[0]], grasps.T_target_gripper[grasps.pair_grasp[0]])
+    way = jnp.array([0.0, 0.05, 0.0])
+    push = Action(
+        kind=jnp.int32(ActionKind.PUSH),
+        object=jnp.int32(0),
+        T_world_gripper=T,
+        displacement=way,
+        T_world_place=T.at[:3, 3].add(way),
+        q7=grasps.q7[grasps.pair_grasp[0]],
+        opening=jnp.float32(0.0),
+    )
+    none = no_sequences(rollout.config, objects)
+    many = jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), push, none.actions)
+    value = jnp.zeros_like(none.value) + jax.random.uniform(key)
+    return Decision(
+        action=push,
+        value=value[0],
+        cost=jnp.float32(9.0),
+        predicted_cost=jnp.float32(8.0),
+        predicted=objects,
+        sequences=none.replace(actions=many, value=value),
+        refused=jnp.int32(0),
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rehearsal", ["none", "physics"])
 def test_after_warming_up_nothing_is_compiled(problem, rehearsal, monkeypatch):
     monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
     searcher = load_searcher(keep=False, rehearsal=rehearsal, sequences=4, horizon=1, trajectories=TRUSTING)
-    searcher.problem = problem
+    searcher.problem, searcher._policy = problem, searcher._policy.replace(plan=one_push)
     stages = []
     searcher.warm_up(lambda what, left: stages.append((what, left)))
     assert [left for _, left in stages] == [5, 4, 3, 2, 1, 0]
     assert (searcher._now.index, searcher.moving) == (0, False)
-    sees = searcher.recogniser
+    sees, moves = searcher.recogniser, 0
+    # Whatever it comes from, what is seen is of one type.
+    shown = [jax.device_put(jax.tree.map(np.asarray, seen(scenario))) for scenario in (HIDDEN, OPEN)]
+    looks = [lambda *images, there=there: there for there in shown]
     with CompileClock() as clock:
-        searcher.next(IMAGES.depth.astype(float), IMAGES.colour)
-        assert clock.seconds == 0.0
-        for scenario in (HIDDEN, OPEN):
-            # What is seen is of one type, whatever it comes from.
-            there = jax.tree.map(np.asarray, seen(scenario))
-            searcher.recogniser = lambda *images, there=there: jax.device_put(there)
-            step = searcher.next(IMAGES.depth, IMAGES.colour)
+        for looking in (sees, *looks, sees):
+            searcher.recogniser = looking
+            step = searcher.next(IMAGES.depth.astype(float), IMAGES.colour)
             step.to_json()
             _ = step.picture
+            moves += searcher.moving
             if searcher.moving:
                 searcher.acted(ok=False)
             assert clock.seconds == 0.0
-        searcher.recogniser = sees
-        searcher.next(IMAGES.depth, IMAGES.colour)
-        assert clock.seconds == 0.0
+    assert moves >= 2
 
 
 @pytest.mark.slow

@@ -346,3 +346,10 @@ def test_what_is_in_the_way_is_marked_in_both_views():
     assert texts[:3] == ["a scene", "start", "after 1 action"]
     assert " ".join(texts[3:]).split() == ("a reason " * 60).split()
     assert all(text.get_position()[1] > 0 for text in figure.texts)
+
+
+def test_what_is_drawn_is_where_the_camera_sees_it():
+    camera = Camera()
+    points = np.random.default_rng(0).uniform((0.4, -0.3, 0.4), (0.8, 0.5, 0.8), (50, 3))
+    rows_columns = np.asarray(project(camera, jnp.asarray(points, jnp.float32))[0])
+    np.testing.assert_allclose(drawing.pixels(camera, points), rows_columns[:, ::-1], atol=0.01)

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 
 if TYPE_CHECKING:
@@ -69,16 +68,15 @@ def _objects(step: SearchStep) -> list[dict[str, Any]]:
 def _target(step: SearchStep) -> dict[str, Any]:
     """What is known of the target; poses are x, y [m] and yaw [rad]."""
     visible, found = bool(step.observation.target_visible), bool(step.belief.found)
-    target, shelf = step.problem.target, step.problem.shelf
-    place = np.asarray(step.belief.found_pose, np.float32)
+    target = step.problem.target
     return {
         "shape": target.shape,
         "half_size": list(target.half_size),
         "visible": visible,
         "pose": _list(step.observation.target_pose) if visible else None,
         "found": found,
-        "found_pose": _list(place) if found else None,
-        "T_world_target": _list(upright_pose(place, target.height(shelf))) if found else None,
+        "found_pose": _list(step.belief.found_pose) if found else None,
+        "T_world_target": _list(step.belief.grasps.T_world_target) if found else None,
         "belief_size": 0 if found else int(np.sum(np.asarray(step.belief.exists))),
     }
 

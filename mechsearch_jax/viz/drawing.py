@@ -9,7 +9,6 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib import patches
@@ -23,7 +22,7 @@ from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import INFEASIBLE
 from mechsearch_jax.shapes import shape_of
-from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -246,9 +245,12 @@ def halo(width: float) -> list:
 
 
 def pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """(column, row) of world points."""
-    pixels, _ = project(camera, jnp.asarray(points, jnp.float32))
-    return np.asarray(pixels)[..., ::-1]
+    """(column, row) of world points, as `camera.project` has them; nothing is compiled for another number of points."""
+    away = np.asarray(points, np.float32) - np.array(camera.position, np.float32)
+    x, y, z = np.moveaxis(away @ np.array(camera.rotation, np.float32), -1, 0)
+    safe = np.maximum(z, np.float32(1e-6))
+    column, row = camera.fx * x / safe + camera.cx - 0.5, camera.fy * y / safe + camera.cy - 0.5
+    return np.stack([column, row], axis=-1)
 
 
 def view_window(camera: Camera, shelf: Shelf, height: float | None = None) -> tuple[int, int, int, int]:
