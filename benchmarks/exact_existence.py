@@ -17,6 +17,7 @@ from mechsearch_jax.existence import (
     ExistenceConfig,
     ExistenceTables,
     allowances,
+    closer_image,
     existence,
     existence_tables,
     object_views,
@@ -47,6 +48,10 @@ class FullResolution(ExistenceConfig):
     window: tuple[int, int] = (336, 336)
     side: int = 1
 
+    def step(self, camera: Camera) -> int:
+        """As of `ExistenceConfig`."""
+        return 1
+
     @property
     def places(self) -> np.ndarray:
         """As of `ExistenceConfig`; the yaw is the pose's own."""
@@ -63,7 +68,8 @@ def _possible(
 ) -> Bool[Array, " x"]:
     everywhere = jnp.ones(tables.corner.shape[0], bool)
     views = object_views(tables, camera, scene, everywhere, config)
-    allowed = allowances(tables, camera, target, scene, views, config)
+    closer = closer_image(camera, scene, views, config)
+    allowed = allowances(tables, camera, target, views, closer, config)
     return existence(tables, camera, views, everywhere, allowed, config)
 
 

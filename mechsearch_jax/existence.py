@@ -43,8 +43,8 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 FAR = 1.5
-# The most coarse pixels of an image of 1280 x 720 that a target may show for a closer look to be worth it; no target
-# that the detector misses was seen to show more than 12. They are a sliver along an edge, as many as that is long.
+# The most coarse pixels that a target may show for a closer look to be worth it; no target that the detector misses was
+# seen to show more than 12.
 DOUBTFUL = 16
 # Of a pose's places those that show least are looked at again, this many.
 CLOSER_PLACES = 3
@@ -72,11 +72,13 @@ class ExistenceConfig:
       found_pixels: more pixels than this of an image of 1280 x 720 and the detector finds the target; of others the
         same share, see `workspace.detector`.
       depth_threshold: threshold of "depth-mse" [m^2] and "depth-norm" [m].
-      downscale: how much coarser than the camera f is rendered.
+      downscale: how much coarser than an image of 1280 x 720 f is rendered; with an image of another size by as much
+        more or less as keeps what it shows as large, to whole numbers.
       cell_reach: a target is tried at the middle of its grid cell and this far on the way to each of the cell's corners
         in x and y; at the corners themselves (1) it is also turned by half a step in yaw, to either side in turn, and
         those of the outermost cells lie at the walls.
-      closer_look: how much coarser than the camera doubtful places are looked at again; 0 for not at all.
+      closer_look: how much coarser than an image of 1280 x 720, likewise, doubtful places are looked at again; 0 for
+        not at all.
       erosion: by how much the target is drawn in for the collision test [m]. One that was pushed touches what pushed
         it, often on several sides, and hardly any of its cell's places fits in between.
       reopen: whether f is opened again around what an action may have moved unseen; see `planner.unseen_motion`.
@@ -127,9 +129,19 @@ class ExistenceConfig:
         corners = [(a, b, a * b * (share == 1.0)) for share in self.cell_reach for a, b in _corners(share)]
         return np.array([(0.0, 0.0, 0.0), *corners], np.float32)
 
+    def step(self, camera: Camera) -> int:
+        """How many rows and columns of a camera's image a coarse pixel stands for."""
+        return max(round(self.downscale * longer(camera)), 1)
+
+    def closer_step(self, camera: Camera) -> int:
+        """The same of a pixel of what is looked at most closely: the coarse image where there is no closer look."""
+        if self.criterion != "detector" or not self.closer_look:
+            return self.step(camera)
+        return max(round(self.closer_look * longer(camera)), 1)
+
     def allowed(self, camera: Camera) -> int:
         """How many coarse pixels of a camera's image a target may show that the detector does not find."""
-        return int(found_pixels(camera, self.found_pixels) // self.downscale**2)
+        return int(found_pixels(camera, self.found_pixels) // self.step(camera) ** 2)
 
 
 def _corners(share: float) -> list[tuple[float, float]]:
@@ -174,7 +186,7 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     """Precompute, for every candidate pose, the target's own depth image and collision cloud."""
     places = target.places(shelf, config.places)
     T = jax.jit(upright_pose)(jnp.asarray(places), target.height(shelf))
-    coarse = camera.scaled(config.downscale)
+    coarse = camera.scaled(config.step(camera))
     half = np.array(target.half_size, np.float32)
     window, around = target_window(coarse, half, T)
 
@@ -285,7 +297,7 @@ def object_views(
     Returns:
       The views of all objects.
     """
-    coarse = camera.scaled(config.downscale)
+    coarse = camera.scaled(config.step(camera))
     fresh = scene.valid if moved is None else moved & scene.valid
 
     def view(coarse, scene, i):
@@ -421,18 +433,18 @@ def allowances(
       closer: of `closer_image`.
       config: static.
     """
-    least, doubt = config.allowed(camera), math.ceil(DOUBTFUL * longer(camera))
+    least = config.allowed(camera)
     bound = jnp.full(tables.corner.shape[:2], least, jnp.int32)
     if config.criterion != "detector" or not config.closer_look:
         return bound
     everywhere = jnp.ones(tables.corner.shape[0], bool)
-    coarse = camera.scaled(config.downscale)
+    coarse = camera.scaled(config.step(camera))
     image = render.merge_windows(coarse, views.windows)
     shown = _shown(tables, coarse, image, everywhere, config)
     free = jnp.ones(shown.shape, bool) if views.collides is None else ~jnp.any(views.collides, axis=-1)
     settled = jnp.any(free & (shown <= least), axis=1)
-    doubtful = free & ~settled[:, None] & (shown > least) & (shown <= doubt)
-    order = jnp.argsort(jnp.where(doubtful, shown, doubt + 1), axis=1, stable=True)
+    doubtful = free & ~settled[:, None] & (shown > least) & (shown <= DOUBTFUL)
+    order = jnp.argsort(jnp.where(doubtful, shown, DOUBTFUL + 1), axis=1, stable=True)
     doubtful &= jnp.argsort(order, axis=1) < CLOSER_PLACES
     counted = _counted(tables, camera, target, closer, doubtful, config)
     hidden = doubtful & (counted <= CLOSER_TOLERANCE * found_pixels(camera, config.found_pixels))
@@ -457,11 +469,6 @@ def _counted(
     return masked_vmap(counted, doubtful.reshape(-1), (tables, camera), closer, block=64).reshape(doubtful.shape)
 
 
-def _closest(config: ExistenceConfig) -> int:
-    """How much coarser than the camera what is looked at most closely is."""
-    return config.closer_look if config.criterion == "detector" and config.closer_look else config.downscale
-
-
 def closer_image(
     camera: Camera, scene: Superquadrics, views: ObjectViews, config: ExistenceConfig
 ) -> Float[Array, "h w"]:
@@ -473,9 +480,9 @@ def closer_image(
       views: of them.
       config: static.
     """
-    scale = _closest(config)
-    closer, grown = camera.scaled(scale), config.downscale / scale
-    if scale == config.downscale:
+    scale, step = config.closer_step(camera), config.step(camera)
+    closer, grown = camera.scaled(scale), step / scale
+    if scale == step:
         return render.merge_windows(closer, views.windows)
     window = math.ceil(config.window[0] * grown), math.ceil(config.window[1] * grown)
     scene = scene.replace(size=scene.size + ROUNDED)
@@ -507,8 +514,8 @@ def _pixels(
       config: static.
       nearer: how many times as large as the largest candidate its image may be; static.
     """
-    scale = _closest(config)
-    grown = nearer * config.downscale / scale
+    scale = config.closer_step(camera)
+    grown = nearer * config.step(camera) / scale
     h, w = tables.depth.shape[-2:]
     window = math.ceil(h * grown), math.ceil(w * grown)
     one = Superquadrics(
@@ -577,7 +584,7 @@ def existence(
     Returns:
       Where the target can be.
     """
-    coarse = camera.scaled(config.downscale)
+    coarse = camera.scaled(config.step(camera))
     image = render.merge_windows(coarse, views.windows)
     if config.criterion == "detector":
         possible = _shown(tables, coarse, image, exists, config) <= allowed

@@ -28,5 +28,5 @@ def found_pixels(camera: Camera, pixels: int | float = FOUND_PIXELS) -> float:
 
 
 def longer(camera: Camera) -> float:
-    """How many times as long, in pixels, an edge is in a camera's image as in one of 1280 x 720 with the same view."""
+    """How many times as long, in pixels, what an image of 1280 x 720 shows is in a camera's image of the same view."""
     return math.sqrt(found_pixels(camera) / FOUND_PIXELS)
