@@ -139,6 +139,10 @@ def test_things_deep_in_each_other_are_said():
     (fault,) = overlap_faults(SETTING, observed(can, visible=True))
     assert "object 0 and the target are 3.0 cm deep" in fault
     assert overlap_faults(SETTING, observed(can)) == ()
+    lost = observed(can)
+    lost = lost.replace(objects=lost.objects.replace(size=lost.objects.size.at[0].set(jnp.nan)))
+    (fault,) = overlap_faults(SETTING, lost)
+    assert fault == "recognition: object 0 has no finite shape or place; look again"
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import types
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +38,7 @@ from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import camera_faults
+from mechsearch_jax.workspace.target import Target
 
 IMAGES = example_images()
 CAMERA, SHELF = IMAGES.camera, Shelf()
@@ -122,6 +124,16 @@ def test_without_an_action_it_says_why(problem):
     assert step.kind == "none"
     assert "something stands on the shelf, but no object and no target is recognised" in step.reason
     assert any("started anew" in warning for warning in step.warnings)
+
+
+def test_what_does_not_tell_the_target_is_a_warning():
+    searcher = Searcher()
+    searcher.problem = types.SimpleNamespace(camera=CAMERA, shelf=SHELF, target=Target())
+    assert searcher._faults(IMAGES.depth, IMAGES.colour, None, None) == []
+    (fault,) = searcher._faults(IMAGES.depth, None, None, None)
+    assert fault.startswith("images: the target cannot be told from the objects")
+    (fault,) = searcher._faults(IMAGES.depth, None, IMAGES.mask, 8)
+    assert fault.startswith("mask: no pixel holds the target's number 8")
 
 
 def test_an_empty_shelf_is_said_to_be_empty(problem):

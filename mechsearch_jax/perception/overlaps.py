@@ -19,7 +19,7 @@ _SPREAD = 64
 
 
 def overlap_faults(setting: Setting, observation: Observation) -> tuple[str, ...]:
-    """Which recognised things interpenetrate by more than recognition's error, a line for each pair.
+    """Which recognised things interpenetrate by more than recognition's error, or have no finite shape; a line each.
 
     Args:
       setting: whose shelf and target are meant; a problem is one.
@@ -27,7 +27,8 @@ def overlap_faults(setting: Setting, observation: Observation) -> tuple[str, ...
     """
     things = things_of(setting.shelf, setting.target, observation)
     deep = [(one.name, other.name, depth_in_each_other(one, other)) for one, other in itertools.combinations(things, 2)]
-    return tuple(
+    lost = (thing.name for thing in things if not np.isfinite([thing.size, thing.position]).all())
+    return *(f"recognition: {name} has no finite shape or place; look again" for name in lost), *(
         f"recognition: {one} and {other} are {100 * depth:.1f} cm deep in each other; at least one of them is wrong"
         for one, other, depth in deep
         if depth > DEEPEST

@@ -272,20 +272,21 @@ def colour_faults(
     inside = above_board(shelf, points)
     least = SOMETHING * camera.width * camera.height / (1280 * 720 * view.stride**2)
 
-    def patch(image: np.ndarray) -> Bool[np.ndarray, "h w"]:
-        return np.asarray(coloured_pixels(detector, jnp.asarray(image), seen) & inside)
+    def alike(image: np.ndarray) -> Bool[np.ndarray, "h w"]:
+        return np.asarray(detector(jnp.asarray(image)) & inside)
 
-    if patch(image).sum() > least:
+    exchanged = image[..., ::-1]
+    if alike(image).sum() > least or alike(exchanged).sum() <= least:
         return ()
-    swapped = patch(image[..., ::-1])
+    swapped = np.asarray(coloured_pixels(detector, jnp.asarray(exchanged), seen) & inside)
     if swapped.sum() <= least:
         return ()
     pose, _ = fitted_pose(jax.random.key(0), target, shelf, view.camera, points, jnp.asarray(swapped))
     away = np.abs(np.asarray(distance(target, shelf, pose, points[swapped])))
     across, _, height = target.half_size
     whole = 4 * across * height * (view.camera.fx / float(np.median(np.asarray(seen)[swapped]))) ** 2
-    alike = PATCH_PIXELS[0] * whole < swapped.sum() < PATCH_PIXELS[1] * whole
-    if not alike or (away < PATCH_DISTANCE).mean() < PATCH_SHARE:
+    as_large = PATCH_PIXELS[0] * whole < swapped.sum() < PATCH_PIXELS[1] * whole
+    if not as_large or (away < PATCH_DISTANCE).mean() < PATCH_SHARE:
         return ()
     return (
         "colour image: looks like blue, green, red: nothing has the target's colour, but with red and blue exchanged "
