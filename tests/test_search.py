@@ -266,7 +266,8 @@ def test_after_warming_up_nothing_is_compiled(problem, rehearsal, monkeypatch):
     assert (searcher._now.index, searcher.moving) == (0, False)
     sees, moves = searcher.recogniser, 0
     # Whatever it comes from, what is seen is of one type.
-    looks = [lambda *images, there=jax.device_put(jax.tree.map(np.asarray, seen(s))): there for s in (HIDDEN, OPEN)]
+    there = [jax.device_put(jax.tree.map(np.asarray, seen(scenario))) for scenario in (HIDDEN, OPEN)]
+    looks = [lambda *images, observation=observation: observation for observation in there]
     with CompileClock() as clock:
         for looking in (sees, *looks, sees):
             searcher.recogniser = looking
