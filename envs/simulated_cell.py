@@ -8,7 +8,8 @@ It stands in for the real cell in front of a `Searcher`. Images come from MuJoCo
 with the robot in it, and from a pinhole model written out here: nothing of the package's own camera is involved. The
 whole trajectory is simulated, the ways through free space included.
 
-An approximation: an arm that is held up follows its trajectory to the end all the same, and says so afterwards.
+Approximations: an arm that is held up follows its trajectory to the end all the same, and says so afterwards. What is
+gripped is gripped harder than the trajectory says by the fingers' stiffness times half its width, up to 20 N.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -199,10 +200,8 @@ class SimulatedCell:
             raise InputError(f"trajectory: begins {apart:.3f} rad from where the arm is; plan from the present joints")
         timestep = float(trajectory.time[1] - trajectory.time[0])
         ahead = LAG * np.diff(trajectory.position, axis=0) / timestep
-        controls = [
-            self._control(position, width)
-            for position, width in zip(trajectory.position[:-1] + ahead, trajectory.width[1:], strict=True)
-        ]
+        rows = zip(trajectory.position[:-1] + ahead, trajectory.width[1:], trajectory.force[1:], strict=True)
+        controls = [self._control(position, width, force) for position, width, force in rows]
         states = self._world.drive(np.array(controls))
         error = float(np.abs(states[:, :ARM] - trajectory.position[1:]).max())
         takes = trajectory.action == "retrieve"
@@ -216,8 +215,10 @@ class SimulatedCell:
             retrieved=held and outside and not fallen.any(),
         )
 
-    def _control(self, arm: Float[np.ndarray, " 7"], width: float) -> Float[np.ndarray, " 9"]:
-        return np.concatenate([arm, [width / 2, width / 2]])
+    def _control(self, arm: Float[np.ndarray, " 7"], width: float, force: float = 0.0) -> Float[np.ndarray, " 9"]:
+        """What the actuators are given; the fingers' are springs, which are drawn further together to grip."""
+        finger = width / 2 - force / models.FINGER_STIFFNESS
+        return np.concatenate([arm, [finger, finger]])
 
     def _cast(self) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 3"], Int[np.ndarray, "h w"]]:
         """Depth [m], outward normal and owner of every pixel."""

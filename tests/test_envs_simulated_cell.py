@@ -101,6 +101,27 @@ def test_an_empty_hand_is_no_retrieval():
     assert not done.retrieved
 
 
+@pytest.mark.slow
+def test_a_searcher_takes_a_target_out_of_the_cell(problem):
+    from test_search import searcher_of
+
+    cell = SimulatedCell(Workcell(), OPEN)
+    searcher = searcher_of(problem, OPEN)
+    step = searcher.next(*cell.look(), joints=cell.joints)
+    assert step.kind == "retrieve"
+    done = cell.follow(step.trajectory)
+    assert (done.ok, done.retrieved, done.fallen) == (True, True, ())
+    assert done.tracking_error < 0.02
+
+
+def test_what_is_gripped_is_pressed_with_the_force_that_is_asked_for():
+    cell = SimulatedCell(CELL, OPEN, noise=EXACT)
+    still = moving(cell.joints, np.zeros(7), 100)
+    ahead = cell._control(still.position[0], 0.0, 60.0)
+    assert ahead[-2:].tolist() == pytest.approx([-0.06, -0.06])
+    assert cell._control(still.position[0], 0.08)[-2:].tolist() == pytest.approx([0.04, 0.04])
+
+
 def test_impossible_noise_is_refused():
     with pytest.raises(InputError, match="missing a share below 1"):
         SensorNoise(missing=1.0)

@@ -277,7 +277,7 @@ class Searcher:
         if now.finished:
             raise InputError("next: the target was taken out, and the search is finished; make another Searcher")
         here = jax.random.fold_in(jax.random.key(self._seed), now.index)
-        # What was refused would be drawn again.
+        # What was refused or doubted would be drawn again.
         seeing, deciding = jax.random.split(jax.random.fold_in(here, now.refusals))
         depth, colour, mask, target_id = alike(depth, colour, mask, target_id)
         if joints is not None:
@@ -311,7 +311,7 @@ class Searcher:
             image=shown(depth, colour),
         )
         handed = done.trajectory is not None
-        refusals = now.refusals + bool((decision.refused or done.blocked) and not handed)
+        refusals = now.refusals + (not handed)
         self._state = State(
             now.index,
             belief,

@@ -38,8 +38,7 @@ class State:
       handed: whether the action's motion was handed out, and nothing was said of it since.
       acted: whether the action was tried since the last look.
       finished: whether the target was taken out.
-      refusals: after how many looks since the last action all that was tried out did harm, or the arm could not do what
-        was decided on.
+      refusals: how many looks since the last action ended without a motion.
     """
 
     index: int
