@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.compiled import Kept, keep_in
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.existence import allowances, existence, existence_tables, object_views
+from mechsearch_jax.existence import allowances, closer_image, existence, existence_tables, object_views
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import recogniser as recognising
 from mechsearch_jax.perception import recognition
@@ -187,7 +187,8 @@ def test_a_camera_that_is_traced_gives_what_a_constant_does(two):
         settings = two[0].config.existence
         everywhere = jnp.ones(tables.corner.shape[0], bool)
         views = object_views(tables, camera, scene, everywhere, settings)
-        allowed = allowances(tables, camera, TARGET, scene, views, settings)
+        closer = closer_image(camera, scene, views, settings)
+        allowed = allowances(tables, camera, TARGET, views, closer, settings)
         return existence(tables, camera, views, everywhere, allowed, settings), views.windows
 
     for problem in two:

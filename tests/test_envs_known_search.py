@@ -115,7 +115,7 @@ def search(problem, monkeypatch):
         ]
 
     grasp = retrieve_action(jnp.eye(4)[None].repeat(2, 0), jnp.zeros(2), jnp.zeros(2))
-    choice = jax.device_get(GraspChoice(jnp.array([True, False]), jnp.array([0, 1]), grasp))
+    choice = jax.device_get(GraspChoice(jnp.array([True, False]), jnp.array([True, True]), jnp.array([0, 1]), grasp))
     monkeypatch.setattr(known_search._Running, "_judged", judged)
     monkeypatch.setattr(known_search, "retrievals_of", lambda problem, world, count: choice)
 

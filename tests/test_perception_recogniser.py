@@ -199,7 +199,7 @@ def test_bad_images_are_refused_in_one_line(see, images):
             see(KEY, *arguments)
         assert "\n" not in str(error.value)
     away = dataclasses.replace(images.camera, position=(2.0, 0.0, 0.6))
-    with pytest.raises(InputError, match="does not look into the shelf"):
+    with pytest.raises(InputError, match="looks away from the shelf"):
         Recogniser(setting(images.camera), camera=away)
     with pytest.raises(InputError, match="threshold"):
         Recogniser(setting(images.camera), detector=TargetColour(threshold=-1.0))

@@ -371,13 +371,16 @@ def test_continuous_settings_are_data_and_compile_nothing(decision, problem):
     assert not np.array_equal(np.asarray(told.sequences.value), np.asarray(usual.sequences.value))
 
 
-def test_a_found_target_is_one_pose_and_stays_found(problem):
-    _, objects = load("first-light")
-    belief = look(problem, objects, True, (0.7, 0.2, 0.0))
+def test_a_found_target_is_one_pose_and_stays_found_where_it_may_be_hidden(problem):
+    hidden, objects = load("first-light")
+    pose = (*hidden.target.position[:2], 0.0)
+    belief = look(problem, objects, True, pose)
     assert bool(belief.found)
     hidden_again = planner.update_belief(problem, belief, seen(objects))
     assert bool(hidden_again.found)
-    np.testing.assert_allclose(hidden_again.found_pose, [0.7, 0.2, 0.0])
+    np.testing.assert_allclose(hidden_again.found_pose, pose, atol=1e-6)
+    in_the_open = look(problem, objects, True, (0.7, 0.2, 0.0))
+    assert not bool(planner.update_belief(problem, in_the_open, seen(objects)).found)
 
 
 def test_the_state_that_a_plan_begins_with_has_the_shapes_of_every_other(decision, root, problem):
