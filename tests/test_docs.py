@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 import mechsearch_jax
-from mechsearch_jax.benchmarks.intervals import share_interval
+from mechsearch_jax.benchmarks.guard import read_reference
+from mechsearch_jax.benchmarks.intervals import share_interval, wilson
 from mechsearch_jax.benchmarks.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.envs.earlier import EARLIER, RENAMED
 from mechsearch_jax.envs.scene_sets import SETS, digest, is_chosen_on, recorded
@@ -282,6 +283,31 @@ def test_the_times_of_a_decision_are_the_stored_ones():
     for file in (ROOT / "benchmarks/results").glob("plan-rehearsal-*.json"):
         assert f"[{1000 * stored_median(file.name):.0f} ms on" in readme
         assert f"](benchmarks/results/{file.name})" in readme
+
+
+def test_what_came_of_searches_in_a_cell_is_what_is_stored():
+    stored = json.loads(read("benchmarks/results/cell-cpu.json"))
+    rows = stored["rows"]
+    low, high = wilson(sum(row["retrieved"] for row in rows), len(rows))
+    counts = (
+        len(rows),
+        sum(row["found_step"] is not None for row in rows),
+        sum(row["retrieved"] for row in rows),
+        f"{low:.2f} to {high:.2f}",
+        *(sum(row[name] for row in rows) for name in ("motions", "failed", "phantoms")),
+        sum(row["error"] is not None for row in rows),
+    )
+    assert "| " + " | ".join(map(str, counts)) + " |" in read("docs/results.md")
+    assert f"took [{counts[2]} of {len(rows)} hidden targets out](" in " ".join(read("README.md").split())
+    assert stored["config"] == read("benchmarks/cells/other-cell.toml")
+
+
+def test_the_guard_is_paired_with_what_it_replaced_as_the_page_says():
+    before, after = (read_reference(ROOT / f"benchmarks/results/guard-{name}.json") for name in ("before-cpu", "cpu"))
+    pairs = {one.episode: one.retrieved for one in before.outcomes}
+    changes = [(pairs[one.episode], one.retrieved) for one in after.outcomes]
+    assert (len(changes), changes.count((False, True)), changes.count((True, False))) == (160, 2, 0)
+    assert "two of 160 episodes are retrieved that were not, and none the other way" in read("docs/commands.md")
 
 
 def test_scenes_that_nothing_was_chosen_on_are_told_apart():
