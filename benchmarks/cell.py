@@ -179,7 +179,7 @@ def _inside(
     rotation: Float[np.ndarray, "3 3"],
     half: Float[np.ndarray, "3"],
 ) -> np.ndarray:
-    return (np.abs((points - centre) @ rotation) <= np.maximum(half, 0.0)).all(axis=1)
+    return np.all(np.abs((points - centre) @ rotation) <= np.maximum(half, 0.0), axis=1)
 
 
 def scenes(settings: Settings, objects: Sequence[int], searches: int, seed: int) -> list[tuple[int, Scenario]]:
