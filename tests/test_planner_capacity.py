@@ -60,6 +60,7 @@ def test_an_object_draws_the_same_numbers():
     assert len(np.unique(many)) == many.size
 
 
+@pytest.mark.slow
 def test_the_target_is_taken_out_the_same_way(problem, objects):
     scenes = [pad(objects, capacity) for capacity in CAPACITIES]
     pose = jnp.float32([0.6, 0.1, 0.0])
