@@ -32,6 +32,7 @@ from mechsearch_jax.planner.settings import Settings, load_settings
 from mechsearch_jax.search.searcher import Searcher
 from mechsearch_jax.search.step import SearchStep
 from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.scenario import Scenario, rotation_matrix
 
 # A search is given up after so many looks in a row without a motion.
@@ -53,7 +54,8 @@ class Row:
       motions: number of motions that were handed out.
       failed: number of motions that the arm could not follow, or that missed the target.
       ended: how it ended, in a few words.
-      phantoms: looks at which an object was recognised in or on the target that was seen.
+      phantoms: looks at which an object was recognised in or on a target in sight.
+      undetected: looks at which a target in sight was not detected.
       astray: looks at which an object was recognised where nothing stands.
       idle: reasons of the looks without a motion.
       warnings: of all looks, and how often each was given.
@@ -70,6 +72,7 @@ class Row:
     failed: int
     ended: str
     phantoms: int
+    undetected: int
     astray: int
     idle: tuple[str, ...]
     warnings: dict[str, int]
@@ -96,7 +99,7 @@ def run_search(
       shown: called with every step.
     """
     found_step, failed, in_a_row = None, 0, 0
-    phantoms = astray = 0
+    phantoms = undetected = astray = 0
     idle: list[str] = []
     actions: list[str] = []
     seconds: list[float] = []
@@ -104,7 +107,7 @@ def run_search(
     ended, error, retrieved = "too many motions", None, False
     try:
         while len(actions) < max_motions and in_a_row < PATIENCE:
-            look = cell.look()
+            look, pixels = cell.look(), cell.target_pixels()
             begin = time.perf_counter()
             step = searcher.next(*look, joints=cell.joints)
             seconds.append(round(time.perf_counter() - begin, 3))
@@ -112,7 +115,10 @@ def run_search(
             warnings.update(step.warnings)
             if bool(step.observation.target_visible):
                 found_step = len(actions) if found_step is None else found_step
+            # As the scene is, not as it is recognised: an undetected target may be an object to the searcher.
+            if pixels > found_pixels(cell.workcell.camera):
                 phantoms += any(_in_target(cell, step.observation))
+                undetected += not bool(step.observation.target_visible)
             astray += any(_astray(cell, step.observation))
             if step.trajectory is None:
                 idle.append(step.reason)
@@ -141,6 +147,7 @@ def run_search(
         failed=failed,
         ended=ended,
         phantoms=phantoms,
+        undetected=undetected,
         astray=astray,
         idle=tuple(idle),
         warnings=dict(warnings),
@@ -264,6 +271,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "motions": sum(row.motions for row in rows),
         "failed_motions": sum(row.failed for row in rows),
         "looks_with_phantom_in_target": sum(row.phantoms for row in rows),
+        "looks_with_undetected_target": sum(row.undetected for row in rows),
         "looks_with_object_astray": sum(row.astray for row in rows),
         "errors": sum(row.error is not None for row in rows),
         "seconds_per_step_median": round(float(np.median(steady)), 2) if steady else None,

@@ -13,6 +13,7 @@ from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception import plausibility
 from mechsearch_jax.perception.colour import RED, TargetColour
 from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.perception.plausibility import (
@@ -146,3 +147,22 @@ def test_an_image_without_a_measurement_is_said_and_refused(value):
     with pytest.raises(InputError, match="depth image: nothing was measured"):
         check_measured(CAMERA, SHELF, depth)
     check_measured(CAMERA, SHELF, sensed(SCENE)[0])
+
+
+def test_an_edge_that_the_image_cuts_off_is_not_the_boards():
+    # Looks straight in; the lower rows of its image end on the board.
+    right, down = np.array([0.0, -1.0, 0.0]), np.array([0.0, 0.0, -1.0])
+    rotation = np.stack([right, down, np.cross(right, down)], axis=1)
+    camera = Camera(
+        width=1280,
+        height=380,
+        cy=190.0,
+        rotation=tuple(map(tuple, rotation.tolist())),
+        position=(-0.15, 0.1, 0.62),
+    )
+    shelf = Shelf()
+    points = np.stack(np.meshgrid(np.linspace(0.43, 0.78, 200), np.linspace(-0.28, 0.48, 400), [shelf.board]), -1)
+    assert not plausibility._edge_in_image(camera, shelf).any()
+    assert plausibility._edge_fault(camera, shelf, points.reshape(-1, 3)) is None
+    assert plausibility._edge_in_image(Camera(), shelf).sum() >= plausibility.LEAST_STRIPS
+    assert "farther" in (plausibility._edge_fault(Camera(), shelf, points.reshape(-1, 3)) or "")

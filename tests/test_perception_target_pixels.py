@@ -17,7 +17,7 @@ from mechsearch_jax.perception.colour import RED, TargetColour
 from mechsearch_jax.perception.labels import FREE, OTHER
 from mechsearch_jax.perception.overlaps import overlap_faults
 from mechsearch_jax.perception.recogniser import Recogniser
-from mechsearch_jax.perception.target_pixels import coloured_pixels, elected, evened, without_phantoms
+from mechsearch_jax.perception.target_pixels import coloured_pixels, elected, evened, near_target, without_phantoms
 from mechsearch_jax.perception.target_pose import distance
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, example_scenarios, load_scenario, superquadrics
@@ -81,7 +81,16 @@ def test_a_segment_mostly_in_the_target_is_none():
     labels = jnp.full((4, 4), FREE, jnp.int8).at[0].set(2).at[1].set(3)
     inside = jnp.zeros((4, 4), bool).at[0, :3].set(True).at[1, :2].set(True)
     expected = jnp.where(labels == 2, OTHER, labels)
-    np.testing.assert_array_equal(without_phantoms(labels, inside), expected)
+    of_target = jnp.zeros((4, 4), bool).at[2].set(True)
+    np.testing.assert_array_equal(without_phantoms(labels, inside, of_target), expected)
+    # A narrow part of the target says too little of where the rest of it is.
+    np.testing.assert_array_equal(without_phantoms(labels, inside, of_target.at[2, :2].set(False)), labels)
+
+
+def test_what_is_seen_inside_of_a_pose_is_not_the_target():
+    target, shelf = Target.box(), Shelf()
+    middle = jnp.float32([[0.6, 0.1, target.height(shelf)], [0.6 + target.half_size[0], 0.1, target.height(shelf)]])
+    assert near_target(target, shelf, jnp.float32([0.6, 0.1, 0.0]), middle).tolist() == [False, True]
 
 
 def target_patch(images):

@@ -20,7 +20,7 @@ from mechsearch_jax.perception.cloud import BLOCK, above_board, shelf_view, thin
 from mechsearch_jax.perception.planes import PlaneConfig, find_plane
 from mechsearch_jax.perception.target_pixels import coloured_pixels, fitted_pose
 from mechsearch_jax.perception.target_pose import distance
-from mechsearch_jax.workspace.camera import Camera, back_project
+from mechsearch_jax.workspace.camera import Camera, back_project, project
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
@@ -113,7 +113,8 @@ def image_faults(
     points = np.asarray(back_project(view.camera, jnp.asarray(np.where(measured, part, np.nan))))[measured]
     floor = _floor_fault(shelf, points)
     # Where the board is not where it should be, walls are looked for in the wrong place, too.
-    faults = [floor] if floor else [_edge_fault(shelf, points), *(_wall_fault(shelf, wall, points) for wall in WALLS)]
+    walls = [_edge_fault(camera, shelf, points), *(_wall_fault(shelf, wall, points) for wall in WALLS)]
+    faults = [floor] if floor else walls
     x, y, z = points.T
     within = (x > shelf.front) & (x < shelf.back) & (y > shelf.right) & (y < shelf.left) & (z < shelf.ceiling)
     if mask is not None and (z[within] > shelf.board + 2 * FLOOR_TOLERANCE).any() and not (mask >= 0).any():
@@ -197,14 +198,14 @@ def _way(wall: Wall, off: float) -> str:
     return "farther out" if off > 0 else "farther in"
 
 
-def _edge_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
+def _edge_fault(camera: Camera, shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
     """What is wrong with the front edge of the board that the points show; nothing where they show too little of it."""
     x, y, z = points.T
     board = (np.abs(z - shelf.board) < 0.008) & (np.abs(x - shelf.front) < 2 * WALL_SEARCH)
     across = (y > shelf.right + WALL_MARGIN) & (y < shelf.left - WALL_MARGIN)
     strip = ((y - shelf.right) / (shelf.left - shelf.right) * EDGE_STRIPS).astype(int)
     firsts = []
-    for i in range(EDGE_STRIPS):
+    for i in np.flatnonzero(_edge_in_image(camera, shelf)):
         own = x[board & across & (strip == i)]
         if len(own) >= 10:
             # Not the very first: at an edge a sensor may measure a mixture of what is before and behind it.
@@ -219,6 +220,15 @@ def _edge_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
         f"depth image: the board's front edge appears {100 * abs(off):.1f} cm {'farther' if off > 0 else 'nearer'} "
         "than shelf.front says; check the place of the shelf in x and the pose of the camera"
     )
+
+
+def _edge_in_image(camera: Camera, shelf: Shelf) -> Bool[np.ndarray, " strips"]:
+    """In which strips across the board an image shows its front edge, and a little of what is before that."""
+    y = shelf.right + (np.arange(EDGE_STRIPS) + 0.5) / EDGE_STRIPS * (shelf.left - shelf.right)
+    before = np.stack([np.full_like(y, shelf.front - 2 * FLOOR_TOLERANCE), y, np.full_like(y, shelf.board)], axis=1)
+    pixels, depth = (np.asarray(a) for a in project(camera, jnp.asarray(before, jnp.float32)))
+    inside = (pixels >= 0).all(axis=1) & (pixels < np.array([camera.height, camera.width]) - 1).all(axis=1)
+    return inside & (depth > 0)
 
 
 def identity_faults(

@@ -211,6 +211,8 @@ def _labelled(
     if mask is None:
         pose, _ = fitted_pose(jax.random.fold_in(key, 0), recogniser.target, shelf, view.camera, points, coloured)
         on_it = near_target(recogniser.target, shelf, pose, points) & near & visible
+        # Where that would be more than its colour shows, the pose is not to be relied on.
+        on_it &= jnp.sum(on_it & ~coloured) <= jnp.sum(coloured)
         of_target = coloured | on_it
         labels = recogniser.segmenter(key, shelf, points, of_target)
     else:

@@ -153,8 +153,8 @@ def recognise_image(
     """
     drawing, choosing = keys
     pose, found = fitted_pose(choosing, target, shelf, camera, image.points, image.of_target)
-    inside = near_target(target, shelf, pose, image.points) & found
-    labels = without_phantoms(image.labels, inside)
+    on_it = near_target(target, shelf, pose, image.points) & found
+    labels = without_phantoms(image.labels, on_it, image.of_target)
     scene = recognise(drawing, shapes.network, shapes.parameters, camera, image.points, labels, shelf)
     refined = refine(camera, shelf, scene, image.points.reshape(-1, 3), labels.reshape(-1), image.depth, refinement)
     return standard_edges(refined.scene), pose

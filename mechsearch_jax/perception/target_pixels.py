@@ -106,24 +106,32 @@ def fitted_pose(
 def near_target(
     target: Target, shelf: Shelf, pose: Float[Array, " 3"], points: Float[Array, "*batch 3"]
 ) -> Bool[Array, "*batch"]:
-    """Which points are in a target that stands at a pose, or on it; False for NaN.
+    """Which points are on the surface of a target that stands at a pose; False for NaN, and for points deep inside it:
+    where something is seen there, the target is not.
 
     Args:
       target, shelf: static.
       pose: x, y [m] and yaw [rad].
       points: in the world [m].
     """
-    return (distance(target, shelf, pose, points.reshape(-1, 3)) < SURFACE).reshape(points.shape[:-1])
+    return (jnp.abs(distance(target, shelf, pose, points.reshape(-1, 3))) < SURFACE).reshape(points.shape[:-1])
 
 
-def without_phantoms(labels: Int[Array, "h w"], inside: Bool[Array, "h w"]) -> Int[Array, "h w"]:
-    """Labels in which a segment that lies mostly in the found target, or on it, is OTHER: its points are the target's.
+def without_phantoms(
+    labels: Int[Array, "h w"], on_it: Bool[Array, "h w"], of_target: Bool[Array, "h w"]
+) -> Int[Array, "h w"]:
+    """Labels in which a segment that lies mostly on the found target is OTHER: its points are the target's.
+
+    Only a segment of which no more is seen than of the target: a narrow part of the target does not say where the rest
+    of it is, and a pose that is fitted to one may reach into what stands beside it.
 
     Args:
       labels: as `perception.labels` has them.
-      inside: which pixels are in or on the found target; none where it is not found.
+      on_it: which pixels are on the found target; none where it is not found.
+      of_target: which are known to be its.
     """
     own = labels[..., None] == jnp.arange(INSTANCES, dtype=labels.dtype).reshape(1, 1, -1)
-    shown, within = jnp.sum(own, axis=(0, 1)), jnp.sum(own & inside[..., None], axis=(0, 1))
-    phantom = jnp.any(own & (2 * within > shown).reshape(1, 1, -1), axis=-1)
+    shown, within = jnp.sum(own, axis=(0, 1)), jnp.sum(own & on_it[..., None], axis=(0, 1))
+    is_phantom = (2 * within > shown) & (shown <= jnp.sum(of_target))
+    phantom = jnp.any(own & is_phantom.reshape(1, 1, -1), axis=-1)
     return jnp.where(phantom, OTHER, labels).astype(labels.dtype)

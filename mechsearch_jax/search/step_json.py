@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 
 if TYPE_CHECKING:
@@ -49,6 +50,13 @@ def _list(array: Any) -> list[Any]:
     return np.asarray(array, float).tolist()
 
 
+def _is_finite(scene: Superquadrics) -> np.ndarray:
+    """Which objects have a shape and a place; of the others a warning says that they have none."""
+    parts = (scene.size, scene.exponents, scene.position, scene.rotation)
+    finite = [np.isfinite(np.asarray(part)).reshape(scene.capacity, -1).all(axis=1) for part in parts]
+    return np.logical_and.reduce(finite)
+
+
 def _objects(step: SearchStep) -> list[dict[str, Any]]:
     """The recognised objects; `slot` is what an action's `object` refers to."""
     scene = step.observation.objects
@@ -61,7 +69,7 @@ def _objects(step: SearchStep) -> list[dict[str, Any]]:
             "rotation": _list(scene.rotation[i]),
             "quaternion": np.roll(Rotation.from_matrix(np.asarray(scene.rotation[i], float)).as_quat(), 1).tolist(),
         }
-        for i in np.flatnonzero(np.asarray(scene.valid)).tolist()
+        for i in np.flatnonzero(np.asarray(scene.valid) & _is_finite(scene)).tolist()
     ]
 
 
