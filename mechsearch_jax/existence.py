@@ -525,9 +525,9 @@ def _pixels(
         rotation=T_world_target[:3, :3],
         valid=jnp.array(True),
     )
-    mine = render.object_window(camera.scaled(scale), one, window)
-    behind, inside = _in_window(camera.scaled(scale), closer, mine.corner, window)
-    return jnp.sum(inside & (mine.depth + config.depth_margin < behind)) * float(scale**2)
+    target_image = render.object_window(camera.scaled(scale), one, window)
+    behind, inside = _in_window(camera.scaled(scale), closer, target_image.corner, window)
+    return jnp.sum(inside & (target_image.depth + config.depth_margin < behind)) * float(scale**2)
 
 
 def plainly_elsewhere(
