@@ -15,7 +15,7 @@ from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_ta
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import transform, upright_pose
+from mechsearch_jax.geometry.transforms import compose, transform, upright_pose
 from mechsearch_jax.graspability import grasp_hits
 from mechsearch_jax.planner import Problem, paper
 from mechsearch_jax.planner.found_target import no_grasps
@@ -87,11 +87,14 @@ def swept_free(
     tables, shelf = grasps.tables, grasps.shelf
     T_world_target = upright_pose(pose, grasps.target.height(shelf))
 
-    def touches(tables, T, i):
-        return jnp.any(hits_shelf(shelf, transform(T[...], tables.clouds[i].T)))
+    T_world_gripper = compose(T_world_target[None], tables.T_target_gripper)
+
+    def touches(_, own, row):
+        T, cloud = row
+        return jnp.any(hits_shelf(shelf, transform(T, cloud.T)))
 
     wanted = jnp.broadcast_to(active, tables.q7.shape)
-    free = wanted & ~masked_vmap(touches, wanted, tables, T_world_target)
+    free = wanted & ~masked_vmap(touches, wanted, None, None, (T_world_gripper, tables.clouds))
     found = no_grasps(grasps).replace(T_world_target=T_world_target, feasible=free)
     hits = grasp_hits(tables, found, scene, jnp.asarray(active)[None])
     return jnp.any(free & ~jnp.any(hits, axis=1))

@@ -31,10 +31,10 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.geometry.collision import Pair, any_inside
+from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.geometry.transforms import inverse, make, transform, upright_pose
 from mechsearch_jax.options import option
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, project
@@ -300,10 +300,10 @@ def object_views(
     coarse = camera.scaled(config.step(camera))
     fresh = scene.valid if moved is None else moved & scene.valid
 
-    def view(coarse, scene, i):
-        return render.object_window(coarse, jax.tree.map(lambda a: a[i], scene), config.window)
+    def view(coarse, _, one):
+        return render.object_window(coarse, one, config.window)
 
-    windows = _seen(masked_vmap(view, fresh, coarse, scene, block=8), fresh)
+    windows = _seen(masked_vmap(view, fresh, coarse, None, scene, block=8), fresh)
     collides = None if exists is None else _collisions(tables, scene, exists, fresh)
     if previous is None or moved is None:
         return ObjectViews(windows, collides)
@@ -329,17 +329,10 @@ def _collisions(tables: ExistenceTables, scene: Superquadrics, exists: Array, fr
     places, spread = tables.T_world_target.shape[:2]
     n = scene.capacity
 
-    def pair(tables, scene, i):
-        place, k = i // n, i % n
-        T = tables.T_world_target.reshape(-1, 4, 4)[place]
-        T_object_world = inverse(make(scene.rotation[k], scene.position[k]))
-        return Pair(tables.cloud, compose(T_object_world, T), scene.size[k], scene.exponents[k])
-
-    offset = tables.T_world_target[:, :, None, :3, 3] - scene.position[None, None]
-    reach = superquadric.bounding_radius(scene.size) + tables.radius
-    near = jnp.sum(offset**2, axis=-1) < reach[None, None] ** 2
-    mask = near & exists[:, None, None] & fresh[None, None]
-    return any_inside(mask.reshape(-1), pair, tables, scene).reshape(places, spread, n)
+    T = tables.T_world_target.reshape(-1, 4, 4)
+    wanted = jnp.repeat(exists, spread)[:, None] & fresh[None]
+    hits = collisions(clouds_of(tables.cloud[None]), np.zeros(len(T), np.int32), T, scene, wanted)
+    return hits.reshape(places, spread, n)
 
 
 def _in_window(camera: Camera, image: Any, corner: Array, window: tuple[int, int]) -> tuple[Array, Array]:
@@ -368,14 +361,14 @@ def _at_places(
       measure: of the target's depth, the depth behind it, and which pixels are in the image; closes over no array.
     """
 
-    def told(tables, image, i):
+    def at_places(_, image, row):
         def at(depth, corner):
             return measure(depth, *_in_window(coarse, image, corner, depth.shape))
 
-        return jax.vmap(at)(tables.depth[i], tables.corner[i])
+        return jax.vmap(at)(*row)
 
     # All of them at once, for every state of a batch, would be most of a plan's memory.
-    return masked_vmap(told, exists, tables, image, block=512)
+    return masked_vmap(at_places, exists, None, image, (tables.depth, tables.corner), block=512)
 
 
 def _shown(
@@ -461,12 +454,11 @@ def _counted(
 ) -> Float[Array, "x s"]:
     """Pixels of the full resolution that a target shows at doubtful places, by a closer look; 0 at the others."""
 
-    def counted(shared, closer, i):
-        tables, camera = shared
-        T = tables.T_world_target.reshape(-1, 4, 4)[i]
-        return _pixels(tables, camera, target, closer, T, config)
+    def counted(shared, closer, T):
+        return _pixels(*shared, target, closer, T, config)
 
-    return masked_vmap(counted, doubtful.reshape(-1), (tables, camera), closer, block=64).reshape(doubtful.shape)
+    T, mask = tables.T_world_target.reshape(-1, 4, 4), doubtful.reshape(-1)
+    return masked_vmap(counted, mask, (tables, camera), closer, T, block=64).reshape(doubtful.shape)
 
 
 def closer_image(
@@ -487,10 +479,10 @@ def closer_image(
     window = math.ceil(config.window[0] * grown), math.ceil(config.window[1] * grown)
     scene = scene.replace(size=scene.size + ROUNDED)
 
-    def view(closer, scene, i):
-        return render.object_window(closer, jax.tree.map(lambda a: a[i], scene), window)
+    def view(closer, _, one):
+        return render.object_window(closer, one, window)
 
-    windows = _seen(masked_vmap(view, scene.valid, closer, scene, block=1), scene.valid)
+    windows = _seen(masked_vmap(view, scene.valid, closer, None, scene, block=1), scene.valid)
     return render.merge_windows(closer, windows)
 
 

@@ -26,20 +26,18 @@ import trimesh
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.geometry.collision import Pair, mark_hits
-from mechsearch_jax.geometry.masked import block_size, for_each, masked_vmap, merged, rows_of
+from mechsearch_jax.geometry.collision import Clouds, collisions
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import compose, inverse, make, transform, upright_pose
+from mechsearch_jax.geometry.transforms import compose, make, upright_pose
 from mechsearch_jax.options import option
-from mechsearch_jax.robot.entry import arm_enters
+from mechsearch_jax.robot.entry import gripper_enters
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
 from mechsearch_jax.shapes import shape_of
-from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
+from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 WRIST_ORIGIN = math.pi / 4
-# So many grasps of a pose are looked at together, and so many points of a cloud first.
-GROUP = 16
+# So many points of a cloud are looked at first.
 COARSE = 320
 # What a pose where no grasp is feasible counts for, in objects hit: one more than the eight objects of a scene and its
 # target. It does not depend on how many slots a scene has; whoever hits as many might as well have no grasp.
@@ -97,15 +95,13 @@ class GraspTables(flax.struct.PyTreeNode):
       T_target_gripper: candidate grasps, shape (G, 4, 4).
       q7: angle of joint 7 in each, shape (G,).
       wrist: index of the wrist's swept gripper cloud, shape (G,).
-      clouds: what each grasp sweeps, in the target's frame as rows of coordinates, shape (G, 3, P) [m].
-      low, high: box around each cloud in the gripper's frame, shape (G, 3) [m].
+      clouds: what gripper and target sweep in each grasp, in the gripper's frame as rows, shape (G, 3, P) [m].
+      low, high: box around each cloud, shape (G, 3) [m].
       still_gripper: what the open gripper takes up with each wrist, in its own frame as rows, shape (W, 3, S) [m].
       still_target: surface of the target in its own frame as rows, shape (3, R) [m].
       T_world_target: candidate poses, shape (X, 4, 4).
       pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose.
       found_grasp: the grasps of a target that has been found, shape (F,): all of them, or none in tables of candidates.
-      group_pose, group_pair: the pairs or the grasps of a found target in groups of at most `GROUP` with the same pose:
-        the pose of each, shape (C,), and its pairs, shape (C, GROUP), with -1 for none.
       gap: how far a point of a cloud may be from the nearest of its first `COARSE` [m].
     """
 
@@ -121,9 +117,12 @@ class GraspTables(flax.struct.PyTreeNode):
     pair_pose: jax.Array
     pair_grasp: jax.Array
     found_grasp: jax.Array
-    group_pose: jax.Array
-    group_pair: jax.Array
     gap: jax.Array
+
+    @property
+    def swept(self) -> Clouds:
+        """The clouds."""
+        return Clouds(self.clouds, self.low, self.high, self.gap, COARSE)
 
 
 def gripper_rotation(yaw: Float[Array, "*batch"], tilt: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
@@ -180,15 +179,9 @@ def feasible_grasps(
     ahead = T[..., 0, 2] >= jnp.cos(config.max_yaw + 1e-4) * jnp.sqrt(T[..., 0, 2] ** 2 + T[..., 1, 2] ** 2)
     ahead &= active
 
-    poses, q7 = T.reshape(-1, 4, 4), jnp.tile(tables.q7, n)
-    reachable = arm_enters(shelf, gripper, config.waypoints, poses, q7, ahead.reshape(-1), block=1024)
-
-    def touches(tables, T_world_target, i):
-        points = transform(T_world_target[i // g], tables.clouds[i % g].T)
-        return jnp.any(hits_shelf(shelf, points))
-
-    touching = masked_vmap(touches, reachable, tables, T_world_target)
-    return (reachable & ~touching).reshape(n, g)
+    poses, q7, grasp = T.reshape(-1, 4, 4), jnp.tile(tables.q7, n), np.tile(np.arange(g), n)
+    mask = ahead.reshape(-1)
+    return gripper_enters(shelf, gripper, config.waypoints, tables.clouds, grasp, poses, q7, mask).reshape(n, g)
 
 
 def grasp_tables(
@@ -222,7 +215,7 @@ def grasp_tables(
         own = swept_targets[direction.tobytes()]
         inside = (own - T[:3, 3]) @ T[:3, :3]
         both = np.concatenate([swept[w], inside])
-        clouds.append(np.concatenate([swept[w] @ T[:3, :3].T + T[:3, 3], own])[order].T)
+        clouds.append(both[order].T)
         low.append(both.min(axis=0))
         high.append(both.max(axis=0))
     poses = jax.jit(upright_pose)(target.candidate_poses(shelf), target.height(shelf))
@@ -241,8 +234,6 @@ def grasp_tables(
         pair_pose=jnp.zeros(0, jnp.int32),
         pair_grasp=jnp.zeros(0, jnp.int32),
         found_grasp=jnp.zeros(0, jnp.int32),
-        group_pose=jnp.zeros(0, jnp.int32),
-        group_pair=jnp.zeros((0, GROUP), jnp.int32),
         gap=jnp.float32(max(_gap(cloud.T, COARSE) for cloud in clouds)),
     )
     if candidates:
@@ -250,37 +241,13 @@ def grasp_tables(
         pose, grasp = np.nonzero(np.asarray(judge(tables)))
         tables = tables.replace(pair_pose=jnp.int32(pose), pair_grasp=jnp.int32(grasp))
     else:
-        pose = np.zeros(len(clouds), int)
         tables = tables.replace(T_world_target=poses[:0], found_grasp=jnp.arange(len(clouds), dtype=jnp.int32))
-    group_pose, group_pair = _groups(pose)
-    return tables.replace(group_pose=jnp.int32(group_pose), group_pair=jnp.int32(group_pair))
+    return tables
 
 
 def _gap(points: np.ndarray, first: int) -> float:
     """How far a point is at most from the nearest of the first ones [m]."""
     return float(scipy.spatial.KDTree(points[:first]).query(points)[0].max()) if len(points) > first else 0.0
-
-
-def _groups(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs, given by their poses in ascending order, in groups of the same pose; see `GraspTables`."""
-    place = np.arange(len(pose)) - np.searchsorted(pose, pose)
-    starts = np.flatnonzero(place % GROUP == 0)
-    group = np.cumsum(place % GROUP == 0) - 1
-    pairs = np.full((len(starts), GROUP), -1)
-    pairs[group, place % GROUP] = np.arange(len(pose))
-    return pose[starts], pairs
-
-
-def boxes_overlap(
-    low: Float[Array, "... 3"],
-    high: Float[Array, "... 3"],
-    T_box_object: Float[Array, "... 4 4"],
-    size: Float[Array, "... 3"],
-) -> Bool[Array, "..."]:
-    """Whether a box and the bounding box of an object may overlap: not separated along any of the box's own axes."""
-    reach = jnp.sum(jnp.abs(T_box_object[..., :3, :3]) * size[..., None, :], axis=-1)
-    centre = T_box_object[..., :3, 3]
-    return jnp.all((centre - reach < high) & (centre + reach > low), axis=-1)
 
 
 class FoundGrasps(flax.struct.PyTreeNode):
@@ -347,64 +314,17 @@ def grasp_hits(
       H, shape (pairs, N).
     """
     fresh = scene.valid if moved is None else moved & scene.valid
-    mask = exists[tables.group_pose][:, None] & fresh[None]
-    hit = merged(_marked, GROUP)(mask.reshape(-1), tables, (found, scene))
+    if found is None:
+        grasp, T_world_target = tables.pair_grasp, tables.T_world_target[tables.pair_pose]
+        counts = exists[tables.pair_pose]
+    else:
+        grasp, T_world_target = tables.found_grasp, found.T_world_target[None]
+        counts = found.feasible & exists
+    T_world_gripper = compose(T_world_target, tables.T_target_gripper[grasp])
+    hit = collisions(tables.swept, grasp, T_world_gripper, scene, counts[:, None] & fresh[None])
     if previous is None or moved is None:
         return hit
     return jnp.where(moved[None], hit, previous)
-
-
-def _marked(mask: Bool[Array, "... e"], tables: GraspTables, rows: tuple[FoundGrasps | None, Superquadrics]) -> Array:
-    """H where a mask of all (group, object) is true; with the axes of a batch in front, see `masked.merged`."""
-    batch, n = mask.shape[:-1], rows[1].size.shape[-2]
-    each, is_found = mask.shape[-1], tables.found_grasp.shape[0] > 0
-    grasp_of = tables.found_grasp if is_found else tables.pair_grasp
-    total = grasp_of.shape[0]
-
-    def place(index):
-        """Row of the batch, pair, object and pose index of entry `index`, of all entries times `GROUP`."""
-        entry, slot = index // GROUP, index % GROUP
-        group, thing = (entry % each) // n, entry % n
-        return entry // each, tables.group_pair[group, slot], thing, tables.group_pose[group]
-
-    def target_pose(row, pose):
-        return row[0].T_world_target[...] if is_found else tables.T_world_target[pose]
-
-    def near(index):
-        b, k, thing, pose = place(index)
-        row = rows_of(rows, b, batch)
-        grasp = grasp_of[jnp.maximum(k, 0)]
-        allowed = k >= 0
-        if is_found:
-            allowed &= row[0].feasible[grasp]
-        T_gripper_world = inverse(compose(target_pose(row, pose), tables.T_target_gripper[grasp]))
-        scene = row[1]
-        T = compose(T_gripper_world, make(scene.rotation[thing], scene.position[thing]))
-        return allowed & boxes_overlap(tables.low[grasp], tables.high[grasp], T, scene.size[thing])
-
-    def pair(index):
-        b, k, thing, pose = place(index)
-        row = rows_of(rows, b, batch)
-        scene, grasp = row[1], grasp_of[jnp.maximum(k, 0)]
-        T_object_world = inverse(make(scene.rotation[thing], scene.position[thing]))
-        T = compose(T_object_world, target_pose(row, pose))
-        return Pair(tables.clouds[grasp], T, scene.size[thing], scene.exponents[thing])
-
-    size = math.prod(batch) * total * n
-
-    def body(hits, entry, active):
-        inner = (entry[:, None] * GROUP + jnp.arange(GROUP)[None]).reshape(-1)
-        safe = jnp.minimum(inner, mask.size * GROUP - 1)
-        worth = jax.vmap(near)(safe) & jnp.repeat(active, GROUP)
-
-        def where(local):
-            b, k, thing, _ = place(safe[jnp.minimum(local, safe.shape[0] - 1)])
-            return jnp.where(local < safe.shape[0], (b * total + k) * n + thing, size)
-
-        return mark_hits(hits, worth, lambda i: pair(safe[i]), where, block_size(256), COARSE, tables.gap)
-
-    hits = for_each(mask.reshape(-1), body, jnp.zeros(size, bool), block_size(256))
-    return hits.reshape(*batch, total, n)
 
 
 def graspability(rows: Pairs, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:

@@ -6,14 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from mechsearch_jax.actions.approach import approach_clear, gripper_hits
+from mechsearch_jax.actions.approach import cloud_index, gripper_clouds
 from mechsearch_jax.actions.config import ActionSpace, ActionTables
 from mechsearch_jax.actions.kind import SampledKind
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Ways
 from mechsearch_jax.actions.unseen_space import PossibleSpace
+from mechsearch_jax.geometry.collision import collisions
 from mechsearch_jax.geometry.footprints import footprints
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.robot.entry import gripper_enters
 
 # The ways of every sampled kind, in the order of `SAMPLED_KINDS`.
 Candidates = tuple[Ways, ...]
@@ -81,7 +83,17 @@ def candidates(
         first += count
     flat = jnp.concatenate([T.reshape(-1, 4, 4) for T in poses])
     opening, wrist = np.concatenate(openings), np.concatenate(wrists)
-    near = approach_clear(space, tables, opening, wrist, flat, jnp.concatenate(wanted))
+    clouds, cloud = gripper_clouds(tables), cloud_index(tables, opening, wrist)
+    near = gripper_enters(
+        space.shelf,
+        space.gripper,
+        space.waypoints,
+        clouds.points,
+        cloud,
+        flat,
+        tables.q7[opening, wrist],
+        jnp.concatenate(wanted),
+    )
 
     reached, against = [], []
     for kind, before, T, part, owner in zip(SAMPLED_KINDS, previous, poses, parts, owners, strict=True):
@@ -90,7 +102,7 @@ def candidates(
         obstacles = others & ~jnp.eye(n, dtype=bool) if kind.surrounds_object else others
         against.append(obstacles[owner] & jnp.any(reached[-1], axis=-1).reshape(-1)[:, None])
     mask = jnp.concatenate(against)
-    by_hand = gripper_hits(tables, opening, wrist, flat, scene, mask)
+    by_hand = collisions(clouds, cloud, flat, scene, mask)
 
     able = jnp.broadcast_to(True if available is None else available, (len(SAMPLED_KINDS), n))
     found = []

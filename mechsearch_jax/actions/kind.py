@@ -149,6 +149,8 @@ class SampledKind(Kind, Protocol):
         ways: Ways,
         index: Int[Array, ""],
         way: Int[Array, ""],
+        wanted: Bool[Array, ""],
     ) -> Draft:
-        """An action from the way and distance `way` (of V times D, clipped) of object `index`."""
+        """An action from the way and distance `way` (of V times D, clipped) of object `index`; anything if it is not
+        `wanted`."""
         ...

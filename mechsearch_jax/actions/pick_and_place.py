@@ -11,12 +11,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.approach import (
     CLOSE_WAYPOINTS,
+    CROSSING_PLACES,
     PLACES,
+    SWEPT_PLACES,
     approach_enters,
-    crossing_hits,
-    gripper_hits,
+    cloud_index,
+    crossing_places,
+    gripper_clouds,
     object_clouds,
-    swept_object,
+    swept_places,
 )
 from mechsearch_jax.actions.config import OPEN, ActionSpace, ActionTables
 from mechsearch_jax.actions.object_grasps import grasp_variants, object_grasps
@@ -25,12 +28,12 @@ from mechsearch_jax.actions.types import Action, Draft, Prediction, Ways
 from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
 from mechsearch_jax.dynamics.rigid import in_hand, pick_and_place
 from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.geometry.collision import Pair, any_inside
-from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.collision import clouds_of, collisions
+from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import compose, inverse, make, matmul, rotate, transform, yaw_rotation
+from mechsearch_jax.geometry.transforms import make, matmul, rotate, transform, translate, yaw_rotation
 from mechsearch_jax.robot.arm_hits import arm_hits
-from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, arm_enters, crossing_length, ways_in
+from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, crossing_length, ways_in
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.robot.motion import MotionConfig, Reference, pick_and_place_reference
 from mechsearch_jax.workspace.shelf import hits_shelf
@@ -49,180 +52,166 @@ def _object_hits(T, owner, held, scene, clouds, distance, mask):
     `held` says how each owner is turned in the hand. Its own column has to be masked out.
     """
     c, n = mask.shape
-
-    def pair(_, row, i):
-        T, scene, clouds, owner, held = row
-        k, j = i // n, i % n
-        o = owner[k]
-        cloud = swept_object(clouds[o], matmul(held[k].T, T[k][:3, :3]), distance)
-        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
-        T_object_owner = compose(T_object_world, make(held[k], scene.position[o]))
-        return Pair(cloud, T_object_owner, scene.size[j], scene.exponents[j])
-
-    # A sphere around the owner, swept along a segment, against a sphere around the other.
-    start = scene.position[owner]
-    along = -T[:, :3, 2] * distance
-    offset = scene.position[None] - start[:, None]
-    t = jnp.clip(jnp.sum(offset * along[:, None], axis=-1) / distance**2, 0.0, 1.0)
-    gap2 = jnp.sum((offset - t[..., None] * along[:, None]) ** 2, axis=-1)
-    radius = superquadric.bounding_radius(scene.size)
-    near = gap2 < (radius[owner][:, None] + radius[None]) ** 2
-    return any_inside((mask & near).reshape(-1), pair, None, (T, scene, clouds, owner, held)).reshape(c, n)
+    places = swept_places(make(held, scene.position[owner]), -T[:, :3, 2], distance)
+    wanted = jnp.repeat(mask, SWEPT_PLACES, axis=0)
+    hits = collisions(
+        clouds_of(clouds), jnp.repeat(owner, SWEPT_PLACES), places.reshape(-1, 4, 4), scene, wanted, own=True
+    )
+    return jnp.any(hits.reshape(c, SWEPT_PLACES, n), axis=1)
 
 
-def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, index, T_grasp):
+def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, cloud, index, T_grasp, picks):
     """Random places for a picked object, most promising first: (position, rotation, turn, whether it can stand there).
 
     Those where it would overlap others or the shelf come last, those in possible space before them.
     """
     shelf, config = space.shelf, space.config
     tries, tests = config.placements
-    n = scene.capacity
-    key_x, key_y, key_yaw, key_turn, key_order = jax.random.split(key, 5)
-    x = jax.random.uniform(key_x, (tries,), minval=shelf.front, maxval=shelf.back)
-    y = jax.random.uniform(key_y, (tries,), minval=shelf.right, maxval=shelf.left)
-    turn = jax.random.uniform(key_yaw, (tries,), minval=-config.place_yaw, maxval=config.place_yaw)
-    turn = jnp.where(jax.random.bernoulli(key_turn, 0.5, (tries,)), turn, 0.0)
+    by_x, by_y, by_yaw, turns, order = jax.random.uniform(key, (5, tries))
+    x = shelf.front + by_x * (shelf.back - shelf.front)
+    y = shelf.right + by_y * (shelf.left - shelf.right)
+    turn = jnp.where(turns < 0.5, (2.0 * by_yaw - 1.0) * config.place_yaw, 0.0)
     approach = jnp.arctan2(T_grasp[1, 2], T_grasp[0, 2])
     turn = jnp.clip(turn, -space.max_yaw - approach, space.max_yaw - approach)
 
     position = jnp.stack([x, y, jnp.full(tries, scene.position[index, 2])], axis=-1)
     rotation = matmul(yaw_rotation(turn), in_hand(scene, index, T_grasp))
-    cloud = superquadric.sample_surface(scene.size[index], scene.exponents[index], config.object_points)
     points = transform(make(rotation, position)[:, None], cloud[None])
     on_board = ~jnp.any(hits_shelf(shelf, points + jnp.array([0.0, 0.0, 1e-3])[None, None]), axis=1)
     on_board &= jnp.min(points[..., 0], axis=1) > shelf.front + config.clearance
-    other = scene.replace(size=scene.size + config.clearance, valid=scene.valid.at[index].set(False))
-    offset = position[:, None] - scene.position[None]
-    reach = superquadric.bounding_radius(other.size) + superquadric.bounding_radius(scene.size[index])
-    near = (jnp.sum(offset**2, axis=-1) < reach[None] ** 2) & other.valid[None] & on_board[:, None]
-
-    def overlap(_, row, i):
-        position, rotation, cloud, other = row
-        k, j = i // n, i % n
-        T_object_world = inverse(make(other.rotation[j], other.position[j]))
-        T = compose(T_object_world, make(rotation[k], position[k]))
-        return Pair(cloud[...].T, T, other.size[j], other.exponents[j])
-
-    row = (position, rotation, cloud, other)
-    overlapping = jnp.any(any_inside(near.reshape(-1), overlap, None, row).reshape(near.shape), axis=1)
+    others = scene.valid & (jnp.arange(scene.capacity) != index) & picks
+    wider = scene.replace(size=scene.size + config.clearance)
+    mask = others[None] & on_board[:, None]
+    body = clouds_of(cloud.T[None])
+    overlaps = collisions(body, np.zeros(tries, np.int32), make(rotation, position), wider, mask, own=True)
+    overlapping = jnp.any(overlaps, axis=1)
     intrudes = jnp.any(enters(possible, points), axis=1) & config.avoid_unseen
-    score = jax.random.uniform(key_order, (tries,)) - 2.0 * intrudes - 8.0 * (overlapping | ~on_board)
+    score = order - 2.0 * intrudes - 8.0 * (overlapping | ~on_board)
     _, best = jax.lax.top_k(score, tests)
     return position[best], rotation[best], turn[best], (~overlapping & on_board)[best]
 
 
-def _placement(key, space: ActionSpace, tables: ActionTables, scene, possible, index, T_grasp, wrist):
-    """A place for a picked object, and the gripper pose that puts it there: (found, T_world_place, T_world_object)."""
-    shelf, config = space.shelf, space.config
-    n, tests = scene.capacity, config.placements[1]
-    position, rotation, turn, candidate = _drawn_places(key, space, scene, possible, index, T_grasp)
-    other = scene.replace(size=scene.size + config.clearance, valid=scene.valid.at[index].set(False))
-    cloud = superquadric.sample_surface(scene.size[index], scene.exponents[index], config.object_points)
-    # The object turns about its own centre, and the gripper with it.
-    arm = T_grasp[:3, 3] - scene.position[index]
-    T_place = make(matmul(yaw_rotation(turn), T_grasp[:3, :3]), rotate(yaw_rotation(turn), arm) + position)
-
-    def clear(tables, row, i):
-        return ~jnp.any(hits_shelf(shelf, transform(row[0][i], tables.clouds[OPEN, row[1][...]].T)))
-
-    q7 = jnp.broadcast_to(tables.q7[OPEN, wrist], tests)
-    clear_way = arm_enters(shelf, space.gripper, space.waypoints, T_place, q7, candidate)
-    clear_way = masked_vmap(clear, clear_way, tables, (T_place, wrist))
-
-    mask = clear_way[:, None] & other.valid[None]
-    hits = gripper_hits(tables, OPEN, jnp.full(tests, wrist), T_place, other, mask)
-
-    def body_pair(_, row, i):
-        T, position, rotation, cloud, scene = row
-        k, j = i // n, i % n
-        swept = swept_object(cloud[...].T, matmul(rotation[k].T, T[k][:3, :3]), space.gripper.approach)
-        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
-        T_object_body = compose(T_object_world, make(rotation[k], position[k]))
-        return Pair(swept, T_object_body, scene.size[j], scene.exponents[j])
-
-    row = (T_place, position, rotation, cloud, scene)
-    mask = clear_way[:, None] & other.valid[None] & ~hits
-    hits |= any_inside(mask.reshape(-1), body_pair, None, row, block=32).reshape(mask.shape)
-    free = clear_way & ~jnp.any(hits, axis=1)
-    first = jnp.argmax(free)
-    return jnp.any(free), T_place[first], make(rotation[first], position[first])
-
-
-def motion_free(
-    space: ActionSpace, others: Superquadrics, T_world_gripper: Float[Array, "2 4 4"], q7: Float[Array, ""]
-) -> tuple[Bool[Array, ""], Float[Array, "2"]]:
-    """Whether the arm can follow both ways in and out closely, in one configuration, and links 2 to 5 touch nothing.
-
-    Between them the arm is outside the shelf, where it may turn as it likes, but not into another of its
-    configurations: it would fling away what it holds.
-
-    Args:
-      space: static.
-      others: the objects without the one in the hand.
-      T_world_gripper: where the object is grasped and where it is placed.
-      q7: angle of joint 7 [rad].
-
-    Returns:
-      Whether it can, and from which places outside [m].
-    """
-    q, reachable, outside = jax.vmap(lambda T: ways_in(T, q7, space.gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS))(
-        T_world_gripper
-    )
-    # Poses 5 cm apart at most.
-    hits = jnp.any(arm_hits(q[:, ::2].reshape(-1, q.shape[-1]), others))
-    able = jnp.all(reachable) & ~jnp.any(arm_hits_shelf(q, space.shelf)) & ~hits
-    return able & jnp.all(jnp.abs(q[1, 0] - q[0, 0]) < LARGEST_TRANSFER), outside
-
-
-def crossings_free(
+def placement(
+    key: Array,
     space: ActionSpace,
     tables: ActionTables,
     scene: Superquadrics,
-    after: Superquadrics,
-    action: Action,
+    possible: PossibleSpace,
+    index: Int[Array, ""],
+    T_grasp: Float[Array, "4 4"],
     wrist: Int[Array, ""],
-    outside: Float[Array, "2"],
     picks: Bool[Array, ""],
-) -> Bool[Array, ""]:
-    """Whether gripper and object hit nothing on their ways along x, and the object is outside the shelf between them.
+) -> tuple[Bool[Array, ""], Float[Array, "4 4"], Float[Array, "4 4"]]:
+    """A place for a picked object where it can be put: the first of those that are drawn, if any will do.
+
+    Args:
+      key: PRNG key.
+      space: static.
+      tables: constants of the problem.
+      scene: the objects.
+      possible: where the target may be.
+      index: the object.
+      T_grasp: where it is grasped.
+      wrist: index of the wrist angle.
+      picks: whether it is wanted; there is no place where it is not.
+
+    Returns:
+      Whether there is one, `T_world_gripper` as the object is released, and `T_world_object` then.
+    """
+    cloud = superquadric.sample_surface(scene.size[index], scene.exponents[index], space.config.object_points)
+    drawn = _drawn_places(key, space, scene, possible, cloud, index, T_grasp, picks)
+    position, rotation, turn, stands = drawn
+    # The object turns about its own centre, and the gripper with it.
+    arm = T_grasp[:3, 3] - scene.position[index]
+    T_place = make(matmul(yaw_rotation(turn), T_grasp[:3, :3]), rotate(yaw_rotation(turn), arm) + position)
+    held = make(in_hand(scene, index, T_grasp), scene.position[index])
+    T_world_gripper = jnp.concatenate([T_grasp[None], T_place])
+    T_world_object = jnp.concatenate([held[None], make(rotation, position)])
+    wanted = jnp.concatenate([picks[None], stands & picks])
+    able = transfers(space, tables, scene, index, cloud, wrist, T_world_gripper, T_world_object, wanted)
+    first = jnp.argmax(able)
+    return jnp.any(able), T_place[first], T_world_object[1:][first]
+
+
+def transfers(
+    space: ActionSpace,
+    tables: ActionTables,
+    scene: Superquadrics,
+    index: Int[Array, ""],
+    cloud: Float[Array, "p 3"],
+    wrist: Int[Array, ""],
+    T_world_gripper: Float[Array, "w 4 4"],
+    T_world_object: Float[Array, "w 4 4"],
+    wanted: Bool[Array, " w"],
+) -> Bool[Array, "{w}-1"]:
+    """To which of several places an object can be taken from where it is grasped.
+
+    The arm has to follow both ways closely, in one configuration: between them it is outside the shelf, where it may
+    turn as it likes, but not into another of its configurations: it would fling away what it holds. Links 2 to 5 and
+    the gripper must touch neither the shelf nor another object, the object no other on its way to the place, both
+    nothing on their ways along x, and between them the object has to be outside the shelf.
 
     Args:
       space: static.
       tables: constants of the problem.
-      scene, after: the objects before and after.
-      action: the pick-and-place.
-      wrist: index of its wrist angle.
-      outside: where the gripper is outside after the grasp, and before it places [m].
-      picks: whether it is one.
+      scene: the objects.
+      index: the one that is picked.
+      cloud: its surface in its own frame [m].
+      wrist: index of the wrist angle.
+      T_world_gripper: where it is grasped, and the gripper at the places.
+      T_world_object: the object in the hand where it is grasped, and at the places.
+      wanted: of which of them it is asked.
     """
-    n, index, p = scene.capacity, action.object, OBJECT_PLACES
-    T = jnp.stack([action.T_world_gripper, action.T_world_place])
-    others = scene.valid & (jnp.arange(n) != index) & picks
-    hit = jnp.any(crossing_hits(space, tables, OPEN, wrist, T, scene, jnp.broadcast_to(others, (2, n))))
+    n, ways, p, gripper = scene.capacity, len(T_world_gripper), OBJECT_PLACES, space.gripper
+    others = scene.replace(valid=scene.valid & (jnp.arange(n) != index))
+    swept, still = (cloud_index(tables, OPEN, wrist, at_rest) for at_rest in (False, True))
+    grippers = gripper_clouds(tables)
 
-    held = in_hand(scene, index, action.T_world_gripper)
-    rotation = jnp.stack([held, after.rotation[index]])
-    position = jnp.stack([scene.position[index], after.position[index]]) - space.gripper.approach * T[:, :3, 2]
-    length = crossing_length(T, outside, space.gripper)
+    def follows(clouds, own, T):
+        others, q7, swept = own
+        q, reachable, outside = ways_in(T, q7, gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS)
+        # Poses 5 cm apart at most.
+        touches = jnp.any(arm_hits(q[::2], others)) | jnp.any(arm_hits_shelf(q, space.shelf))
+        touches |= jnp.any(hits_shelf(space.shelf, transform(T, taken(clouds, swept[None])[0].T)))
+        return reachable & ~touches, q[0], outside
+
+    own = (others, tables.q7[OPEN, wrist], swept)
+    able, q, outside = masked_vmap(follows, wanted, grippers.points, own, T_world_gripper, block=32)
+    able &= jnp.all(jnp.abs(q - q[:1]) < LARGEST_TRANSFER, axis=-1)
+    able &= able[0]
+
+    # The gripper's approach to the places, at a distance from others, and its ways along x.
+    wider = scene.replace(size=scene.size + space.config.clearance)
+    objects = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wider, scene)
+    crossings, crosses = crossing_places(space, T_world_gripper)
+    places = jnp.concatenate([T_world_gripper[1:], crossings.reshape(-1, 4, 4)])
+    at_rest = np.arange(len(places)) >= ways - 1
+    near = jnp.where(at_rest[:, None], np.arange(2 * n)[None] >= n, np.arange(2 * n)[None] < n)
+    asked = jnp.concatenate([able[1:], jnp.repeat(able & crosses, CROSSING_PLACES)])
+    mask = asked[:, None] & near & jnp.tile(others.valid, 2)[None]
+    by_gripper = jnp.any(collisions(grippers, jnp.where(at_rest, still, swept), places, objects, mask), axis=1)
+    hit = jnp.any(by_gripper[ways - 1 :].reshape(ways, -1), axis=1) | jnp.pad(by_gripper[: ways - 1], (1, 0))
+
+    # The object on its way to the places, and along x.
+    back = -T_world_gripper[:, :3, 2]
+    into = swept_places(T_world_object[1:], back[1:], gripper.approach)
+    length = crossing_length(T_world_gripper, outside, gripper)
     share = (jnp.arange(p) + 1.0) / p
-    passed = jnp.broadcast_to(position[:, None], (2, p, 3)).at[..., 0].add(-length[:, None] * share[None])
-    ahead = jnp.sum(jnp.abs(rotation[:, 0]) * scene.size[index][None], axis=-1)
-    inside = passed[:, -1, 0] + ahead > space.shelf.front
-
-    def pair(_, row, i):
-        rotation, passed, cloud, scene = row
-        way, place, j = i // (p * n), i // n % p, i % n
-        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
-        T = compose(T_object_world, make(rotation[way], passed[way, place]))
-        return Pair(cloud[...].T, T, scene.size[j], scene.exponents[j])
-
-    reach = superquadric.bounding_radius(scene.size)
-    gap2 = jnp.sum((passed[:, :, None] - scene.position[None, None]) ** 2, axis=-1)
-    near = others[None, None] & (length > 0.0)[:, None, None] & (gap2 < ((reach + reach[index]) ** 2)[None, None])
-    cloud = superquadric.sample_surface(scene.size[index], scene.exponents[index], space.config.object_points)
-    hit |= jnp.any(any_inside(near.reshape(-1), pair, None, (rotation, passed, cloud, scene), block=32))
-    return ~hit & ~jnp.any(inside)
+    shift = jnp.broadcast_to((gripper.approach * back)[:, None], (ways, p, 3))
+    shift = shift.at[..., 0].add(-length[:, None] * share[None])
+    along = translate(jnp.broadcast_to(T_world_object[:, None], (ways, p, 4, 4)), shift)
+    ahead = jnp.sum(jnp.abs(T_world_object[:, 0, :3]) * scene.size[index][None], axis=-1)
+    inside = along[:, -1, 0, 3] + ahead > space.shelf.front
+    places = jnp.concatenate([into.reshape(-1, 4, 4), along.reshape(-1, 4, 4)])
+    asked = jnp.concatenate([jnp.repeat((able & ~hit)[1:], SWEPT_PLACES), jnp.repeat(able & ~hit & (length > 0.0), p)])
+    mask = asked[:, None] & others.valid[None]
+    body = clouds_of(cloud.T[None])
+    by_object = jnp.any(collisions(body, np.zeros(len(places), np.int32), places, scene, mask, own=True), axis=1)
+    by_sweep, on_crossing = jnp.split(by_object, [(ways - 1) * SWEPT_PLACES])
+    hit |= jnp.any(on_crossing.reshape(ways, p), axis=1)
+    hit |= jnp.pad(jnp.any(by_sweep.reshape(ways - 1, SWEPT_PLACES), axis=1), (1, 0))
+    free = able & ~hit & ~inside
+    return free[1:] & free[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -272,15 +261,15 @@ class PickAndPlace:
         """Whether the gripper enters possible space as it grasps; where the object is put is looked at later."""
         n, v, d = ways.reached.shape
         usable = ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None] & space.config.avoid_unseen
-        wrist = np.tile(self.wrists(space), n)
+        cloud = cloud_index(tables, OPEN, np.tile(self.wrists(space), n))
         T = ways.T_world_gripper.reshape(-1, 4, 4)
-        return approach_enters(tables, possible, OPEN, wrist, T, usable.reshape(-1)).reshape(n, v, d)
+        return approach_enters(tables, possible, cloud, T, usable.reshape(-1)).reshape(n, v, d)
 
-    def draft(self, key, space: ActionSpace, tables: ActionTables, scene, possible, ways: Ways, index, way) -> Draft:
-        """The grasp, a place, and the space at both ends."""
+    def draft(self, key, space: ActionSpace, tables: ActionTables, scene, possible, ways, index, way, wanted) -> Draft:
+        """The grasp, a place that it can be taken to, and the space at both ends."""
         way = jnp.clip(way, 0, ways.reached.shape[1] - 1)
         T, wrist = ways.T_world_gripper[index, way], jnp.asarray(self.wrists(space))[way]
-        placed, T_place, T_object = _placement(key, space, tables, scene, possible, index, T, wrist)
+        placed, T_place, T_object = placement(key, space, tables, scene, possible, index, T, wrist, wanted)
         action = Action(
             kind=jnp.int32(CODE),
             object=index.astype(jnp.int32),
@@ -294,19 +283,10 @@ class PickAndPlace:
         return Draft(placed, action, wrist, grippers, jnp.broadcast_to(T_object, (PLACES, 4, 4)))
 
     def predict(self, space, tables, push_model, scene, untouchable, action: Action, wrist) -> Prediction:
-        """The object, turned in the hand, moves with the gripper; impossible where either cannot get in or out."""
-        picks = action.kind == CODE
+        """The object, turned in the hand, moves with the gripper; `draft` has found out that it can."""
         after = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
-
-        def follows(_, row, i):
-            others, grasp, place, q7 = jax.tree.map(lambda a: a[...], row)
-            return motion_free(space, others, jnp.stack([grasp, place]), q7)
-
-        others = scene.replace(valid=scene.valid & (jnp.arange(scene.capacity) != action.object))
-        row = (others, action.T_world_gripper, action.T_world_place, action.q7)
-        able, outside = (a[0] for a in masked_vmap(follows, picks[None], None, row))
-        free = crossings_free(space, tables, scene, after, action, wrist, outside, able)
-        return Prediction(after, scene.valid & ~others.valid, able & free, jnp.float32(0.0))
+        moved = scene.valid & (jnp.arange(scene.capacity) == action.object)
+        return Prediction(after, moved, action.kind == CODE, jnp.float32(0.0))
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
         """See `motion.pick_and_place_reference`."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 
 import jax
@@ -11,14 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, PLACES, crossing_hits, gripper_hits, object_clouds
+from mechsearch_jax.actions.approach import (
+    CLOSE_WAYPOINTS,
+    CROSSING_PLACES,
+    PLACES,
+    cloud_index,
+    crossing_places,
+    gripper_clouds,
+    object_clouds,
+)
 from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace, ActionTables
 from mechsearch_jax.actions.push_starts import PushStarts, object_pushes, push_starts
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.types import Action, Draft, Prediction, Ways
 from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
 from mechsearch_jax.dynamics.push_model import PushModel
-from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.collision import collisions
+from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import back_off, make, transform, translate
 from mechsearch_jax.robot.arm_hits import arm_hits
@@ -27,7 +35,6 @@ from mechsearch_jax.robot.entry import (
     FEW_CROSSINGS,
     arm_follows,
     arm_path,
-    crossing_length,
     crossing_poses,
     way_in,
 )
@@ -66,74 +73,40 @@ def motion_free(
     n, gripper = CLOSE_WAYPOINTS, space.gripper
     start, end = action.T_world_gripper, action.T_world_place
     way = translate(jnp.broadcast_to(start, (n, 4, 4)), jnp.linspace(0.0, 1.0, n)[:, None] * (end - start)[None, :3, 3])
-    into, back = (way_in(T, gripper.nearest_outside, gripper, CLOSE_CROSSINGS, n) for T in (start, end))
+    into, back = jax.vmap(lambda T: way_in(T, gripper.nearest_outside, gripper, CLOSE_CROSSINGS, n))(
+        jnp.stack([start, end])
+    )
     q, follows = arm_path(jnp.concatenate([into, way[1:], back[::-1][1:]]), action.q7, space.shelf)
     begins, ends = len(into), len(into) + n - 1
-    # Poses 5 cm apart at most.
-    hits = arm_hits(q[:begins:2], scene) | arm_hits(q[ends::2], after) | (arm_hits(q[begins:ends:3], scene) & still)
-    return follows & ~jnp.any(hits)
+    # Poses 5 cm apart at most, of which those before the push see the objects where they were.
+    poses = np.concatenate([np.arange(len(q))[part] for part in (slice(0, begins, 2), slice(begins, ends, 3))])
+    both = arm_hits(q[np.concatenate([poses, np.arange(ends, len(q), 2)])], _joined(scene, after))
+    into, along, back = np.split(np.arange(len(both)), [len(range(0, begins, 2)), len(poses)])
+    hits = jnp.any(both[into], axis=0) | (jnp.any(both[along], axis=0) & jnp.concatenate([still, still]))
+    now = np.arange(2 * scene.capacity) < scene.capacity
+    return follows & ~jnp.any(jnp.where(now, hits, jnp.any(both[back], axis=0)))
 
 
-def push_hits_others(
+def _joined(*scenes: Superquadrics) -> Superquadrics:
+    """The objects of all scenes."""
+    return jax.tree.map(lambda *a: jnp.concatenate(a), *scenes)
+
+
+def gripper_meets(
     space: ActionSpace,
     tables: ActionTables,
     scene: Superquadrics,
-    action: Action,
-    wrist: Int[Array, ""],
-    still: Bool[Array, " n"],
-) -> Bool[Array, ""]:
-    """Whether a pushing gripper, on its way or on its retreat, hits an object that the push should leave in place.
-
-    A `PushModel` knows the hand and the fingers; links 6 and 7 and the retreat are tested here.
-
-    Args:
-      space: static.
-      tables: constants of the problem.
-      scene: the objects, before or after the push.
-      action: the push.
-      wrist: index of its wrist angle.
-      still: which objects it leaves in place.
-    """
-    share = (jnp.arange(PUSH_PLACES) + 1.0) / PUSH_PLACES
-    T = jnp.broadcast_to(action.T_world_gripper, (PUSH_PLACES, 4, 4))
-    T = translate(T, share[:, None] * action.displacement[None])
-    mask = jnp.broadcast_to(still & scene.valid, (PUSH_PLACES, scene.capacity))
-    return jnp.any(gripper_hits(tables, CLOSED, jnp.broadcast_to(wrist, PUSH_PLACES), T, scene, mask))
-
-
-def retreat_hits(
-    space: ActionSpace,
-    tables: ActionTables,
     after: Superquadrics,
     action: Action,
     wrist: Int[Array, ""],
     moved: Bool[Array, " n"],
-) -> Bool[Array, ""]:
-    """Whether the gripper, on its straight way back, hits an object that the push moved beside its own.
-
-    Args:
-      space: static.
-      tables: constants of the problem.
-      after: the objects after the push.
-      action: the push.
-      wrist: index of its wrist angle.
-      moved: which objects it moved.
-    """
-    others = moved & after.valid & (jnp.arange(after.capacity) != action.object)
-    slim = after.replace(size=jnp.maximum(after.size - TOUCHING, 0.5 * after.size))
-    return jnp.any(gripper_hits(tables, CLOSED, wrist[None], action.T_world_place[None], slim, others[None]))
-
-
-def crossings_hit(
-    space: ActionSpace,
-    tables: ActionTables,
-    scene: Superquadrics,
-    after: Superquadrics,
-    action: Action,
-    wrist: Int[Array, ""],
     pushes: Bool[Array, ""],
 ) -> Bool[Array, ""]:
-    """Whether the gripper hits an object before a push on its way in along x, or after the push on its way out.
+    """Whether the gripper hits what a push should not make it hit.
+
+    A `PushModel` knows the hand and the fingers while they push. Here links 6 and 7 are looked at, against objects that
+    stay; the way in along x, against all objects as they are; and the way back, against those that moved beside the
+    push's own, and along x against all objects as they are then.
 
     Args:
       space: static.
@@ -141,13 +114,32 @@ def crossings_hit(
       scene, after: the objects before and after the push.
       action: the push.
       wrist: index of its wrist angle.
-      pushes: whether it is one.
+      moved: which objects it moves.
+      pushes: whether it is one; nothing is hit where it is not.
     """
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene, after)
-    now = jnp.arange(2 * scene.capacity) < scene.capacity
-    mask = jnp.stack([now, ~now]) & both.valid[None] & pushes
-    T = jnp.stack([action.T_world_gripper, action.T_world_place])
-    return jnp.any(crossing_hits(space, tables, CLOSED, wrist, T, both, mask))
+    n, k = scene.capacity, PUSH_PLACES
+    slim = after.replace(size=jnp.maximum(after.size - TOUCHING, 0.5 * after.size))
+    ends = jnp.stack([action.T_world_gripper, action.T_world_place])
+    share = (jnp.arange(k) + 1.0) / k
+    along = translate(jnp.broadcast_to(ends[0], (k, 4, 4)), share[:, None] * action.displacement[None])
+    crossings, crosses = crossing_places(space, ends)
+    places = jnp.concatenate([along, ends[1:], crossings.reshape(-1, 4, 4)])
+    others = moved & (jnp.arange(n) != action.object)
+    nothing = jnp.zeros(n, bool)
+    rows = [
+        jnp.concatenate(row)
+        for row in (
+            (~moved, nothing, nothing),
+            (nothing, nothing, others),
+            (jnp.broadcast_to(crosses[0], n), nothing, nothing),
+            (nothing, jnp.broadcast_to(crosses[1], n), nothing),
+        )
+    ]
+    objects = _joined(scene, after, slim)
+    mask = jnp.repeat(jnp.stack(rows), np.array([k, 1, *[CROSSING_PLACES] * 2]), axis=0)
+    swept, still = (cloud_index(tables, CLOSED, wrist, at_rest) for at_rest in (False, True))
+    cloud = jnp.where(np.arange(len(places)) <= k, swept, still)
+    return jnp.any(collisions(gripper_clouds(tables), cloud, places, objects, mask & objects.valid[None] & pushes))
 
 
 def _in_words(displacement: Float[np.ndarray, " 3"]) -> str:
@@ -198,27 +190,18 @@ class Push:
 
         gripper, outside = space.gripper, space.gripper.nearest_outside
 
-        def follows(tables, row, i, crossing):
-            starts, ends = row
-            T, end = starts[i // d], ends[i // d, i % d]
+        def leaves(clouds, _, row):
+            T, end, q7, cloud = row
             back = jnp.float32(gripper.approach)
             middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
-            path = jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)])
-            if crossing:
-                into, out = (crossing_poses(pose, outside, gripper, FEW_CROSSINGS) for pose in (T, end))
-                path = jnp.concatenate([into, path, out[::-1]])
-            return arm_follows(path, tables.q7[CLOSED, jnp.asarray(wrist)[i // d]], space.shelf)
+            into, out = crossing_poses(jnp.stack([T, end]), outside, gripper, FEW_CROSSINGS)
+            way = jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)])
+            follows = arm_follows(jnp.concatenate([into, way, out[::-1]]), q7, space.shelf)
+            return follows & ~jnp.any(hits_shelf(space.shelf, transform(end, taken(clouds, cloud[None])[0].T)))
 
-        def leaves(tables, row, i):
-            points = transform(row[1][i // d, i % d], tables.clouds[CLOSED, jnp.asarray(wrist)[i // d]].T)
-            return follows(tables, row, i, crossing=False) & ~jnp.any(hits_shelf(space.shelf, points))
-
-        crosses = functools.partial(follows, crossing=True)
-        reached = masked_vmap(leaves, jnp.repeat(near, d), tables, (T, ends), block=512)
-        longest = jnp.maximum(crossing_length(T, outside, gripper)[:, None], crossing_length(ends, outside, gripper))
-        crossing = reached & (longest > 0.0).reshape(-1)
-        reached = (reached & ~crossing) | masked_vmap(crosses, crossing, tables, (T, ends), block=128)
-        return reached.reshape(-1, d)
+        q7, cloud = jnp.repeat(tables.q7[CLOSED, wrist], d), np.repeat(cloud_index(tables, CLOSED, wrist), d)
+        rows = (jnp.repeat(T, d, axis=0), ends.reshape(-1, 4, 4), q7, jnp.asarray(cloud))
+        return masked_vmap(leaves, jnp.repeat(near, d), gripper_clouds(tables).points, None, rows).reshape(-1, d)
 
     def swept_hits(self, space, scene, T, mask):
         """The hand is empty."""
@@ -234,20 +217,27 @@ class Push:
         usable = ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None] & space.config.avoid_unseen
         shift = self._displacements(space, n)
 
-        def one(tables, row, i):
-            T, shift, possible, scene, clouds = row
-            k, j = i // d, i % d
-            w, o = jnp.asarray(wrist)[k], jnp.asarray(owner)[k]
-            way = shift[k, j][None] * jnp.linspace(0.0, 1.0, PLACES)[:, None]
-            gripper = transform(T[k], tables.clouds[CLOSED, w].T)
-            body = transform(make(scene.rotation[o], scene.position[o]), clouds[o].T)
-            both = jnp.concatenate([gripper[None] + way[:, None], body[None] + way[:, None]], axis=1)
-            return jnp.any(enters(jax.tree.map(lambda a: a[...], possible), both))
+        def one(grippers, own, row):
+            T, shift, gripper, owner = row
+            possible, bodies = own
+            way = shift[None] * jnp.linspace(0.0, 1.0, PLACES)[:, None]
+            points = transform(T, taken(grippers, gripper[None])[0].T)
+            both = jnp.concatenate([points, taken(bodies, owner[None])[0].T])
+            return jnp.any(enters(possible, both[None] + way[:, None]))
 
-        row = (ways.T_world_gripper.reshape(-1, 4, 4), shift, possible, scene, clouds)
-        return masked_vmap(one, usable.reshape(-1), tables, row, block=64).reshape(n, v, d)
+        bodies = jnp.swapaxes(
+            transform(make(scene.rotation, scene.position)[:, None], jnp.swapaxes(clouds, 1, 2)), 1, 2
+        )
+        rows = (
+            jnp.repeat(ways.T_world_gripper.reshape(-1, 4, 4), d, axis=0),
+            shift.reshape(-1, 3),
+            jnp.asarray(np.repeat(cloud_index(tables, CLOSED, wrist), d)),
+            jnp.asarray(np.repeat(owner, d)),
+        )
+        grippers = gripper_clouds(tables).points
+        return masked_vmap(one, usable.reshape(-1), grippers, (possible, bodies), rows, block=64).reshape(n, v, d)
 
-    def draft(self, key, space: ActionSpace, tables: ActionTables, scene, possible, ways: Ways, index, way) -> Draft:
+    def draft(self, key, space: ActionSpace, tables: ActionTables, scene, possible, ways, index, way, wanted) -> Draft:
         """The push, and the space that it sweeps between its ends."""
         _, v, d = ways.reached.shape
         way = jnp.clip(way, 0, v * d - 1)
@@ -290,19 +280,17 @@ class Push:
         way = jnp.where(pushes, action.displacement, 0.0)
         pushed = push_model(space.shelf, scene, tables.pusher, action.T_world_gripper, way, action.q7)
         moved = pushed.moved
-        still = scene.valid & ~moved & pushes
         config = space.config
         holds = pushed.resolved & jnp.isfinite(pushed.residual) & jnp.all(pushed.topples <= config.topple)
         spoiled = ~holds | jnp.any(moved & untouchable)
         spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
-        spoiled |= push_hits_others(space, tables, scene, action, wrist, still)
-        spoiled |= retreat_hits(space, tables, pushed.scene, action, wrist, moved & pushes)
-        spoiled |= crossings_hit(space, tables, scene, pushed.scene, action, wrist, pushes & ~spoiled)
+        spoiled |= gripper_meets(space, tables, scene, pushed.scene, action, wrist, moved, pushes & ~spoiled)
 
-        def free(_, row, i):
-            return motion_free(space, *jax.tree.map(lambda a: a[...], row))
+        def free(_, own, row):
+            return motion_free(space, *own)
 
-        follows = masked_vmap(free, (pushes & ~spoiled)[None], None, (scene, pushed.scene, still, action))[0]
+        own = (scene, pushed.scene, scene.valid & ~moved, action)
+        follows = masked_vmap(free, (pushes & ~spoiled)[None], None, own, None)[0]
         return Prediction(pushed.scene, moved, ~spoiled & follows, jnp.sum(pushed.topples))
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:

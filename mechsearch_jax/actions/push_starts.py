@@ -141,13 +141,12 @@ def object_pushes(
     _, first, alike = np.unique(told, axis=0, return_index=True, return_inverse=True)
     headings = starts.heading[first]
 
-    def clear(tables, row, i):
-        k, variant = i // len(first), i % len(first)
-        one = jax.tree.map(lambda a: a[k], row[0])
-        world = transform(row[1][k, variant], tables.pusher)
+    def clear(pusher, _, row):
+        one, T, heading = row
+        world = transform(T, pusher)
         level = (world[:, 2] > one.low - config.push_gap) & (world[:, 2] < one.high + config.push_gap)
         local = turned(-one.yaw, world[:, :2] - one.position[None])
-        heading = turned(-one.yaw, -jnp.asarray(headings)[variant])
+        heading = turned(-one.yaw, -heading)
         # In front of the object the palm may pass close by; only along the push does it keep the whole gap.
         grown = one.half + PASSING_GAP
         away = _exit_distance(grown[None], one.round, local, jnp.broadcast_to(heading[None], local.shape))
@@ -157,7 +156,9 @@ def object_pushes(
         lowest = jnp.min(jnp.where(touching, world[:, 2], jnp.inf))
         return farthest + config.push_gap - PASSING_GAP, lowest - shelf.board
 
-    found = masked_vmap(clear, jnp.repeat(fresh, len(first)), tables, (prints, T[:, first]))
+    each = jax.tree.map(lambda a: jnp.repeat(a, len(first), axis=0), prints)
+    rows = (each, T[:, first].reshape(-1, 4, 4), np.tile(headings, (n, 1)))
+    found = masked_vmap(clear, jnp.repeat(fresh, len(first)), tables.pusher, None, rows)
     distance, contact = (a.reshape(n, len(first))[:, alike.reshape(-1)] for a in found)
     stable = contact <= jnp.maximum(leverage, LOW_CONTACT)
     back = -distance[..., None] * starts.heading[None]

@@ -92,8 +92,8 @@ def sample_action(
     chosen, index = row // n, row % n
 
     drafts = [
-        kind.draft(key_place, space, tables, scene, possible, w, index, way)
-        for kind, w in zip(SAMPLED_KINDS, options, strict=True)
+        kind.draft(key_place, space, tables, scene, possible, w, index, way, possible_at_all & (chosen == i))
+        for i, (kind, w) in enumerate(zip(SAMPLED_KINDS, options, strict=True))
     ]
     draft = drafts[-1]
     for i in reversed(range(len(drafts) - 1)):

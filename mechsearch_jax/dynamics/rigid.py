@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from mechsearch_jax.geometry.footprints import QUARTER_TURN, footprints, turned
+from mechsearch_jax.geometry.footprints import QUARTER_TURN, headings, turned
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, matmul, transform, yaw_rotation
 
@@ -28,11 +27,11 @@ def in_hand(scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Ar
     An approximation: one with flat sides turns about its own vertical axis until the nearest of them lies flat against
     a finger, and does not shift; a round one stays as it is.
     """
-    one = footprints(jax.tree.map(lambda a: a[index][None], scene))
-    approach = jnp.arctan2(T_world_grasp[1, 2], T_world_grasp[0, 2])
-    skew = approach - one.yaw[0]
+    rotation = scene.rotation[index]
+    now = headings(rotation, scene.exponents[index])
+    skew = jnp.arctan2(T_world_grasp[1, 2], T_world_grasp[0, 2]) - now.yaw
     skew = skew - QUARTER_TURN * jnp.round(skew / QUARTER_TURN)
-    return matmul(yaw_rotation(jnp.where(one.round[0], 0.0, skew)), scene.rotation[index])
+    return matmul(yaw_rotation(jnp.where(now.round, 0.0, skew)), rotation)
 
 
 def pick_and_place(

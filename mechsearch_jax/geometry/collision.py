@@ -1,141 +1,183 @@
-"""Points against superquadrics.
+"""Point clouds against superquadrics: the one place where collisions are looked for.
 
-A cloud collides with an object if one of its points is inside it (paper equations 14 to 17). Powers are by far the most
-expensive part of that test, and almost never needed: the p-norms of the gauge lie between norms without powers, which
-decide every cloud except those that graze the surface.
+A cloud collides with an object if one of its points is inside it, where the gauge is below 1 (paper equations 14 to
+17). Powers are by far the most expensive part of that test, and almost never needed: most pairs are told apart by boxes
+around them, and the p-norms of the gauge lie between norms without powers, which decide every cloud except those that
+graze the surface.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+import functools
+from typing import NamedTuple
 
+import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.geometry.masked import block_size, for_each, merged, rows_of
+from mechsearch_jax.geometry.collision_kernel import collide, kernel_available
+from mechsearch_jax.geometry.masked import Entry, block_size, entry_of, for_each, merged, on_cpu, put, taken
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import inverse, make, matmul
+
+# How many pairs a CPU looks at together: at boxes, at whole clouds, and at gauges.
+BOXES, CLOUDS, GAUGES = 1024, 128, 32
+# Of so few pairs, those that are near are decided by gauges at once: it would not pay to look at bounds first.
+FEW = 1024
+# What is known of a pair: it is apart, not decided yet, or it collides.
+APART, OPEN, HIT = jnp.uint8(0), jnp.uint8(1), jnp.uint8(2)
 
 
-def _transform_cloud(T, cloud):
-    """Coordinates of a cloud stored as three rows, after a rigid transform: three arrays of its length."""
-    return [sum(T[i, k] * cloud[k] for k in range(3)) + T[i, 3] for i in range(3)]
-
-
-@jax.jit
-def _bounds(cloud, T_object_cloud, size, exponents):
-    """Bounds on the least gauge of a cloud's points, with no power evaluated per point."""
-    p, r = 2.0 / exponents[1], 2.0 / exponents[0]
-    x, y, z = (jnp.abs(q) / size[k] for k, q in enumerate(_transform_cloud(T_object_cloud, cloud)))
-    most, two = jnp.maximum(x, y), jnp.sqrt(x * x + y * y)
-    below = jnp.where(p > 2.0, most, two)
-    above = jnp.where(p >= 2.0, jnp.minimum(two, 2.0 ** (1.0 / p) * most), x + y)
-    # The axis and the plane are joined by an r-norm with r >= 1: at least the larger of the two, at most 2^(1/r)
-    # times it.
-    return jnp.min(jnp.maximum(below, z)), jnp.min(jnp.maximum(above, z)) * 2.0 ** (1.0 / r)
-
-
-@jax.jit
-def _least_gauge(cloud, T_object_cloud, size, exponents):
-    points = jnp.stack(_transform_cloud(T_object_cloud, cloud), axis=-1)
-    return jnp.min(superquadric.gauge(size[None], exponents[None], points))
-
-
-class Pair(NamedTuple):
-    """A cloud and a superquadric that may collide.
+class Clouds(flax.struct.PyTreeNode):
+    """Point clouds, each in a frame of its own.
 
     Attributes:
-      cloud: the cloud's coordinates in its own frame, three rows [m].
-      T_object_cloud: pose of the cloud in the object's frame.
-      size: half-extents of the superquadric [m].
-      exponents: its exponents.
+      points: as rows of coordinates, shape (C, 3, P) [m].
+      low, high: boxes around them, shape (C, 3) [m].
+      gap: how far a point may be from the nearest one of the first `first` of its cloud [m].
+      first: so many points of a cloud that all of a batch share are looked at first; all where it is 0. Static.
     """
 
-    cloud: Array
-    T_object_cloud: Array
-    size: Array
-    exponents: Array
+    points: jax.Array
+    low: jax.Array
+    high: jax.Array
+    gap: jax.Array | float = 0.0
+    first: int = flax.struct.field(pytree_node=False, default=0)
 
 
-def mark_hits(
-    hits: Bool[Array, " m"],
-    mask: Bool[Array, " n"],
-    pair: Callable[[Array], Pair],
-    where: Callable[[Array], Array],
-    block: int,
-    coarse: int = 0,
-    gap: Array | float = 0.0,
-) -> Bool[Array, " m"]:
-    """Set `hits[where(i)]` for the masked `i` whose pair collides.
-
-    Three tests, each only for what the one before left open: a first part of the cloud, the whole cloud with bounds
-    that need no powers, and the exact gauge.
-
-    Args:
-      hits: what was hit before.
-      mask: which of the `n` pairs are worth a look.
-      pair: makes pair `i`.
-      where: place of pair `i` in `hits`; beyond its end where `i` is `n`.
-      block: how many pairs are tested at once.
-      coarse: how many points the first part has; 0 leaves that test out.
-      gap: how far a point of the cloud may be from the nearest one of its first part [m].
-    """
-    n = mask.shape[0]
-
-    def bounded(cut):
-        def bounds(i):
-            cloud, T, size, exponents = pair(i)
-            lower, upper = _bounds(cloud[:, :cut] if cut else cloud, T, size, exponents)
-            # The gauge is a norm, at most the length over the least half-extent, or twice that below 2-norms.
-            slack = jnp.where(jnp.max(exponents) > 1.0, 2.0, 1.0) * gap / jnp.min(size) if cut else 0.0
-            return lower < 1.0 + slack, upper < 1.0
-
-        return jax.vmap(bounds)
-
-    def test(hits, index, mask, cut):
-        """Test the masked ones of pairs `index`, or of all pairs, and those that stay open further."""
-
-        def body(hits, inner, active):
-            chosen = inner if index is None else jnp.where(active, index[jnp.minimum(inner, mask.size - 1)], n)
-            near, sure = bounded(cut)(jnp.minimum(chosen, n - 1))
-            sure &= active
-            hits = hits.at[where(jnp.where(sure, chosen, n))].set(True, mode="drop")
-            still_open = active & near & ~sure
-            return test(hits, chosen, still_open, 0) if cut else exact(hits, chosen, still_open)
-
-        return for_each(mask, body, hits, block)
-
-    def exact(hits, index, mask):
-        def body(hits, inner, active):
-            chosen = jnp.where(active, index[jnp.minimum(inner, index.shape[0] - 1)], n)
-            least = jax.vmap(lambda i: _least_gauge(*pair(i)))(jnp.minimum(chosen, n - 1))
-            return hits.at[where(jnp.where(active & (least < 1.0), chosen, n))].set(True, mode="drop")
-
-        return for_each(mask, body, hits, max(block // 8, 1))
-
-    return test(hits, None, mask, coarse)
+def clouds_of(points: Float[Array, "c 3 p"]) -> Clouds:
+    """Clouds from their points, as rows of coordinates [m]."""
+    return Clouds(points, jnp.min(points, axis=-1), jnp.max(points, axis=-1))
 
 
-def any_inside(
-    mask: Bool[Array, " n"], pair: Callable[[Any, Any, Array], Pair], shared: Any, row: Any, block: int = 256
-) -> Bool[Array, " n"]:
-    """Whether any point of a cloud lies inside a superquadric, for the masked ones of `n` pairs.
+def collisions(
+    clouds: Clouds,
+    cloud: Int[Array, " m"],
+    T_world_cloud: Float[Array, "m 4 4"],
+    scene: Superquadrics,
+    mask: Bool[Array, "m n"],
+    own: bool = False,
+) -> Bool[Array, "m n"]:
+    """Which placed clouds collide with which objects.
 
     Args:
+      clouds: what is placed.
+      cloud: which of them each placed cloud is.
+      T_world_cloud: where it is.
+      scene: the objects, fields (N, ...).
       mask: pairs that are worth a look; the others are reported as free of collision.
-      pair: makes pair `i` from `shared`, `row` and `i`; see `masked.masked_vmap`.
-      shared, row: what pairs are made from.
-      block: how many pairs are evaluated at once on a CPU.
+      own: whether the clouds differ along a batch. If they do not they are not copied; static.
 
     Returns:
       True where a masked pair collides.
     """
+    T_object_world = inverse(make(scene.rotation, scene.position))[:, :3].reshape(-1, 12)
+    objects = jnp.concatenate([T_object_world, scene.size, scene.exponents], axis=1)
+    boxes = jnp.stack([clouds.low, clouds.high], axis=1)
+    table = (clouds.points, boxes, clouds.gap)
+    rows = (jnp.asarray(cloud, jnp.uint32), T_world_cloud, objects, table[:2] if own else None)
+    return merged(functools.partial(_collide, clouds.first))(mask, None if own else table, rows)
 
-    def run(mask, shared, rows):
-        batch, n = mask.shape[:-1], mask.shape[-1]
-        make = lambda i: pair(shared, rows_of(rows, i // n, batch), i % n)  # noqa: E731
-        hits = jnp.zeros(mask.size, bool)
-        return mark_hits(hits, mask.reshape(-1), make, lambda i: i, block_size(block)).reshape(mask.shape)
 
-    return merged(run)(mask, shared, row)
+def _collide(first: int, mask: Bool[Array, "*batch m n"], shared: tuple | None, rows: tuple) -> Array:
+    """See `collisions`; the axes of a batch may be in front."""
+    batch, (m, n), total = mask.shape[:-2], mask.shape[-2:], mask.size
+    clouds, T_world_cloud, objects, own = rows
+    if not on_cpu() and kernel_available():
+        if shared is not None:
+            own = tuple(a.reshape(*[1] * len(batch), *a.shape) for a in shared[:2])
+        return collide(mask, *own, clouds, T_world_cloud, objects)
+
+    class Pairs(NamedTuple):
+        """Pairs of a cloud and an object, and the cloud's pose in the object's frame, as 3 x 4 numbers."""
+
+        relative: Array
+        size: Array
+        exponents: Array
+        entry: Entry
+        cloud: Array
+
+        def table(self, i: int) -> Array:
+            if shared is not None:
+                return taken(shared[i], self.cloud)
+            return self.entry.of(own[i], (self.cloud, own[i].shape[len(batch)]))
+
+    def pairs(index):
+        entry, width = entry_of(index, batch, m * n), jnp.uint32(n)
+        j = jax.lax.rem(index, width)
+        k = jax.lax.rem(jax.lax.div(index, width), jnp.uint32(m))
+        numbers = entry.of(objects, (j, n))
+        relative = matmul(numbers[:, :12].reshape(-1, 3, 4), entry.of(T_world_cloud, (k, m)))
+        return Pairs(relative, numbers[:, 12:15], numbers[:, 15:], entry, entry.of(clouds, (k, m)))
+
+    def near(index):
+        """Whether the boxes around clouds and objects overlap, along the axes of the clouds'."""
+        here = pairs(index)
+        box = here.table(1)
+        rotation = here.relative[:, :, :3]
+        reach = jnp.sum(jnp.abs(rotation) * here.size[:, :, None], axis=1)
+        centre = -jnp.sum(rotation * here.relative[:, :, 3:], axis=1)
+        return jnp.where(jnp.all((centre - reach < box[:, 1]) & (centre + reach > box[:, 0]), axis=1), OPEN, APART)
+
+    def coordinates(here, count):
+        """Magnitudes of the points' coordinates in half-extents, (3, K, P)."""
+        points = here.table(0)
+        points = points[..., :count] if count else points
+        rows = jnp.moveaxis(here.relative / here.size[:, :, None], 1, 0)
+        x, y, z = jnp.moveaxis(points, 1, 0)
+        return jnp.abs(rows[..., :1] * x[None] + rows[..., 1:2] * y[None] + (rows[..., 2:3] * z[None] + rows[..., 3:]))
+
+    def bounded(count):
+        def bounds(index):
+            here = pairs(index)
+            least, most = _bounds(coordinates(here, count), here.exponents)
+            if count:
+                assert shared is not None
+                # The gauge is a norm, at most the length over the least half-extent, or twice that below 2-norms.
+                twice = jnp.where(jnp.max(here.exponents, axis=1) > 1.0, 2.0, 1.0)
+                least = least - twice * shared[2] / jnp.min(here.size, axis=1)
+            return jnp.where(most < 1.0, HIT, jnp.where(least < 1.0, OPEN, APART))
+
+        return bounds
+
+    def gauged(index):
+        here = pairs(index)
+        least = jnp.min(superquadric.unit_gauge(coordinates(here, 0), here.exponents.T[:, :, None]), axis=1)
+        return jnp.where(least < 1.0, HIT, APART)
+
+    def decide(state, test, block):
+        """Look closer at what is open."""
+
+        def body(state, index, active):
+            return put(state, index, test(jax.lax.min(index, jnp.uint32(total - 1))))
+
+        return for_each(state == OPEN, body, state, block_size(block))
+
+    state = decide(jnp.where(mask.reshape(-1), OPEN, APART), near, BOXES)
+    if first:
+        state = decide(state, bounded(first), CLOUDS)
+    if m * n > FEW:
+        state = decide(state, bounded(0), CLOUDS)
+    state = decide(state, gauged, GAUGES)
+    return (state == HIT).reshape(mask.shape)
+
+
+def _bounds(scaled: Float[Array, "3 k p"], exponents: Float[Array, "k 2"]) -> tuple[Float[Array, " k"], ...]:
+    """Bounds on the least gauge of points, with no power evaluated per point.
+
+    Args:
+      scaled: magnitudes of their coordinates in half-extents.
+      exponents: of the superquadrics.
+    """
+    powers = 2.0 / exponents
+    roots = jnp.exp2(0.5 * exponents)
+    p, root = powers[:, 1:], roots[:, 1:]
+    x, y, z = scaled
+    most, two = jnp.maximum(x, y), jnp.sqrt(x * x + y * y)
+    below = jnp.where(p > 2.0, most, two)
+    above = jnp.where(p >= 2.0, jnp.minimum(two, root * most), x + y)
+    # The axis and the plane are joined by an r-norm with r >= 1: at least the larger of the two, at most 2^(1/r)
+    # times it.
+    return jnp.min(jnp.maximum(below, z), axis=1), jnp.min(jnp.maximum(above, z), axis=1) * roots[:, 0]

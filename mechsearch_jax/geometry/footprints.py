@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
 
@@ -32,24 +33,43 @@ def footprints(scene: Superquadrics) -> Footprints:
 
     An approximation: exponents e2 above 0.6 about a vertical axis count as round, everything else as a rectangle.
     """
-    rows = jnp.arange(scene.capacity)
-    vertical = jnp.argmax(jnp.abs(scene.rotation[:, 2, :]), axis=-1)
-    first, second = (vertical + 1) % 3, (vertical + 2) % 3
-    axis = scene.rotation[rows, :, first]
-    yaw = jnp.arctan2(axis[:, 1], axis[:, 0])
-    along = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
-    across = jnp.stack([-jnp.sin(yaw), jnp.cos(yaw)], axis=-1)
-    upright = jnp.abs(scene.rotation[rows, 2, vertical]) > 0.98
-    # Each object has directions of its own here.
-    one_by_one = jax.vmap(lambda one, u: extents(jax.tree.map(lambda a: a[None], one), u)[0])
-    level = jnp.stack([along, across], axis=-1)
-    projected = one_by_one(scene, jnp.concatenate([level, jnp.zeros_like(level[:, :1])], axis=1))
-    own = [scene.size[rows, first], scene.size[rows, second]]
-    half = jnp.where(upright[:, None], jnp.stack(own, axis=-1), projected)
-    height = bounding_half_extents(scene)[:, 2]
-    z = scene.position[:, 2]
-    is_round = upright & (vertical == 2) & (scene.exponents[:, 1] > ROUND_EXPONENT)
-    return Footprints(half, is_round, scene.position[:, :2], yaw, z - height, z + height, scene.valid)
+    heading = headings(scene.rotation, scene.exponents)
+    c, s, zero = jnp.cos(heading.yaw), jnp.sin(heading.yaw), jnp.zeros_like(heading.yaw)
+    # Along its yaw, across it, and upwards.
+    rows = [jnp.stack(row, axis=-1) for row in ((c, -s, zero), (s, c, zero), (zero, zero, zero + 1.0))]
+    reach = extents(scene, jnp.stack(rows, axis=-2))
+    own = jnp.sum(scene.size[:, None] * heading.level, axis=-1)
+    half = jnp.where(heading.upright[:, None], own, reach[:, :2])
+    z, height = scene.position[:, 2], reach[:, 2]
+    return Footprints(half, heading.round, scene.position[:, :2], heading.yaw, z - height, z + height, scene.valid)
+
+
+class Headings(NamedTuple):
+    """How objects stand; see `footprints`.
+
+    Attributes:
+      yaw: of the first axis that is level [rad].
+      level: which of their own axes are the first and the second level one, as 0 and 1, shape (..., 2, 3).
+      upright: whether the third axis is vertical.
+      round: whether they are round seen from above.
+    """
+
+    yaw: Float[Array, "*batch"]
+    level: Float[Array, "*batch 2 3"]
+    upright: Bool[Array, "*batch"]
+    round: Bool[Array, "*batch"]
+
+
+def headings(rotation: Float[Array, "*batch 3 3"], exponents: Float[Array, "*batch 2"]) -> Headings:
+    """How objects with some `R_world_object` and exponents stand."""
+    up = jnp.abs(rotation[..., 2, :])
+    vertical = jnp.argmax(up, axis=-1)
+    order = (vertical[..., None] + jnp.arange(1, 3).reshape(*[1] * vertical.ndim, 2)) % 3
+    level = jax.nn.one_hot(order, 3)
+    axis = jnp.sum(rotation[..., :2, :] * level[..., :1, :], axis=-1)
+    upright = jnp.max(up, axis=-1) > 0.98
+    is_round = upright & (vertical == 2) & (exponents[..., 1] > ROUND_EXPONENT)
+    return Headings(jnp.arctan2(axis[..., 1], axis[..., 0]), level, upright, is_round)
 
 
 def turned(yaw: Float[Array, "..."], v: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
@@ -63,7 +83,7 @@ def dot(a, b):
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
 
 
-def extents(scene: Superquadrics, directions: Float[Array, "3 d"]) -> Float[Array, "n d"]:
+def extents(scene: Superquadrics, directions: Float[Array, "*#n 3 d"]) -> Float[Array, "n d"]:
     """How far objects reach from their centres along directions [m].
 
     An approximation: the objects are taken as elliptic cylinders if their exponent e2 is above 0.6, else as boxes; both
@@ -71,10 +91,11 @@ def extents(scene: Superquadrics, directions: Float[Array, "3 d"]) -> Float[Arra
 
     Args:
       scene: the objects, fields (N, ...).
-      directions: unit vectors in the world, as columns.
+      directions: unit vectors in the world, as columns; of all objects, or of each.
     """
-    local = jnp.sum(scene.rotation[:, :, :, None] * directions[None, :, None, :], axis=1)
-    x, y, z = (jnp.abs(local[:, i]) * scene.size[:, i, None] for i in range(3))
+    directions = directions[None] if directions.ndim == 2 else directions
+    local = jnp.sum(scene.rotation[:, :, :, None] * directions[:, :, None, :], axis=1)
+    x, y, z = jnp.moveaxis(jnp.abs(local) * scene.size[:, :, None], 1, 0)
     square = x**2 + y**2
     plane = jnp.sqrt(jnp.where(square > 0, square, 1.0)) * (square > 0)
     return jnp.where((scene.exponents[:, 1] > ROUND_EXPONENT)[:, None], plane, x + y) + z

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 # A GPU needs that many times as large blocks to be busy; beyond that its memory is the limit.
 GPU_BLOCKS = 64
@@ -27,27 +27,57 @@ WIDTH = 64
 Carry = TypeVar("Carry")
 
 
-class Row:
-    """An array's part that belongs to one element of a batch. What is taken from it is all that is ever read.
+class Entry(NamedTuple):
+    """Places in what has the axes of a batch in front, each given by one number.
 
-    It stands for the array without its batch axes: `row[k, 2]` and `row[...]` do what they would do there.
+    Attributes:
+      batch: sizes of the axes.
+      axes: where along each of them.
     """
 
-    __slots__ = ("_array", "_index")
+    batch: tuple[int, ...]
+    axes: tuple[Array, ...]
 
-    def __init__(self, array: Array, index: tuple[Array, ...]):
-        # An array that does not vary along an axis of the batch has a length of 1 there.
-        self._array = array
-        self._index = tuple(jnp.zeros_like(i) if n == 1 else i for i, n in zip(index, array.shape, strict=False))
+    def of(self, array: Array, *within: tuple[Array, int]) -> Array:
+        """The parts of an array that belong to the entries; one that does not vary along an axis has a length of 1.
 
-    def __getitem__(self, key: Any) -> Array:
-        return self._array[(*self._index, *(key if isinstance(key, tuple) else (key,)))]
+        Args:
+          array: with the axes of the batch in front, and after them those of `within`.
+          within: where along further axes, and their sizes.
+        """
+        lead = len(self.batch)
+        axes = [*((i, n) for i, n in zip(self.axes, array.shape[:lead], strict=True) if n > 1), *within]
+        flat = array.reshape(-1, *array.shape[lead + len(within) :])
+        if not axes:
+            return flat[0]
+        index, _ = axes[0]
+        for more, size in axes[1:]:
+            index = index * jnp.uint32(size) + more
+        return taken(flat, index)
 
 
-def rows_of(rows: Any, index: Array, batch: tuple[int, ...]) -> Any:
-    """The `Row`s of a pytree whose leaves have the axes of a batch in front, for an index into the flattened batch."""
-    where = jnp.unravel_index(index, batch) if batch else ()
-    return jax.tree.map(lambda a: Row(a, where), rows)
+def taken(array: Array, index: Int[Array, " k"]) -> Array:
+    """Rows of an array; `array[index]` for indices that are known to be in range, which needs many operations less."""
+    numbers = jax.lax.GatherDimensionNumbers(tuple(range(1, array.ndim)), (0,), (0,))
+    sizes = (1, *array.shape[1:])
+    return jax.lax.gather(array, index[:, None], numbers, sizes, mode=jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+
+
+def put(array: Array, index: Int[Array, " k"], values: Array) -> Array:
+    """The array with other rows; those beyond its end are left out."""
+    numbers = jax.lax.ScatterDimensionNumbers(tuple(range(1, array.ndim)), (0,), (0,))
+    mode = jax.lax.GatherScatterMode.FILL_OR_DROP
+    return jax.lax.scatter(array, index[:, None], values, numbers, mode=mode)
+
+
+def entry_of(index: Int[Array, " k"], batch: tuple[int, ...], inner: int) -> Entry:
+    """The batch's part of indices into all entries, of which each element of the batch has `inner`."""
+    axes: list[Array] = []
+    rest = jax.lax.div(index, jnp.uint32(inner)) if batch else index
+    for place, size in reversed(list(enumerate(batch))):
+        axes.insert(0, jax.lax.rem(rest, jnp.uint32(size)) if place else rest)
+        rest = jax.lax.div(rest, jnp.uint32(size)) if place else rest
+    return Entry(batch, tuple(axes))
 
 
 def on_cpu() -> bool:
@@ -74,22 +104,35 @@ def for_each(mask: Bool[Array, " n"], body: Callable[[Carry, Array, Array], Carr
     n = mask.shape[0]
     if n <= block and not on_cpu():
         # A GPU evaluates the idle entries of a single block faster than it finds out whether there is anything to do.
-        return body(carry, jnp.where(mask, jnp.arange(n, dtype=jnp.int32), n), mask)
+        return body(carry, jnp.where(mask, jnp.arange(n, dtype=jnp.uint32), jnp.uint32(n)), mask)
     size, rows = min(block, n), math.ceil(n / WIDTH)
-    bits = jnp.pad(mask, (0, rows * WIDTH - n)).reshape(rows, WIDTH)
-    counts = jnp.sum(bits, axis=1, dtype=jnp.int32)
-    ends = jnp.cumsum(counts)
+    bits = jax.lax.pad(mask.astype(jnp.uint8), jnp.uint8(0), ((0, rows * WIDTH - n, 0),)).reshape(rows, WIDTH)
+    ends = jax.lax.cumsum(jnp.sum(bits, axis=1, dtype=jnp.uint32))
+    starts = jax.lax.pad(ends, jnp.uint32(0), ((1, -1, 0),))
     total = ends[-1]
+    # How often a range of rows is halved until one is left.
+    halvings = max(rows - 1, 1).bit_length()
 
     def step(i, carry):
-        rank = i * size + jnp.arange(size, dtype=jnp.int32)
+        rank = i * jnp.uint32(size) + jnp.arange(size, dtype=jnp.uint32)
         active = rank < total
-        row = jnp.minimum(jnp.searchsorted(ends, rank, side="right", method="scan_unrolled"), rows - 1)
-        rank_in_row = rank - (ends[row] - counts[row])
-        column = jnp.argmax(jnp.cumsum(bits[row], axis=1, dtype=jnp.int32) > rank_in_row[:, None], axis=1)
-        return body(carry, jnp.where(active, row * WIDTH + column, n).astype(jnp.int32), active)
+        rank = jax.lax.min(rank, total - 1)
 
-    return jax.lax.fori_loop(0, (total + size - 1) // size, step, carry)
+        def halve(_, bounds):
+            """The last row that begins at or before each rank."""
+            low, high = bounds
+            middle = jax.lax.shift_right_logical(low + high, jnp.uint32(1))
+            later = taken(ends, middle) <= rank
+            return jnp.where(later, middle + 1, low), jnp.where(later, high, middle)
+
+        first = jnp.zeros_like(rank)
+        row, _ = jax.lax.fori_loop(0, halvings, halve, (first, first + jnp.uint32(rows - 1)), unroll=not on_cpu())
+        before = jax.lax.cumsum(taken(bits, row), axis=1)
+        column = jax.lax.argmax(before > (rank - taken(starts, row)).astype(jnp.uint8)[:, None], 1, jnp.uint32)
+        return body(carry, jnp.where(active, row * jnp.uint32(WIDTH) + column, jnp.uint32(n)), active)
+
+    blocks = jax.lax.div(total + jnp.uint32(size - 1), jnp.uint32(size))
+    return jax.lax.fori_loop(jnp.uint32(0), blocks, step, carry)
 
 
 def merged(run: Callable[[Array, Any, Any], Any], indices: int = 1) -> Callable[[Array, Any, Any], Any]:
@@ -138,37 +181,68 @@ def merged(run: Callable[[Array, Any, Any], Any], indices: int = 1) -> Callable[
 
 
 def masked_vmap(
-    function: Callable[[Any, Any, Array], Any], mask: Bool[Array, " n"], shared: Any, row: Any, block: int = 256
+    function: Callable[[Any, Any, Any], Any],
+    mask: Bool[Array, " n"],
+    shared: Any,
+    own: Any,
+    rows: Any,
+    block: int = 256,
 ) -> Any:
-    """`function(shared, row, i)` for every `i` whose mask is true, zeros (or False) for the others.
+    """`function(shared, own, row)` for every row whose mask is true, zeros (or False) for the others.
 
     Args:
-      function: maps two pytrees and an index to a pytree of arrays. It must not close over traced values. The leaves
-        of its second argument are `Row`s: index them to get arrays.
-      mask: which of the `n` indices to evaluate.
+      function: maps three pytrees to a pytree of arrays. It must not close over traced values.
+      mask: which of the `n` rows to evaluate.
       shared: pytree that stays the same under `vmap`. (It may be batched too, but then the batch runs one by one.)
-      row: pytree that differs along a batch.
-      block: how many indices are evaluated at once on a CPU; changes the speed, never a result.
+      own: pytree of what all rows share, but the elements of a batch do not.
+      rows: pytree whose leaves have a leading axis `n`.
+      block: how many rows are evaluated at once on a CPU; changes the speed, never a result.
 
     Returns:
       The function's results with a leading axis `n`.
     """
 
-    def run(mask, shared, rows):
+    def run(mask, shared, both):
         batch, n, total = mask.shape[:-1], mask.shape[-1], mask.size
+        own, rows = both
+        size = block_size(block)
+        if total <= size and not on_cpu():
+            return _everywhere(function, mask, shared, own, rows)
+        width = jnp.uint32(n)
 
-        # Jitted, it is traced once for both of the places below; most of the time of tracing a plan went there.
-        @jax.jit
-        def evaluate(shared, rows, index):
-            return jax.vmap(lambda i: function(shared, rows_of(rows, i // n, batch), i % n))(index)
+        def evaluate(shared, own, rows, index):
+            entry = entry_of(index, batch, n)
+            row = jax.tree.map(lambda a: entry.of(a, (jax.lax.rem(index, width), n)), rows)
+            mine = jax.tree.map(entry.of, own)
+            varies = jax.tree.map(lambda a: 0 if any(k > 1 for k in a.shape[: len(batch)]) else None, own)
+            return jax.vmap(function, (None, varies, 0), axis_size=len(index))(shared, mine, row)
 
         def body(result, index, active):
-            values = evaluate(shared, rows, jnp.minimum(index, total - 1))
-            return jax.tree.map(lambda r, v: r.at[index].set(v, mode="drop"), result, values)
+            values = evaluate(shared, own, rows, jax.lax.min(index, jnp.uint32(total - 1)))
+            return jax.tree.map(lambda r, v: put(r, index, v), result, values)
 
-        shape = jax.eval_shape(evaluate, shared, rows, jax.ShapeDtypeStruct((1,), jnp.int32))
+        shape = jax.eval_shape(evaluate, shared, own, rows, jax.ShapeDtypeStruct((1,), jnp.uint32))
         result = jax.tree.map(lambda s: jnp.zeros((total, *s.shape[1:]), s.dtype), shape)
-        result = for_each(mask.reshape(-1), body, result, block_size(block))
+        result = for_each(mask.reshape(-1), body, result, size)
         return jax.tree.map(lambda r: r.reshape(*mask.shape, *r.shape[1:]), result)
 
-    return merged(run)(mask, shared, row)
+    return merged(run)(mask, shared, (own, rows))
+
+
+def _everywhere(function, mask, shared, own, rows):
+    """`masked_vmap` without looking for what is masked."""
+    batch = mask.shape[:-1]
+    evaluate = jax.vmap(function, (None, None, 0), axis_size=mask.shape[-1])
+    for k in reversed(range(len(batch))):
+        own_axes, row_axes = (jax.tree.map(lambda a, k=k: 0 if a.shape[k] > 1 else None, tree) for tree in (own, rows))
+        evaluate = jax.vmap(evaluate, (None, own_axes, row_axes), axis_size=batch[k])
+    squeezed = (
+        jax.tree.map(lambda a: a.reshape([k for k in a.shape[: len(batch)] if k > 1] + [*a.shape[len(batch) :]]), tree)
+        for tree in (own, rows)
+    )
+    values = evaluate(shared, *squeezed)
+
+    def masked(v):
+        return jnp.where(mask.reshape(*mask.shape, *[1] * (v.ndim - mask.ndim)), v, jnp.zeros_like(v))
+
+    return jax.tree.map(masked, values)

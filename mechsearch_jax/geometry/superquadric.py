@@ -104,9 +104,14 @@ def gauge(
       0 at the centre, 1 on the surface, more outside; broadcast over the leading axes.
     """
     size, exponents, points = align((size, 1), (exponents, 1), (points, 1))
-    x = jnp.abs(points / size)
-    p, r = 2.0 / exponents[..., 1], 2.0 / exponents[..., 0]
-    return _norm2(_norm2(x[..., 0], x[..., 1], p), x[..., 2], r)
+    return unit_gauge(jnp.moveaxis(jnp.abs(points / size), -1, 0), jnp.moveaxis(exponents, -1, 0))
+
+
+def unit_gauge(scaled: Float[Array, "3 ..."], exponents: Float[Array, "2 ..."]) -> Float[Array, "..."]:
+    """`gauge` of points whose coordinates are given as magnitudes in half-extents, along the first axis, as e1, e2."""
+    x, y, z = scaled
+    e1, e2 = exponents
+    return _norm2(_norm2(x, y, 2.0 / e2), z, 2.0 / e1)
 
 
 def radial_distance(

@@ -40,7 +40,7 @@ def compose(T_a_b: Float[Array, "... 4 4"], T_b_c: Float[Array, "... 4 4"]) -> F
 def matmul(a: Float[Array, "... i j"], b: Float[Array, "... j k"]) -> Float[Array, "... i k"]:
     """Product of small matrices, as explicit sums: a batched 3 x 3 product is slower than the arithmetic around it."""
     a, b = align((a, 2), (b, 2))
-    terms = (a[..., :, k, None] * b[..., None, k, :] for k in range(a.shape[-1]))
+    terms = (a[..., :, k : k + 1] * b[..., k : k + 1, :] for k in range(a.shape[-1]))
     return functools.reduce(operator.add, terms)
 
 

@@ -135,15 +135,15 @@ def spread_labels(
     measured = jnp.isfinite(points).all(axis=-1)
     pixels = jnp.where(measured[..., None], points, 0.0).reshape(-1, 3)
 
-    def nearest(_, image, i):
-        pixels, cloud, labels = image
-        square = _squares(pixels[i][None], cloud[...])[0]
+    def nearest(_, image, pixel):
+        cloud, labels = image
+        square = _squares(pixel[None], cloud)[0]
         best = jnp.argmin(square)
         return jnp.where(square[best] < reach**2, labels[best], OTHER).astype(jnp.int8)
 
     # The shelf itself is most of an image.
     wanted = (measured & candidates).reshape(-1)
-    found = masked_vmap(nearest, wanted, None, (pixels, cloud, labels)).reshape(measured.shape)
+    found = masked_vmap(nearest, wanted, None, (cloud, labels), pixels).reshape(measured.shape)
     return jnp.where(~measured, MISSING, jnp.where(candidates, found, FREE)).astype(jnp.int8)
 
 

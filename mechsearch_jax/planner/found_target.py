@@ -6,17 +6,16 @@ straight approach counts too, and so do links 2 to 5.
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, CROSSING_PLACES
-from mechsearch_jax.geometry.collision import Pair, any_inside
+from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
-from mechsearch_jax.graspability import FoundGrasps, GraspTables, boxes_overlap, feasible_grasps, grasp_hits
+from mechsearch_jax.geometry.transforms import compose, inverse, transform
+from mechsearch_jax.graspability import FoundGrasps, GraspTables, feasible_grasps, grasp_hits
 from mechsearch_jax.planner.problem import TargetGrasps
 from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import arm_path, crossing_length, crossing_poses, way_in
@@ -49,13 +48,14 @@ def found_grasps(
     tables, gripper, shelf = grasps.tables, grasps.gripper, grasps.shelf
     feasible = feasible_grasps(tables, shelf, gripper, grasps.config, T_world_target[None], active)[0]
 
-    def enters(_, row, i):
-        path = way_in(row[0][i], gripper.nearest_outside, gripper, CROSSINGS, CLOSE_WAYPOINTS)
-        q, follows = arm_path(path, row[1][i], shelf)
+    def enters(_, own, row):
+        T, q7 = row
+        path = way_in(T, gripper.nearest_outside, gripper, CROSSINGS, CLOSE_WAYPOINTS)
+        q, follows = arm_path(path, q7, shelf)
         return follows, q[ARM_POSES]
 
     T = compose(T_world_target[None], tables.T_target_gripper)
-    able, q = masked_vmap(enters, feasible, None, (T, tables.q7), block=64)
+    able, q = masked_vmap(enters, feasible, None, None, (T, tables.q7), block=64)
     return FoundGrasps(T_world_target, feasible & able, q)
 
 
@@ -77,17 +77,18 @@ def found_hits(
       previous: the same before some objects moved.
       moved: which objects moved since; only their columns are computed anew.
     """
+    if found.feasible.shape[0] == 0:
+        return jnp.zeros((0, scene.capacity), bool)
     here = jnp.asarray(active)
     fresh = scene.replace(valid=scene.valid if moved is None else scene.valid & moved)
     hits = grasp_hits(grasps.tables, found, fresh, here[None])
     feasible = found.feasible & here
     hits |= crossing_hits(grasps.tables, grasps.gripper, fresh, found.T_world_target, feasible)
 
-    def touches(_, row, i):
-        q, scene = row
-        return arm_hits(q[i], jax.tree.map(lambda a: a[...], scene))
+    def touches(_, scene, q):
+        return jnp.any(arm_hits(q, scene), axis=0)
 
-    hits |= masked_vmap(touches, feasible & jnp.any(fresh.valid), None, (found.q, fresh), block=16)
+    hits |= masked_vmap(touches, feasible & jnp.any(fresh.valid), None, fresh, found.q, block=16)
     return hits if previous is None or moved is None else jnp.where(moved[None], hits, previous)
 
 
@@ -111,29 +112,10 @@ def crossing_hits(
     T = compose(T_world_target[None], tables.T_target_gripper)
     length = crossing_length(T, gripper.nearest_outside, gripper)
     places = crossing_poses(T, gripper.nearest_outside, gripper, p)
-
-    def near(tables, row, i):
-        """Whether boxes around gripper and target, in the gripper's frame, overlap the objects'."""
-        places, scene = row[0][i], jax.tree.map(lambda a: a[...], row[1])
-        target = transform(inverse(tables.T_target_gripper[i]), tables.still_target.T)
-        still = tables.still_gripper[tables.wrist[i]]
-        low = jnp.minimum(jnp.min(still, axis=-1), jnp.min(target, axis=0))
-        high = jnp.maximum(jnp.max(still, axis=-1), jnp.max(target, axis=0))
-        T_gripper_object = compose(inverse(places)[:, None], make(scene.rotation, scene.position)[None])
-        size, low, high = scene.size[None], low[None, None], high[None, None]
-        return boxes_overlap(low, high, T_gripper_object, size) & scene.valid[None]
-
-    # Few grasps cross, and none before the target is found: nothing is computed for the others.
-    crosses = feasible & (length > 0.0) & jnp.any(scene.valid)
-    mask = masked_vmap(near, crosses, tables, (places, scene), block=16)
-
-    def pair(tables, row, i):
-        places, scene = row
-        k, place, j = i // (p * n), i // n % p, i % n
-        target = transform(inverse(tables.T_target_gripper[k]), tables.still_target.T)
-        cloud = jnp.concatenate([tables.still_gripper[tables.wrist[k]], target.T], axis=-1)
-        T_object_world = inverse(make(scene.rotation[j], scene.position[j]))
-        return Pair(cloud, compose(T_object_world, places[k, place]), scene.size[j], scene.exponents[j])
-
-    hits = any_inside(mask.reshape(-1), pair, tables, (places, scene), block=128)
+    target = transform(inverse(tables.T_target_gripper)[:, None], tables.still_target.T[None])
+    still = clouds_of(jnp.concatenate([tables.still_gripper[tables.wrist], jnp.swapaxes(target, 1, 2)], axis=-1))
+    # Few grasps cross.
+    crosses = feasible & (length > 0.0)
+    wanted = jnp.repeat(crosses[:, None] & scene.valid[None], p, axis=0)
+    hits = collisions(still, jnp.repeat(jnp.arange(g), p), places.reshape(-1, 4, 4), scene, wanted)
     return jnp.any(hits.reshape(g, p, n), axis=1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,6 +20,7 @@ from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.types import Action, Prediction, Sample
 from mechsearch_jax.existence import existence, no_views, object_views
+from mechsearch_jax.geometry.masked import on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import grasp_hits, no_hits, pairs, split_found
 from mechsearch_jax.planner.belief import Belief, possible_space, with_target
@@ -34,6 +36,8 @@ from mechsearch_jax.planner.state import Decision, Sequences, State
 # A sequence whose value is a smaller share of J gains nothing.
 GAIN = 0.02
 # What an action changes in a state, and what is then computed for the next one.
+# Draws an action in a state, and predicts it: one of several.
+Attempt = Callable[[State, Array], tuple[Sample, Prediction]]
 CHANGING = ("scene", "target_at", "moved", "available", "alive", "options")
 
 
@@ -143,27 +147,12 @@ class Rollout:
 
     def _draw(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
         """An action and what it does; drawn again until it is possible, at most so often as `config` says."""
-        attempt = functools.partial(self._attempt, first, state)
         most = max(self.config.draws, self.config.first_draws)
         if most == 1:
-            return attempt(key)
+            return self._attempt(first, state, key)
         draws = jnp.where(first, most, self.config.draws)
-        shapes, _ = jax.eval_shape(attempt, key)
-        nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False), jnp.float32(0.0))
-        blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
-
-        def again(carry):
-            i, (_, told) = carry
-            # In a batch, those that have an action go round with the others. Without objects they have little to do.
-            needed = state.alive & ~told.possible
-            here = state.replace(scene=state.scene.replace(valid=state.scene.valid & needed))
-            return i + 1, self._attempt(first, here, jax.random.fold_in(key, i))
-
-        def wanted(carry):
-            i, (_, prediction) = carry
-            return (i < draws) & ~prediction.possible & state.alive
-
-        return jax.lax.while_loop(wanted, again, (jnp.int32(0), blank))[1]
+        attempt = lambda state, i: self._attempt(first, state, jax.random.fold_in(key, i))  # noqa: E731
+        return (_one_after_the_other if on_cpu() else _at_once)(attempt, state, draws, most)
 
     def act(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[dict[str, Any], Action, Array]:
         """Sample an action and predict what it changes in a state; also what it may cost beside, as a share of J."""
@@ -212,6 +201,36 @@ class Rollout:
         changes, actions, price = jax.lax.cond(time < self.config.horizon, go_on, stay)
         kept = (actions, jax.vmap(self.cost)(states), price, changes["scene"])
         return states.replace(**changes), kept
+
+
+def _one_after_the_other(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
+    """The first attempt that is possible, and no more of them than it takes: for a CPU, which has enough to do."""
+    shapes, _ = jax.eval_shape(attempt, state, jnp.int32(0))
+    nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False), jnp.float32(0.0))
+    blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
+
+    def again(carry):
+        i, (_, found) = carry
+        # In a batch, those that have an action go round with the others. Without objects they have little to do.
+        needed = state.alive & ~found.possible
+        here = state.replace(scene=state.scene.replace(valid=state.scene.valid & needed))
+        return i + 1, attempt(here, i)
+
+    def wanted(carry):
+        i, (_, found) = carry
+        return (i < draws) & ~found.possible & state.alive
+
+    return jax.lax.while_loop(wanted, again, (jnp.int32(0), blank))[1]
+
+
+def _at_once(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
+    """The first attempt that is possible, of all of them: for a GPU, on which waiting for the first takes longer."""
+    number = jnp.arange(most, dtype=jnp.int32)
+    here = state.replace(scene=state.scene.replace(valid=state.scene.valid & state.alive))
+    sample, found = jax.vmap(lambda i: attempt(here, i))(number)
+    works = found.possible & (number < draws)
+    sample, found = jax.tree.map(lambda a: a[jnp.argmax(works)], (sample, found))
+    return sample, found.replace(possible=jnp.any(works))
 
 
 def repeated(tree: Any, count: int) -> Any:

@@ -28,8 +28,8 @@ def grown(
     return size + radius[..., None], jnp.maximum(exponents, rounder)
 
 
-def arm_hits(q: Float[Array, "w 7"], scene: Superquadrics, count: int = 5) -> Bool[Array, " n"]:
-    """Which objects links 2 to 5 touch in any of several poses of the arm.
+def arm_hits(q: Float[Array, "w 7"], scene: Superquadrics, count: int = 5) -> Bool[Array, "w n"]:
+    """Which objects links 2 to 5 touch in each of several poses of the arm.
 
     Args:
       q: joint angles [rad]; poses close enough to each other that no link passes an object between them.
@@ -45,4 +45,4 @@ def arm_hits(q: Float[Array, "w 7"], scene: Superquadrics, count: int = 5) -> Bo
         each,
     )
     near = gauge(size[None], exponents[None], to_object_frame(scene, points)) < 1.0
-    return jnp.any(near, axis=(0, 1)) & scene.valid
+    return jnp.any(near, axis=1) & scene.valid[None]

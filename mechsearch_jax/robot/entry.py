@@ -11,14 +11,14 @@ gripper's frame, and the free space of the shelf is a prism along x. Links 2 to 
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.geometry.masked import masked_vmap
-from mechsearch_jax.geometry.transforms import translate
+from mechsearch_jax.geometry.masked import masked_vmap, taken
+from mechsearch_jax.geometry.transforms import transform, translate
 from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
 from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
-from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 
 # How far in front of the shelf the gripper has to be to count as outside [m]: a target in the hand is outside then,
 # and so are the hand and its open fingers, of which one is up to 4 cm ahead where the hand is turned by 45 degrees.
@@ -122,36 +122,34 @@ def arm_follows(path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf)
     return arm_path(path, q7, shelf)[1]
 
 
-def arm_enters(
+def gripper_enters(
     shelf: Shelf,
     gripper: Gripper,
     waypoints: int,
+    clouds: Float[Array, "k 3 p"],
+    cloud: Int[Array, " c"],
     T_world_gripper: Float[Array, "c 4 4"],
     q7: Float[Array, " c"],
     mask: Bool[Array, " c"],
-    block: int = 512,
 ) -> Bool[Array, " c"]:
-    """Whether the arm follows the way in to each pose and does not touch the shelf.
+    """Whether the arm follows the way in to each pose, and neither it nor what the gripper sweeps touches the shelf.
 
-    The nearest place outside will do: what reaches a farther one passes it. Most ways have no crossing, and those that
-    have one are looked at again only if the arm follows the approach.
+    The nearest place outside will do: what reaches a farther one passes it.
 
     Args:
       shelf, gripper: static.
       waypoints: poses on the approach; there are `FEW_CROSSINGS` on the crossing.
+      clouds: what grippers sweep, in their own frames as rows of coordinates [m].
+      cloud: which of them is swept on each way.
       T_world_gripper: where the ways end.
       q7: angles of joint 7 [rad].
       mask: which are looked at; false for the others.
-      block: how many at once on a CPU.
     """
 
-    def approaches(_, row, i):
-        return arm_follows(line_poses(row[0][i], jnp.float32(gripper.approach), waypoints), row[1][i], shelf)
+    def enters(clouds, _, row):
+        T, q7, cloud = row
+        path = way_in(T, gripper.nearest_outside, gripper, FEW_CROSSINGS, waypoints)
+        touches = hits_shelf(shelf, transform(T, taken(clouds, cloud[None])[0].T))
+        return arm_follows(path, q7, shelf) & ~jnp.any(touches)
 
-    def crosses(_, row, i):
-        path = way_in(row[0][i], gripper.nearest_outside, gripper, FEW_CROSSINGS, waypoints)
-        return arm_follows(path, row[1][i], shelf)
-
-    reached = masked_vmap(approaches, mask, None, (T_world_gripper, q7), block)
-    crossing = reached & (crossing_length(T_world_gripper, gripper.nearest_outside, gripper) > 0.0)
-    return (reached & ~crossing) | masked_vmap(crosses, crossing, None, (T_world_gripper, q7), min(block, 128))
+    return masked_vmap(enters, mask, clouds, None, (T_world_gripper, q7, jnp.asarray(cloud)))

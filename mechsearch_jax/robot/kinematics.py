@@ -14,6 +14,7 @@ the hand frame moved to between the finger tips: z is the approach direction, y 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -65,25 +66,34 @@ def forward_kinematics(q: Float[Numbers, "*batch 7"]) -> Float[Array, "*batch 8 
     Returns:
       `T_base_link`; entry `i` is link `i + 1` for `i` up to 6, entry 7 is the hand.
     """
-    q = jnp.asarray(q, jnp.float32)
+    return jnp.stack([_pose(*frame) for frame in _frames(jnp.asarray(q, jnp.float32))], axis=-3)
+
+
+def _frames(q: Float[Array, "*batch 7"]) -> list[tuple[Array, Array, Array, Array]]:
+    """Axes x, y and z and the origin of links 1 to 7 and of the hand, each (*batch, 3)."""
     x, y, z, p = (jnp.broadcast_to(jnp.array(v, jnp.float32), (*q.shape[:-1], 3)) for v in (*np.eye(3), np.zeros(3)))
     frames = []
     for i, (a, turns, d) in enumerate(JOINTS):
-        p = p + a * x
+        p = p + a * x if a else p
         y, z = {0: (y, z), 1: (z, -y), -1: (-z, y)}[turns]
         c, s = jnp.cos(q[..., i, None]), jnp.sin(q[..., i, None])
         x, y = c * x + s * y, c * y - s * x
-        p = p + d * z
-        frames.append(_pose(x, y, z, p))
+        p = p + d * z if d else p
+        frames.append((x, y, z, p))
     c, s = math.cos(HAND_ANGLE), math.sin(HAND_ANGLE)
-    frames.append(_pose(c * x + s * y, c * y - s * x, z, p + FLANGE * z))
-    return jnp.stack(frames, axis=-3)
+    return [*frames, (c * x + s * y, c * y - s * x, z, p + FLANGE * z)]
+
+
+def link_frames(q: Float[Numbers, "*batch 7"], links: Sequence[int]) -> Float[Array, "*batch n 4 3"]:
+    """Axes x, y and z and the origin of a few links in the base frame, counted from 0, for joint angles `q` [rad]."""
+    frames = _frames(jnp.asarray(q, jnp.float32))
+    return jnp.stack([jnp.stack(frames[link], axis=-2) for link in links], axis=-3)
 
 
 def gripper_pose(q: Float[Numbers, "*batch 7"]) -> Float[Array, "*batch 4 4"]:
     """Pose of the gripper in the base frame, `T_base_gripper`, for joint angles `q` [rad]."""
-    hand = forward_kinematics(q)[..., -1, :, :]
-    return hand.at[..., :3, 3].add(FINGER_TIPS * hand[..., :3, 2])
+    x, y, z, p = _frames(jnp.asarray(q, jnp.float32))[-1]
+    return _pose(x, y, z, p + FINGER_TIPS * z)
 
 
 @jax.jit
