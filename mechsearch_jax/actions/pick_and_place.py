@@ -306,7 +306,7 @@ class PickAndPlace:
         row = (others, action.T_world_gripper, action.T_world_place, action.q7)
         able, outside = (a[0] for a in masked_vmap(follows, picks[None], None, row))
         free = crossings_free(space, tables, scene, after, action, wrist, outside, able)
-        return Prediction(after, scene.valid & ~others.valid, able & free, jnp.float32(0.0))
+        return Prediction(after, scene.valid & ~others.valid, able & free)
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
         """See `motion.pick_and_place_reference`."""

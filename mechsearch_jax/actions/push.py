@@ -303,7 +303,7 @@ class Push:
             return motion_free(space, *jax.tree.map(lambda a: a[...], row))
 
         follows = masked_vmap(free, (pushes & ~spoiled)[None], None, (scene, pushed.scene, still, action))[0]
-        return Prediction(pushed.scene, moved, ~spoiled & follows, jnp.sum(pushed.topples))
+        return Prediction(pushed.scene, moved, ~spoiled & follows)
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
         """See `motion.push_reference`."""

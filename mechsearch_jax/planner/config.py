@@ -43,7 +43,6 @@ class Weights(NamedTuple):
     data_fields=(
         "gamma",
         "unseen_contact_penalty",
-        "topple_charge",
         "guided_fraction",
         "crowding_weight",
         "hindrance_weight",
@@ -71,9 +70,6 @@ class PlannerConfig:
       unseen_contact_penalty: what touching the target unseen would cost, in units of J: a sampled action is charged
         with J times the share of the possible poses at which it would do so, unless no sequence gains anything then.
         The paper charges nothing.
-      topple_charge: what an object that falls over would cost, in units of J: a sampled push is charged with J times
-        the number of objects that are expected to. `ActionConfig.topple` says which pushes are ruled out altogether;
-        to charge what is left with 0.5 gained nothing.
       guided_fraction: share of the draws that go to objects by how much they hide or are in the way; the others are
         even, as the paper's all are. 0 to below 1.
       crowding_weight: how much J minds objects that only some of a pose's grasps hit; the paper's J sees the best grasp
@@ -100,9 +96,6 @@ class PlannerConfig:
     sequences: int = option(30, "sequences that are sampled for a decision; the paper's is 30")
     unseen_contact_penalty: float = option(
         1.0, "what an action costs that may touch the unseen target, as a share of J; the paper's is 0"
-    )
-    topple_charge: float = option(
-        0.0, "what a push costs, as a share of J, for each object that is expected to fall over; the paper's is 0"
     )
     guided_fraction: float = option(
         0.7, "share of the sampled actions that go to objects by how much they hide or block; the paper's is 0"
@@ -139,7 +132,7 @@ class PlannerConfig:
         number = lambda name: isinstance(getattr(self, name), int | float)  # noqa: E731
         if number("gamma") and not 0.0 < self.gamma <= 1.0:
             raise InputError(f"gamma {self.gamma} is outside (0, 1]; the default is 0.9")
-        for name in ("unseen_contact_penalty", "topple_charge", "crowding_weight", "hindrance_weight"):
+        for name in ("unseen_contact_penalty", "crowding_weight", "hindrance_weight"):
             if number(name) and not 0.0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name} {getattr(self, name)} must be a number that is not negative")
         if number("guided_fraction") and not 0.0 <= self.guided_fraction < 1.0:

@@ -227,7 +227,6 @@ def random_action(config: PlannerConfig | None = None, **options: Any) -> Search
         move_target=False,
         guided_fraction=0.0,
         unseen_contact_penalty=0.0,
-        topple_charge=0.0,
     )
     return search(even, objective=Indifferent(), **options)
 
@@ -246,7 +245,6 @@ def greedy(config: PlannerConfig | None = None, **options: Any) -> Search:
         guided_fraction=0.0,
         crowding_weight=0.0,
         unseen_contact_penalty=0.0,
-        topple_charge=0.0,
     )
     return search_and_grasp(plain, **options)
 

@@ -84,7 +84,7 @@ class PredictByKind:
         action, scene = sample.action, state.scene
         # What is sampled may move the target only by pushing it itself.
         untouchable = state.is_target & (jnp.arange(scene.capacity) != action.object)
-        found = Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False), jnp.float32(0.0))
+        found = Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False))
         for code, kind in KINDS.items():
             told = kind.predict(problem.space, problem.actions, push_model, scene, untouchable, action, sample.wrist)
             found = jax.tree.map(lambda a, b, code=code: jnp.where(action.kind == code, a, b), told, found)

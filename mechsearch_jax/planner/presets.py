@@ -50,7 +50,6 @@ def paper(**changes: Any) -> Config:
         "avoid_unseen": False,
         "guided_fraction": 0.0,
         "unseen_contact_penalty": 0.0,
-        "topple_charge": 0.0,
         "crowding_weight": 0.0,
         "draws": REDRAWS,
         "first_draws": 1,

@@ -149,7 +149,7 @@ class Rollout:
             return attempt(key)
         draws = jnp.where(first, most, self.config.draws)
         shapes, _ = jax.eval_shape(attempt, key)
-        nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False), jnp.float32(0.0))
+        nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False))
         blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
 
         def again(carry):
@@ -183,8 +183,7 @@ class Rollout:
             "available": state.available & ~spent,
             "alive": acted,
         }
-        charge = self.config.unseen_contact_penalty * sample.risk + self.config.topple_charge * told.topples
-        return changes, action, charge
+        return changes, action, self.config.unseen_contact_penalty * sample.risk
 
     def step(self, states: State, keys: Array, time: Int[Array, ""]):
         """All sequences by one action: the states after it, and what is to be kept of the ones before it."""
