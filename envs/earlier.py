@@ -35,7 +35,6 @@ EARLIER: Mapping[str, Any] = {
     "erosion": 0.0,
     "reopen": False,
     "push_directions": [math.radians(angle) for angle in (90, -90)],
-    "high_pushes": 0.0,
     "grasp_tilts": [math.radians(angle) for angle in (20, 25, 30)],
     "retrieval_tilts": [math.radians(angle) for angle in (20, 22.5, 25, 27.5, 30)],
     "object_grasp_tilts": [math.radians(angle) for angle in (20, 30)],
@@ -44,6 +43,7 @@ EARLIER: Mapping[str, Any] = {
 # another goes on saying it: it is not like today's.
 GONE: Mapping[str, Any] = {
     "topple_charge": 0.0,
+    "high_pushes": 0.0,
 }
 # When there were two kinds of action, their set was a word.
 _KINDS: Mapping[str, list[str]] = {

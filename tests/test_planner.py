@@ -90,7 +90,6 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "actions": ["push", "pick-and-place"],
         "push_directions": pytest.approx(np.radians([90, -90, 0, 35, -35, 65, -65]).tolist()),
         "push_distances": [0.05, 0.1, 0.15],
-        "high_pushes": 0.0,
         "avoid_unseen": True,
         "object_grasp_tilts": pytest.approx([np.radians(20), np.radians(30)]),
         "criterion": "detector",
@@ -122,7 +121,7 @@ def test_the_papers_preset_is_as_the_paper_describes_it():
     assert (config.problem.existence.erosion, config.problem.existence.reopen) == (0.0, False)
     assert (config.problem.existence.criterion, actions.avoid_unseen) == ("depth-mse", False)
     assert (actions.push_distances, set(actions.actions)) == ((0.05, 0.10, 0.15), {"push", "pick-and-place"})
-    assert (actions.push_directions, actions.high_pushes) == ((np.pi / 2, -np.pi / 2), 0.0)
+    assert actions.push_directions == (np.pi / 2, -np.pi / 2)
     assert config.problem.grasps.tilts == config.problem.retrieval.tilts == (np.radians(20),)
     assert actions.grasps.tilts == (np.radians(20),)
     assert config.rehearsal == "none"

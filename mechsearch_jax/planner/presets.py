@@ -45,7 +45,6 @@ def paper(**changes: Any) -> Config:
         "object_grasp_tilts": tilt,
         "push_directions": (math.radians(90), math.radians(-90)),
         "push_distances": (0.05, 0.10, 0.15),
-        "high_pushes": 0.0,
         "actions": ("push", "pick-and-place"),
         "avoid_unseen": False,
         "guided_fraction": 0.0,
@@ -98,7 +97,7 @@ PRESETS: Mapping[str, Callable[..., Config]] = {
 DEFAULT_PRESET = "standard"
 
 # The options that say which actions there are, and not how they are chosen.
-ACTION_OPTIONS = ("actions", "push_directions", "push_distances", "high_pushes", "object_grasp_tilts")
+ACTION_OPTIONS = ("actions", "push_directions", "push_distances", "object_grasp_tilts")
 
 
 def action_set(name: str) -> dict[str, Any]:
