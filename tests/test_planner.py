@@ -246,7 +246,7 @@ def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(
 
 
 def test_options_are_changed_by_name_and_survive_json():
-    config = planner.standard(gamma=0.5, criterion="depth-norm", push_distances=(0.05, 0.2), max_steps=3)
+    config = planner.standard(gamma=0.5, criterion="depth-mse", push_distances=(0.05, 0.2), max_steps=3)
     again = planner.Config().with_options(**json.loads(json.dumps(config.options())))
     assert again == config
     with pytest.raises(InputError, match="option focus is unknown; there are gamma, "):
