@@ -403,9 +403,27 @@ def test_rows_with_an_option_that_is_gone_are_as_todays_only_where_they_ran_so(t
     assert episode_key(today) == episode_key(same) != episode_key(other)
     assert name not in json.loads(same.configuration)
     assert json.loads(other.configuration)[name] == 0.125
-    assert len(set(label_variants([today, same, other]))) == 2
+    labels = label_variants([today, same, other])
+    assert labels[0] == labels[1] != labels[2] == f"search-for-grasp, {name.replace('_', ' ')} 0.125"
+    assert not any("unknown" in label for label in labels)
     with pytest.raises(InputError, match=f"option {name} is gone: what ran with 0.125 cannot be run again"):
         Method.of_options(options_of(other))
+
+
+def test_rows_of_the_planner_of_the_published_code_are_as_todays():
+    then = {"hindrance_weight": 0.1, "later_draws": "present", "later_placements": False}
+    plain, published, today, half = (
+        dataclasses.replace(ROW, configuration=configuration({**EARLIER, **more}))
+        for more in ({}, then, {"imitates": "published-code"}, {**then, "hindrance_weight": 1.0})
+    )
+    assert identity(published) == identity(today) != identity(plain)
+    assert options_of(published) == options_of(today)
+    # What was varied beside the preset is still said.
+    assert len({identity(row) for row in (plain, today, half)}) == 3
+    assert options_of(half).keys() - options_of(plain).keys() == {"later_draws", "later_placements"}
+    Method.of_options(options_of(published))
+    with pytest.raises(InputError, match="option later_draws is gone: what ran with 'present' cannot be run again"):
+        Method.of_options(options_of(half))
 
 
 def test_confidence_intervals_are_wilsons():

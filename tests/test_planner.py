@@ -21,7 +21,9 @@ from mechsearch_jax.graspability import GraspConfig, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner.config import Weights
-from mechsearch_jax.planner.prediction import LaterPlacementsStay, PredictByKind
+from mechsearch_jax.planner.imitation import LaterPlacementsStay
+from mechsearch_jax.planner.objective import SearchAndGrasp, SearchForGrasp
+from mechsearch_jax.planner.prediction import PredictByKind
 from mechsearch_jax.planner.proposal import ALONE, DEPTH, blame, passed_on, sampling_weights
 from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, sequence_values
 from mechsearch_jax.workspace import scenario
@@ -79,14 +81,12 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "unseen_contact_penalty": 1.0,
         "guided_fraction": 0.7,
         "crowding_weight": 0.02,
-        "hindrance_weight": 1.0,
         "draws": 1,
         "first_draws": 4,
         "move_again": False,
         "move_target": True,
         "predicted_collisions": False,
-        "later_draws": "predicted",
-        "later_placements": True,
+        "imitates": "nothing",
         "actions": ["push", "pick-and-place"],
         "push_directions": pytest.approx(np.radians([90, -90, 0, 35, -35, 65, -65]).tolist()),
         "push_distances": [0.05, 0.1, 0.15],
@@ -135,10 +135,21 @@ def test_the_best_preset_is_the_standard_with_more_draws_and_actions():
     assert planner.best(max_steps=10, gamma=0.8) == planner.standard(draws=4, gamma=0.8)
 
 
-def test_the_preset_of_the_published_code_is_the_papers_but_for_four_settings():
-    changed = {"push_distances": (0.1,), "later_draws": "present", "later_placements": False, "hindrance_weight": 0.1}
+def test_the_preset_of_the_published_code_is_the_papers_but_for_two_settings():
+    changed = {"push_distances": (0.1,), "imitates": "published-code"}
     assert planner.published_code() == planner.paper(**changed)
     assert all(planner.paper().options()[name] != value for name, value in changed.items())
+
+
+@pytest.mark.parametrize("factory", [planner.search_for_grasp, planner.search_and_grasp, planner.greedy])
+def test_the_slots_of_the_published_code_are_chosen_by_one_name(factory):
+    own, published = factory(), factory(PlannerConfig(imitates="published-code"))
+    assert (own.config.later_draws, published.config.later_draws) == ("predicted", "present")
+    assert published.predict == LaterPlacementsStay(own.predict)
+    assert isinstance(own.predict, PredictByKind)
+    assert (own.objective.hindrance, published.objective.hindrance) == (1.0, 0.1)
+    assert published.objective == dataclasses.replace(own.objective, hindrance=0.1)
+    assert published.propose == own.propose
 
 
 def test_what_is_in_the_way_of_a_grasp_weighs_as_much_as_is_said(problem):
@@ -148,16 +159,15 @@ def test_what_is_in_the_way_of_a_grasp_weighs_as_much_as_is_said(problem):
     exists = jnp.arange(problem.poses.shape[0]) % 7 == 0
     nowhere = jnp.zeros_like(exists)
 
-    def cost(policy, known, weights):
-        return float(policy.objective.cost(problem, known, exists, nowhere, hits, weights))
+    def cost(objective, known):
+        return float(objective.cost(problem, known, exists, nowhere, hits, Weights()))
 
-    plain, light, none = (cost(POLICY, belief, Weights(hindrance=h)) for h in (1.0, 0.1, 0.0))
+    plain, light, none = (cost(SearchForGrasp(hindrance=h), belief) for h in (1.0, 0.1, 0.0))
     assert none == exists.sum()
     assert light - none == pytest.approx(0.1 * (plain - none), rel=1e-5)
-    both = planner.search_and_grasp()
-    assert cost(both, belief, Weights()) == exists.sum()
+    assert cost(SearchAndGrasp(), belief) == exists.sum()
     found = belief.replace(found=jnp.array(True))
-    assert cost(both, found, Weights(hindrance=0.5)) == pytest.approx(0.5 * cost(both, found, Weights()))
+    assert cost(SearchAndGrasp(hindrance=0.5), found) == pytest.approx(0.5 * cost(SearchAndGrasp(), found))
 
 
 def test_what_is_picked_later_stays_where_it_is_in_the_published_code(problem):
@@ -181,11 +191,9 @@ def test_what_is_picked_later_stays_where_it_is_in_the_published_code(problem):
     assert shift(ActionKind.PICK_AND_PLACE, False) == 0
     for kind, first in ((ActionKind.PICK_AND_PLACE, True), (ActionKind.PUSH, True), (ActionKind.PUSH, False)):
         assert shift(kind, first) == pytest.approx(0.1, abs=1e-6)
-    assert isinstance(planner.search_for_grasp(planner.published_code().planner).predict, LaterPlacementsStay)
-    assert isinstance(POLICY.predict, PredictByKind)
 
 
-def test_later_actions_are_drawn_in_the_present_scene_if_asked_for(problem):
+def test_later_actions_are_drawn_in_the_present_scene_in_the_published_code(problem):
     _, objects = load("first-light")
     belief, shift = planner.initial_belief(problem), jnp.float32([0.0, 0.05, 0.0])
 
@@ -212,15 +220,15 @@ def test_later_actions_are_drawn_in_the_present_scene_if_asked_for(problem):
         def cost(self, state):
             return jnp.sum(state.scene.position[0])
 
-    def starts(later_draws):
-        config = dataclasses.replace(CONFIG, later_draws=later_draws, horizon=3, sequences=2)
+    def starts(imitates):
+        config = dataclasses.replace(CONFIG, imitates=imitates, horizon=3, sequences=2)
         rollout = Drawn(problem, belief, config, draws_where_it_stands, moves, POLICY.objective)
         told = jax.jit(lambda key, objects: plan(rollout, key, objects))(jax.random.key(0), objects)
         np.testing.assert_allclose(np.diff(told.sequences.cost[0]), 0.05, atol=1e-6)
         return np.asarray(told.sequences.actions.T_world_gripper)[0, :, 1, 3] - float(objects.position[0, 1])
 
-    np.testing.assert_allclose(starts("predicted"), [0.0, 0.05, 0.1], atol=1e-6)
-    np.testing.assert_allclose(starts("present"), 0.0, atol=1e-6)
+    np.testing.assert_allclose(starts("nothing"), [0.0, 0.05, 0.1], atol=1e-6)
+    np.testing.assert_allclose(starts("published-code"), 0.0, atol=1e-6)
 
 
 def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(problem, root):
@@ -509,8 +517,7 @@ def test_an_empty_shelf_leaves_nothing_to_do(problem):
         ({"guided_fraction": -0.1}, "0 draws evenly"),
         ({"unseen_contact_penalty": -1.0}, "unseen_contact_penalty -1.0 must be a number that is not negative"),
         ({"unseen_contact_penalty": float("nan")}, "unseen_contact_penalty nan"),
-        ({"hindrance_weight": -0.1}, "hindrance_weight -0.1 must be a number that is not negative"),
-        ({"later_draws": "past"}, 'later_draws "past" is unknown; use predicted, present'),
+        ({"imitates": "me"}, 'imitates "me" is unknown; use nothing, published-code'),
         ({"draws": 0}, "draws 0 must be at least 1"),
         ({"first_draws": 0}, "first_draws 0 must be at least 1"),
         ({"max_steps": 0}, "max_steps 0 must be at least 1"),

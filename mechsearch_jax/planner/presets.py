@@ -81,9 +81,7 @@ def published_code(**changes: Any) -> Config:
     """
     settings = {
         "push_distances": (0.10,),
-        "later_draws": "present",
-        "later_placements": False,
-        "hindrance_weight": 0.1,
+        "imitates": "published-code",
     }
     return paper(**settings | changes)
 
