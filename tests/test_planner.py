@@ -586,7 +586,7 @@ def test_a_greedy_policy_looks_one_action_ahead_and_minds_nothing_but_the_area()
     policy = planner.greedy(planner.standard(horizon=3, sequences=40).planner)
     assert isinstance(policy.objective, type(planner.search_and_grasp().objective))
     config = policy.config
-    assert (config.horizon, config.sequences, config.guided_fraction, config.topple_charge) == (1, 40, 0.0, 0.0)
+    assert (config.horizon, config.sequences, config.guided_fraction) == (1, 40, 0.0)
     assert (config.crowding_weight, config.unseen_contact_penalty) == (0.0, 0.0)
     assert planner.policy_factory("greedy") is planner.greedy
 
