@@ -10,6 +10,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 from mechsearch_jax.benchmarks.rows import OPTIONS, Row, options_of
+from mechsearch_jax.envs.earlier import GONE
 from mechsearch_jax.errors import InputError, nearest
 
 # A label that is longer does not fit into a table or a picture; variants are numbered then.
@@ -37,7 +38,7 @@ def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dic
     """For each row what is known of its options, and for each of those the policy and the options that differ."""
     variants = list(map(_variant, rows))
     # Thousands of rows have the same few options.
-    each = {variant: options_of(row) for variant, row in dict(zip(variants, rows, strict=True)).items()}
+    each = {variant: {**GONE, **options_of(row)} for variant, row in dict(zip(variants, rows, strict=True)).items()}
     names = sorted({name for options in each.values() for name in options} - {"policy"})
     differing = [name for name in names if len({json.dumps(options.get(name)) for options in each.values()}) > 1]
     parts = {
@@ -141,7 +142,9 @@ def column(rows: Sequence[Row], name: str) -> list[Hashable]:
     if not any(name in options for options in each.values()):
         options = {option for known in each.values() for option in known}
         raise InputError(f"report: column {name} is unknown; {nearest(name, [VARIANT, *fields, *sorted(options)])}")
-    values: dict[Any, Hashable] = {variant: _plain(options.get(name)) for variant, options in each.items()}
+    values: dict[Any, Hashable] = {
+        variant: _plain(options.get(name, GONE.get(name))) for variant, options in each.items()
+    }
     return [values[variant] for variant in variants]
 
 

@@ -8,6 +8,7 @@ from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
+from mechsearch_jax.envs.earlier import GONE
 from mechsearch_jax.envs.policy_numbers import mould
 from mechsearch_jax.envs.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.push_models import push_models
@@ -104,8 +105,11 @@ class Method:
         """The method whose `options` these are; what they do not hold is as in the preset `standard`. It runs natively.
 
         Raises:
-          InputError: a setting is impossible, or there is none of a path.
+          InputError: a setting is impossible, there is none of a path, or an option is gone.
         """
+        for name, usual in GONE.items():
+            if options.get(name, usual) != usual:
+                raise InputError(f"option {name} is gone: what ran with {options[name]!r} cannot be run again")
         known = {option.name for option in OPTIONS}
         config = PRESETS["standard"](**{name: value for name, value in options.items() if name in known})
         parts: dict[str, Any] = {"config": config, "workcell": Workcell()}

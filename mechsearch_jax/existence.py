@@ -3,7 +3,7 @@ docs/method.md, "Existence")
 
 A candidate pose stands for its whole grid cell, so the target is tried at several places of the cell. At each it must
 be hidden (it would show no more pixels than the detector needs) and free of collision. f is 1 if any of the places
-passes. Margins in depth and size for shapes that are not exactly known are options, and off by default.
+passes. Shapes count as they are recognised, without margins.
 
 Pixels are counted at a fraction of the camera's resolution, where a sliver beside an object may count for several times
 its size. Where few pixels show, what is really seen is therefore counted again, more finely (`allowances`), and a place
@@ -67,11 +67,10 @@ class ExistenceConfig:
 
     Attributes:
       criterion: what makes the target visible: "detector" counts the pixels it would show at full resolution;
-        "depth-mse" is the paper's mean squared difference of the two depth images; "depth-norm" their Euclidean
-        distance.
+        "depth-mse" is the paper's mean squared difference of the two depth images.
       found_pixels: more pixels than this of an image of 1280 x 720 and the detector finds the target; of others the
         same share, see `workspace.detector`.
-      depth_threshold: threshold of "depth-mse" [m^2] and "depth-norm" [m].
+      depth_threshold: threshold of "depth-mse" [m^2].
       downscale: how much coarser than an image of 1280 x 720 f is rendered; with an image of another size by as much
         more or less as keeps what it shows as large, to whole numbers.
       cell_reach: a target is tried at the middle of its grid cell and this far on the way to each of the cell's corners
@@ -82,15 +81,14 @@ class ExistenceConfig:
       erosion: by how much the target is drawn in for the collision test [m]. One that was pushed touches what pushed
         it, often on several sides, and hardly any of its cell's places fits in between.
       reopen: whether f is opened again around what an action may have moved unseen; see `planner.unseen_motion`.
-      depth_margin: by how much nearer than an object the target must be to count as visible [m].
       window: rows and columns of the window an object is rendered in, at the coarse resolution.
       points: points on the target's surface for the collision test.
     """
 
-    criterion: Literal["detector", "depth-mse", "depth-norm"] = option(
+    criterion: Literal["detector", "depth-mse"] = option(
         "detector",
         "what makes a target visible: its pixels, as the detector counts them, or the depth image, as in the paper",
-        ("detector", "depth-mse", "depth-norm"),
+        ("detector", "depth-mse"),
     )
     found_pixels: int = FOUND_PIXELS
     depth_threshold: float = 0.001
@@ -107,13 +105,12 @@ class ExistenceConfig:
     reopen: bool = option(
         True, "whether f is opened again around what an action may have moved unseen; not in the paper"
     )
-    depth_margin: float = 0.0
     window: tuple[int, int] = (48, 48)
     points: int = 512
 
     def __post_init__(self):
-        if self.criterion not in ("detector", "depth-mse", "depth-norm"):
-            raise InputError(f'criterion "{self.criterion}" is unknown; use "detector", "depth-mse" or "depth-norm"')
+        if self.criterion not in ("detector", "depth-mse"):
+            raise InputError(f'criterion "{self.criterion}" is unknown; use "detector" or "depth-mse"')
         if not all(0.0 < share <= 1.0 for share in self.cell_reach):
             raise InputError(f"cell_reach {self.cell_reach} must be shares above 0 and at most 1")
         if not 0.0 <= self.erosion < math.inf:
@@ -376,12 +373,11 @@ def _shown(
     coarse: Camera,
     image: Float[Array, "h w"],
     exists: Bool[Array, " x"],
-    config: ExistenceConfig,
 ) -> Int[Array, "x s"]:
     """How many coarse pixels the target would show at each place of the poses that matter; 0 at the others."""
 
     def shown(depth, behind, inside):
-        return jnp.sum(inside & (depth + config.depth_margin < behind))
+        return jnp.sum(inside & (depth < behind))
 
     return _at_places(tables, coarse, image, exists, shown)
 
@@ -398,9 +394,7 @@ def _alike(
     def alike(depth, behind, inside):
         difference = jnp.where(inside, jnp.maximum(jnp.minimum(behind, FAR) - depth, 0.0), 0.0)
         square = jnp.sum(jnp.where(jnp.isfinite(depth), difference, 0.0) ** 2)
-        if config.criterion == "depth-mse":
-            return square / (coarse.height * coarse.width) < config.depth_threshold
-        return jnp.sqrt(square) < config.depth_threshold
+        return square / (coarse.height * coarse.width) < config.depth_threshold
 
     return _at_places(tables, coarse, image, exists, alike)
 
@@ -433,7 +427,7 @@ def allowances(
     everywhere = jnp.ones(tables.corner.shape[0], bool)
     coarse = camera.scaled(config.step(camera))
     image = render.merge_windows(coarse, views.windows)
-    shown = _shown(tables, coarse, image, everywhere, config)
+    shown = _shown(tables, coarse, image, everywhere)
     free = jnp.ones(shown.shape, bool) if views.collides is None else ~jnp.any(views.collides, axis=-1)
     settled = jnp.any(free & (shown <= least), axis=1)
     doubtful = free & ~settled[:, None] & (shown > least) & (shown <= DOUBTFUL)
@@ -519,7 +513,7 @@ def _pixels(
     )
     target_image = render.object_window(camera.scaled(scale), one, window)
     behind, inside = _in_window(camera.scaled(scale), closer, target_image.corner, window)
-    return jnp.sum(inside & (target_image.depth + config.depth_margin < behind)) * float(scale**2)
+    return jnp.sum(inside & (target_image.depth < behind)) * float(scale**2)
 
 
 def plainly_elsewhere(
@@ -579,7 +573,7 @@ def existence(
     coarse = camera.scaled(config.step(camera))
     image = render.merge_windows(coarse, views.windows)
     if config.criterion == "detector":
-        possible = _shown(tables, coarse, image, exists, config) <= allowed
+        possible = _shown(tables, coarse, image, exists) <= allowed
     else:
         possible = _alike(tables, coarse, image, exists, config)
     if views.collides is not None:

@@ -231,7 +231,7 @@ def test_96_settings_trace_the_plan_once(tmp_path, files, monkeypatch, how):
 
     monkeypatch.setattr(policies, "plan", plan)
     monkeypatch.setattr(batches, "new_simulator", QuickStage)
-    names = ("gamma", "guided_fraction", "unseen_contact_penalty", "topple_charge", "crowding_weight")
+    names = ("gamma", "guided_fraction", "unseen_contact_penalty", "crowding_weight")
     values = list(itertools.product((0.5, 0.6, 0.7, 0.8, 0.9, 1.0), (0.0, 0.7), (0.0, 1.0), (0.0, 0.5), (0.0, 0.02)))
     small = {"max_steps": 1, "horizon": 2, "sequences": 7 if how == "batch" else 6}
     methods = [Method(config=PRESETS["standard"](**dict(zip(names, value, strict=True)), **small)) for value in values]

@@ -144,7 +144,7 @@ def test_rows_of_other_options_stay(tmp_path, files, command):
         {"unseen_contact_penalty": 0.5},
         {"push_distances": (0.1,)},
         {"push_model": "physics"},
-        {"topple_charge": 0.5},
+        {"crowding_weight": 0.5},
     ],
     ids=lambda other: next(iter(other)),
 )

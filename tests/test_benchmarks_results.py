@@ -21,12 +21,13 @@ from mechsearch_jax.benchmarks.rows import (
     configuration,
     episode_key,
     identity,
+    options_of,
     parse_row,
     read_rows,
     write_rows,
 )
 from mechsearch_jax.benchmarks.variants import label_variants
-from mechsearch_jax.envs.earlier import EARLIER, RENAMED
+from mechsearch_jax.envs.earlier import EARLIER, GONE, RENAMED
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.narration import verdict
 from mechsearch_jax.envs.records import Episode, Step, load_episode, record_action, save_episode
@@ -376,7 +377,7 @@ def test_options_that_differ_tell_rows_apart():
 def test_rows_without_a_push_model_were_planned_with_the_first_one(tmp_path):
     old, new, other = (
         dataclasses.replace(ROW, configuration=configuration({"gamma": 0.9, **more}))
-        for more in ({}, {"push_model": "quasi-static", "topple_charge": 0.0}, {"push_model": "physics"})
+        for more in ({}, {"push_model": "quasi-static"}, {"push_model": "physics"})
     )
     write_rows([old, new, other], tmp_path / "rows.parquet")
     old, new, other = read_rows(tmp_path / "rows.parquet")
@@ -387,6 +388,42 @@ def test_rows_without_a_push_model_were_planned_with_the_first_one(tmp_path):
         "search-for-grasp, push model quasi-static",
         "search-for-grasp, push model physics",
     ]
+
+
+@pytest.mark.parametrize("name", GONE)
+def test_rows_with_an_option_that_is_gone_are_as_todays_only_where_they_ran_so(tmp_path, name):
+    assert name not in Method().options()
+    today, same, other = (
+        dataclasses.replace(ROW, configuration=configuration({"gamma": 0.9, **more}))
+        for more in ({}, {name: GONE[name]}, {name: 0.125})
+    )
+    write_rows([today, same, other], tmp_path / "rows.parquet")
+    today, same, other = read_rows(tmp_path / "rows.parquet")
+    assert identity(today) == identity(same) != identity(other)
+    assert episode_key(today) == episode_key(same) != episode_key(other)
+    assert name not in json.loads(same.configuration)
+    assert json.loads(other.configuration)[name] == 0.125
+    labels = label_variants([today, same, other])
+    assert labels[0] == labels[1] != labels[2] == f"search-for-grasp, {name.replace('_', ' ')} 0.125"
+    assert not any("unknown" in label for label in labels)
+    with pytest.raises(InputError, match=f"option {name} is gone: what ran with 0.125 cannot be run again"):
+        Method.of_options(options_of(other))
+
+
+def test_rows_of_the_planner_of_the_published_code_are_as_todays():
+    then = {"hindrance_weight": 0.1, "later_draws": "present", "later_placements": False}
+    plain, published, today, half = (
+        dataclasses.replace(ROW, configuration=configuration({**EARLIER, **more}))
+        for more in ({}, then, {"imitates": "published-code"}, {**then, "hindrance_weight": 1.0})
+    )
+    assert identity(published) == identity(today) != identity(plain)
+    assert options_of(published) == options_of(today)
+    # What was varied beside the preset is still said.
+    assert len({identity(row) for row in (plain, today, half)}) == 3
+    assert options_of(half).keys() - options_of(plain).keys() == {"later_draws", "later_placements"}
+    Method.of_options(options_of(published))
+    with pytest.raises(InputError, match="option later_draws is gone: what ran with 'present' cannot be run again"):
+        Method.of_options(options_of(half))
 
 
 def test_confidence_intervals_are_wilsons():

@@ -12,7 +12,7 @@ import mechsearch_jax
 from mechsearch_jax.benchmarks.guard import read_reference
 from mechsearch_jax.benchmarks.intervals import share_interval, wilson
 from mechsearch_jax.benchmarks.paper_tables import BOTH, METHODS, TABLES, paper_figures
-from mechsearch_jax.envs.earlier import EARLIER, RENAMED
+from mechsearch_jax.envs.earlier import EARLIER, GONE, RENAMED
 from mechsearch_jax.envs.scene_sets import SETS, digest, is_chosen_on, recorded
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.workspace.detector import FOUND_PIXELS
@@ -127,6 +127,7 @@ def test_old_names_are_what_is_read():
     assert missing == {
         name: pytest.approx(value) if isinstance(value, list) else value for name, value in EARLIER.items()
     }
+    assert {name.strip("`"): said(value) for name, value in rows(page, "| option | value of today |")} == GONE
 
 
 def test_the_options_of_the_command_line_are_all_there_with_their_defaults():

@@ -278,9 +278,6 @@ def test_settings_that_make_no_sense_are_refused():
     for postures in ((), ((0.0, 3),)):
         with pytest.raises(InputError, match=r"push_postures .* pairs of a yaw and an index"):
             ActionConfig(push_postures=postures)
-    for share in (-0.1, 1.5, float("nan")):
-        with pytest.raises(InputError, match="high_pushes"):
-            ActionConfig(high_pushes=share)
     with pytest.raises(InputError, match="contact_tolerance"):
         ActionConfig(contact_tolerance=-0.001)
     with pytest.raises(InputError, match="give as many each"):

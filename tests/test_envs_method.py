@@ -69,7 +69,6 @@ def test_what_earlier_files_ran_with_by_default_is_the_default_but_for_what_is_n
         erosion=0.0,
         reopen=False,
         push_directions=(math.pi / 2, -math.pi / 2),
-        high_pushes=0.0,
         first_draws=1,
         move_target=False,
         rehearsal="none",

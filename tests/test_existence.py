@@ -66,7 +66,7 @@ def reference_existence(problem, objects, places, config):
                 rotation=jnp.eye(3)[None],
                 valid=jnp.ones(1, bool),
             )
-            visible = reference_superquadric_depth(cam, one) + config.depth_margin < scene_depth
+            visible = reference_superquadric_depth(cam, one) < scene_depth
             hidden = visible.sum() * config.downscale**2 <= config.found_pixels
             points = cloud + position
             free = True
@@ -347,19 +347,18 @@ def test_collisions_need_not_count(problem):
     np.testing.assert_array_equal(coarsely(problem, without, some), hidden & some)
 
 
-@pytest.mark.parametrize("criterion", ["depth-mse", pytest.param("depth-norm", marks=pytest.mark.slow)])
-def test_other_criteria_are_selectable(problem, criterion):
+def test_the_papers_criterion_lets_visible_targets_pass(problem):
     one = scenario.load_scenario(scenario.example_scenarios()["first-light"])
     objects = scenario.superquadrics(one.objects)
     ours = look(problem, objects).exists
-    other = look(problem.replace(config=planner.standard(criterion=criterion).problem), objects).exists
-    # A mean over the whole image lets visible targets pass, a norm almost none.
-    assert (jnp.sum(other) > jnp.sum(ours)) == (criterion == "depth-mse")
+    other = look(problem.replace(config=planner.standard(criterion="depth-mse").problem), objects).exists
+    # A mean over the whole image hardly minds a few pixels.
+    assert jnp.sum(other) > jnp.sum(ours)
 
 
 def test_bad_settings_are_refused_with_what_would_do():
-    with pytest.raises(InputError, match='use "detector", "depth-mse" or "depth-norm"'):
-        ExistenceConfig(criterion="guess")
+    with pytest.raises(InputError, match='"depth-norm" is unknown; use "detector" or "depth-mse"'):
+        ExistenceConfig(criterion="depth-norm")
     with pytest.raises(InputError, match="downscale"):
         ExistenceConfig(downscale=0)
     with pytest.raises(InputError, match="closer_look 7 must be 0 or more and below downscale 7"):

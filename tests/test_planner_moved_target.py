@@ -65,7 +65,7 @@ def states(problem, belief, objects):
     moving = dataclasses.replace(
         rollout,
         propose=lambda *_: Sample(action, jnp.int32(0), jnp.float32(0.0)),
-        predict=lambda *_: Prediction(pushed, root.is_target, jnp.array(True), jnp.float32(0.0)),
+        predict=lambda *_: Prediction(pushed, root.is_target, jnp.array(True)),
     )
     changes, _, _ = moving.act(jnp.array(True), root, jax.random.key(0))
 

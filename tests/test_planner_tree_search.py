@@ -60,18 +60,18 @@ def to_either_side(key, problem, belief, objective, guided_fraction, state):
 def moves(problem, state, sample, first):
     scene = state.scene
     after = scene.replace(position=scene.position + sample.action.displacement[None])
-    return Prediction(after, scene.valid, jnp.array(True), jnp.float32(0.0))
+    return Prediction(after, scene.valid, jnp.array(True))
 
 
 def never(problem, state, sample, first):
-    return Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False), jnp.float32(0.0))
+    return Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False))
 
 
 def only_left(problem, state, sample, first):
     told = moves(problem, state, sample, first)
     possible = sample.action.displacement[1] < 0
     scene = jax.tree.map(lambda a, b: jnp.where(possible, a, b), told.scene, state.scene)
-    return Prediction(scene, told.moved & possible, possible, jnp.float32(0.0))
+    return Prediction(scene, told.moved & possible, possible)
 
 
 @pytest.fixture(scope="module")

@@ -141,14 +141,6 @@ def test_exponents_of_two_tenths_stand_for_boxes_and_cylinders(body, shape):
     assert (np.isfinite(depth) != np.isfinite(exact)).sum() < 0.15 * both.sum()
 
 
-def test_volumetric_depth_is_the_root_and_ten_millimetres():
-    scene = scene_of(BOX, CYLINDER)
-    root, volume = (np.asarray(render.render_depth(COARSE, scene, method)) for method in ("root", "volumetric"))
-    both = np.isfinite(root) & np.isfinite(volume)
-    assert both.sum() > 150
-    np.testing.assert_allclose(np.median(volume[both] - root[both]), 1 / render.TAU, atol=2e-3)
-
-
 def test_windows_merge_to_the_whole_image():
     scene = scene_of(BOX, CYLINDER)
     windows = jax.vmap(lambda one: render.object_window(COARSE, one, (48, 48)))(scene)

@@ -39,9 +39,8 @@ class ActionConfig:
       push_wrists: angles of joint 7 relative to 45 degrees that pushes are tried with [rad].
       push_yaws: angles between the gripper's approach and +x in a push to a side, seen from above [rad].
       push_height: largest height of the finger tips above the board in a push [m].
-      push_leverage: largest height at which a push may begin to touch without toppling; see `push_model.LEVERAGE`.
-      high_pushes: sampling weight of pushes that begin higher, beside the others of the object: the push model says
-        whether it falls over. With 0 there are none, as for a model that does not know.
+      push_leverage: largest height at which a push may begin to touch without toppling, above which there is none;
+        see `push_model.LEVERAGE`.
       topple: a push is not executed if an object is predicted to fall over with a probability above this.
       push_gap: distance between gripper and object where a push starts [m].
       push_depths: how far the finger tips reach past the object's front, or past its centre, in a push to a side [m].
@@ -76,9 +75,6 @@ class ActionConfig:
     push_yaws: tuple[float, ...] = (math.radians(-25), 0.0, math.radians(25))
     push_height: float = 0.08
     push_leverage: tuple[float, float] = LEVERAGE
-    high_pushes: float = option(
-        0.0, "sampling weight of pushes that touch an object high up, beside its others; 0 for none"
-    )
     topple: float = 0.5
     push_gap: float = 0.01
     push_depths: tuple[float, float] = (0.02, 0.02)
@@ -102,8 +98,6 @@ class ActionConfig:
             raise InputError(f"actions {self.actions!r}: give a tuple of one or more kinds of action")
         if not self.contact_tolerance >= 0.0:
             raise InputError(f"contact_tolerance {self.contact_tolerance} m must not be negative")
-        if not 0.0 <= self.high_pushes <= 1.0:
-            raise InputError(f"high_pushes {self.high_pushes} must be a share from 0 to 1")
         self._check_pushes()
 
     def _check_pushes(self):

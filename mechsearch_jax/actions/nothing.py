@@ -38,7 +38,7 @@ class Nothing:
 
     def predict(self, space, tables, push_model, scene, untouchable, action, wrist) -> Prediction:
         """Nothing changes, and nothing is achieved: not a possible action."""
-        return Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False), jnp.float32(0.0))
+        return Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False))
 
     def reference(self, action, config) -> None:
         """No motion."""

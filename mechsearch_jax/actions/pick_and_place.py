@@ -286,7 +286,7 @@ class PickAndPlace:
         """The object, turned in the hand, moves with the gripper; `draft` has found out that it can."""
         after = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
         moved = scene.valid & (jnp.arange(scene.capacity) == action.object)
-        return Prediction(after, moved, action.kind == CODE, jnp.float32(0.0))
+        return Prediction(after, moved, action.kind == CODE)
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
         """See `motion.pick_and_place_reference`."""

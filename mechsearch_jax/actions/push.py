@@ -291,7 +291,7 @@ class Push:
 
         own = (scene, pushed.scene, scene.valid & ~moved, action)
         follows = masked_vmap(free, (pushes & ~spoiled)[None], None, own, None)[0]
-        return Prediction(pushed.scene, moved, ~spoiled & follows, jnp.sum(pushed.topples))
+        return Prediction(pushed.scene, moved, ~spoiled & follows)
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
         """See `motion.push_reference`."""

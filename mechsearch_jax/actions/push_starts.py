@@ -121,8 +121,8 @@ def object_pushes(
 ) -> tuple[Float[Array, "n v 4 4"], Float[Array, "n v"]]:
     """Gripper poses where pushes start, at `push_gap` from each object, and their sampling weights.
 
-    1 where the push begins so low that leverage cannot topple the object, else `ActionConfig.high_pushes`. Only for
-    `fresh` objects; in the order of `push_starts`.
+    1 where the push begins so low that leverage cannot topple the object, else 0. Only for `fresh` objects; in the
+    order of `push_starts`.
     """
     shelf, config = space.shelf, space.config
     starts = push_starts(config, space.wrists)
@@ -162,4 +162,4 @@ def object_pushes(
     distance, contact = (a.reshape(n, len(first))[:, alike.reshape(-1)] for a in found)
     stable = contact <= jnp.maximum(leverage, LOW_CONTACT)
     back = -distance[..., None] * starts.heading[None]
-    return T.at[..., :2, 3].add(back), jnp.where(stable, 1.0, config.high_pushes)
+    return T.at[..., :2, 3].add(back), stable.astype(jnp.float32)

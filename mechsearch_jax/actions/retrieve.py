@@ -53,7 +53,7 @@ class Retrieve:
 
     def predict(self, space, tables, push_model, scene, untouchable, action, wrist) -> Prediction:
         """A retrieval that hits nothing leaves all objects where they are."""
-        return Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(True), jnp.float32(0.0))
+        return Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(True))
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
         """See `motion.retrieve_reference`."""

@@ -70,13 +70,11 @@ class Prediction(flax.struct.PyTreeNode):
       scene: the objects afterwards.
       moved: which of them the action moves, shape (N,).
       possible: whether it can be executed as predicted.
-      topples: how many objects are expected to fall over.
     """
 
     scene: Superquadrics
     moved: jax.Array
     possible: jax.Array
-    topples: jax.Array
 
 
 class Ways(flax.struct.PyTreeNode):

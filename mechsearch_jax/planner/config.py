@@ -22,19 +22,17 @@ from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.graspability import GraspConfig
 from mechsearch_jax.options import option
 
-LaterDraws = Literal["predicted", "present"]
+Imitated = Literal["nothing", "published-code"]
 RehearsalName = Literal["none", "physics"]
 
 
 class Weights(NamedTuple):
-    """How much J minds what is in the way of a grasp; see `PlannerConfig`.
+    """How much J minds what it adds to equation 2; see `PlannerConfig`.
 
     Attributes:
-      hindrance: of the best grasp of a pose.
-      crowding: of all grasps of a pose.
+      crowding: what is in the way of all grasps of a pose.
     """
 
-    hindrance: Array | float = 1.0
     crowding: Array | float = 0.0
 
 
@@ -43,10 +41,8 @@ class Weights(NamedTuple):
     data_fields=(
         "gamma",
         "unseen_contact_penalty",
-        "topple_charge",
         "guided_fraction",
         "crowding_weight",
-        "hindrance_weight",
     ),
     meta_fields=(
         "horizon",
@@ -56,8 +52,7 @@ class Weights(NamedTuple):
         "move_again",
         "move_target",
         "predicted_collisions",
-        "later_draws",
-        "later_placements",
+        "imitates",
     ),
 )
 @dataclasses.dataclass(frozen=True)
@@ -71,15 +66,10 @@ class PlannerConfig:
       unseen_contact_penalty: what touching the target unseen would cost, in units of J: a sampled action is charged
         with J times the share of the possible poses at which it would do so, unless no sequence gains anything then.
         The paper charges nothing.
-      topple_charge: what an object that falls over would cost, in units of J: a sampled push is charged with J times
-        the number of objects that are expected to. `ActionConfig.topple` says which pushes are ruled out altogether;
-        to charge what is left with 0.5 gained nothing.
       guided_fraction: share of the draws that go to objects by how much they hide or are in the way; the others are
         even, as the paper's all are. 0 to below 1.
       crowding_weight: how much J minds objects that only some of a pose's grasps hit; the paper's J sees the best grasp
         of a pose alone. Small enough that no number of hits outweighs one object of the cost proper.
-      hindrance_weight: how much J minds what is in the way of a grasp: the factor of f (1 - g) in equation 2. The
-        paper's is 1, the published code's 0.1.
       draws: how often an action is drawn, until one is possible; static. The paper draws until one is.
       first_draws: the same for the first action of a sequence, where that is more; static. Of the first actions one is
         made, so that they are worth more draws.
@@ -89,10 +79,7 @@ class PlannerConfig:
       predicted_collisions: whether f also rules out, in predicted states, where the target would overlap objects
         (equation 14), as in the paper; static. Without, what an action covers is not ruled out: a target there would be
         pushed along, not found to be elsewhere.
-      later_draws: where the later actions of a sequence are drawn; static. In the state that is "predicted" before
-        them, as the paper says, or in the "present" one, as in the published code, whatever has moved since.
-      later_placements: whether a pick-and-place that is not the first action of a sequence is predicted to move its
-        object; static. In the published code it does not.
+      imitates: whose peculiarities the slots of a policy have, one of `imitation.IMITATIONS`; static.
     """
 
     gamma: float = option(0.9, "discount of later actions, above 0 and at most 1")
@@ -101,17 +88,11 @@ class PlannerConfig:
     unseen_contact_penalty: float = option(
         1.0, "what an action costs that may touch the unseen target, as a share of J; the paper's is 0"
     )
-    topple_charge: float = option(
-        0.0, "what a push costs, as a share of J, for each object that is expected to fall over; the paper's is 0"
-    )
     guided_fraction: float = option(
         0.7, "share of the sampled actions that go to objects by how much they hide or block; the paper's is 0"
     )
     crowding_weight: float = option(
         0.02, "how much J minds objects that only some grasps of a pose hit; the paper's is 0"
-    )
-    hindrance_weight: float = option(
-        1.0, "how much J minds what is in the way of a grasp; the paper's is 1, the published code's 0.1"
     )
     draws: int = option(1, "how often an action is drawn until one is possible")
     first_draws: int = option(4, "the same for the first action of a sequence, where that is more")
@@ -120,34 +101,35 @@ class PlannerConfig:
     predicted_collisions: bool = option(
         False, "whether f rules out overlaps with objects in predicted states too, as in the paper"
     )
-    later_draws: LaterDraws = option(
-        "predicted",
-        "where later actions of a sequence are drawn: in the state predicted before them, or in the present one",
-        get_args(LaterDraws),
-    )
-    later_placements: bool = option(
-        True, "whether later pick-and-places of a sequence are predicted to move anything; not in the published code"
+    imitates: Imitated = option(
+        "nothing", "what else is done as somebody's code does it, which no option says", get_args(Imitated)
     )
 
     @property
     def weights(self) -> Weights:
         """What an `Objective` weighs with."""
-        return Weights(self.hindrance_weight, self.crowding_weight)
+        return Weights(self.crowding_weight)
+
+    @property
+    def later_draws(self) -> Literal["predicted", "present"]:
+        """Where the later actions of a sequence are drawn: in the state that is predicted before them, as the paper
+        says, or in the present one, as in the published code, whatever has moved since."""
+        return "present" if self.imitates == "published-code" else "predicted"
 
     def __post_init__(self):
         # Rebuilt by JAX, the fields that are data hold whatever stands for their leaves, which is not checked.
         number = lambda name: isinstance(getattr(self, name), int | float)  # noqa: E731
         if number("gamma") and not 0.0 < self.gamma <= 1.0:
             raise InputError(f"gamma {self.gamma} is outside (0, 1]; the default is 0.9")
-        for name in ("unseen_contact_penalty", "topple_charge", "crowding_weight", "hindrance_weight"):
+        for name in ("unseen_contact_penalty", "crowding_weight"):
             if number(name) and not 0.0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name} {getattr(self, name)} must be a number that is not negative")
         if number("guided_fraction") and not 0.0 <= self.guided_fraction < 1.0:
             raise InputError(
                 f"guided_fraction {self.guided_fraction} is outside [0, 1); the default is 0.7, and 0 draws evenly"
             )
-        if self.later_draws not in get_args(LaterDraws):
-            raise InputError(f'later_draws "{self.later_draws}" is unknown; use {", ".join(get_args(LaterDraws))}')
+        if self.imitates not in get_args(Imitated):
+            raise InputError(f'imitates "{self.imitates}" is unknown; use {", ".join(get_args(Imitated))}')
         for name in ("horizon", "sequences", "draws", "first_draws"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} {getattr(self, name)} must be at least 1")

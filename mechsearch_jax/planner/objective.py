@@ -52,9 +52,8 @@ class Objective(Protocol):
         ...
 
 
-def _where_and_how_graspable(problem, belief, exists, target_at, hits, weights):
-    """f, how far each pose is from graspable with g extended below zero (B.4), and how crowded its grasps are; the last
-    two as J weighs them.
+def _where_and_how_graspable(problem, belief, exists, target_at, hits):
+    """f, how far each pose is from graspable with g extended below zero (B.4), and how crowded its grasps are.
 
     g only sees the best grasp of a pose; while nothing changes that one, clearing the way for others is progress too.
     A found target that is pushed to where it could be hidden counts as if no grasp were feasible: once it is not seen,
@@ -64,18 +63,24 @@ def _where_and_how_graspable(problem, belief, exists, target_at, hits, weights):
     rows = pairs(problem.grasps, belief.grasps)
     hidden = jnp.append(exists & belief.found, False)
     g = jnp.minimum(graspability(rows, hits), jnp.where(hidden, 1 - INFEASIBLE, 1)).astype(jnp.float32)
-    return f, weights.hindrance * (1.0 - g), weights.crowding * crowding(rows, hits)
+    return f, 1.0 - g, crowding(rows, hits)
 
 
 @dataclasses.dataclass(frozen=True)
 class SearchForGrasp:
-    """Where the target can be and how far it is from graspable there, together (the sum of f * (2 - g))."""
+    """Where the target can be and how far it is from graspable there, together (the sum of f * (2 - g)).
 
+    Attributes:
+      hindrance: how much J minds what is in the way of a grasp: the factor of f (1 - g) in equation 2.
+      reached: see `Objective`.
+    """
+
+    hindrance: float = 1.0
     reached: float = 1.0
 
     def cost(self, problem, belief, exists, target_at, hits, weights) -> Float[Array, ""]:
-        f, hindered, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits, weights)
-        return jnp.sum(f * (1.0 + hindered + crowded))
+        f, hindered, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits)
+        return jnp.sum(f * (1.0 + self.hindrance * hindered + weights.crowding * crowded))
 
     def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:
         return possible_poses(belief, exists, target_at)
@@ -83,13 +88,20 @@ class SearchForGrasp:
 
 @dataclasses.dataclass(frozen=True)
 class SearchAndGrasp:
-    """First where the target can be; once it is found, how far it is from graspable."""
+    """First where the target can be; once it is found, how far it is from graspable.
 
+    Attributes:
+      hindrance: see `SearchForGrasp`.
+      reached: see `Objective`.
+    """
+
+    hindrance: float = 1.0
     reached: float = 0.0
 
     def cost(self, problem, belief, exists, target_at, hits, weights) -> Float[Array, ""]:
-        f, hindered, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits, weights)
-        return jnp.where(belief.found, jnp.sum(f * (hindered + crowded)), jnp.sum(f))
+        f, hindered, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits)
+        minded = self.hindrance * hindered + weights.crowding * crowded
+        return jnp.where(belief.found, jnp.sum(f * minded), jnp.sum(f))
 
     def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:
         return possible_poses(belief, exists, target_at) & belief.found

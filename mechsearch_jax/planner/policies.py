@@ -26,8 +26,9 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.belief import Belief
 from mechsearch_jax.planner.config import PlannerConfig
+from mechsearch_jax.planner.imitation import IMITATIONS, Slots
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
-from mechsearch_jax.planner.prediction import LaterPlacementsStay, Predict, PredictByKind
+from mechsearch_jax.planner.prediction import Predict, PredictByKind
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import Propose, guided_draw
 from mechsearch_jax.planner.rehearsal import Rehearsal, rehearsed
@@ -199,14 +200,8 @@ def search(
     """
     push_model = push_model or own_push_model("learned")
     config = dataclasses.replace(_planner_config(config), **changes)
-    predict: Predict = PredictByKind(push_model, later_push_model or push_model)
-    return Search(
-        config=config,
-        propose=propose,
-        predict=predict if config.later_placements else LaterPlacementsStay(predict),
-        objective=objective,
-        rehearsal=rehearsal,
-    )
+    slots = Slots(propose, PredictByKind(push_model, later_push_model or push_model), objective)
+    return Search(config=config, rehearsal=rehearsal, **IMITATIONS[config.imitates](slots)._asdict())
 
 
 # Minds the grasp while it searches: f and g together (equation 2).
@@ -227,7 +222,6 @@ def random_action(config: PlannerConfig | None = None, **options: Any) -> Search
         move_target=False,
         guided_fraction=0.0,
         unseen_contact_penalty=0.0,
-        topple_charge=0.0,
     )
     return search(even, objective=Indifferent(), **options)
 
@@ -246,7 +240,6 @@ def greedy(config: PlannerConfig | None = None, **options: Any) -> Search:
         guided_fraction=0.0,
         crowding_weight=0.0,
         unseen_contact_penalty=0.0,
-        topple_charge=0.0,
     )
     return search_and_grasp(plain, **options)
 

@@ -46,26 +46,6 @@ def _either(first: Bool[Array, ""], model: PushModel, later: PushModel) -> PushM
 
 
 @dataclasses.dataclass(frozen=True)
-class LaterPlacementsStay:
-    """A `Predict` as in the published code: what is picked after the first action of a sequence stays where it is.
-
-    Attributes:
-      inner: predicts everything else.
-    """
-
-    inner: Predict
-
-    def __call__(self, problem: Problem, state: State, sample: Sample, first: Bool[Array, ""]) -> Prediction:
-        told = self.inner(problem, state, sample, first)
-        held = functools.reduce(
-            jnp.logical_or, [sample.action.kind == code for code, kind in KINDS.items() if kind.holds_object]
-        )
-        stays = held & ~first
-        scene = jax.tree.map(lambda old, new: jnp.where(stays, old, new), state.scene, told.scene)
-        return told.replace(scene=scene, moved=told.moved & ~stays)
-
-
-@dataclasses.dataclass(frozen=True)
 class PredictByKind:
     """The default `Predict`: every kind of action predicts itself, pushes with a push model.
 
@@ -84,7 +64,7 @@ class PredictByKind:
         action, scene = sample.action, state.scene
         # What is sampled may move the target only by pushing it itself.
         untouchable = state.is_target & (jnp.arange(scene.capacity) != action.object)
-        found = Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False), jnp.float32(0.0))
+        found = Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False))
         for code, kind in KINDS.items():
             told = kind.predict(problem.space, problem.actions, push_model, scene, untouchable, action, sample.wrist)
             found = jax.tree.map(lambda a, b, code=code: jnp.where(action.kind == code, a, b), told, found)

@@ -172,8 +172,7 @@ class Rollout:
             "available": state.available & ~spent,
             "alive": acted,
         }
-        charge = self.config.unseen_contact_penalty * sample.risk + self.config.topple_charge * told.topples
-        return changes, action, charge
+        return changes, action, self.config.unseen_contact_penalty * sample.risk
 
     def step(self, states: State, keys: Array, time: Int[Array, ""]):
         """All sequences by one action: the states after it, and what is to be kept of the ones before it."""
@@ -206,7 +205,7 @@ class Rollout:
 def _one_after_the_other(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
     """The first attempt that is possible, and no more of them than it takes: for a CPU, which has enough to do."""
     shapes, _ = jax.eval_shape(attempt, state, jnp.int32(0))
-    nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False), jnp.float32(0.0))
+    nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False))
     blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
 
     def again(carry):

@@ -1,9 +1,8 @@
-"""Depth images of superquadrics (paper equations 8 to 13)."""
+"""Depth images of superquadrics, by the first crossing of each ray with each surface (docs/method.md, "Depth")."""
 
 from __future__ import annotations
 
 import functools
-from typing import Literal
 
 import flax.struct
 import jax
@@ -15,9 +14,6 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make, rotate, transform
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
 
-SHARPNESS = 1000.0
-TAU = 100.0
-SAMPLES = 64
 NEWTON_STEPS = 8
 GRAZING = 2e-3
 
@@ -60,66 +56,32 @@ def cast(
     return jnp.where(hit, refined, jnp.inf)
 
 
-def integrate(
-    size: Float[Array, "3"], exponents: Float[Array, "2"], origin: Float[Array, "3"], direction: Float[Array, "3"]
-) -> Float[Array, ""]:
-    """The volumetric depth of equations 10 to 12 of one superquadric, in its own frame and in units of the ray
-    parameter.
-
-    Integrated over the chord through the ellipsoid of equation 13. The finite `TAU` lets a ray sink in by 1 / TAU =
-    10 mm in the mean, which is this method's bias.
-    """
-    scaled_o, scaled_d = origin / (3.0**0.5 * size), direction / (3.0**0.5 * size)
-    a, b = jnp.sum(scaled_d**2), jnp.sum(scaled_o * scaled_d)
-    square = b**2 - a * (jnp.sum(scaled_o**2) - 1.0)
-    meets = square > 0
-    half = jnp.sqrt(jnp.where(meets, square, 1.0)) / a
-    start = jnp.maximum(-b / a - half, 0.0)
-    length = jnp.maximum(-b / a + half - start, 0.0)
-    step = length / SAMPLES
-    t = start + (jnp.arange(SAMPLES) + 0.5) * step
-    points = origin[None] + t[:, None] * direction[None]
-    value = jnp.minimum(superquadric.gauge(size, exponents, points) ** 2, 1e6)
-    occupancy = jax.nn.sigmoid(SHARPNESS * (1.0 - value))
-    metres = jnp.sqrt(jnp.sum(direction**2))
-    transparent = jnp.exp(-TAU * jnp.cumsum(occupancy) * step * metres)
-    return jnp.where(meets & (transparent[-1] < 0.5), start + jnp.sum(transparent) * step, jnp.inf)
-
-
-METHODS = {"root": cast, "volumetric": integrate}
-
-
 def object_depth(
     scene_object: Superquadrics,
     origin: Float[Array, "3"],
     directions: Float[Array, "*batch 3"],
-    method: Literal["root", "volumetric"] = "root",
 ) -> Float[Array, "*batch"]:
     """Depth of one object (a `Superquadrics` without its object axis) along world rays; infinite where it is not."""
     inverse = scene_object.rotation.T
     local_origin = rotate(inverse, origin - scene_object.position)
     local = rotate(inverse, directions)
-    trace = jax.vmap(METHODS[method], in_axes=(None, None, None, 0))
+    trace = jax.vmap(cast, in_axes=(None, None, None, 0))
     depth = trace(scene_object.size, scene_object.exponents, local_origin, local.reshape(-1, 3))
     return jnp.where(scene_object.valid, depth, jnp.inf).reshape(local.shape[:-1])
 
 
-def render_depth(
-    camera: Camera, scene: Superquadrics, method: Literal["root", "volumetric"] = "root"
-) -> Float[Array, "h w"]:
+def render_depth(camera: Camera, scene: Superquadrics) -> Float[Array, "h w"]:
     """Depth image of a scene, object by object and then the nearest.
 
     Args:
       camera: pinhole camera.
       scene: superquadrics with fields (N, ...).
-      method: "root" finds the crossing S = 1; "volumetric" integrates equations 9 to 12 (biased by 10 mm, see
-        `integrate`); static.
 
     Returns:
       Depth along the optical axis [m], shape (height, width); infinite where no object is seen.
     """
     origin, directions = jnp.array(camera.position), rays(camera)
-    each = jax.lax.map(lambda one: object_depth(one, origin, directions, method), scene)
+    each = jax.lax.map(lambda one: object_depth(one, origin, directions), scene)
     return jnp.min(each, axis=0)
 
 
