@@ -96,7 +96,7 @@ def collide(
     # A point that is there twice changes no minimum.
     points = jnp.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, -points.shape[-1] % size)], mode="edge")
     steps = points.shape[-1] // size
-    asked = jnp.pad(mask, [(0, 0)] * (lead + 1) + [(0, width - n)]).reshape(-1, m, width).astype(jnp.int32)
+    asked = jnp.pad(mask, [(0, 0)] * (lead + 1) + [(0, width - n)]).reshape(-1, m, width).astype(jnp.int8)
     arrays = [points, boxes.reshape(*boxes.shape[:-2], 6), cloud, T_world_cloud.reshape(*T_world_cloud.shape[:-2], 16)]
     arrays.append(objects)
     shapes = [a.shape[:lead] for a in arrays]
@@ -114,16 +114,16 @@ def collide(
     def kernel(asked_ref, points_ref, boxes_ref, cloud_ref, T_ref, objects_ref, out_ref):
         b, i = pl.program_id(1), pl.program_id(0)
         in_points, in_boxes, in_cloud, in_T, in_objects = (place(shape, b) for shape in shapes)
-        out_ref[b, i, :] = jnp.zeros(width, jnp.int32)
+        out_ref[b, i, :] = jnp.zeros(width, jnp.int8)
 
-        @pl.when(jnp.max(asked_ref[b, i, :]) > 0)
+        @pl.when(jnp.max(asked_ref[b, i, :].astype(jnp.int32)) > 0)
         def _():
             c = cloud_ref[in_cloud, i]
             T = [[T_ref[in_T, i, 4 * row + column] for column in range(4)] for row in range(3)]
             box = [boxes_ref[in_boxes, c, k] for k in range(6)]
 
             def each(j, _):
-                @pl.when(asked_ref[b, i, j] > 0)
+                @pl.when(asked_ref[b, i, j].astype(jnp.int32) > 0)
                 def _():
                     o = [objects_ref[in_objects, j, k] for k in range(17)]
                     relative = [
@@ -151,7 +151,7 @@ def collide(
                             return jnp.minimum(least, log_gauge(scaled, powers, log2, exp2))
 
                         least = jax.lax.fori_loop(0, steps, step, jnp.full(size, jnp.inf, jnp.float32))
-                        out_ref[b, i, j] = (jnp.min(least) < 0.0).astype(jnp.int32)
+                        out_ref[b, i, j] = (jnp.min(least) < 0.0).astype(jnp.int8)
 
                 return 0
 
@@ -159,7 +159,7 @@ def collide(
 
     out = pl.pallas_call(
         kernel,
-        out_shape=jax.ShapeDtypeStruct(asked.shape, jnp.int32),
+        out_shape=jax.ShapeDtypeStruct(asked.shape, jnp.int8),
         grid=(m, math.prod(batch)),
         compiler_params=triton.CompilerParams(num_warps=WARPS, num_stages=1),
         interpret=interpret,
