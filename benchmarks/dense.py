@@ -1,28 +1,24 @@
 """Every point of a cloud against every superquadric: the inner reduction, without looking for what can be left out.
 
-`collision` decides nearly all pairs without a power, and is what the planner uses. This is for where the gauge itself
-is wanted, or most pairs graze each other. There are two versions of the same formula behind one function: one that XLA
-compiles, for every device, and a Pallas kernel for NVIDIA GPUs. `benchmarks/roofline.md` tells how fast they are.
+`geometry.collision` is what the planner uses: it looks at boxes first, and only says whether a cloud collides. This is
+for where the gauge itself is wanted, and for measuring how fast its formula can be. There are two versions of it behind
+one function: one that XLA compiles, for every device, and a Pallas kernel for NVIDIA GPUs. `benchmarks/roofline.md`
+shows how fast they are.
 
-The formula works with logarithms, where a power is a product and a p-norm of two numbers is
+The formula is `geometry.collision_kernel.log_gauge`, which works with logarithms. An evaluation takes 5 of them and 2
+powers, 7 operations of a GPU's special-function units, which do 16 per clock and multiprocessor.
 
-    log ||(a, b)||_p = max(log a, log b) + log(1 + exp(-p |log a - log b|)) / p,
-
-so that nothing overflows, whatever the exponents and however far away a point. The base is free; it is 2 in the kernel,
-because a GPU's special-function units know that one. An evaluation takes 5 logarithms and 2 powers, 7 operations of
-those units, which do 16 per clock and multiprocessor.
-
-What is exact and what is not: gauges below `TINY` read as about `TINY`. Otherwise the formula is the gauge's, and both
-versions are within a relative 1e-5 of it in float64, beside the rounding of a point's coordinates in an object's frame
-(1e-6 for a cloud within 10 half-extents of it, more in proportion to the distance). The kernel takes logarithms and
-powers from the special-function units as they are (`lg2.approx`, `ex2.approx`: 22 bits), the other version has them
-rounded like every other function of JAX. Values only: the kernel has no gradient.
+What is exact and what is not: gauges below `collision_kernel.TINY` read as about that. Otherwise the formula is the
+gauge's, and both versions are within a relative 1e-5 of it in float64, beside the rounding of a point's coordinates in
+an object's frame (1e-6 for a cloud within 10 half-extents of it, more in proportion to the distance). The kernel takes
+logarithms and powers from the special-function units as they are, the other version has them rounded like every other
+function of JAX. Values only: the kernel has no gradient.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -30,16 +26,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.collision_kernel import kernel_available, log_gauge, special
 from mechsearch_jax.geometry.masked import block_size
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make
 
 Method = Literal["auto", "xla", "kernel"]
-Function = Callable[[Array], Array]
 
 # Logarithms, or powers of 2, that one point and one superquadric take.
 OPERATIONS = 7
-TINY = 1e-30
 # Evaluations that XLA is given at once on a CPU, in case that it keeps them all.
 BLOCK = 1 << 21
 
@@ -59,20 +54,6 @@ class Tiling(NamedTuple):
 
 
 TILING = Tiling()
-
-
-def log_gauge(point: Sequence[Array], powers: Sequence[Array] | Array, log: Function, exp: Function) -> Array:
-    """Logarithm of the gauge.
-
-    Args:
-      point: x, y, z in half-extents.
-      powers: p = 2/e2, r = 2/e1, 1/p and 1/r.
-      log, exp: of any base.
-    """
-    a, b, c = (log(jnp.maximum(jnp.abs(q), TINY)) for q in point)
-    p, r, over_p, over_r = powers
-    plane = jnp.maximum(a, b) + log(1.0 + exp(-p * jnp.abs(a - b))) * over_p
-    return jnp.maximum(plane, c) + log(1.0 + exp(-r * jnp.abs(plane - c))) * over_r
 
 
 def _numbers(scene: Superquadrics, T_world_cloud: Array) -> Array:
@@ -104,17 +85,6 @@ def _least_xla(clouds: Array, cloud: Array, numbers: Array) -> Array:
     return jnp.exp(jax.lax.map(lambda args: one(*args), (cloud, numbers), batch_size=min(at_once, cloud.shape[0])))
 
 
-def _special(name: str) -> Function:
-    """A special-function unit's own result: XLA and Triton otherwise add what rounds it better."""
-    from jax.experimental.pallas import triton
-
-    def function(x: Array) -> Array:
-        asm, shape = f"{name}.approx.ftz.f32 $0, $1;", jax.ShapeDtypeStruct(x.shape, x.dtype)
-        return triton.elementwise_inline_asm(asm, args=[x], constraints="=f,f", pack=1, result_shape_dtypes=[shape])[0]
-
-    return function
-
-
 def least_kernel(
     clouds: Float[Array, "c 3 p"],
     cloud: Int[Array, " m"],
@@ -142,7 +112,7 @@ def least_kernel(
     clouds = jnp.pad(clouds, ((0, 0), (0, 0), (0, -clouds.shape[2] % points)), mode="edge")
     numbers = jnp.pad(numbers, ((0, 0), (0, -n % objects), (0, 0)), mode="edge")
     steps, groups = clouds.shape[2] // points, numbers.shape[1] // objects
-    log2, exp2 = (jnp.log2, jnp.exp2) if interpret else (_special("lg2"), _special("ex2"))
+    log2, exp2 = (jnp.log2, jnp.exp2) if interpret else (special("lg2"), special("ex2"))
 
     def kernel(clouds_ref, cloud_ref, numbers_ref, out_ref):
         m, first = pl.program_id(1), pl.program_id(0) * objects
@@ -168,15 +138,6 @@ def least_kernel(
         interpret=interpret,
     )(clouds, cloud.astype(jnp.int32), numbers)
     return jnp.exp2(out[:, :n])
-
-
-def kernel_available() -> bool:
-    """Whether this version of JAX has what the kernel is written in. (JAX 0.11 announces that it will go.)"""
-    try:
-        from jax.experimental.pallas import triton
-    except ImportError:
-        return False
-    return hasattr(triton, "CompilerParams") and hasattr(triton, "elementwise_inline_asm")
 
 
 @functools.partial(jax.jit, static_argnames="method")
