@@ -223,6 +223,8 @@ def run_episodes(
             lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), from_scenario(scenarios[0])
         )
         known = ManySlots(problem, policy, recogniser, shapes, min(at_once, count))
+        # Before anything is compiled in vain.
+        known.decide_by({row: start.policy for row, (_, start) in enumerate(first)})
         with prepared(batch_programs(known, simulator, shapes), compiling):
             simulator.reset(scenarios)
     with CompileClock() as clock:
