@@ -8,6 +8,7 @@ begins with the first of them.
 from __future__ import annotations
 
 import contextlib
+import functools
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,6 +19,7 @@ import numpy as np
 
 from mechsearch_jax.actions import KINDS, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
+from mechsearch_jax.cores import cores
 from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
@@ -64,30 +66,35 @@ def program(name: str, function: Any, *args: Any) -> Program:
     return Program(name, lambda: function.is_ready(*args), lambda: function.begin(*args))
 
 
-def first_decision(problem: Problem, policy: Policy) -> list[Program]:
-    """What takes long to compile of a first look and a first decision; that which takes longest first."""
+def first_decision(problem: Problem, policy: Policy, motion: MotionConfig) -> list[Program]:
+    """What takes long to compile of a first look, a first decision and a first action; that which takes longest first.
+
+    Args:
+      problem, policy: of the episode.
+      motion: how actions are executed.
+    """
     # Only shapes and types count.
     shapes = jax.eval_shape(lambda: Observation(empty(TARGET), jax.numpy.array(False), jax.numpy.zeros(3)))
     seen: Observation = jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
     belief = initial_belief(problem)
     found = []
     if isinstance(policy, Search):
-        found.append(program("the plan", policy, jax.random.key(0), problem, belief, seen))
-    return [*found, program("the belief", update_belief, problem, belief, seen, seen, no_action())]
+        found.append(program("plan", policy, jax.random.key(0), problem, belief, seen))
+    found.append(program("belief", update_belief, problem, belief, seen, seen, no_action()))
+    return [*found, *motions(motion)]
 
 
 def motions(config: MotionConfig) -> list[Program]:
     """The motions of all kinds of action, one at a time, as a simulator on the host makes them."""
-    return [
-        program(f"the motion of a {kind.name}", reference_motion, kind, no_action(), config) for kind in KINDS.values()
-    ]
+    return [program(f"motion of {kind.name}", reference_motion, kind, no_action(), config) for kind in KINDS.values()]
 
 
 @contextlib.contextmanager
 def prepared(programs: Sequence[Program], told: Callable[[str], None]) -> Iterator[None]:
     """Prepare programs in threads while the block runs; who calls one before it is ready waits for it.
 
-    What is wrong with a program is said by who calls it. Where the block raises, what has not begun is left out.
+    As many are compiled at the same time as there are cores. What is wrong with a program is said by who calls it.
+    Where the block raises, what has not begun is left out.
 
     Args:
       programs: the longest first.
@@ -96,25 +103,31 @@ def prepared(programs: Sequence[Program], told: Callable[[str], None]) -> Iterat
     """
     missing = [program.name for program in programs if not program.is_ready()]
     count, lock, ended = len(missing), threading.Lock(), threading.Event()
+    # What is lowered is compiled at once: a call would wait for it in vain where it never was.
+    free = threading.Semaphore(max(cores(), 2))
 
     def say() -> None:
-        left = f": {', '.join(missing)}" if missing else ""
+        left = f": {', '.join(dict.fromkeys(missing))}" if missing else ""
         told(f"compiling{left}; {count - len(missing)} of {count} done")
 
-    def ready(name: str, future: Future[None]) -> None:
+    def over(name: str, future: Future[None]) -> None:
+        free.release()
         with lock:
-            if name in missing and not future.cancelled() and future.exception() is None:
+            if name in missing and future.exception() is None:
                 missing.remove(name)
                 say()
 
     def lower() -> None:
         for each in programs:
-            if ended.is_set():
-                return
-            with contextlib.suppress(Exception):
-                work = each.begin()
-                if work is not None:
-                    threads.submit(work).add_done_callback(lambda future, name=each.name: ready(name, future))
+            free.acquire()
+            work = None
+            if not ended.is_set():
+                with contextlib.suppress(Exception):
+                    work = each.begin()
+            if work is None:
+                free.release()
+            else:
+                threads.submit(work).add_done_callback(functools.partial(over, each.name))
 
     if missing:
         say()
@@ -124,7 +137,6 @@ def prepared(programs: Sequence[Program], told: Callable[[str], None]) -> Iterat
             yield
         except BaseException:
             ended.set()
-            threads.shutdown(wait=False, cancel_futures=True)
             raise
         lowering.result()
 

