@@ -40,10 +40,9 @@ from mechsearch_jax.envs.episode_log import (
     target_trouble,
 )
 from mechsearch_jax.envs.outcome import Outcome
-from mechsearch_jax.envs.preparing import Prepares, Program, prepared, program
 from mechsearch_jax.envs.protocols import ALL_FAILED, EpisodeProtocol, Execution, Strict, chosen_actions
 from mechsearch_jax.envs.records import Episode, Step
-from mechsearch_jax.envs.simulator import Flowing, Simulator
+from mechsearch_jax.envs.simulator import Flowing, Prepares, Simulator
 from mechsearch_jax.envs.slots import ManySlots, OneSlot, Slots
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.verdicts import Verdict
@@ -51,6 +50,7 @@ from mechsearch_jax.envs.world import TARGET, World, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem
+from mechsearch_jax.preparing import Program, prepared, program
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.target import Target
 

@@ -41,10 +41,10 @@ from mechsearch_jax.envs.batch_model import BodyFields
 from mechsearch_jax.envs.mjx_model import MjxConfig, MjxModel, where
 from mechsearch_jax.envs.mjx_step import Progress, Task, acting, advance, begin, merged, taken_over, verdicts, waiting
 from mechsearch_jax.envs.outcome import Failure, Outcome
-from mechsearch_jax.envs.preparing import Program
 from mechsearch_jax.envs.simulator import ROBOT, check_actions
 from mechsearch_jax.envs.world import World, from_scenario
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.preparing import Program
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -79,6 +79,7 @@ class MjxSimulator:
         self._moving = np.zeros(0, bool)
         # They hang on this simulator's model, so that no other process could use them.
         self._start = Kept(self._model.start, on_disk=False)
+        self._place = Kept(_placed, on_disk=False, donate_argnums=(1,))
         self._begin = Kept(self._begun, on_disk=False, donate_argnums=(0,))
         self._go_on = Kept(self._gone_on, on_disk=False, donate_argnums=(1,))
         self._prepared: frozenset[int] = frozenset()
@@ -119,25 +120,18 @@ class MjxSimulator:
         count = len(world.kind)
         if only is not None and (self.world is None or len(self.world.kind) != count or len(only) != count):
             raise InputError(f"MjxSimulator: some of {count} worlds can be replaced only where there are as many")
-        world = jax.tree.map(jnp.asarray, world)
+        world = jax.tree.map(lambda a: a if isinstance(a, jax.Array) else jax.device_put(a), world)
         fields, qpos, ctrl = self._start(world)
+        new = fields, world
         if only is None:
             if self._data is None or self._data.qpos.shape[0] != count:
                 self._data = self._model.make_data(count)
             self._tasks, self._moving = None, np.zeros(count, bool)
-            changed = jnp.ones(count, bool)
-        else:
-            changed = jnp.asarray(only)
-            fields, world = jax.tree.map(functools.partial(where, changed), (fields, world), (self._fields, self.world))
-        data = self._data
-        self._data = data.replace(
-            qpos=where(changed, qpos, data.qpos),
-            ctrl=where(changed, ctrl, data.ctrl),
-            qvel=where(changed, jnp.zeros_like(data.qvel), data.qvel),
-            qacc_warmstart=where(changed, jnp.zeros_like(data.qvel), data.qacc_warmstart),
-        )
-        self._fields, self.world = fields, world
-        return world
+        changed = jax.device_put(np.ones(count, bool) if only is None else np.array(only))
+        data, self._data = self._data, None
+        old = new if only is None else (self._fields, self.world)
+        self._data, (self._fields, self.world) = self._place(changed, data, qpos, ctrl, new, old)
+        return self.world
 
     def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Execute an action in every world and let the bodies come to rest; see `Simulator.execute`.
@@ -166,9 +160,9 @@ class MjxSimulator:
         if np.any(begins & self._moving):
             raise InputError(f"MjxSimulator: world {np.argmax(begins & self._moving)} is moving; advance it to its end")
         data, self._data = self._data, None
-        self._data, *new = self._begin(data, actions, jnp.asarray(begins))
+        self._data, *new = self._begin(data, actions, jax.device_put(begins))
         if self._moving.any():
-            new = self._merge(jnp.asarray(self._moving), self._tasks, tuple(new))
+            new = self._merge(jax.device_put(self._moving), self._tasks, tuple(new))
         self._tasks, self._moving = tuple(new), self._moving | begins
 
     def advance(self, least: int) -> tuple[Bool[np.ndarray, " worlds"], Outcome]:
@@ -208,20 +202,25 @@ class MjxSimulator:
 
         # Tracing takes its time, and who lowers does it.
         @functools.cache
-        def shapes() -> tuple[BodyFields, Any, Any]:
-            fields, _, _ = jax.eval_shape(self._model.start, world)
+        def shapes() -> tuple[Any, Any, Any]:
+            start = jax.eval_shape(self._model.start, world)
             data, *tasks = jax.eval_shape(self._begun, self._model.data_shapes(count), actions, mask)
-            return fields, data, tuple(tasks)
+            return start, data, tuple(tasks)
 
         def going() -> Callable[[], None] | None:
-            fields, data, tasks = shapes()
+            (fields, _, _), data, tasks = shapes()
             return self._go_on.begin(fields, data, world, tasks, np.int32(count))
+
+        def placing() -> Callable[[], None] | None:
+            (fields, qpos, ctrl), data, _ = shapes()
+            return self._place.begin(mask, data, qpos, ctrl, (fields, world), (fields, world))
 
         begins = {
             "kernels": lambda: self._model.kernels(count),
             "simulate": going,
             "motions": lambda: self._begin.begin(shapes()[1], actions, mask),
             "reset": lambda: self._start.begin(world),
+            "next episodes": placing,
             "next motions": lambda: self._merge.begin(mask, shapes()[2], shapes()[2]),
         }
         known, self._prepared = self._prepared, self._prepared | {count}
@@ -349,6 +348,14 @@ class MjxSimulator:
     def _one_step(self, fields: BodyFields, task: Task):
         step = functools.partial(self._model.step, fields)
         return functools.partial(advance, self.config.simulator, step, self._model.robot, task)
+
+
+def _placed(
+    changed: Bool[Array, " worlds"], data: Any, qpos: Array, ctrl: Array, new: tuple[Any, World], old: tuple[Any, World]
+) -> tuple[Any, tuple[Any, World]]:
+    """`load`, compiled: the state, and fields and worlds, where some are changed and at rest."""
+    data = _at_rest(data, changed).replace(qpos=where(changed, qpos, data.qpos), ctrl=where(changed, ctrl, data.ctrl))
+    return data, jax.tree.map(functools.partial(where, changed), new, old)
 
 
 def _at_rest(data: Any, which: Bool[Array, " worlds"]) -> Any:

@@ -31,10 +31,10 @@ from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.cores import cores
 from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.outcome import Failure, Outcome
-from mechsearch_jax.envs.preparing import Program, motions
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, check_actions, controls
 from mechsearch_jax.envs.world import BODIES, TARGET, World, bodies_of, fallen_over, from_scenario, slots
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.preparing import Program, motions
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference
 from mechsearch_jax.workspace.camera import Camera

@@ -17,6 +17,7 @@ from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.outcome import Outcome
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.preparing import Program
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.workspace.scenario import Scenario
@@ -138,6 +139,19 @@ class Flowing(Protocol):
 
         Returns:
           Which are done that were not before, and what came of their actions; of others the outcome says nothing.
+        """
+        ...
+
+
+@runtime_checkable
+class Prepares(Protocol):
+    """What knows the programs that it will call."""
+
+    def programs(self, world: World) -> Sequence[Program]:
+        """Those for so many worlds, the longest first.
+
+        Args:
+          world: of all worlds, or its shapes.
         """
         ...
 

@@ -21,7 +21,6 @@ from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.episode_log import Choice, chosen
 from mechsearch_jax.envs.policy_numbers import as_pytree, mould, numbers, with_numbers
-from mechsearch_jax.envs.preparing import Program, program
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
 from mechsearch_jax.envs.verdicts import Verdict, graspable_many, judge, judge_many, judged_sets, swept_free
 from mechsearch_jax.envs.world import World
@@ -29,6 +28,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.moved_target import nearest_candidate
+from mechsearch_jax.preparing import Program, program
 from mechsearch_jax.workspace.camera import Camera
 
 

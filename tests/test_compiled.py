@@ -289,7 +289,7 @@ SEARCH = """
     import jax
     from mechsearch_jax.envs.episodes import run_episode, target_of
     from mechsearch_jax.envs.native import NativeSimulator
-    from mechsearch_jax.envs.preparing import first_decision, prepared
+    from mechsearch_jax.preparing import first_decision, prepared
     from mechsearch_jax.planner import search_for_grasp
     from mechsearch_jax.planner.cache import cached_problem, keep_compilations
     from mechsearch_jax.robot.motion import MotionConfig

@@ -21,10 +21,10 @@ from mechsearch_jax.envs.batch_model import BodyFields, body_fields
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
 from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.outcome import Failure, Overflow
-from mechsearch_jax.envs.preparing import prepare
 from mechsearch_jax.envs.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import TARGET, from_scenario, slots
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.preparing import prepare
 from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -253,17 +253,18 @@ def test_worlds_need_not_wait_for_each_other_and_nothing_is_left_to_compile(sim,
         outcome = sim.execute(actions)
         together = jax.device_get(sim.world)
         sim.reset(starts)
-        sim.begin(actions, jnp.array([True, False, False]))
+        sim.begin(actions, np.array([True, False, False]))
         with pytest.raises(InputError, match="world 0 is moving"):
             sim.begin(actions)
         assert sim.advance(1)[0].tolist() == [True, False, False]
         # Of two that begin, one has nothing to do, and is done at once.
-        sim.begin(actions, jnp.array([False, True, True]))
+        sim.begin(actions, np.array([False, True, True]))
         done, told = sim.advance(1)
         assert done.tolist() == [False, False, True]
         assert told.reason(2) == "unreachable"
-        sim.begin(actions, jnp.array([True, False, False]))
+        sim.begin(actions, np.array([True, False, False]))
         steps = [sim.advance(1) for _ in range(2)]
+        sim.replace({0: starts[1]})
     finally:
         jax.monitoring.unregister_event_duration_listener(note)
     assert [done.tolist() for done, _ in steps] in (
@@ -274,6 +275,7 @@ def test_worlds_need_not_wait_for_each_other_and_nothing_is_left_to_compile(sim,
     assert int(late.steps[1]) == int(outcome.steps[1])
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(jax.device_get(sim.world)), strict=True):
         np.testing.assert_array_equal(a[1:], b[1:])
+    np.testing.assert_array_equal(sim.world.position[0], from_scenario(starts[1]).position)
     assert compiled == []
 
 

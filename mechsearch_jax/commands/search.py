@@ -56,8 +56,8 @@ def _run(
 ) -> tuple[Episode, Narrator, Recorder]:
     """Run the episode; what was told of it, and what was recorded."""
     from mechsearch_jax.envs.episodes import run_episode
-    from mechsearch_jax.envs.preparing import first_decision, prepared
     from mechsearch_jax.envs.simulator import SimulatorConfig
+    from mechsearch_jax.preparing import first_decision, prepared
 
     policy, workcell = chosen.policy(), chosen.workcell
     first = first_decision(problem, policy, SimulatorConfig().motion)

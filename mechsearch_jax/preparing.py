@@ -12,7 +12,7 @@ import functools
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -20,12 +20,14 @@ import numpy as np
 from mechsearch_jax.actions import KINDS, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.cores import cores
-from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.policies import Search
 from mechsearch_jax.robot.motion import MotionConfig
+
+# Objects that an observation has room for.
+SLOTS = 8
 
 
 class Program(NamedTuple):
@@ -40,19 +42,6 @@ class Program(NamedTuple):
     name: str
     is_ready: Callable[[], bool]
     begin: Callable[[], Callable[[], None] | None]
-
-
-@runtime_checkable
-class Prepares(Protocol):
-    """What knows the programs that it will call."""
-
-    def programs(self, world: World) -> Sequence[Program]:
-        """Those for so many worlds, the longest first.
-
-        Args:
-          world: of all worlds, or its shapes.
-        """
-        ...
 
 
 def program(name: str, function: Any, *args: Any) -> Program:
@@ -74,7 +63,7 @@ def first_decision(problem: Problem, policy: Policy, motion: MotionConfig) -> li
       motion: how actions are executed.
     """
     # Only shapes and types count.
-    shapes = jax.eval_shape(lambda: Observation(empty(TARGET), jax.numpy.array(False), jax.numpy.zeros(3)))
+    shapes = jax.eval_shape(lambda: Observation(empty(SLOTS), jax.numpy.array(False), jax.numpy.zeros(3)))
     seen: Observation = jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
     belief = initial_belief(problem)
     found = []

@@ -6,8 +6,8 @@ import time
 import pytest
 
 from mechsearch_jax.actions import KINDS
-from mechsearch_jax.envs.preparing import Program, first_decision, prepare, prepared
 from mechsearch_jax.planner import search_for_grasp
+from mechsearch_jax.preparing import Program, first_decision, prepare, prepared
 from mechsearch_jax.robot.motion import MotionConfig
 
 
