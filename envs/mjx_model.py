@@ -145,8 +145,9 @@ class MjxModel:
         """The shapes of `make_data`."""
         return jax.eval_shape(_repeated, jnp.arange(worlds), jax.device_get(self._one(self._config.contacts * worlds)))
 
-    def kernels(self, worlds: int) -> Callable[[], None]:
-        """Begin to compile Warp's kernels for so many worlds in another process; returns what waits for it."""
+    def kernels(self, worlds: int) -> Callable[[], None] | None:
+        """Begin to compile Warp's kernels for so many worlds in another process; returns what waits for it, if it is
+        not known to have been done."""
         device = "cpu" if jax.default_backend() == "cpu" else "cuda:0"
         batched = tuple(BodyFields.__dataclass_fields__)
         return compile_kernels(self.blank, batched, worlds, self._config.contacts * worlds, self._config.rows, device)

@@ -11,6 +11,8 @@ noted, and then all are compiled, on all cores. The process of who asks goes on 
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import json
 import os
 import subprocess
@@ -29,8 +31,8 @@ from mechsearch_jax.cores import cores
 
 def compile_kernels(
     model: mujoco.MjModel, batched: Sequence[str], worlds: int, contacts: int, rows: int, device: str
-) -> Callable[[], None]:
-    """Begin to compile what a step of many worlds launches.
+) -> Callable[[], None] | None:
+    """Begin to compile what a step of many worlds launches, unless a note beside the kernels says that it was done.
 
     Args:
       model: of C MuJoCo.
@@ -40,16 +42,30 @@ def compile_kernels(
       device: Warp's name of the device.
 
     Returns:
-      What waits until all are compiled. Where that fails, it warns, and they are compiled when they are needed.
+      What waits until all are compiled. Where that fails, it warns, and they are compiled when they are needed. None
+      where all were compiled before.
     """
+    import warp
+
     folder = tempfile.TemporaryDirectory()
     file = Path(folder.name) / "model.mjb"
     mujoco.mj_saveModel(model, str(file))
-    told = {"model": str(file), "batched": list(batched), "worlds": worlds, "contacts": contacts, "rows": rows}
+    told: dict[str, Any] = {"batched": list(batched), "worlds": worlds, "contacts": contacts, "rows": rows}
+    what = repr((told, device, warp.get_device(device).name, warp.__version__, mujoco.__version__))
+    digest = hashlib.sha256(what.encode() + file.read_bytes()).hexdigest()[:32]
+    note = Path(warp.config.kernel_cache_dir) / f"step-{digest}"
+    if note.exists():
+        folder.cleanup()
+        return None
     # Importing JAX must not take the GPU's memory there.
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     process = subprocess.Popen(
-        [sys.executable, "-m", __spec__.name, json.dumps(told | {"device": device, "threads": cores()})],
+        [
+            sys.executable,
+            "-m",
+            __spec__.name,
+            json.dumps(told | {"model": str(file), "device": device, "threads": cores()}),
+        ],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
@@ -62,6 +78,9 @@ def compile_kernels(
         if process.returncode:
             last = complaints.rpartition("\n")[2]
             warnings.warn(f"Warp's kernels are compiled one by one when they are needed: {last}", stacklevel=2)
+            return
+        with contextlib.suppress(OSError):
+            note.touch()
 
     return wait
 

@@ -253,16 +253,16 @@ def test_worlds_need_not_wait_for_each_other_and_nothing_is_left_to_compile(sim,
         outcome = sim.execute(actions)
         together = jax.device_get(sim.world)
         sim.reset(starts)
-        sim.begin(actions, np.array([True, False, False]))
+        sim.begin(actions, jax.device_put(np.array([True, False, False])))
         with pytest.raises(InputError, match="world 0 is moving"):
             sim.begin(actions)
         assert sim.advance(1)[0].tolist() == [True, False, False]
         # Of two that begin, one has nothing to do, and is done at once.
-        sim.begin(actions, np.array([False, True, True]))
+        sim.begin(actions, jax.device_put(np.array([False, True, True])))
         done, told = sim.advance(1)
         assert done.tolist() == [False, False, True]
         assert told.reason(2) == "unreachable"
-        sim.begin(actions, np.array([True, False, False]))
+        sim.begin(actions, jax.device_put(np.array([True, False, False])))
         steps = [sim.advance(1) for _ in range(2)]
         sim.replace({0: starts[1]})
     finally:
@@ -279,10 +279,25 @@ def test_worlds_need_not_wait_for_each_other_and_nothing_is_left_to_compile(sim,
     assert compiled == []
 
 
-def test_who_compiles_kernels_says_where_it_cannot(monkeypatch):
+def test_who_compiles_kernels_says_where_it_cannot(tmp_path, monkeypatch):
+    import warp
+
+    monkeypatch.setattr(warp.config, "kernel_cache_dir", str(tmp_path))
     wait = warp_kernels.compile_kernels(model.compile_model(Shelf(), Camera(), 0.004), ("nothing",), 2, 128, 320, "cpu")
     with pytest.warns(UserWarning, match="kernels are compiled one by one when they are needed: .*nothing"):
         wait()
+    assert not list(tmp_path.iterdir())
+
+
+def test_kernels_that_were_compiled_are_not_compiled_again(tmp_path, monkeypatch):
+    import warp
+
+    monkeypatch.setattr(warp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(warp_kernels.sys, "executable", "true")
+    asked = model.compile_model(Shelf(), Camera(), 0.004), ("geom_size",), 2, 128, 320, "cpu"
+    warp_kernels.compile_kernels(*asked)()
+    assert warp_kernels.compile_kernels(*asked) is None
+    assert warp_kernels.compile_kernels(*asked[:2], 3, *asked[3:]) is not None
 
 
 @pytest.mark.slow
