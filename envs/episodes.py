@@ -401,7 +401,6 @@ class _EpisodePool:
         moment = self._moment(choices)
         if self._run.watcher is not None and moment is not None and acting:
             self._run.watcher.decided(moment)
-        over = [r for r in decided if r not in acting]
         executed: Execution | None = None
         with self._clock("simulate", [*acting, *self._moving]):
             if acting or self._moving:
@@ -411,11 +410,15 @@ class _EpisodePool:
                 for r, choice in others.items():
                     decided[r].log.took(choice)
 
+        # Without an action there is nothing to wait for.
+        ends: dict[int, tuple[Result | None, str | None]] = {
+            r: (None, trouble.get(r)) for r in decided if r not in acting
+        }
+        if executed is not None:
+            ends |= {r: _result(executed, r) for r in executed.choices.keys() | executed.stuck}
         done: list[tuple[int, tuple[int, Episode]]] = []
-        for r in sorted([*over, *(executed.choices.keys() | executed.stuck if executed else ())]):
-            slot, result, why = self.running[r], None, trouble.get(r)
-            if executed is not None and r not in over:
-                result, why = _result(executed, r)
+        for r, (result, why) in sorted(ends.items()):
+            slot = self.running[r]
             if slot.log.act(result, why, self._clock.timings(r)):
                 done.append((r, (slot.place, slot.log.episode(slot.start.scenario, self._options(slot.start)))))
                 self._slots[r] = None

@@ -327,8 +327,9 @@ class MjxSimulator:
             data = _at_rest(data, task.moves)
             tasks = task, begin(task, data), ~active
         else:
-            data, *tasks = self._begun(data, actions, active)
-        data, world, _, _, outcome = self._gone_on(fields, data, world, tuple(tasks), jnp.int32(len(active)))
+            data, task, progress, known = self._begun(data, actions, active)
+            tasks = task, progress, known
+        data, world, _, _, outcome = self._gone_on(fields, data, world, tasks, jnp.int32(len(active)))
         return data, world, outcome
 
     def _follow(self, fields: BodyFields, data: Any, world: World, controls: Array):

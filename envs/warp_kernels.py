@@ -53,7 +53,7 @@ def compile_kernels(
     told: dict[str, Any] = {"batched": list(batched), "worlds": worlds, "contacts": contacts, "rows": rows}
     what = repr((told, device, warp.get_device(device).name, warp.__version__, mujoco.__version__))
     digest = hashlib.sha256(what.encode() + file.read_bytes()).hexdigest()[:32]
-    note = Path(warp.config.kernel_cache_dir) / f"step-{digest}"
+    note = Path(str(warp.config.kernel_cache_dir)) / f"step-{digest}"
     if note.exists():
         folder.cleanup()
         return None
