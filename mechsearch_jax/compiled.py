@@ -101,6 +101,8 @@ class Kept:
         self._on_disk = on_disk
         # What runs a call, or will once it is compiled, by what tells calls apart in this process.
         self._loaded: dict[Hashable, Future[Any]] = {}
+        # What was lowered here returns, as shapes.
+        self._returned: dict[Hashable, Any] = {}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         found = self._executable(args, kwargs)
@@ -132,7 +134,7 @@ class Kept:
         if key is None or self._loaded.setdefault(key, mine) is not mine:
             return None
         try:
-            compiling = self._compiling(args, kwargs)
+            compiling = self._compiling(key, args, kwargs)
         except BaseException as error:
             self._failed(key, error)
             raise
@@ -151,6 +153,18 @@ class Kept:
         finish = self.begin(*args, **kwargs)
         if finish is not None:
             finish()
+
+    def returns(self, *args: Any, **kwargs: Any) -> Any:
+        """The shapes of what a call returns for which `begin` was called, so that what takes it can be prepared, too.
+
+        What is read from disk is waited for.
+
+        Raises:
+          KeyError: `begin` was not called for such arguments, or did not succeed.
+        """
+        key = self._key(args, kwargs)
+        found = self._returned[key] if key in self._returned else self._loaded[key].result().out_info
+        return jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type), found)
 
     def is_ready(self, *args: Any, **kwargs: Any) -> bool:
         """Whether `prepare` with these arguments has nothing to compile; what was kept may still have to be read."""
@@ -212,11 +226,11 @@ class Kept:
     def _failed(self, key: Hashable, error: BaseException) -> None:
         self._loaded.pop(key).set_exception(error)
 
-    def _compiling(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[[], Any]:
+    def _compiling(self, key: Hashable, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[[], Any]:
         """What gives the executable of a call: all that needs Python is done."""
         said, executables = self._said(args, kwargs), _KEEPING.executables
         if said is None or executables is None:
-            return functools.partial(_compile, self._lowered(args, kwargs))
+            return functools.partial(_compile, self._lowered(key, args, kwargs))
 
         def load() -> Any:
             moving, named, _ = self._split(args, kwargs)
@@ -229,13 +243,14 @@ class Kept:
 
         if executables.has(self._name, said):
             # What is damaged is compiled all the same, where it is found to be.
-            return lambda: load() or compile_and_save(self._lowered(args, kwargs, alone=True))
-        return functools.partial(compile_and_save, self._lowered(args, kwargs, alone=True))
+            return lambda: load() or compile_and_save(self._lowered(key, args, kwargs, alone=True))
+        return functools.partial(compile_and_save, self._lowered(key, args, kwargs, alone=True))
 
-    def _lowered(self, args: tuple[Any, ...], kwargs: dict[str, Any], alone: bool = False) -> Any:
+    def _lowered(self, key: Hashable, args: tuple[Any, ...], kwargs: dict[str, Any], alone: bool = False) -> Any:
         """The function, lowered for some arguments.
 
         Args:
+          key: of the call.
           args, kwargs: of a call.
           alone: such that it can be kept. What JAX reads from its own cache cannot be written a second time, so that it
             must not be found there: the name of a program counts.
@@ -252,6 +267,7 @@ class Kept:
         # One after the other, so that the first is compiled, for which Python is not needed, as the next is traced.
         with _TRACING:
             lowered = jitted.lower(*args, **kwargs)
+            self._returned[key] = lowered.out_info
             if alone:
                 _forget_source(lowered)
         return lowered

@@ -59,6 +59,8 @@ def test_a_second_process_traces_nothing(folder):
     assert file.name.startswith("scaled-")
     again = another_process()
     assert again.is_ready(Camera(), VALUES)
+    again.prepare(Camera(), VALUES)
+    assert again.returns(Camera(), VALUES)["sum"] == jax.ShapeDtypeStruct((), jnp.float32)
     second = again(Camera(), VALUES)
     again(Camera(), jnp.asarray(VALUES))
     assert TRACED == []
@@ -170,6 +172,7 @@ def test_what_is_prepared_in_memory_is_what_is_called():
     finish = function.begin(Camera(), jax.ShapeDtypeStruct((11,), jnp.float32))
     assert TRACED == ["scaled"]
     assert function.begin(Camera(), values) is None
+    assert function.returns(Camera(), values)["scaled"] == jax.ShapeDtypeStruct((11,), jnp.float32)
     threading.Thread(target=finish).start()
     # Who calls it before it is compiled waits for it.
     result = function(Camera(), values)
