@@ -34,6 +34,7 @@ from mechsearch_jax.envs.outcome import Failure, Outcome
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, check_actions, controls
 from mechsearch_jax.envs.world import BODIES, TARGET, World, bodies_of, fallen_over, from_scenario, slots
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.preparing import Program, motions
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference
 from mechsearch_jax.workspace.camera import Camera
@@ -487,6 +488,10 @@ class NativeSimulator:
         check_actions(self.engine, actions, len(self._worlds))
         actions = jax.device_get(actions)
         return self._each(active, lambda i: self._worlds[i].execute(_row(actions, i)))
+
+    def programs(self, world: World) -> list[Program]:
+        """The motions of all kinds of action; see `preparing.Prepares`."""
+        return motions(self.config.motion)
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Let time pass in every active world; see `Simulator.settle`.

@@ -8,7 +8,6 @@ traceable.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -23,12 +22,13 @@ from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.episode_log import Choice, chosen
 from mechsearch_jax.envs.policy_numbers import as_pytree, mould, numbers, with_numbers
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
-from mechsearch_jax.envs.verdicts import Verdict, judge, judge_many, swept_free
+from mechsearch_jax.envs.verdicts import Verdict, graspable_many, judge, judge_many, judged_sets, swept_free
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.moved_target import nearest_candidate
+from mechsearch_jax.preparing import Program, program
 from mechsearch_jax.workspace.camera import Camera
 
 
@@ -182,7 +182,7 @@ class ManySlots:
         problem: of all episodes.
         policy: of all slots that have none of their own.
         recogniser: must be traceable, as the policy.
-        world: of all slots, for what recognisers make of it.
+        world: of all slots, or its shapes, for what recognisers make of it.
         at_once: how many slots are looked at or decided upon in one computation.
         """
         self._problem = problem
@@ -193,12 +193,38 @@ class ManySlots:
         self._numbers = [numbers(self._policy)] * self._count
         # Policies that were looked at, by what tells objects apart while they are kept.
         self._known: dict[int, tuple[Policy, tuple[np.ndarray, ...]]] = {}
-        one = jax.tree.map(lambda a: a[0], world)
+        one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), world)
         seen = jax.eval_shape(
             lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), one
         )
         empty = PlannerState(initial_belief(problem), seen, no_action())
-        self._state: PlannerState = jax.tree.map(lambda a: jnp.zeros((self._count, *a.shape), a.dtype), empty)
+        self._state: PlannerState = jax.tree.map(
+            lambda a: jax.device_put(np.zeros((self._count, *a.shape), a.dtype)), empty
+        )
+
+    def programs(self, world: World) -> list[Program]:
+        """All that is compiled for these slots, the longest first.
+
+        Args:
+          world: of all slots, or its shapes.
+        """
+        rows = jax.ShapeDtypeStruct((self._at_once,), jnp.int32)
+        keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), self._count))
+        own = tuple(jax.ShapeDtypeStruct((self._at_once, *a.shape), a.dtype) for a in numbers(self._policy))
+        few = jax.tree.map(lambda a: jax.ShapeDtypeStruct((self._at_once, *a.shape[1:]), a.dtype), world)
+        active = jax.ShapeDtypeStruct((self._at_once,), bool)
+        done = jax.tree.map(lambda a: jax.ShapeDtypeStruct((self._at_once, *a.shape), a.dtype), no_action())
+        fresh = jax.ShapeDtypeStruct((self._count,), bool)
+        problem, state = self._problem, self._state
+        return [
+            program("plan", _decide, self._policy, own, problem, state, keys, rows),
+            program("look", _look, problem, state, world, keys, rows, self._recogniser, problem.camera),
+            program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
+            program("small ones", _told, problem.poses, state.belief.exists, world),
+            program("small ones", _forget, problem, state, fresh),
+            program("small ones", _note, state, done, rows),
+            program("small ones", _some_worlds, world, rows),
+        ]
 
     def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
         """See `Slots`."""
@@ -253,7 +279,8 @@ class ManySlots:
         """See `Slots`."""
         found: dict[int, Verdict] = {}
         for some, padded in self._chunks(rows):
-            verdicts = judge_many(self._problem, _some_worlds(world, padded), padded < self._count)
+            active = jax.device_put(np.asarray(padded) < self._count)
+            verdicts = judge_many(self._problem, _some_worlds(world, padded), active)
             found |= dict(zip(some, verdicts, strict=False))
         return found
 
@@ -271,7 +298,7 @@ def _some(tree: Any, rows: Int[Array, " n"]) -> Any:
     return jax.tree.map(lambda a: a[jnp.minimum(rows, a.shape[0] - 1)], tree)
 
 
-@jax.jit
+@kept()
 def _some_worlds(world: World, rows: Int[Array, " n"]) -> World:
     """The worlds in the slots `rows`, empty ones for rows beyond the end."""
     here = _some(world, rows)
@@ -291,7 +318,7 @@ def _told(poses: Array, exists: Bool[Array, "slots x"], world: World) -> tuple[A
     return jnp.sum(exists, axis=1), jnp.take_along_axis(exists, nearest[:, None], axis=1)[:, 0]
 
 
-@jax.jit
+@kept()
 def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"]) -> PlannerState:
     """Let the fresh slots know nothing."""
     belief, action = jax.tree.map(
@@ -302,13 +329,13 @@ def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"])
     return state.replace(belief=belief, action=action)
 
 
-@jax.jit
+@kept()
 def _note(state: PlannerState, action: Action, rows: Int[Array, " n"]) -> PlannerState:
     """Keep what was decided in the slots `rows` until the next look."""
     return state.replace(action=jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state.action, action))
 
 
-@functools.partial(jax.jit, static_argnames=("recogniser", "camera"))
+@kept(static_argnames=("recogniser", "camera"))
 def _look(
     problem: Problem,
     state: PlannerState,
@@ -332,7 +359,7 @@ def _look(
     return jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state, new)
 
 
-@jax.jit
+@kept()
 def _decide(
     policy: Policy,
     own: tuple[Array, ...],
@@ -361,7 +388,7 @@ def _swept_free(problem: Problem, seen: Observation, active: Bool[Array, ""]) ->
     return swept_free(problem.target_grasps, seen.objects, seen.target_pose, active & seen.target_visible)
 
 
-@jax.jit
+@kept()
 def _swept_free_many(problem: Problem, state: PlannerState, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
     """The same in the slots `rows`; False for rows beyond the end."""
     active = rows < state.belief.found.shape[0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import flax.struct
@@ -104,9 +104,11 @@ class Search(flax.struct.PyTreeNode):
         """What a plan depends on: it is the same, and compiled once, whatever tries it out."""
         return self.replace(rehearsal=None)
 
-    def prepare(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> None:
-        """Load or compile what a plan with such arguments needs, without planning; see `compiled.Kept.prepare`."""
-        _plan.prepare(self._planning, key, problem, belief, observation)
+    def begin(
+        self, key: Array, problem: Problem, belief: Belief, observation: Observation
+    ) -> Callable[[], None] | None:
+        """Lower what a plan with such arguments needs, without planning; see `compiled.Kept.begin`."""
+        return _plan.begin(self._planning, key, problem, belief, observation)
 
     def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
         """Whether nothing has to be compiled for a plan with such arguments; see `compiled.Kept.is_ready`."""

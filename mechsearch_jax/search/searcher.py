@@ -50,7 +50,9 @@ from mechsearch_jax.planner.problem import NOWHERE, Problem
 from mechsearch_jax.planner.rehearsal import Rehearsal
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.preparing import first_decision, prepared
 from mechsearch_jax.robot.free_motion import check_joints
+from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.search import warming
 from mechsearch_jax.search.images import Images, alike
 from mechsearch_jax.search.slots import UNTRIED, filled, tries_nothing
@@ -211,28 +213,32 @@ class Searcher:
         stage()
         problem, key = self.problem, jax.random.key(0)
         images = warming.images(self.workcell.camera, self.workcell.shelf, colour, mask, target_id)
-        stage()
-        seen = jax.block_until_ready(self.recogniser(key, *images))
-        hidden, found = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
-        stage()
-        belief = update_belief(problem, initial_belief(problem), hidden)
-        jax.block_until_ready(update_belief(problem, belief, hidden, hidden, no_action()))
-        stage()
-        twin = self._twin()
-        step = twin._looking(hidden, images)
-        stage()
-        twin._state = dataclasses.replace(twin._now, handed=False, acted=True)
-        taken = twin._looking(found, images)
-        stage()
-        impasse(problem, step.belief, hidden.objects)
-        action = taken.decision.action
-        warming.motions(problem, action, twin._trajectories.motion if twin._trajectories else None)
-        rehearsal = getattr(self._policy, "rehearsal", None)
-        if rehearsal is not None:
-            warming.trials(rehearsal, problem, hidden, action)
-        for each in (step, taken):
-            each.to_json()
-            _ = each.picture
+        config = self._trajectories.motion if self._trajectories else None
+        first = first_decision(problem, self._policy, config or MotionConfig(gripper=problem.gripper))
+        # What takes longest is compiled while the rest is gone through, which waits for it where it needs it.
+        with prepared(first, lambda text: None):
+            stage()
+            seen = jax.block_until_ready(self.recogniser(key, *images))
+            hidden, found = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
+            stage()
+            belief = update_belief(problem, initial_belief(problem), hidden)
+            jax.block_until_ready(update_belief(problem, belief, hidden, hidden, no_action()))
+            stage()
+            twin = self._twin()
+            step = twin._looking(hidden, images)
+            stage()
+            twin._state = dataclasses.replace(twin._now, handed=False, acted=True)
+            taken = twin._looking(found, images)
+            stage()
+            impasse(problem, step.belief, hidden.objects)
+            action = taken.decision.action
+            warming.motions(problem, action, config)
+            rehearsal = getattr(self._policy, "rehearsal", None)
+            if rehearsal is not None:
+                warming.trials(rehearsal, problem, hidden, action)
+            for each in (step, taken):
+                each.to_json()
+                _ = each.picture
 
     def _twin(self) -> Searcher:
         """A searcher at the beginning of a search, that shares all but how far it is, and makes any motion."""
