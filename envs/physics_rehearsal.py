@@ -13,10 +13,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -31,9 +29,10 @@ from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.cores import cores
-from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.physics_push import bodies, sound
 from mechsearch_jax.envs.simulator import SimulatorConfig
+from mechsearch_jax.envs.trials.order import in_order
+from mechsearch_jax.envs.trials.scene import TrialScene
 from mechsearch_jax.envs.world import TARGET, World, bodies_of
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -205,37 +204,27 @@ def _in_turn(
       asked: which are to be tried.
       motion: of an action by row and column.
     """
-    threads = how.threads or 1
-    told = np.full(asked.shape, Rehearsed.HARMFUL, np.int32)
-    left = {row: iter(np.flatnonzero(asked[row]).tolist()) for row in np.flatnonzero(asked.any(axis=1)).tolist()}
-    with ThreadPoolExecutor(threads) as pool:
-        while left:
-            # Of few scenes several actions are tried at the same time.
-            some = [(row, i) for row, rest in left.items() for i in itertools.islice(rest, -(-threads // len(left)))]
-            tasks = [
-                (jax.tree.map(lambda a, row=row: a[row], world), int(kind[row, i]), motion(row, i), int(index[row, i]))
-                for row, i in some
-            ]
-            for at, result in zip(some, pool.map(lambda task: _tried_out(shelf, how, *task), tasks), strict=True):
-                told[at] = result
-            tried = {row for row, _ in some}
-            left = {r: rest for r, rest in left.items() if r in tried and told[r].max() < Rehearsed.SUCCEEDED}
-    return told
+
+    def one(row: int) -> World:
+        return jax.tree.map(lambda a: a[row], world)
+
+    def attempt(scene: TrialScene | None, row: int, i: int, needed: Callable[[], bool]) -> Rehearsed | None:
+        told = motion(row, i)
+        if told is None or not told[1]:
+            return Rehearsed.FAILED
+        if scene is None or not sound(*jax.tree.map(lambda a: a[None], (one(row), told[0]))):
+            return Rehearsed.HARMFUL
+        try:
+            return scene.attempt(kind_of(int(kind[row, i])), told[0], int(index[row, i]), needed)
+        except mujoco.FatalError:
+            return Rehearsed.HARMFUL
+
+    return in_order(asked, how.threads or 1, lambda row: _at_rest(shelf, how, one(row)), attempt)
 
 
-def _tried_out(shelf: Shelf, how: NativeRehearsal, world: World, kind: int, motion: Motion, index: int) -> Rehearsed:
-    """What becomes of one action."""
-    if motion is None or not motion[1]:
-        return Rehearsed.FAILED
-    if not sound(*jax.tree.map(lambda a: a[None], (world, motion[0]))):
-        return Rehearsed.HARMFUL
-    here = NativeWorld(shelf, config=how.simulation)
+def _at_rest(shelf: Shelf, how: NativeRehearsal, world: World) -> TrialScene | None:
+    """A scene in which actions can be tried; None where it is none, which must not end those beside it."""
     try:
-        here.place(bodies_of(world), how.friction)
-        succeeds, harmless = here.rehearse(kind_of(kind), motion[0], index)
+        return TrialScene(shelf, how.simulation, bodies_of(world), how.friction)
     except (ValueError, mujoco.FatalError):
-        # A scene that cannot be built must not end those beside it.
-        return Rehearsed.HARMFUL
-    if not harmless:
-        return Rehearsed.HARMFUL
-    return Rehearsed.SUCCEEDED if succeeds else Rehearsed.FAILED
+        return None

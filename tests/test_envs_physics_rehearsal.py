@@ -4,6 +4,8 @@ what is free to move takes the target out, and one that runs into what is not do
 import dataclasses
 import functools
 import math
+import threading
+import time
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +14,17 @@ import pytest
 from test_envs_simulator import pose, push, scene, standing
 from test_envs_simulator import take_out as retrieval
 
-from mechsearch_jax.actions import ActionKind, no_action
+from mechsearch_jax.actions import ActionKind, kind_of, no_action
+from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs import physics_rehearsal
 from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.outcome import Failure
-from mechsearch_jax.envs.physics_rehearsal import NativeRehearsal
+from mechsearch_jax.envs.physics_rehearsal import NativeRehearsal, _world
 from mechsearch_jax.envs.rehearsals import rehearsal
 from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.envs.trials.order import in_order
+from mechsearch_jax.envs.trials.scene import TrialScene
+from mechsearch_jax.envs.world import bodies_of, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
@@ -290,7 +295,7 @@ def test_friction(problem):
     seen, at = known(problem, EDGE)
     actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
     # What is rough holds the hand up, and what is rougher still tips over.
-    for friction, said in ((1.0, DONE), (5.0, FAILED), (20.0, HARM)):
+    for friction, said in ((1.0, DONE), (4.0, FAILED), (20.0, HARM)):
         model = NativeRehearsal(friction=friction)
         assert model(problem, seen, at, False, actions, asked, PUSHES).tolist() == [said]
     for wrong in (0.0, -1.0, math.nan):
@@ -354,23 +359,69 @@ def test_a_scene_that_is_none_is_harmed_and_leaves_the_others_alone(problem):
 
 
 @pytest.mark.parametrize("threads", [1, 3, 16])
-def test_the_first_that_succeeds_is_the_same_with_any_number_of_threads(problem, monkeypatch, threads):
-    made = []
+def test_the_first_that_succeeds_is_the_same_with_any_number_of_threads(threads):
+    made, tried = [], []
 
-    def tried_out(shelf, how, world, kind, motion, index):
-        made.append(motion)
-        return DONE if motion >= (3, 6)[int(world.kind)] else FAILED
+    def attempt(scene, row, i, needed):
+        assert scene == 10 * row
+        tried.append((row, i))
+        time.sleep(0.001)
+        if not needed():
+            return None
+        return DONE if i >= (3, 6)[row] else FAILED
 
-    monkeypatch.setattr(physics_rehearsal, "_tried_out", tried_out)
-    blank = np.zeros((2, TRIES), int)
-    world = from_scenario(begin(OPEN)).replace(kind=np.arange(2))
-    world = world.replace(**{n: np.zeros(2) for n in ("half_size", "position", "rotation", "valid")})
-    said = physics_rehearsal._in_turn(
-        problem.shelf, NativeRehearsal(threads=threads), world, blank, blank, blank == 0, lambda row, i: i
-    )
+    def make(row):
+        made.append(row)
+        return 10 * row
+
+    said = in_order(np.ones((2, TRIES), bool), threads, make, attempt)
+    assert sorted(made) == [0, 1]
     assert said.argmax(axis=1).tolist() == [3, 6]
     assert (said.max(axis=1) == DONE).all()
-    assert threads > 3 or len(made) < 2 * TRIES
+    assert said[0, :3].tolist() == [FAILED] * 3
+    assert said[1, :6].tolist() == [FAILED] * 6
+    # The best of both scenes come before what is next.
+    assert {tried[0], tried[1]} == {(0, 0), (1, 0)}
+    assert threads > 1 or len(tried) == 4 + 7
+
+
+def test_what_nobody_waits_for_any_more_is_stopped():
+    stopped, late = [], threading.Event()
+
+    def attempt(scene, row, i, needed):
+        if i == 0:
+            late.wait(10.0)
+            return DONE
+        late.set()
+        while needed():
+            time.sleep(0.001)
+        stopped.append(i)
+        return None
+
+    said = in_order(np.ones((1, 3), bool), 2, lambda row: None, attempt)
+    assert (said.tolist(), stopped) == ([[DONE, HARM, HARM]], [1])
+
+
+def test_a_scene_is_made_once_and_trying_does_not_change_it(problem):
+    seen, at = known(problem, EDGE)
+    world = jax.device_get(_world(problem, seen, at, jnp.array(False)))
+    scene = TrialScene(problem.shelf, MODEL.simulation, bodies_of(world))
+    kind = kind_of(ActionKind.PUSH)
+    over, _, aside = (jax.device_get(reference_motion(kind, a, MODEL.simulation.motion)[0]) for a in pushes())
+    before = scene.positions
+    for _ in range(2):
+        assert scene.attempt(kind, over, 0) is HARM
+        assert scene.attempt(kind, aside, 1) is DONE
+        np.testing.assert_array_equal(scene.positions, before)
+    assert scene.attempt(kind, aside, 1, lambda: False) is None
+
+
+def test_what_is_not_touched_sleeps(problem):
+    seen, at = known(problem, EDGE)
+    world = jax.device_get(_world(problem, seen, at, jnp.array(False)))
+    scene = TrialScene(problem.shelf, MODEL.simulation, bodies_of(world))
+    # The arm alone is awake, before anything is touched.
+    assert (scene._data.tree_asleep >= 0).tolist() == [False] + [True] * 9
 
 
 def test_names():
