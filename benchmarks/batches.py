@@ -138,6 +138,7 @@ class Batches:
             at_once=AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE,
             busy=self.busy,
             protocol=method.terms,
+            trials=method.trials(),
         )
 
 

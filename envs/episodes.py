@@ -1,4 +1,4 @@
-"""The closed loop: look, recognise, update the belief, decide, act; many episodes at once, or one alone.
+"""The closed loop: look, recognise, update the belief, propose, try, choose, act; many episodes at once, or one alone.
 
 Each episode has a slot. All slots look, decide and act together; an episode that ends leaves its slot to the next one,
 so that short episodes do not wait for long ones. The random numbers of an episode are its own: what it decides depends
@@ -50,6 +50,7 @@ from mechsearch_jax.envs.world import TARGET, World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem
+from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.target import Target
 
@@ -135,14 +136,15 @@ def run_episode(
     options: Mapping[str, Any] | None = None,
     watcher: Watcher | None = None,
     protocol: EpisodeProtocol = STRICT,
+    trials: Trials | None = None,
 ) -> Episode:
     """Run one episode to its end, whatever that is.
 
     Args:
       seed: see `Start`.
       scenario: where everything stands at the start.
-      problem, policy, simulator, recogniser, max_steps, options, watcher, protocol: see `run_episodes`. Neither the
-        policy nor the recogniser need be traceable.
+      problem, policy, simulator, recogniser, max_steps, options, watcher, protocol, trials: see `run_episodes`. Neither
+        the policy nor the recogniser need be traceable.
     """
     found: list[tuple[int, Episode]] = []
     start = Start(scenario, seed)
@@ -158,6 +160,7 @@ def run_episode(
         options,
         watcher=watcher,
         protocol=protocol,
+        trials=trials,
     )
     return found[0][1]
 
@@ -176,6 +179,7 @@ def run_episodes(
     busy: Callable[[str, int], None] = lambda stage, episodes: None,
     watcher: Watcher | None = None,
     protocol: EpisodeProtocol = STRICT,
+    trials: Trials | None = None,
 ) -> None:
     """Run episodes to their ends, many at a time.
 
@@ -193,6 +197,7 @@ def run_episodes(
       busy: told of every stage ("recognise", "plan", "judge", "simulate"), with the number of slots in it.
       watcher: told of every step; for one slot only.
       protocol: how they are run and judged. Who gives another has built the problem by `protocol.problem`.
+      trials: what tries the policy's best actions out before one is made; nothing if left out.
 
     Raises:
       InputError: there is no slot, a watcher is given for several, the policy decides on an unknown kind of action, or
@@ -209,9 +214,9 @@ def run_episodes(
     count, recogniser = len(first), protocol.recogniser(recogniser)
     world = simulator.reset([start.scenario for _, start in first])
     if count == 1:
-        known: Slots = OneSlot(problem, policy, recogniser)
+        known: Slots = OneSlot(problem, policy, recogniser, trials)
     else:
-        known = ManySlots(problem, policy, recogniser, world, min(at_once, count))
+        known = ManySlots(problem, policy, recogniser, world, min(at_once, count), trials)
     with CompileClock() as compiling:
         pool = _EpisodePool(
             simulator, problem, known, count, _Run(max_steps, options or {}, busy, watcher, compiling, protocol)

@@ -155,15 +155,15 @@ class NativeWorld:
         target = found.pop(TARGET)
         return Scenario(name, tuple(found.values()), target)
 
-    def place(self, bodies: list[Body | None], friction: float = 1.0) -> None:
+    def place(self, bodies: list[Body | None], friction: float = 1.0, mass: float = 1.0) -> None:
         """Start from bodies, everything at rest and the robot at home; `world` stays what it was.
 
         Args:
           bodies: in their slots.
-          friction: sliding friction of everything, as a multiple of what it is.
+          friction, mass: sliding friction of everything, and masses of the bodies, as multiples of what they are.
         """
         self._bodies = bodies
-        self._model = models.with_bodies(self._blank, bodies)
+        self._model = models.with_bodies(self._blank, bodies, mass=mass)
         self._model.geom_friction[:, 0] *= friction
         self._data = models.initial_state(self._model, bodies)
         self._go_home()

@@ -10,11 +10,11 @@ from typing import Generic, TypeVar
 import numpy as np
 from jaxtyping import Bool, Int
 
-from mechsearch_jax.planner.rehearsal import Rehearsed
+from mechsearch_jax.planner.trials import TrialResult
 
 Scene = TypeVar("Scene")
 # Tries column i of row r in its scene; None where `needed` says meanwhile that nobody wants to know any more.
-Attempt = Callable[[Scene, int, int, Callable[[], bool]], Rehearsed | None]
+Attempt = Callable[[Scene, int, int, Callable[[], bool]], TrialResult | None]
 
 
 class _Row(Generic[Scene]):
@@ -42,7 +42,7 @@ def in_order(
     make: Callable[[int], Scene],
     attempt: Attempt[Scene],
 ) -> Int[np.ndarray, "n k"]:
-    """What becomes of what is wanted in each row, as `Rehearsed`, up to the first that succeeds.
+    """What becomes of what is wanted in each row, as `TrialResult`, up to the first that succeeds.
 
     The best of every row comes first, then the next of those rows where nothing has succeeded yet. A free thread also
     tries what may turn out not to be needed; it stops when it does. So what is said of a row up to its first success
@@ -54,7 +54,7 @@ def in_order(
       make: the scene of a row; called once, in a thread.
       attempt: tries; called in a thread.
     """
-    told = np.full(wanted.shape, Rehearsed.HARMFUL, np.int32)
+    told = np.full(wanted.shape, TrialResult.UNKNOWN, np.int32)
     rows: dict[int, _Row[Scene]] = {int(r): _Row(wanted[r]) for r in np.flatnonzero(wanted.any(axis=1))}
     lock = threading.Lock()
 
@@ -78,7 +78,7 @@ def in_order(
             if result is None:
                 continue
             told[r, i] = result
-            if result is Rehearsed.SUCCEEDED:
+            if result is TrialResult.SUCCEEDED:
                 with lock:
                     row.first = min(row.first, i)
 

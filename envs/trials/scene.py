@@ -24,7 +24,7 @@ from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.outcome import Failure
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, controls
 from mechsearch_jax.envs.world import BODIES, TARGET
-from mechsearch_jax.planner.rehearsal import Rehearsed
+from mechsearch_jax.planner.trials import TrialResult
 from mechsearch_jax.robot.motion import Reference
 from mechsearch_jax.shapes import in_order
 from mechsearch_jax.workspace.camera import Camera
@@ -45,8 +45,12 @@ EMPTY = 1e-3
 
 @functools.cache
 def blank_model(shelf: Shelf, timestep: float) -> mujoco.MjModel:
-    """The model with empty slots; not to be changed."""
-    return models.compile_model(shelf, Camera(), timestep)
+    """The model with empty slots, in which what is at rest sleeps; not to be changed."""
+    model = models.compile_model(shelf, Camera(), timestep)
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+    # Little is awake at a time.
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    return model
 
 
 class TrialScene(NativeWorld):
@@ -56,21 +60,30 @@ class TrialScene(NativeWorld):
       diverged: whether the simulation did before everything was at rest; nothing can be tried then.
     """
 
-    def __init__(self, shelf: Shelf, config: SimulatorConfig, bodies: list[Body | None], friction: float = 1.0):
+    def __init__(
+        self,
+        shelf: Shelf,
+        config: SimulatorConfig,
+        bodies: list[Body | None],
+        friction: float = 1.0,
+        mass: float = 1.0,
+    ):
         """Let bodies come to rest.
 
         Args:
           shelf: where.
           config: how it is simulated.
           bodies: in their slots.
-          friction: sliding friction of everything, as a multiple of what it is.
+          friction, mass: sliding friction of everything, and masses of the bodies, as multiples of what they are.
 
         Raises:
           ValueError, mujoco.FatalError: MuJoCo cannot build the scene.
         """
         super().__init__(shelf, config=config, blank=blank_model(shelf, config.motion.timestep))
-        self.place(bodies, friction)
-        self._come_to_rest()
+        self.place(bodies, friction, mass)
+        self._model.opt.sleep_tolerance = config.rest_speed
+        self._hide_what_is_no_body()
+        self._rest_again(np.empty((0, 0)))
         self.diverged = self._recorder.diverged
         self._gone, self._lay = self._fallen(), self._target_lies()
         if not self.diverged:
@@ -78,10 +91,8 @@ class TrialScene(NativeWorld):
 
     def attempt(
         self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool] = lambda: True
-    ) -> Rehearsed | None:
-        """What becomes of an action; None where that is not needed any more.
-
-        Nothing is computed with JAX, so that a callback of JAX may ask.
+    ) -> TrialResult | None:
+        """What becomes of an action; None where that is not needed any more. Nothing is computed with JAX.
 
         Args:
           kind: of the action.
@@ -90,13 +101,15 @@ class TrialScene(NativeWorld):
           needed: asked again and again whether anybody still wants to know.
         """
         if self.diverged:
-            return Rehearsed.HARMFUL
+            return TrialResult.UNKNOWN
         here = copy.copy(self)
         here._data = copy.copy(self._data)
         here._record()
         return here._attempted(kind, reference, index, needed)
 
-    def _attempted(self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool]) -> Rehearsed | None:
+    def _attempted(
+        self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool]
+    ) -> TrialResult | None:
         start = np.asarray(reference.start, float)
         self._set_robot(start[:ARM], float(start[ARM]))
         told = controls(reference)
@@ -106,10 +119,12 @@ class TrialScene(NativeWorld):
             states = np.concatenate([states, block]) if first else block
             if not needed():
                 return None
-            if self._recorder.diverged or self._harm_is_certain(kind):
-                return Rehearsed.HARMFUL
+            if self._recorder.diverged:
+                return TrialResult.UNKNOWN
+            if self._harm_is_certain(kind):
+                return TrialResult.HARMFUL
             if kind.takes_target and self._fails_for_certain(states, reference):
-                return Rehearsed.FAILED
+                return TrialResult.FAILED
         failed = self._tracking_error(states, reference) > self.config.tracking_bound
         if kind.holds_object:
             failed |= not self._slip(states, reference, index) < self.config.slip
@@ -117,35 +132,30 @@ class TrialScene(NativeWorld):
             self._go_home()
         self._rest_again(states)
         if self._recorder.diverged:
-            return Rehearsed.HARMFUL
+            return TrialResult.UNKNOWN
         held, fallen = False, self._fallen()
         if kind.takes_target:
             taken = self._retrieval(self._gone)
             failed, held, fallen = failed or taken.failure is not Failure.NONE, taken.held, taken.fallen
         toppled = self._target_lies() and not (self._lay or held)
         if toppled or (fallen & ~self._gone).any():
-            return Rehearsed.HARMFUL
-        return Rehearsed.FAILED if failed else Rehearsed.SUCCEEDED
+            return TrialResult.HARMFUL
+        return TrialResult.FAILED if failed else TrialResult.SUCCEEDED
+
+    def _hide_what_is_no_body(self) -> None:
+        """Leave out geometry that stands for nothing, or is hidden inside of a body."""
+        for i, body in enumerate(self._bodies):
+            for shape in in_order():
+                if body is None or body.shape != shape.name:
+                    geom = self._model.geom(models.geometry_name(shape, i)).id
+                    self._model.geom_contype[geom] = self._model.geom_conaffinity[geom] = 0
 
     def _fall_asleep(self) -> None:
         """Let all bodies sleep where they are, until they are touched."""
         positions = self._data.qpos.copy()
-        self._model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
-        self._model.opt.sleep_tolerance = self.config.rest_speed
-        # Little is awake at a time.
-        self._model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-        for i, body in enumerate(self._bodies):
-            for shape in in_order():
-                if body is None or body.shape != shape.name:
-                    # What is hidden inside of something, or stands for nothing, need not be looked at.
-                    geom = self._model.geom(models.geometry_name(shape, i)).id
-                    self._model.geom_contype[geom] = self._model.geom_conaffinity[geom] = 0
-        # What sleeps is known only to data that were made for it.
-        self._data = mujoco.MjData(self._model)
-        self._data.qpos[:] = positions
         self._go_home()
         # One more step without motion, and they sleep.
-        self._data.tree_asleep[1:] = -1
+        self._data.tree_asleep[1:] = np.maximum(self._data.tree_asleep[1:], -1)
         mujoco.mj_step(self._model, self._data)
         self._data.qpos[:] = positions
         self._data.qvel[:] = 0.0
@@ -168,6 +178,8 @@ class TrialScene(NativeWorld):
     def _quiet(self, states: Float[np.ndarray, "steps size"]) -> int:
         """In how many of the last states all bodies were at rest."""
         limit = self.config.rest_speed * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
+        if not len(states):
+            return 0
         first = 1 + self._model.nq + ROBOT
         speed = np.abs(states[:, first : first + 6 * BODIES]).reshape(-1, BODIES, 6)
         moves = np.flatnonzero(~(speed < limit).all(axis=(1, 2)))

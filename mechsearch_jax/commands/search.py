@@ -83,6 +83,7 @@ def _run(
             chosen.options(),
             narrator,
             chosen.terms,
+            chosen.trials(),
         )
     return episode, narrator, recorder
 

@@ -16,12 +16,12 @@ from test_envs_simulator import take_out as retrieval
 
 from mechsearch_jax.actions import ActionKind, kind_of, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
-from mechsearch_jax.envs import physics_rehearsal
 from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.outcome import Failure
-from mechsearch_jax.envs.physics_rehearsal import NativeRehearsal, _world
-from mechsearch_jax.envs.rehearsals import rehearsal
 from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
+from mechsearch_jax.envs.trials import native
+from mechsearch_jax.envs.trials.named import rehearsal
+from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.trials.scene import TrialScene
 from mechsearch_jax.envs.world import bodies_of, from_scenario
@@ -29,12 +29,12 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, Decision, initial_belief, search_for_grasp, update_belief
-from mechsearch_jax.planner.rehearsal import TRIES, Rehearsed
-from mechsearch_jax.planner.retrieval import ALIKE, ALIKE_WRIST, graspable_at, take_out, worth_trying
+from mechsearch_jax.planner.retrieval import ALIKE, ALIKE_WRIST, graspable_at, worth_trying
 from mechsearch_jax.planner.rollout import no_sequences
+from mechsearch_jax.planner.trials import TRIES, TrialResult, TrialScenes, choose, decide, scenes_of
 
 TARGET = standing("cylinder", (0.02, 0.02, 0.05), 0.6, 0.0)
-MODEL = NativeRehearsal()
+MODEL = NativeTrials()
 OPEN = ()
 # Light cylinders on either side of the target: every grasp hits one, and pushes it aside.
 LOOSE = (
@@ -57,12 +57,27 @@ def known(problem, objects):
 
 EDGE = (standing("cylinder", (0.024, 0.024, 0.067), 0.43, 0.1), standing("box", (0.054, 0.025, 0.054), 0.6, 0.2))
 SCENES = {"open": OPEN, "loose": LOOSE, "firm": FIRM}
-PUSHES, GRASPS = (ActionKind.PUSH,), (ActionKind.RETRIEVE,)
-DONE, FAILED, HARM = Rehearsed.SUCCEEDED, Rehearsed.FAILED, Rehearsed.HARMFUL
+DONE, FAILED, HARM, UNKNOWN = TrialResult.SUCCEEDED, TrialResult.FAILED, TrialResult.HARMFUL, TrialResult.UNKNOWN
 
 
 def stack(*trees):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def told_of(model, problem, seen, at, found, actions, wanted=None):
+    """What becomes of actions in a single scene."""
+    belief = dataclasses.replace(initial_belief(problem), found=jnp.array(found), found_pose=at)
+    observation = Observation(seen, jnp.array(found), at)
+    one = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get((scenes_of(belief, observation), actions)))
+    wanted = np.ones(one[1].kind.shape[1], bool) if wanted is None else np.asarray(wanted)
+    return model(problem, *one, wanted[None])[0]
+
+
+def world_of(problem, objects):
+    """What is simulated of a scene whose target is not found."""
+    seen, at = known(problem, objects)
+    several = jax.tree.map(lambda a: a[None], (seen, at, jnp.array(False)))
+    return jax.device_get(jax.tree.map(lambda a: a[0], native._worlds(problem.target, problem.shelf, *several)))
 
 
 @functools.cache
@@ -107,7 +122,7 @@ def told(problem):
     for name, objects in SCENES.items():
         seen, at = known(problem, objects)
         tried = worth_trying(problem, seen, at)
-        found[name] = tried, MODEL(problem, seen, at, True, tried.action, tried.feasible, GRASPS)
+        found[name] = tried, told_of(MODEL, problem, seen, at, True, tried.action, tried.feasible)
     return found
 
 
@@ -138,7 +153,7 @@ def test_what_the_rehearsal_says_is_what_the_simulator_does(problem, told):
     for name in ("loose", "firm"):
         tried, said = told[name]
         world.reset(begin(SCENES[name]))
-        first = int(jnp.argmax(said))
+        first = int(np.argmax(said))
         outcome = world.execute(jax.tree.map(lambda a, i=first: a[i], tried.action))
         assert bool(outcome.retrieved) == bool(said[first] == DONE)
 
@@ -146,11 +161,10 @@ def test_what_the_rehearsal_says_is_what_the_simulator_does(problem, told):
 def test_what_throws_an_object_down_does_harm_and_what_is_out_of_reach_fails(problem):
     over, away, aside = pushes()
     seen, at = known(problem, EDGE)
-    all_asked = jnp.ones(3, bool)
-    assert MODEL(problem, seen, at, False, stack(over, away, aside), all_asked, PUSHES).tolist() == [HARM, FAILED, DONE]
+    assert told_of(MODEL, problem, seen, at, False, stack(over, away, aside)).tolist() == [HARM, FAILED, DONE]
     # After what succeeds nothing is tried any more, with one thread.
-    alone = NativeRehearsal(threads=1)
-    assert alone(problem, seen, at, False, stack(aside, over, away), all_asked, PUSHES).tolist() == [DONE, HARM, HARM]
+    alone = NativeTrials(threads=1)
+    assert told_of(alone, problem, seen, at, False, stack(aside, over, away)).tolist() == [DONE, UNKNOWN, UNKNOWN]
     world = NativeWorld()
     world.reset(begin(EDGE))
     assert np.asarray(world.execute(over).fallen).tolist() == [True] + [False] * 8
@@ -160,42 +174,52 @@ def test_a_target_that_is_found_must_not_fall_and_one_that_is_not_is_not_there(p
     seen, at = known(problem, OPEN)
     # High against the target, from its side.
     tip = push(pose(0.63, -0.02 - 0.1125, 0.09, tilt=math.radians(30)), (0.0, 0.1, 0.0))
-    asked = jnp.ones(1, bool)
-    assert MODEL(problem, seen, at, True, stack(tip), asked, PUSHES).tolist() == [HARM]
-    assert MODEL(problem, seen, at, False, stack(tip), asked, PUSHES).tolist() == [DONE]
+    assert told_of(MODEL, problem, seen, at, True, stack(tip)).tolist() == [HARM]
+    assert told_of(MODEL, problem, seen, at, False, stack(tip)).tolist() == [DONE]
 
 
-def test_the_policy_does_the_first_thing_that_goes_well(problem):
+def made(policy, trials, problem, belief, observation):
+    return decide(policy, trials, jax.random.key(0), problem, belief, observation)
+
+
+def proposes(*actions):
+    """A policy whose best sequences begin with these actions."""
+    return search_for_grasp(tries=True).replace(plan=planned(*actions))
+
+
+def test_the_first_thing_that_goes_well_is_made(problem):
     over, away, aside = pushes()
     belief, observation = look(problem, EDGE, found=False)
     for actions, chosen in (((aside, over), 0), ((over, aside), 1), ((over, away, aside), 2), ((over, away), 1)):
-        policy = search_for_grasp(rehearsal=MODEL).replace(plan=planned(*actions))
-        decision = policy(jax.random.key(0), problem, belief, observation)
+        decision = made(proposes(*actions), MODEL, problem, belief, observation)
         assert int(decision.action.kind) == ActionKind.PUSH
         np.testing.assert_array_equal(decision.action.T_world_gripper, actions[chosen].T_world_gripper)
         assert (float(decision.value), float(decision.predicted_cost)) == (chosen - 10.0, chosen + 10.0)
         before = observation.objects.position
         np.testing.assert_allclose(decision.predicted.position - before, chosen if chosen else 0.0, atol=1e-6)
-    plain = search_for_grasp().replace(plan=planned(over, aside))
-    done = plain(jax.random.key(0), problem, belief, observation)
-    np.testing.assert_array_equal(done.action.T_world_gripper, over.T_world_gripper)
+    # What a policy proposes does not depend on what becomes of it.
+    for policy in (proposes(over, aside), search_for_grasp().replace(plan=planned(over, aside))):
+        done = made(policy, None, problem, belief, observation)
+        np.testing.assert_array_equal(done.action.T_world_gripper, over.T_world_gripper)
+        assert (done.alternatives is None) == (not policy.tries)
 
 
 def says(*codes):
-    """A rehearsal that says the same of the first actions, whatever they are and whether or not it is asked."""
+    """Trials that say the same of the first actions, whatever they are and whether or not they are wanted."""
 
-    def rehearsal(problem, scene, pose, found, actions, asked, kinds):
-        return jnp.full(asked.shape, HARM).at[: len(codes)].set(jnp.array(codes))
+    def trials(problem, scenes, actions, wanted):
+        told = np.full(wanted.shape, UNKNOWN, np.int32)
+        told[:, : len(codes)] = codes
+        return told
 
-    return rehearsal
+    return trials
 
 
 def test_where_everything_does_harm_nothing_is_done(problem):
     over, *_ = pushes()
     belief, observation = look(problem, EDGE, found=False)
     for actions, refused in (((over, over), 2), ((no_action(),), 0)):
-        policy = search_for_grasp(rehearsal=MODEL).replace(plan=planned(*actions))
-        decision = policy(jax.random.key(0), problem, belief, observation)
+        decision = made(proposes(*actions), MODEL, problem, belief, observation)
         assert (int(decision.action.kind), int(decision.refused)) == (ActionKind.NONE, refused)
         assert (float(decision.value), float(decision.predicted_cost)) == (math.inf, 20.0)
         jax.tree.map(np.testing.assert_array_equal, decision.predicted, observation.objects)
@@ -205,14 +229,13 @@ def test_where_everything_does_harm_nothing_is_done(problem):
 def test_what_does_harm_is_refused_and_what_is_made_comes_first(problem):
     over, _, aside = pushes()
     belief, observation = look(problem, EDGE, found=False)
-    plan = planned(over, aside, over, aside)
     for codes, order, refused in (
         ((DONE, HARM, HARM, HARM), (0, 1, 2, 3), 0),
         ((HARM, FAILED, DONE, HARM), (2, 1, 3), 1),
         ((FAILED, HARM, FAILED, HARM), (0, 2), 2),
+        ((UNKNOWN, FAILED, UNKNOWN, FAILED), (1, 3), 2),
     ):
-        policy = search_for_grasp(rehearsal=says(*codes)).replace(plan=plan)
-        decision = policy(jax.random.key(0), problem, belief, observation)
+        decision = made(proposes(over, aside, over, aside), says(*codes), problem, belief, observation)
         value, after = np.asarray(decision.sequences.value), decision.sequences.after
         assert value[: len(order)].tolist() == [i - 10.0 for i in order]
         assert np.isinf(value[len(order) :]).all()
@@ -224,31 +247,93 @@ def test_what_does_harm_is_refused_and_what_is_made_comes_first(problem):
         jax.tree.map(np.testing.assert_array_equal, decision.predicted, jax.tree.map(lambda a: a[0], after))
 
 
-def test_what_is_said_of_what_was_not_asked_for_counts_for_nothing(problem):
+def test_what_is_not_known_is_never_made(problem):
     _, _, aside = pushes()
     belief, observation = look(problem, EDGE, found=False)
-    policy = search_for_grasp(rehearsal=says(FAILED, DONE)).replace(plan=planned(aside))
-    decision = policy(jax.random.key(0), problem, belief, observation)
+    decision = made(proposes(aside, aside), says(), problem, belief, observation)
+    assert (int(decision.action.kind), int(decision.refused)) == (ActionKind.NONE, 2)
+
+
+def test_what_is_said_of_what_was_not_wanted_counts_for_nothing(problem):
+    _, _, aside = pushes()
+    belief, observation = look(problem, EDGE, found=False)
+    decision = made(proposes(aside), says(FAILED, DONE), problem, belief, observation)
     assert (int(decision.action.kind), float(decision.value)) == (ActionKind.PUSH, -10.0)
-    seen, at = known(problem, FIRM)
-    far = at.at[0].set(3.0)
-    assert not take_out(says(*[DONE] * TRIES), problem, seen, far).success
+    # No grasp reaches a target that is far away.
+    belief, observation = look(problem, FIRM)
+    far = belief.replace(found_pose=belief.found_pose.at[0].set(3.0))
+    decision = made(proposes(aside), says(*[DONE] * TRIES), problem, far, observation)
+    assert int(decision.action.kind) == ActionKind.PUSH
 
 
 def test_where_no_grasp_succeeds_one_that_hits_nothing_is_made(problem):
-    for objects, success in ((OPEN, True), (FIRM, False)):
-        seen, at = known(problem, objects)
-        told, plain = take_out(says(*[FAILED] * TRIES), problem, seen, at), graspable_at(problem, seen, at)
-        assert bool(told.success) == success == bool(plain.success)
-        np.testing.assert_array_equal(told.action.T_world_gripper, plain.action.T_world_gripper)
+    _, _, aside = pushes()
+    for objects, kind in ((OPEN, ActionKind.RETRIEVE), (FIRM, ActionKind.PUSH)):
+        belief, observation = look(problem, objects)
+        decision = made(proposes(aside), says(*[FAILED] * TRIES), problem, belief, observation)
+        assert int(decision.action.kind) == kind
+        if kind == ActionKind.RETRIEVE:
+            plain = graspable_at(problem, *known(problem, objects))
+            np.testing.assert_array_equal(decision.action.T_world_gripper, plain.action.T_world_gripper)
 
 
-def test_a_simulation_that_diverges_at_any_time_does_harm(problem):
+def test_a_plan_is_made_only_where_the_target_is_not_taken_out(problem):
+    _, _, aside = pushes()
+    plans, tried = [], []
+
+    def plan(*args):
+        plans.append(1)
+        return planned(aside)(*args)
+
+    def trials(problem, scenes, actions, wanted):
+        tried.append(set(actions.kind[wanted].tolist()))
+        return np.where(actions.kind == code, DONE, FAILED).astype(np.int32)
+
+    policy = search_for_grasp(tries=True).replace(plan=plan)
+    for code, planned_, kinds in (
+        (ActionKind.RETRIEVE, 0, [{ActionKind.RETRIEVE}]),
+        (ActionKind.PUSH, 1, [{ActionKind.RETRIEVE}, {ActionKind.PUSH}]),
+    ):
+        belief, observation = look(problem, FIRM)
+        plans.clear(), tried.clear()
+        decision = made(policy, trials, problem, belief, observation)
+        assert (int(decision.action.kind), len(plans), tried) == (code, planned_, kinds)
+
+
+@pytest.mark.parametrize("found", [True, False])
+def test_one_choice_among_grasps_and_actions_is_what_two_in_turn_are(problem, found):
+    over, _, aside = pushes()
+    policy = proposes(over, aside)
+    belief, observation = look(problem, LOOSE, found=found)
+    both = policy(jax.random.key(0), problem, belief, observation)
+    count = TRIES if found else 0
+    assert both.alternatives.sequence[:count].tolist() == [-1] * count
+    assert both.alternatives.worth[:count].any() == found
+    for grasps, actions in (
+        ((FAILED, DONE), (DONE,)),
+        ((FAILED, HARM), (HARM, DONE)),
+        ((), (FAILED, UNKNOWN)),
+        ((), ()),
+    ):
+        results = np.full(len(both.alternatives.worth), UNKNOWN, np.int32)
+        if found:
+            results[: len(grasps)] = grasps
+        results[count : count + len(actions)] = actions
+
+        def trials(problem, scenes, proposed, wanted, results=results):
+            return (results[:count] if (proposed.kind == ActionKind.RETRIEVE).any() else results[count:])[None]
+
+        chosen = choose(both, jnp.asarray(results))
+        in_turn = made(policy, trials, problem, belief, observation)
+        for name in ("action", "value", "cost", "predicted_cost", "predicted", "sequences", "refused"):
+            jax.tree.map(np.testing.assert_array_equal, getattr(chosen, name), getattr(in_turn, name))
+
+
+def test_what_becomes_of_a_simulation_that_diverges_is_not_known(problem):
     seen, at = known(problem, EDGE)
-    actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
     # It does as everything comes to rest, long before the push is over.
     thrown = seen.replace(position=seen.position.at[0, 0].set(1e11))
-    assert MODEL(problem, thrown, at, False, actions, asked, PUSHES).tolist() == [HARM]
+    assert told_of(MODEL, problem, thrown, at, False, stack(pushes()[2])).tolist() == [UNKNOWN]
     world = NativeWorld()
     world.reset(begin(EDGE))
     world._data.qvel[-1] = 1e12
@@ -258,104 +343,97 @@ def test_a_simulation_that_diverges_at_any_time_does_harm(problem):
     np.testing.assert_array_equal(world._data.qpos, before)
 
 
-def test_the_hand_of_the_problem_is_the_one_that_is_rehearsed(problem):
+def test_the_hand_of_the_problem_is_the_one_that_is_tried(problem, monkeypatch):
     seen, at = known(problem, EDGE)
-    actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
     heard = []
-
-    def tried_alone(shelf, how, *rest):
-        heard.append(how.simulation.motion.gripper)
-        return np.full(1, DONE, np.int32)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(physics_rehearsal, "_tried_alone", tried_alone)
-        other = problem.replace(gripper=dataclasses.replace(problem.gripper, approach=0.09))
-        for here in (problem, other):
-            MODEL(here, seen, at, False, actions, asked, PUSHES)
+    monkeypatch.setattr(native, "reference_motion", lambda kind, action, config: heard.append(config.gripper))
+    other = problem.replace(gripper=dataclasses.replace(problem.gripper, approach=0.09))
+    for here in (problem, other):
+        assert told_of(MODEL, here, seen, at, False, stack(pushes()[2])).tolist() == [FAILED]
     assert heard == [problem.gripper, other.gripper]
 
 
+def several(*scenes):
+    """Scenes with hidden targets as `Trials` take them."""
+    seen = stack(*scenes)
+    count = len(scenes)
+    return TrialScenes(seen, np.zeros((count, 3)), np.zeros(count, bool), np.ones(count), np.ones(count))
+
+
 def test_a_scene_that_cannot_be_built_costs_its_own_row_alone(problem, monkeypatch):
-    seen, at = known(problem, EDGE)
+    seen, _ = known(problem, EDGE)
     built = NativeWorld.place
 
-    def place(world, bodies, friction):
+    def place(world, bodies, *args):
         if bodies[0].position[0] > 0.5:
             raise ValueError("no such body")
-        built(world, bodies, friction)
+        built(world, bodies, *args)
 
     monkeypatch.setattr(NativeWorld, "place", place)
     other = seen.replace(position=seen.position.at[0, 0].set(0.55))
-    actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
-    said = jax.vmap(lambda here: MODEL(problem, here, at, False, actions, asked, PUSHES))(stack(other, seen))
-    assert said.tolist() == [[HARM], [DONE]]
+    broken = seen.replace(position=seen.position.at[0, 0].set(jnp.nan))
+    mirrored = seen.replace(rotation=seen.rotation.at[0, 0, 0].set(-1.0))
+    aside = stack(pushes()[2])
+    said = MODEL(problem, several(other, seen, broken, mirrored), stack(*[aside] * 4), np.ones((4, 1), bool))
+    assert said.tolist() == [[UNKNOWN], [DONE], [UNKNOWN], [UNKNOWN]]
 
 
-def test_friction(problem):
+def test_friction_and_mass(problem):
     seen, at = known(problem, EDGE)
-    actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
+    aside = stack(pushes()[2])
     # What is rough holds the hand up, and what is rougher still tips over.
     for friction, said in ((1.0, DONE), (4.0, FAILED), (20.0, HARM)):
-        model = NativeRehearsal(friction=friction)
-        assert model(problem, seen, at, False, actions, asked, PUSHES).tolist() == [said]
+        assert told_of(NativeTrials(friction=friction), problem, seen, at, False, aside).tolist() == [said]
+    scenes = several(seen, seen, seen).replace(friction=np.array([1.0, 4.0, 1.0]), mass=np.array([1.0, 1.0, 30.0]))
+    said = MODEL(problem, scenes, stack(*[aside] * 3), np.ones((3, 1), bool))
+    assert said.tolist() == [[DONE], [FAILED], [FAILED]]
     for wrong in (0.0, -1.0, math.nan):
         with pytest.raises(InputError, match="must be a positive number"):
-            NativeRehearsal(friction=wrong)
+            NativeTrials(friction=wrong)
 
 
 def test_more_objects_than_the_simulator_has_slots_for_are_refused(problem):
     with pytest.raises(InputError, match="slots for 8 objects, not for 9"):
-        MODEL(problem, empty(9), jnp.zeros(3), False, stack(no_action()), jnp.ones(1, bool), PUSHES)
+        told_of(MODEL, problem, empty(9), jnp.zeros(3), False, stack(no_action()))
 
 
-def test_the_policy_takes_out_what_can_be_and_searches_on_where_nothing_can(problem):
+def test_what_can_be_taken_out_is_and_where_nothing_can_the_search_goes_on(problem):
     _, _, aside = pushes()
     for objects, takes in ((LOOSE, True), (FIRM, False), (OPEN, True)):
         belief, observation = look(problem, objects)
-        seen, at = observation.objects, observation.target_pose
-        assert bool(take_out(MODEL, problem, seen, at).success) == takes
-        assert bool(take_out(None, problem, seen, at).success) == (objects is OPEN)
-        policies = [search_for_grasp(rehearsal=r).replace(plan=planned(aside)) for r in (MODEL, None)]
-        kinds = [int(policy(jax.random.key(0), problem, belief, observation).action.kind) for policy in policies]
+        kinds = [int(made(proposes(aside), t, problem, belief, observation).action.kind) for t in (MODEL, None)]
         assert [kind == ActionKind.RETRIEVE for kind in kinds] == [takes, objects is OPEN]
 
 
 @pytest.mark.slow
-def test_a_policy_that_rehearses_decides_the_same_alone_and_mapped_over(problem):
+def test_a_policy_proposes_the_same_alone_and_mapped_over(problem):
     over, _, aside = pushes()
-    policy = search_for_grasp(rehearsal=MODEL).replace(plan=planned(over, aside))
-    rows = [look(problem, EDGE, found=False), look(problem, LOOSE), look(problem, FIRM)]
+    policy = proposes(over, aside)
+    rows = [look(problem, EDGE, found=False), look(problem, LOOSE), look(problem, FIRM), look(problem, OPEN)]
     beliefs, seen = stack(*rows)
     keys = jax.random.split(jax.random.key(0), len(rows))
-    mapped = jax.jit(jax.vmap(lambda *row: policy(row[0], problem, *row[1:])))(keys, beliefs, seen)
+    proposed = jax.jit(jax.vmap(lambda *row: policy(row[0], problem, *row[1:])))(keys, beliefs, seen)
+    alternatives = proposed.alternatives
+    told = MODEL(problem, scenes_of(beliefs, seen), *jax.device_get((alternatives.actions, alternatives.worth)))
+    mapped = jax.jit(jax.vmap(choose))(proposed, told)
     for i, (belief, observation) in enumerate(rows):
-        alone = policy(keys[i], problem, belief, observation)
+        alone = decide(policy, MODEL, keys[i], problem, belief, observation)
         assert int(alone.action.kind) == int(mapped.action.kind[i])
         np.testing.assert_allclose(alone.action.T_world_gripper, mapped.action.T_world_gripper[i], atol=1e-6)
     assert mapped.action.kind.tolist()[:2] == [ActionKind.PUSH, ActionKind.RETRIEVE]
+    assert int(mapped.action.kind[3]) == ActionKind.RETRIEVE
 
 
-def test_mapped_over_it_says_the_same_and_nothing_where_it_is_not_asked(problem, told):
+def test_of_many_scenes_it_says_the_same_and_nothing_where_it_is_not_wanted(problem, told):
     over, away, aside = pushes()
-    scenes = stack(*(known(problem, objects) for objects in (EDGE, LOOSE, FIRM)))
+    beliefs, seen = stack(look(problem, EDGE, found=False), look(problem, LOOSE), look(problem, FIRM))
     grasps = jax.tree.map(lambda a: a[:3], told["loose"][0].action)
     actions = stack(stack(over, away, aside), grasps, grasps)
-    asked = jnp.array([[True, True, True], [True, True, True], [False, False, False]])
-    found = jnp.array([False, True, True])
-    mapped = jax.jit(jax.vmap(lambda scene, found, *row: MODEL(problem, *scene, found, *row, PUSHES + GRASPS)))(
-        scenes, found, actions, asked
-    )
-    assert mapped[0].tolist() == [HARM, FAILED, DONE]
-    assert int(jnp.argmax(mapped[1])) == int(jnp.argmax(told["loose"][1]))
-    assert mapped[2].tolist() == [HARM, HARM, HARM]
-
-
-def test_a_scene_that_is_none_is_harmed_and_leaves_the_others_alone(problem):
-    seen, at = known(problem, EDGE)
-    broken = seen.replace(position=seen.position.at[0, 0].set(jnp.nan))
-    actions, asked = stack(pushes()[2]), jnp.ones(1, bool)
-    said = jax.vmap(lambda here: MODEL(problem, here, at, False, actions, asked, PUSHES))(stack(broken, seen))
-    assert said.tolist() == [[HARM], [DONE]]
+    wanted = np.array([[True, True, True], [True, True, True], [False, False, False]])
+    said = MODEL(problem, scenes_of(beliefs, seen), actions, wanted)
+    assert said[0].tolist() == [HARM, FAILED, DONE]
+    assert int(np.argmax(said[1])) == int(np.argmax(told["loose"][1]))
+    assert said[2].tolist() == [UNKNOWN, UNKNOWN, UNKNOWN]
 
 
 @pytest.mark.parametrize("threads", [1, 3, 16])
@@ -399,13 +477,11 @@ def test_what_nobody_waits_for_any_more_is_stopped():
         return None
 
     said = in_order(np.ones((1, 3), bool), 2, lambda row: None, attempt)
-    assert (said.tolist(), stopped) == ([[DONE, HARM, HARM]], [1])
+    assert (said.tolist(), stopped) == ([[DONE, UNKNOWN, UNKNOWN]], [1])
 
 
 def test_a_scene_is_made_once_and_trying_does_not_change_it(problem):
-    seen, at = known(problem, EDGE)
-    world = jax.device_get(_world(problem, seen, at, jnp.array(False)))
-    scene = TrialScene(problem.shelf, MODEL.simulation, bodies_of(world))
+    scene = TrialScene(problem.shelf, MODEL.simulation, bodies_of(world_of(problem, EDGE)))
     kind = kind_of(ActionKind.PUSH)
     over, _, aside = (jax.device_get(reference_motion(kind, a, MODEL.simulation.motion)[0]) for a in pushes())
     before = scene.positions
@@ -417,9 +493,7 @@ def test_a_scene_is_made_once_and_trying_does_not_change_it(problem):
 
 
 def test_what_is_not_touched_sleeps(problem):
-    seen, at = known(problem, EDGE)
-    world = jax.device_get(_world(problem, seen, at, jnp.array(False)))
-    scene = TrialScene(problem.shelf, MODEL.simulation, bodies_of(world))
+    scene = TrialScene(problem.shelf, MODEL.simulation, bodies_of(world_of(problem, EDGE)))
     # The arm alone is awake, before anything is touched.
     assert (scene._data.tree_asleep >= 0).tolist() == [False] + [True] * 9
 
