@@ -18,7 +18,8 @@ from mechsearch_jax.actions import ActionKind, kind_of, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs.native import NativeWorld
 from mechsearch_jax.envs.outcome import Failure
-from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
+from mechsearch_jax.envs.slots import ManySlots
+from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, oracle, true_target_pose
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
@@ -434,6 +435,56 @@ def test_of_many_scenes_it_says_the_same_and_nothing_where_it_is_not_wanted(prob
     assert said[0].tolist() == [HARM, FAILED, DONE]
     assert int(np.argmax(said[1])) == int(np.argmax(told["loose"][1]))
     assert said[2].tolist() == [UNKNOWN, UNKNOWN, UNKNOWN]
+
+
+def slots_of(problem, policy, trials, rows):
+    """Slots in which this is known and seen."""
+    world = stack(*(from_scenario(begin(objects)) for objects, _ in rows))
+    slots = ManySlots(problem, policy, oracle, world, 2, trials)
+    beliefs, seen = stack(*(look(problem, *row) for row in rows))
+    slots._state = slots._state.replace(belief=beliefs, observation=seen)
+    return slots, jax.random.split(jax.random.key(0), len(rows))
+
+
+def test_what_is_worth_trying_in_all_slots_is_tried_together(problem):
+    over, _, aside = pushes()
+    calls = []
+
+    def trials(problem, scenes, actions, wanted):
+        calls.append((len(wanted), scenes.found.tolist()))
+        return MODEL(problem, scenes, actions, wanted)
+
+    # Three slots, two at a time.
+    slots, keys = slots_of(problem, proposes(over, aside), trials, [(EDGE, False), (FIRM, False), (EDGE, False)])
+    choices = slots.decide(keys, [0, 1, 2])
+    assert calls == [(3, [False] * 3)]
+    for row, chosen in ((0, aside), (2, aside)):
+        np.testing.assert_array_equal(choices[row].action.T_world_gripper, chosen.T_world_gripper)
+        assert int(choices[row].refused) == 1
+    np.testing.assert_array_equal(slots._state.action.T_world_gripper[2], aside.T_world_gripper)
+    assert slots.decide(keys, []) == {}
+
+
+@pytest.mark.slow
+def test_slots_whose_target_is_not_taken_out_plan(problem):
+    _, _, aside = pushes()
+    calls = []
+
+    def trials(problem, scenes, actions, wanted):
+        calls.append(sorted({int(kind) for kind in actions.kind[wanted]}))
+        return MODEL(problem, scenes, actions, wanted)
+
+    rows = [(LOOSE, True), (EDGE, False), (FIRM, True), (OPEN, True)]
+    slots, keys = slots_of(problem, proposes(aside), trials, rows)
+    choices = slots.decide(keys, [0, 1, 2, 3])
+    kinds = [int(choices[row].action.kind) for row in range(4)]
+    assert [kind == ActionKind.RETRIEVE for kind in kinds] == [True, False, False, True]
+    assert calls == [[ActionKind.RETRIEVE], [ActionKind.PUSH]]
+    for row, (objects, found) in enumerate(rows):
+        belief, observation = look(problem, objects, found)
+        alone = decide(proposes(aside), MODEL, keys[row], problem, belief, observation)
+        assert int(alone.action.kind) == kinds[row]
+        np.testing.assert_allclose(alone.action.T_world_gripper, choices[row].action.T_world_gripper, atol=1e-6)
 
 
 @pytest.mark.parametrize("threads", [1, 3, 16])
