@@ -45,7 +45,7 @@ from mechsearch_jax.workspace.target import Target
 
 # What the arm is to do, and whether it can; None where nothing is to be done.
 Motion = tuple[Reference, Any] | None
-# So many motions are computed at once, where there are several scenes.
+# So many motions are computed at once on a GPU, where there are several scenes.
 AT_ONCE = 16
 
 
@@ -91,7 +91,9 @@ class NativeTrials:
         simulation = dataclasses.replace(self.simulation, motion=motion)
         actions = jax.device_get(actions)
         chosen = np.asarray(wanted)
-        motions = _Motions(actions, chosen, motion)
+        # A GPU computes many motions as fast as one.
+        together = len(chosen) > 1 and jax.default_backend() != "cpu"
+        motions = _Motions(actions, chosen, motion, together)
 
         def one(row: int) -> World:
             return jax.tree.map(lambda a: a[row], worlds)
@@ -149,27 +151,34 @@ def _at_rest(
 
 
 class _Motions:
-    """The motions of actions, each computed when it is first asked for; of several scenes `AT_ONCE` together."""
+    """The motions of actions, each computed when it is first needed; NumPy arrays."""
 
-    def __init__(self, actions: Action, wanted: Bool[np.ndarray, "r k"], config: MotionConfig):
-        self._actions, self._wanted, self._config = actions, wanted, config
+    def __init__(self, actions: Action, wanted: Bool[np.ndarray, "r k"], config: MotionConfig, together: bool):
+        """Args:
+        actions, wanted: as of `Trials`, NumPy arrays.
+        config: of the motions.
+        together: whether those of several scenes are computed at once, `AT_ONCE` of them.
+        """
+        self._actions, self._wanted, self._config, self._together = actions, wanted, config, together
         self._known: dict[tuple[int, int], Motion] = {}
         self._lock = threading.Lock()
 
     def __call__(self, row: int, i: int) -> Motion:
-        """The motion of an action, by row and column; NumPy arrays."""
+        """The motion of an action, by row and column."""
         kind = kind_of(int(self._actions.kind[row, i]))
-        if len(self._wanted) == 1:
+        if not self._together:
             action: Action = jax.tree.map(lambda a: jnp.asarray(a[row, i]), self._actions)
             return jax.device_get(reference_motion(kind, action, self._config))
         with self._lock:
             if (row, i) not in self._known:
                 alike = np.flatnonzero(self._wanted[:, i] & (self._actions.kind[:, i] == kind.code)).tolist()
-                alike = [row, *(r for r in alike if r != row and (r, i) not in self._known)][:AT_ONCE]
-                padded = np.resize(alike, AT_ONCE)
-                several: Action = jax.tree.map(lambda a: jnp.asarray(a[padded, i]), self._actions)
+                # Always the same ones together, whichever is needed first: results must not depend on threads.
+                first = alike.index(row) // AT_ONCE * AT_ONCE
+                some = alike[first : first + AT_ONCE]
+                rows = np.resize(some, AT_ONCE)
+                several: Action = jax.tree.map(lambda a: jnp.asarray(a[rows, i]), self._actions)
                 found = jax.device_get(_motions(kind, several, self._config))
-                for place, r in enumerate(alike):
+                for place, r in enumerate(some):
                     self._known[r, i] = jax.tree.map(lambda a, place=place: a[place], found)
             return self._known[row, i]
 
