@@ -280,11 +280,11 @@ class ManySlots:
         """
         if self._trials is None or any(decision.alternatives is None for decision, _ in proposed) or not proposed:
             return [None] * len(proposed)
-        told = [
+        rows = [
             jax.tree.map(lambda a, count=count: a[:count], jax.device_get((scenes, decision.alternatives)))
             for count, (decision, scenes) in zip(counts, proposed, strict=True)
         ]
-        scenes, alternatives = jax.tree.map(lambda *leaves: np.concatenate(leaves), *told)
+        scenes, alternatives = jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)
         results = self._trials(self._problem, scenes, alternatives.actions, alternatives.worth)
         blank = np.full((self._at_once, results.shape[1]), TrialResult.UNKNOWN, np.int32)
         parts = np.split(results, np.cumsum(counts)[:-1])

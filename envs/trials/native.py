@@ -87,13 +87,13 @@ class NativeTrials:
         worlds: World = jax.device_get(
             _worlds(problem.target, problem.shelf, scenes.objects, jnp.asarray(scenes.pose), jnp.asarray(scenes.found))
         )
-        motion = dataclasses.replace(self.simulation.motion, gripper=problem.gripper)
-        simulation = dataclasses.replace(self.simulation, motion=motion)
+        config = dataclasses.replace(self.simulation.motion, gripper=problem.gripper)
+        simulation = dataclasses.replace(self.simulation, motion=config)
         actions = jax.device_get(actions)
         chosen = np.asarray(wanted)
         # A GPU computes many motions as fast as one.
         together = len(chosen) > 1 and jax.default_backend() != "cpu"
-        motions = _Motions(actions, chosen, motion, together)
+        motions = _Motions(actions, chosen, config, together)
 
         def one(row: int) -> World:
             return jax.tree.map(lambda a: a[row], worlds)
@@ -103,13 +103,13 @@ class NativeTrials:
             return _at_rest(problem.shelf, simulation, one(row), friction, mass)
 
         def attempt(scene: TrialScene | None, row: int, i: int, needed: Callable[[], bool]) -> TrialResult | None:
-            told = motions(row, i)
-            if told is None or not told[1]:
+            motion = motions(row, i)
+            if motion is None or not motion[1]:
                 return TrialResult.FAILED
-            if scene is None or not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (one(row), told[0]))):
+            if scene is None or not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (one(row), motion[0]))):
                 return TrialResult.UNKNOWN
             try:
-                return scene.attempt(kind_of(int(actions.kind[row, i])), told[0], int(actions.object[row, i]), needed)
+                return scene.attempt(kind_of(int(actions.kind[row, i])), motion[0], int(actions.object[row, i]), needed)
             except mujoco.FatalError:
                 return TrialResult.UNKNOWN
 
@@ -174,11 +174,11 @@ class _Motions:
                 alike = np.flatnonzero(self._wanted[:, i] & (self._actions.kind[:, i] == kind.code)).tolist()
                 # Always the same ones together, whichever is needed first: results must not depend on threads.
                 first = alike.index(row) // AT_ONCE * AT_ONCE
-                some = alike[first : first + AT_ONCE]
-                rows = np.resize(some, AT_ONCE)
+                block = alike[first : first + AT_ONCE]
+                rows = np.resize(block, AT_ONCE)
                 several: Action = jax.tree.map(lambda a: jnp.asarray(a[rows, i]), self._actions)
                 found = jax.device_get(_motions(kind, several, self._config))
-                for place, r in enumerate(some):
+                for place, r in enumerate(block):
                     self._known[r, i] = jax.tree.map(lambda a, place=place: a[place], found)
             return self._known[row, i]
 

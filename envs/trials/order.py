@@ -54,7 +54,7 @@ def in_order(
       make: the scene of a row; called once, in a thread.
       attempt: tries; called in a thread.
     """
-    told = np.full(wanted.shape, TrialResult.UNKNOWN, np.int32)
+    results = np.full(wanted.shape, TrialResult.UNKNOWN, np.int32)
     rows: dict[int, _Row[Scene]] = {int(r): _Row(wanted[r]) for r in np.flatnonzero(wanted.any(axis=1))}
     lock = threading.Lock()
 
@@ -77,7 +77,7 @@ def in_order(
             result = attempt(row.scene[0], r, i, lambda row=row, i=i: i < row.first)
             if result is None:
                 continue
-            told[r, i] = result
+            results[r, i] = result
             if result is TrialResult.SUCCEEDED:
                 with lock:
                     row.first = min(row.first, i)
@@ -89,4 +89,4 @@ def in_order(
         with ThreadPoolExecutor(count) as pool:
             for done in [pool.submit(work) for _ in range(count)]:
                 done.result()
-    return told
+    return results

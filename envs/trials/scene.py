@@ -112,10 +112,10 @@ class TrialScene(NativeWorld):
     ) -> TrialResult | None:
         start = np.asarray(reference.start, float)
         self._set_robot(start[:ARM], float(start[ARM]))
-        told = controls(reference)
+        commands = controls(reference)
         states = np.empty((0, 0))
-        for first in range(0, len(told), BLOCK):
-            block = self._run(np.ascontiguousarray(told[first : first + BLOCK]))
+        for first in range(0, len(commands), BLOCK):
+            block = self._run(np.ascontiguousarray(commands[first : first + BLOCK]))
             states = np.concatenate([states, block]) if first else block
             if not needed():
                 return None

@@ -108,14 +108,14 @@ def decide(
       trials: what tries its alternatives; None where nothing does.
       key, problem, belief, observation: as for the policy.
     """
-    asked = (key, problem, belief, observation)
+    arguments = (key, problem, belief, observation)
     if trials is None or not isinstance(policy, AsksTwice):
-        return tried(trials, problem, belief, observation, policy(*asked))
+        return tried(trials, problem, belief, observation, policy(*arguments))
     if belief.found:
-        decision = tried(trials, problem, belief, observation, policy.retrieval(*asked))
+        decision = tried(trials, problem, belief, observation, policy.retrieval(*arguments))
         if int(decision.action.kind) == ActionKind.RETRIEVE:
             return decision
-    return tried(trials, problem, belief, observation, policy.search(*asked))
+    return tried(trials, problem, belief, observation, policy.search(*arguments))
 
 
 def tried(
@@ -180,16 +180,16 @@ def choose(decision: Decision, results: Int[Array, " k"]) -> Decision:
     every, alternatives = decision.sequences, decision.alternatives
     if alternatives is None:
         return decision
-    told = jnp.where(alternatives.worth, results, TrialResult.UNKNOWN)
+    known = jnp.where(alternatives.worth, results, TrialResult.UNKNOWN)
     grasps = alternatives.sequence < 0
     takes = decision.action.kind == ActionKind.RETRIEVE
     # Of what would take the target out it only counts whether it does.
-    best = jnp.argmax(jnp.where(grasps & (told < TrialResult.SUCCEEDED), -1, told))
-    succeeds = told[best] == TrialResult.SUCCEEDED
-    does = told[best] > TrialResult.HARMFUL
+    best = jnp.argmax(jnp.where(grasps & (known < TrialResult.SUCCEEDED), -1, known))
+    succeeds = known[best] == TrialResult.SUCCEEDED
+    does = known[best] > TrialResult.HARMFUL
     # What comes after the first that succeeds was not tried.
-    order = jnp.arange(told.shape[0])
-    rejected = alternatives.worth & ~grasps & ((order < best) | ~succeeds) & (told <= TrialResult.HARMFUL)
+    order = jnp.arange(known.shape[0])
+    rejected = alternatives.worth & ~grasps & ((order < best) | ~succeeds) & (known <= TrialResult.HARMFUL)
     place = jnp.where(grasps, every.value.shape[0], alternatives.sequence)
     refused = jnp.zeros(every.value.shape, bool).at[place].set(rejected, mode="drop")
     planned = _planned(decision, alternatives.now, refused, alternatives.sequence[best], does & ~grasps[best])
