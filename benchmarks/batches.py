@@ -145,6 +145,7 @@ class Batches:
             busy=self.busy,
             compiling=self.compiling,
             protocol=method.terms,
+            trials=method.trials(),
         )
 
 

@@ -1,4 +1,4 @@
-"""The closed loop: look, recognise, update the belief, decide, act; many episodes at once, or one alone.
+"""The closed loop: look, recognise, update the belief, propose, try, choose, act; many episodes at once, or one alone.
 
 Each episode has a slot. All slots look, decide and act together; an episode that ends leaves its slot to the next one,
 so that short episodes do not wait for long ones. The random numbers of an episode are its own: what it decides depends
@@ -50,6 +50,7 @@ from mechsearch_jax.envs.world import TARGET, World, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem
+from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.preparing import Program, prepared, program
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.target import Target
@@ -136,14 +137,15 @@ def run_episode(
     options: Mapping[str, Any] | None = None,
     watcher: Watcher | None = None,
     protocol: EpisodeProtocol = STRICT,
+    trials: Trials | None = None,
 ) -> Episode:
     """Run one episode to its end, whatever that is.
 
     Args:
       seed: see `Start`.
       scenario: where everything stands at the start.
-      problem, policy, simulator, recogniser, max_steps, options, watcher, protocol: see `run_episodes`. Neither the
-        policy nor the recogniser need be traceable.
+      problem, policy, simulator, recogniser, max_steps, options, watcher, protocol, trials: see `run_episodes`. Neither
+        the policy nor the recogniser need be traceable.
     """
     found: list[tuple[int, Episode]] = []
     start = Start(scenario, seed)
@@ -159,6 +161,7 @@ def run_episode(
         options,
         watcher=watcher,
         protocol=protocol,
+        trials=trials,
     )
     return found[0][1]
 
@@ -178,6 +181,7 @@ def run_episodes(
     watcher: Watcher | None = None,
     protocol: EpisodeProtocol = STRICT,
     compiling: Callable[[str], None] = lambda text: None,
+    trials: Trials | None = None,
 ) -> None:
     """Run episodes to their ends, many at a time.
 
@@ -200,6 +204,7 @@ def run_episodes(
       watcher: told of every step; for one slot only.
       protocol: how they are run and judged. Who gives another has built the problem by `protocol.problem`.
       compiling: told of what is being compiled before the first episode, if anything is.
+      trials: what tries the policy's best actions out before one is made; nothing if left out.
 
     Raises:
       InputError: there is no slot, a watcher is given for several, the policy decides on an unknown kind of action, or
@@ -217,12 +222,12 @@ def run_episodes(
     scenarios = [start.scenario for _, start in first]
     if count == 1:
         simulator.reset(scenarios)
-        known: Slots = OneSlot(problem, policy, recogniser)
+        known: Slots = OneSlot(problem, policy, recogniser, trials)
     else:
         shapes: World = jax.tree.map(
             lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), from_scenario(scenarios[0])
         )
-        known = ManySlots(problem, policy, recogniser, shapes, min(at_once, count))
+        known = ManySlots(problem, policy, recogniser, shapes, min(at_once, count), trials)
         # Before anything is compiled in vain.
         known.decide_by({row: start.policy for row, (_, start) in enumerate(first)})
         with prepared(batch_programs(known, simulator, shapes), compiling):

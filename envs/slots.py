@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.compiled import kept
-from mechsearch_jax.envs.episode_log import Choice, chosen
+from mechsearch_jax.envs.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.policy_numbers import as_pytree, mould, numbers, with_numbers
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
 from mechsearch_jax.envs.verdicts import Verdict, graspable_many, judge, judge_many, judged_sets, swept_free
@@ -27,7 +27,9 @@ from mechsearch_jax.envs.world import World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
+from mechsearch_jax.planner.belief import without_grasps
 from mechsearch_jax.planner.moved_target import nearest_candidate
+from mechsearch_jax.planner.trials import AsksTwice, TrialResult, Trials, TrialScenes, choose, decide, scenes_of
 from mechsearch_jax.preparing import Program, program
 from mechsearch_jax.workspace.camera import Camera
 
@@ -103,14 +105,19 @@ class OneSlot:
       action: what was decided at the last look, to be executed before the next; of kind NONE before the first.
     """
 
-    def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser) -> None:
+    def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, trials: Trials | None = None) -> None:
+        """Args:
+        problem: of the episode.
+        policy, recogniser: need not be traceable.
+        trials: what tries actions out before one is made; nothing if left out.
+        """
         self.snapshot: Snapshot | None = None
         self.observation: Observation | None = None
         self.belief = initial_belief(problem)
         self.decision: Decision | None = None
         self.action: Action = no_action()
         self._problem, self._usual, self._recogniser = problem, policy, recogniser
-        self._policy = policy
+        self._policy, self._trials = policy, trials
 
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
         """See `Slots`."""
@@ -139,7 +146,7 @@ class OneSlot:
         if not rows:
             return {}
         assert self.observation is not None
-        self.decision = self._policy(keys[0], self._problem, self.belief, self.observation)
+        self.decision = decide(self._policy, self._trials, keys[0], self._problem, self.belief, self.observation)
         self.action = self.decision.action
         return {0: jax.device_get(chosen(self.decision))}
 
@@ -177,15 +184,24 @@ class ManySlots:
     scenes take their places, which cost next to nothing.
     """
 
-    def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, world: World, at_once: int) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        policy: Policy,
+        recogniser: Recogniser,
+        world: World,
+        at_once: int,
+        trials: Trials | None = None,
+    ) -> None:
         """Args:
         problem: of all episodes.
         policy: of all slots that have none of their own.
         recogniser: must be traceable, as the policy.
         world: of all slots, or its shapes, for what recognisers make of it.
         at_once: how many slots are looked at or decided upon in one computation.
+        trials: what tries actions out before one is made; nothing if left out.
         """
-        self._problem = problem
+        self._problem, self._trials = problem, trials
         self._policy, self._mould = as_pytree(policy), mould(policy)
         self._recogniser = recogniser
         self._at_once = at_once
@@ -216,8 +232,10 @@ class ManySlots:
         done = jax.tree.map(lambda a: jax.ShapeDtypeStruct((self._at_once, *a.shape), a.dtype), no_action())
         fresh = jax.ShapeDtypeStruct((self._count,), bool)
         problem, state = self._problem, self._state
+        twice = [("search", True), ("search", False), ("retrieval", False)]
+        questions = twice if isinstance(self._policy, AsksTwice) else [("__call__", False)]
         return [
-            program("plan", _decide, self._policy, own, problem, state, keys, rows),
+            *(program("plan", _propose, self._policy, own, problem, state, keys, rows, *how) for how in questions),
             program("look", _look, problem, state, world, keys, rows, self._recogniser, problem.camera),
             program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
             program("small ones", _told, problem.poses, state.belief.exists, world),
@@ -249,17 +267,58 @@ class ManySlots:
         return _known(self._problem, self._state.belief, world)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
-        """See `Slots`."""
-        found: dict[int, Choice] = {}
-        for some, padded in self._chunks(rows):
+        """See `Slots`.
+
+        Only where a target is found is asked whether to take it out, and only where it is not taken out is planned.
+        What is worth trying out is tried in all slots together.
+        """
+        if not isinstance(self._policy, AsksTwice):
+            return self._ask("__call__", keys, rows)
+        there = np.asarray(self._state.belief.found)
+        choices = self._ask("retrieval", keys, [r for r in rows if there[r]])
+        choices = {r: choice for r, choice in choices.items() if takes_target(choice)}
+        choices |= self._ask("search", keys, [r for r in rows if there[r] and r not in choices])
+        return choices | self._ask("search", keys, [r for r in rows if not there[r]], hidden=True)
+
+    def _ask(self, question: str, keys: Array, rows: Sequence[int], hidden: bool = False) -> dict[int, Choice]:
+        """What the policy answers to a question in some slots, after trials; see `_propose`."""
+        chunks = list(self._chunks(rows))
+        proposed = []
+        for some, padded in chunks:
             # Rows beyond the end decide by anything.
             told = [self._numbers[r] for r in some] + [self._numbers[some[0]]] * (self._at_once - len(some))
             own = tuple(np.stack(values) for values in zip(*told, strict=True))
-            decided = _decide(self._policy, own, self._problem, self._state, keys, padded)
+            proposed.append(_propose(self._policy, own, self._problem, self._state, keys, padded, question, hidden))
+        found: dict[int, Choice] = {}
+        for (some, padded), (decision, _), results in zip(
+            chunks, proposed, self._tried([len(some) for some, _ in chunks], proposed), strict=True
+        ):
+            decided = _choose(decision, results)
             self._state = _note(self._state, decided.action, padded)
             choice = jax.device_get(decided)
             found |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(some)}
         return found
+
+    def _tried(
+        self, counts: Sequence[int], proposed: Sequence[tuple[Decision, TrialScenes]]
+    ) -> Sequence[Int[np.ndarray, "n k"] | None]:
+        """What becomes of the alternatives of decisions in chunks of slots; None where nothing is tried.
+
+        Args:
+          counts: how many rows of each chunk there are; the others are beyond the end.
+          proposed: decisions and scenes of each chunk.
+        """
+        if self._trials is None or any(decision.alternatives is None for decision, _ in proposed) or not proposed:
+            return [None] * len(proposed)
+        rows = [
+            jax.tree.map(lambda a, count=count: a[:count], jax.device_get((scenes, decision.alternatives)))
+            for count, (decision, scenes) in zip(counts, proposed, strict=True)
+        ]
+        scenes, alternatives = jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)
+        results = self._trials(self._problem, scenes, alternatives.actions, alternatives.worth)
+        blank = np.full((self._at_once, results.shape[1]), TrialResult.UNKNOWN, np.int32)
+        parts = np.split(results, np.cumsum(counts)[:-1])
+        return [np.concatenate([part, blank[len(part) :]]).astype(np.int32) for part in parts]
 
     def took(self, actions: Mapping[int, Action]) -> None:
         """See `Slots`."""
@@ -359,27 +418,43 @@ def _look(
     return jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state, new)
 
 
-@kept()
-def _decide(
+@kept(static_argnames=("question", "hidden"))
+def _propose(
     policy: Policy,
     own: tuple[Array, ...],
     problem: Problem,
     state: PlannerState,
     keys: Array,
     rows: Int[Array, " n"],
-) -> Choice:
-    """What the policy decides in the slots `rows`, with the numbers in `own`, shape (n,) each, in place of its own."""
+    question: str,
+    hidden: bool,
+) -> tuple[Decision, TrialScenes]:
+    """What the policy decides in the slots `rows` before trials, and the scenes to try it in.
+
+    The numbers in `own`, shape (n,) each, are in place of the policy's own. The question is "__call__", or one of those
+    of a policy that `AsksTwice`, and `hidden` whether the target is found in none of the slots; both static.
+    """
 
     def one(values, key, mine):
-        return chosen(with_numbers(policy, values)(key, problem, mine.belief, mine.observation))
+        ask = getattr(with_numbers(policy, values), question)
+        return ask(key, problem, mine.belief, mine.observation), scenes_of(mine.belief, mine.observation)
 
     mine, active = _some(state, rows), rows < keys.shape[0]
     # Where the target is not found and can be nowhere, and nothing stands, a decision costs next to nothing.
     belief = mine.belief.replace(exists=mine.belief.exists & active[:, None], found=mine.belief.found & active)
+    belief = without_grasps(belief) if hidden else belief
     objects = mine.observation.objects
     objects = objects.replace(valid=objects.valid & active[:, None])
     seen = mine.observation.replace(objects=objects)
     return jax.vmap(one)(own, _some(keys, rows), mine.replace(belief=belief, observation=seen))
+
+
+@jax.jit
+def _choose(decisions: Decision, results: Int[Array, "n k"] | None) -> Choice:
+    """What decisions come down to after trials, of which there may have been none."""
+    if results is not None:
+        decisions = jax.vmap(choose)(decisions, results)
+    return jax.vmap(chosen)(decisions)
 
 
 @kept()

@@ -84,6 +84,7 @@ def _run(
             chosen.options(),
             narrator,
             chosen.terms,
+            chosen.trials(),
         )
     return episode, narrator, recorder
 
