@@ -246,7 +246,7 @@ class ManySlots:
 
     def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
         """See `Slots`."""
-        self._state = _forget(self._problem, self._state, jnp.asarray(fresh))
+        self._state = _forget(self._problem, self._state, jax.device_put(np.asarray(fresh)))
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
         """See `Slots`."""
@@ -349,7 +349,7 @@ class ManySlots:
             some = rows[i : i + self._at_once]
             padded = np.full(self._at_once, self._count, np.int32)
             padded[: len(some)] = some
-            yield some, jnp.asarray(padded)
+            yield some, jax.device_put(padded)
 
 
 def _some(tree: Any, rows: Int[Array, " n"]) -> Any:
