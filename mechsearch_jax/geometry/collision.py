@@ -14,6 +14,7 @@ from typing import NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry import superquadric
@@ -54,7 +55,7 @@ def clouds_of(points: Float[Array, "c 3 p"]) -> Clouds:
 
 def collisions(
     clouds: Clouds,
-    cloud: Int[Array, " m"],
+    cloud: Int[Array | np.ndarray, " m"],
     T_world_cloud: Float[Array, "m 4 4"],
     scene: Superquadrics,
     mask: Bool[Array, "m n"],

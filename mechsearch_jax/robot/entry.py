@@ -11,6 +11,7 @@ gripper's frame, and the free space of the shelf is a prism along x. Links 2 to 
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.errors import InputError
@@ -127,7 +128,7 @@ def gripper_enters(
     gripper: Gripper,
     waypoints: int,
     clouds: Float[Array, "k 3 p"],
-    cloud: Int[Array, " c"],
+    cloud: Int[Array | np.ndarray, " c"],
     T_world_gripper: Float[Array, "c 4 4"],
     q7: Float[Array, " c"],
     mask: Bool[Array, " c"],
