@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Integer
 
 # A GPU needs that many times as large blocks to be busy. With eight times as many, so that a single decision has no
 # block but the first, it takes a third longer: what is masked then costs more than looking for what is not.
@@ -57,21 +57,21 @@ class Entry(NamedTuple):
         return taken(flat, index)
 
 
-def taken(array: Array, index: Int[Array, " k"]) -> Array:
+def taken(array: Array, index: Integer[Array, " k"]) -> Array:
     """Rows of an array; `array[index]` for indices that are known to be in range, which needs many operations less."""
     numbers = jax.lax.GatherDimensionNumbers(tuple(range(1, array.ndim)), (0,), (0,))
     sizes = (1, *array.shape[1:])
     return jax.lax.gather(array, index[:, None], numbers, sizes, mode=jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
-def put(array: Array, index: Int[Array, " k"], values: Array) -> Array:
+def put(array: Array, index: Integer[Array, " k"], values: Array) -> Array:
     """The array with other rows; those beyond its end are left out."""
     numbers = jax.lax.ScatterDimensionNumbers(tuple(range(1, array.ndim)), (0,), (0,))
     mode = jax.lax.GatherScatterMode.FILL_OR_DROP
     return jax.lax.scatter(array, index[:, None], values, numbers, mode=mode)
 
 
-def entry_of(index: Int[Array, " k"], batch: tuple[int, ...], inner: int) -> Entry:
+def entry_of(index: Integer[Array, " k"], batch: tuple[int, ...], inner: int) -> Entry:
     """The batch's part of indices into all entries, of which each element of the batch has `inner`."""
     axes: list[Array] = []
     rest = jax.lax.div(index, jnp.uint32(inner)) if batch else index
