@@ -8,7 +8,8 @@ traceable.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import flax.struct
@@ -234,8 +235,18 @@ class ManySlots:
         problem, state = self._problem, self._state
         twice = [("search", True), ("search", False), ("retrieval", False)]
         questions = twice if isinstance(self._policy, AsksTwice) else [("__call__", False)]
+        asked = [(self._policy, own, problem, state, keys, rows, *how) for how in questions]
+
+        def choosing(question: tuple[Any, ...]) -> Callable[[], None] | None:
+            decision, _ = _propose.returns(*question)
+            results = None
+            if self._trials is not None and decision.alternatives is not None:
+                results = jax.ShapeDtypeStruct(decision.alternatives.worth.shape, np.int32)
+            return _choose.begin(decision, results)
+
         return [
-            *(program("plan", _propose, self._policy, own, problem, state, keys, rows, *how) for how in questions),
+            *(program("plan", _propose, *question) for question in asked),
+            *(Program("small ones", lambda: False, functools.partial(choosing, question)) for question in asked),
             program("look", _look, problem, state, world, keys, rows, self._recogniser, problem.camera),
             program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
             program("small ones", _told, problem.poses, state.belief.exists, world),
@@ -352,6 +363,11 @@ class ManySlots:
             yield some, jax.device_put(padded)
 
 
+def _strong(tree: Any) -> Any:
+    """The same, with nothing of a weak type: what takes it is compiled once, whatever a policy returns."""
+    return jax.tree.map(lambda a: jax.lax.convert_element_type(a, jnp.result_type(a)), tree)
+
+
 def _some(tree: Any, rows: Int[Array, " n"]) -> Any:
     """These rows of all leaves; the last one for rows beyond the end."""
     return jax.tree.map(lambda a: a[jnp.minimum(rows, a.shape[0] - 1)], tree)
@@ -437,7 +453,7 @@ def _propose(
 
     def one(values, key, mine):
         ask = getattr(with_numbers(policy, values), question)
-        return ask(key, problem, mine.belief, mine.observation), scenes_of(mine.belief, mine.observation)
+        return _strong((ask(key, problem, mine.belief, mine.observation), scenes_of(mine.belief, mine.observation)))
 
     mine, active = _some(state, rows), rows < keys.shape[0]
     # Where the target is not found and can be nowhere, and nothing stands, a decision costs next to nothing.
@@ -449,7 +465,7 @@ def _propose(
     return jax.vmap(one)(own, _some(keys, rows), mine.replace(belief=belief, observation=seen))
 
 
-@jax.jit
+@kept()
 def _choose(decisions: Decision, results: Int[Array, "n k"] | None) -> Choice:
     """What decisions come down to after trials, of which there may have been none."""
     if results is not None:
