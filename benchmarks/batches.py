@@ -57,10 +57,12 @@ class Batches:
     Attributes:
       worlds: how many at the same time; as many as fit the device's memory, within reason, if None.
       busy: told of every stage and how many episodes are in it.
+      compiling: told of what is being compiled, where anything is.
     """
 
     worlds: int | None = None
     busy: Callable[[str, int], None] = lambda stage, episodes: None
+    compiling: Callable[[str], None] = lambda text: None
 
     def __call__(
         self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
@@ -77,9 +79,13 @@ class Batches:
             not suffice for a single world.
         """
         failures = _Failures(ended)
+        # What is compiled for one group serves the next.
+        simulators: dict[tuple[EngineName, Workcell], Simulator] = {}
         for target, group in groups(jobs):
             method = group[0].method
-            simulator = new_simulator(method.engine, method.workcell)
+            scene = method.engine, method.workcell
+            simulator = simulators.get(scene) or new_simulator(*scene)
+            simulators[scene] = simulator
             worlds = min(self.worlds or fitting_worlds(simulator), len(group))
             # Those that take longest come first, so that none of them begins when all others are over.
             longest_first = sorted(group, key=lambda job: -len(job.scenario.objects))
@@ -91,7 +97,7 @@ class Batches:
                 except InputError:
                     raise
                 except Exception as error:
-                    simulator = new_simulator(method.engine, method.workcell)
+                    simulators[scene] = simulator = new_simulator(*scene)
                     if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error):
                         if worlds == 1:
                             raise
@@ -137,7 +143,9 @@ class Batches:
             recogniser=recogniser(method.recognition, target),
             at_once=AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE,
             busy=self.busy,
+            compiling=self.compiling,
             protocol=method.terms,
+            trials=method.trials(),
         )
 
 

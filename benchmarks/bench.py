@@ -39,7 +39,9 @@ from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Config, Decision, Problem
+from mechsearch_jax.planner import trials as trying
 from mechsearch_jax.planner.settings import Settings
+from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.robot import motion
 from mechsearch_jax.train.push import push_scenes
@@ -222,21 +224,44 @@ def bench_plan(
     Raises:
       InputError: the number of objects does not fit, or the method cannot be used.
     """
-    policy = method.policy()
+    policy, trials = method.policy(), method.trials()
     problem, states, shapes = _states(objects, method.config, method.workcell, sizes, batch, scenes)
     shapes |= {"sequences": method.config.planner.sequences, "horizon": method.config.planner.horizon}
 
-    def decide(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
+    def propose(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
         return policy(key, problem, belief, seen)
+
+    def decide(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
+        return trying.decide(policy, trials, key, problem, belief, seen)
 
     if batch > 1:
         several = [(problem, *_batch_of(states, batch))]
-        compile_seconds, seconds = measure(jax.vmap(decide, in_axes=(None, 0, 0, 0)), several, repeats)
+        proposed = jax.vmap(propose, in_axes=(None, 0, 0, 0))
+        if trials is None:
+            compile_seconds, seconds = measure(proposed, several, repeats)
+        else:
+            compile_seconds, seconds = measure_first(_after_trials(jax.jit(proposed), trials), several, repeats)
     else:
         # As in an episode alone: a policy compiles what it needs, and computes only what the belief asks for.
         compile_seconds, seconds = measure_first(decide, [(problem, *state) for state in states], repeats)
     told = versions() | {"push model": method.config.push_model}
     return Timing("plan", objects, shapes, compile_seconds, tuple(seconds), told)
+
+
+def _after_trials(proposed: Callable[..., Decision], trials: Trials) -> Callable[..., Decision]:
+    """What decides on many scenes after trials."""
+    choose = jax.jit(jax.vmap(trying.choose))
+
+    def decide(problem: Problem, keys: Array, beliefs: Belief, seen: Observation) -> Decision:
+        decisions = proposed(problem, keys, beliefs, seen)
+        alternatives = decisions.alternatives
+        if alternatives is None:
+            return decisions
+        scenes = trying.scenes_of(beliefs, seen)
+        results = trials(problem, scenes, *jax.device_get((alternatives.actions, alternatives.worth)))
+        return choose(decisions, jnp.asarray(results))
+
+    return decide
 
 
 def _states(

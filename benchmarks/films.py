@@ -181,6 +181,7 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
         method.options(),
         watcher,
         method.terms,
+        method.trials(),
     )
     save_figure(filmstrip(watcher.frames, problem.camera, problem.shelf, problem.target, verdict(episode)), file)
     again = Row.of_episode(episode)

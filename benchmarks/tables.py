@@ -291,6 +291,12 @@ class EpisodeProgress:
         """Say what a batch is at."""
         self._bar.update(self._task, stage=f"{stage} ({episodes})")
 
+    def compiling(self, text: str) -> None:
+        """Say what is being compiled before a batch begins."""
+        if not self._console.is_terminal:
+            self._console.print(text, soft_wrap=True)
+        self._bar.update(self._task, stage=text)
+
     def waiting(self, episodes: int) -> None:
         """Say that other processes run what is left."""
         if not self._console.is_terminal and not self._waited:

@@ -60,6 +60,7 @@ class Worker:
             method.config.max_steps,
             method.options(),
             protocol=method.terms,
+            trials=method.trials(),
         )
         return Row.of_episode(episode, present_code())
 

@@ -85,4 +85,4 @@ def searcher_of(
     if camera is not None:
         workcell = dataclasses.replace(workcell, camera=camera)
     method = Method(policy, settings.config, workcell=workcell)
-    return Searcher(workcell, settings.config, policy=method.policy(), **arguments)
+    return Searcher(workcell, settings.config, policy=method.policy(), rehearsal=method.trials(), **arguments)

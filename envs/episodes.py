@@ -1,4 +1,4 @@
-"""The closed loop: look, recognise, update the belief, decide, act; many episodes at once, or one alone.
+"""The closed loop: look, recognise, update the belief, propose, try, choose, act; many episodes at once, or one alone.
 
 Each episode has a slot. All slots look, decide and act together; an episode that ends leaves its slot to the next one,
 so that short episodes do not wait for long ones. The random numbers of an episode are its own: what it decides depends
@@ -40,16 +40,18 @@ from mechsearch_jax.envs.episode_log import (
     target_trouble,
 )
 from mechsearch_jax.envs.outcome import Outcome
-from mechsearch_jax.envs.protocols import ALL_FAILED, EpisodeProtocol, Execution, Strict
+from mechsearch_jax.envs.protocols import ALL_FAILED, EpisodeProtocol, Execution, Strict, chosen_actions
 from mechsearch_jax.envs.records import Episode, Step
-from mechsearch_jax.envs.simulator import Simulator
+from mechsearch_jax.envs.simulator import Flowing, Prepares, Simulator
 from mechsearch_jax.envs.slots import ManySlots, OneSlot, Slots
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.verdicts import Verdict
-from mechsearch_jax.envs.world import TARGET, World
+from mechsearch_jax.envs.world import TARGET, World, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem
+from mechsearch_jax.planner.trials import Trials
+from mechsearch_jax.preparing import Program, prepared, program
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.target import Target
 
@@ -135,14 +137,15 @@ def run_episode(
     options: Mapping[str, Any] | None = None,
     watcher: Watcher | None = None,
     protocol: EpisodeProtocol = STRICT,
+    trials: Trials | None = None,
 ) -> Episode:
     """Run one episode to its end, whatever that is.
 
     Args:
       seed: see `Start`.
       scenario: where everything stands at the start.
-      problem, policy, simulator, recogniser, max_steps, options, watcher, protocol: see `run_episodes`. Neither the
-        policy nor the recogniser need be traceable.
+      problem, policy, simulator, recogniser, max_steps, options, watcher, protocol, trials: see `run_episodes`. Neither
+        the policy nor the recogniser need be traceable.
     """
     found: list[tuple[int, Episode]] = []
     start = Start(scenario, seed)
@@ -158,6 +161,7 @@ def run_episode(
         options,
         watcher=watcher,
         protocol=protocol,
+        trials=trials,
     )
     return found[0][1]
 
@@ -176,8 +180,14 @@ def run_episodes(
     busy: Callable[[str, int], None] = lambda stage, episodes: None,
     watcher: Watcher | None = None,
     protocol: EpisodeProtocol = STRICT,
+    compiling: Callable[[str], None] = lambda text: None,
+    trials: Trials | None = None,
 ) -> None:
     """Run episodes to their ends, many at a time.
+
+    With several slots everything is compiled before the first of them begins; see `preparing.prepare`. In a simulator
+    that can, `Flowing`, slots do not wait for each other: those that have acted look and decide again, while what the
+    others do goes on afterwards.
 
     Args:
       starts: the episodes.
@@ -193,6 +203,8 @@ def run_episodes(
       busy: told of every stage ("recognise", "plan", "judge", "simulate"), with the number of slots in it.
       watcher: told of every step; for one slot only.
       protocol: how they are run and judged. Who gives another has built the problem by `protocol.problem`.
+      compiling: told of what is being compiled before the first episode, if anything is.
+      trials: what tries the policy's best actions out before one is made; nothing if left out.
 
     Raises:
       InputError: there is no slot, a watcher is given for several, the policy decides on an unknown kind of action, or
@@ -207,14 +219,22 @@ def run_episodes(
     if watcher is not None and len(first) > 1:
         raise InputError(f"run_episodes: a watcher looks on at one slot, not at {len(first)}")
     count, recogniser = len(first), protocol.recogniser(recogniser)
-    world = simulator.reset([start.scenario for _, start in first])
+    scenarios = [start.scenario for _, start in first]
     if count == 1:
-        known: Slots = OneSlot(problem, policy, recogniser)
+        simulator.reset(scenarios)
+        known: Slots = OneSlot(problem, policy, recogniser, trials)
     else:
-        known = ManySlots(problem, policy, recogniser, world, min(at_once, count))
-    with CompileClock() as compiling:
+        shapes: World = jax.tree.map(
+            lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), from_scenario(scenarios[0])
+        )
+        known = ManySlots(problem, policy, recogniser, shapes, min(at_once, count), trials)
+        # Before anything is compiled in vain.
+        known.decide_by({row: start.policy for row, (_, start) in enumerate(first)})
+        with prepared(batch_programs(known, simulator, shapes), compiling):
+            simulator.reset(scenarios)
+    with CompileClock() as clock:
         pool = _EpisodePool(
-            simulator, problem, known, count, _Run(max_steps, options or {}, busy, watcher, compiling, protocol)
+            simulator, problem, known, count, _Run(max_steps, options or {}, busy, watcher, clock, protocol, at_once)
         )
         pool.begin(dict(enumerate(first)))
         while pool.running:
@@ -227,6 +247,22 @@ def run_episodes(
                 pool.begin(fresh)
 
 
+def batch_programs(known: ManySlots, simulator: Simulator, world: World) -> list[Program]:
+    """All that is compiled for several slots, in the order in which it is to be lowered.
+
+    Args:
+      known: what the planner knows in every slot.
+      simulator: see `run_episodes`.
+      world: of all slots, or its shapes.
+    """
+    deciding, *seeing = known.programs(world)
+    simulating = simulator.programs(world) if isinstance(simulator, Prepares) else []
+    kernels = [each for each in simulating if each.name == "kernels"]
+    keys = jax.ShapeDtypeStruct((len(world.kind), 2, *jax.random.key_data(jax.random.key(0)).shape), np.uint32)
+    stepping = program("small ones", _keys_at, keys, jax.ShapeDtypeStruct((len(world.kind),), np.int32))
+    return [*kernels, deciding, *(each for each in simulating if each not in kernels), *seeing, stepping]
+
+
 @dataclasses.dataclass(frozen=True)
 class _Run:
     """What concerns all episodes alike; see `run_episodes`."""
@@ -237,6 +273,7 @@ class _Run:
     watcher: Watcher | None
     compiling: CompileClock
     protocol: EpisodeProtocol
+    at_once: int
 
     def busy(self, stage: str, episodes: int) -> None:
         """Say that a stage begins."""
@@ -246,7 +283,7 @@ class _Run:
 
 
 class _Clock:
-    """Wall time of the stages of a round, shared equally by the slots that took part.
+    """Wall time of the stages of a step, shared equally by the slots that took part.
 
     What JAX compiled meanwhile is apart from them, as "compile".
     """
@@ -265,12 +302,14 @@ class _Clock:
         took, compiled = time.perf_counter() - start, self._compiling.seconds - before
         for row in rows:
             timings = self._timings[row]
-            timings[stage] = round(max(took - compiled, 0.0) / len(rows), 6)
+            timings[stage] = round(timings.get(stage, 0.0) + max(took - compiled, 0.0) / len(rows), 6)
             if compiled:
                 timings["compile"] = round(timings.get("compile", 0.0) + compiled / len(rows), 6)
 
     def timings(self, row: int) -> dict[str, float]:
-        return self._timings[row]
+        """Those of a slot since it was last asked for."""
+        found, self._timings[row] = self._timings[row], {}
+        return found
 
 
 @dataclasses.dataclass
@@ -295,6 +334,9 @@ class _EpisodePool:
         """
         self._simulator, self._problem, self._known, self._run = simulator, problem, known, run
         self._slots: list[_Slot | None] = [None] * count
+        self._clock = _Clock(count, run.busy, run.compiling)
+        # What is being done in the slots that wait for the end of it.
+        self._moving: dict[int, Choice] = {}
         key = jax.random.key_data(jax.random.key(0))
         self._keys: UInt[np.ndarray, "slots 2 *words"] = np.zeros((count, 2, *key.shape), key.dtype)
 
@@ -314,10 +356,14 @@ class _EpisodePool:
         self._known.decide_by({row: start.policy for row, (_, start) in starts.items()})
 
     def round(self) -> list[tuple[int, tuple[int, Episode]]]:
-        """Look, decide and act once in all slots; the slots whose episodes ended, with their places and records."""
-        world, logs = self._simulator.world, {row: slot.log for row, slot in self.running.items()}
+        """Look, decide and act once in the slots that wait for nothing.
+
+        Returns:
+          The slots whose episodes ended, with their places and records.
+        """
+        world, clock = self._simulator.world, self._clock
+        logs = {row: slot.log for row, slot in self.running.items() if row not in self._moving}
         assert world is not None
-        clock = _Clock(len(self._slots), self._run.busy, self._run.compiling)
         steps = [slot.log.index if slot else 0 for slot in self._slots]
         planner_keys, environment_keys = _keys_at(*jax.device_put((self._keys, np.array(steps, np.int32))))
 
@@ -345,7 +391,7 @@ class _EpisodePool:
             size = 1 if found[r] else int(known.size[r])
             truth = None if found[r] or r in lost else bool(known.truth[r])
             log.decide(record(bool(found[r]), size, verdict, choice, truth, int(known.restarts[r])))
-        return self._act(clock, {r: choice for r, choice in choices.items() if r not in trouble}, trouble)
+        return self._act({r: choice for r, choice in choices.items() if r not in trouble}, trouble)
 
     def _target_troubles(self, world: World, rows: Sequence[int]) -> dict[int, str]:
         """In which of these slots the target can no longer be taken out, and why."""
@@ -353,37 +399,49 @@ class _EpisodePool:
         reasons = {r: target_trouble(self._problem.shelf, position[r], rotation[r]) for r in rows}
         return {r: reason for r, reason in reasons.items() if reason}
 
-    def _act(
-        self, clock: _Clock, choices: Mapping[int, Choice], trouble: Mapping[int, str]
-    ) -> list[tuple[int, tuple[int, Episode]]]:
-        """Execute what was decided, and note what came of it; returns as `round`."""
-        running = self.running
-        acting = [r for r, slot in running.items() if slot.log.acts]
+    def _act(self, choices: Mapping[int, Choice], trouble: Mapping[int, str]) -> list[tuple[int, tuple[int, Episode]]]:
+        """Execute what was decided, and note what came of what is over; returns as `round`."""
+        decided = {r: slot for r, slot in self.running.items() if r not in self._moving}
+        acting = [r for r, slot in decided.items() if slot.log.acts]
         moment = self._moment(choices)
         if self._run.watcher is not None and moment is not None and acting:
             self._run.watcher.decided(moment)
         executed: Execution | None = None
-        with clock("simulate", acting):
-            if acting:
-                executed = self._run.protocol.execute(self._simulator, {r: choices[r] for r in acting})
-                taken = executed.choices
-                others = {r: choice for r, choice in taken.items() if choice is not choices[r]}
+        with self._clock("simulate", [*acting, *self._moving]):
+            if acting or self._moving:
+                executed = self._executed({r: choices[r] for r in acting})
+                others = {r: choice for r, choice in executed.choices.items() if choice is not choices.get(r, choice)}
                 self._known.took({r: choice.action for r, choice in others.items()})
                 for r, choice in others.items():
-                    running[r].log.took(choice)
+                    decided[r].log.took(choice)
 
+        # Without an action there is nothing to wait for.
+        ends: dict[int, tuple[Result | None, str | None]] = {
+            r: (None, trouble.get(r)) for r in decided if r not in acting
+        }
+        if executed is not None:
+            ends |= {r: _result(executed, r) for r in executed.choices.keys() | executed.stuck}
         done: list[tuple[int, tuple[int, Episode]]] = []
-        for r, slot in running.items():
-            result, why = None, trouble.get(r)
-            if executed is not None and r in acting:
-                result, why = _result(executed, r)
-            if slot.log.act(result, why, clock.timings(r)):
+        for r, (result, why) in sorted(ends.items()):
+            slot = self.running[r]
+            if slot.log.act(result, why, self._clock.timings(r)):
                 done.append((r, (slot.place, slot.log.episode(slot.start.scenario, self._options(slot.start)))))
                 self._slots[r] = None
         if self._run.watcher is not None and moment is not None:
             told = None if executed is None else jax.tree.map(lambda a: a[0], executed.outcome)
-            self._run.watcher.acted(dataclasses.replace(moment, record=running[0].log.steps[-1], outcome=told))
+            self._run.watcher.acted(dataclasses.replace(moment, record=decided[0].log.steps[-1], outcome=told))
         return done
+
+    def _executed(self, choices: Mapping[int, Choice]) -> Execution:
+        """Execute what was decided in some slots; what came of it in those whose actions are over."""
+        if not (self._run.protocol.once and isinstance(self._simulator, Flowing) and len(self._slots) > 1):
+            return self._run.protocol.execute(self._simulator, choices)
+        if choices:
+            self._simulator.begin(*chosen_actions(choices, len(self._slots)))
+        self._moving |= choices
+        # As many as decide at once, and of few every second one: a decision takes less long than an action.
+        done, outcome = self._simulator.advance(min(self._run.at_once, (len(self._moving) + 1) // 2))
+        return Execution(outcome, {r: self._moving.pop(r) for r in list(self._moving) if done[r]})
 
     def _options(self, start: Start) -> dict[str, Any]:
         """The options of an episode, as its record keeps them."""

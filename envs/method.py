@@ -13,9 +13,10 @@ from mechsearch_jax.envs.policy_numbers import mould
 from mechsearch_jax.envs.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.push_models import push_models
 from mechsearch_jax.envs.recognisers import RecognitionName, recogniser
-from mechsearch_jax.envs.rehearsals import rehearsal
+from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
+from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.planner.workcell import Workcell
 
 EngineName = Literal["NativeSimulator", "MjxSimulator"]
@@ -45,6 +46,8 @@ class Method:
     def policy(self) -> Policy:
         """The policy, with the models that the configuration names.
 
+        What it proposes is tried out by `trials`, between its decision and what is done.
+
         Raises:
           InputError: there is no such policy, or its push model cannot be used.
         """
@@ -53,8 +56,12 @@ class Method:
             self.config.planner,
             push_model=first,
             later_push_model=later,
-            rehearsal=rehearsal(self.config.rehearsal),
+            tries=self.config.rehearsal != "none",
         )
+
+    def trials(self) -> Trials | None:
+        """What tries the policy's best actions out before one is made; None where nothing does."""
+        return rehearsal(self.config.rehearsal)
 
     @property
     def terms(self) -> EpisodeProtocol:
@@ -73,7 +80,8 @@ class Method:
         Raises:
           InputError: as `policy`.
         """
-        return self.workcell, self.config.problem, self.recognition, self.engine, self.protocol, mould(self.policy())
+        shared = self.workcell, self.config.problem, self.recognition, self.engine, self.protocol
+        return *shared, self.config.rehearsal, mould(self.policy())
 
     def check(self) -> None:
         """Fail before the first episode rather than in every one.

@@ -9,6 +9,7 @@ import copy
 import dataclasses
 import functools
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,6 +23,7 @@ from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.batch_model import BodyFields, body_fields
 from mechsearch_jax.envs.outcome import Overflow
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig
+from mechsearch_jax.envs.warp_kernels import compile_kernels
 from mechsearch_jax.envs.world import BODIES, TARGET, World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME
@@ -137,7 +139,18 @@ class MjxModel:
             # MJX ties it to a device, and with it all results; what was compiled for free arrays would not serve for
             # those.
             one = jax.device_get(one)
-        return jax.jit(jax.vmap(lambda _, data: data, in_axes=(0, None)))(jnp.arange(worlds), one)
+        return jax.jit(_repeated)(jnp.arange(worlds), one)
+
+    def data_shapes(self, worlds: int) -> Any:
+        """The shapes of `make_data`."""
+        return jax.eval_shape(_repeated, jnp.arange(worlds), jax.device_get(self._one(self._config.contacts * worlds)))
+
+    def kernels(self, worlds: int) -> Callable[[], None] | None:
+        """Begin to compile Warp's kernels for so many worlds in another process; returns what waits for it, if it is
+        not known to have been done."""
+        device = "cpu" if jax.default_backend() == "cpu" else "cuda:0"
+        batched = tuple(BodyFields.__dataclass_fields__)
+        return compile_kernels(self.blank, batched, worlds, self._config.contacts * worlds, self._config.rows, device)
 
     def step(self, fields: BodyFields, data: Any) -> Any:
         """The state of all worlds one time step later."""
@@ -178,6 +191,11 @@ class MjxModel:
         a, b = owner[contacts.contact__geom[:, 0]], owner[contacts.contact__geom[:, 1]]
         found &= ((a == finger) & (b == target)) | ((a == target) & (b == finger))
         return jnp.zeros(worlds, bool).at[jnp.where(found, contacts.contact__worldid, worlds)].set(True, mode="drop")
+
+
+def _repeated(places: Array, one: Any) -> Any:
+    """A state for each place."""
+    return jax.vmap(lambda _, data: data, in_axes=(0, None))(places, one)
 
 
 def overflow_of(flags: Array) -> Array:

@@ -15,6 +15,11 @@ together until the last of them is at rest; a world that is done before that is 
 finite is put back to where it was and frozen at once, so that it touches no other. The first call for a number of
 worlds compiles; later ones do not, whatever the actions are.
 
+A step of few worlds takes as long as one of some hundreds. Who has many does not wait for the last of them:
+
+    simulator.begin(actions, active)               # the others go on with what they are at
+    done, outcome = simulator.advance(64)          # until so many more are done; which, and what came of it
+
 Everything stays on the device: the host waits for the kinds of the actions, and where a field of an outcome or of
 `world` is read.
 """
@@ -22,7 +27,7 @@ Everything stays on the device: the host waits for the kinds of the actions, and
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -30,14 +35,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.actions import Action
+from mechsearch_jax.actions import Action, ActionKind, no_action
+from mechsearch_jax.compiled import Kept
 from mechsearch_jax.envs.batch_model import BodyFields
 from mechsearch_jax.envs.mjx_model import MjxConfig, MjxModel, where
-from mechsearch_jax.envs.mjx_step import Task, acting, advance, begin, taken_over, verdicts, waiting
+from mechsearch_jax.envs.mjx_step import Progress, Task, acting, advance, begin, merged, taken_over, verdicts, waiting
 from mechsearch_jax.envs.outcome import Failure, Outcome
 from mechsearch_jax.envs.simulator import ROBOT, check_actions
 from mechsearch_jax.envs.world import World, from_scenario
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.preparing import Program
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -67,8 +74,17 @@ class MjxSimulator:
         self._model = MjxModel(self.shelf, self.camera, self.config)
         self._fields: BodyFields | None = None
         self._data: Any = None
-        self._start = jax.jit(self._model.start)
-        self._execute = jax.jit(self._simulate, donate_argnums=1)
+        # What all worlds are at, and of which nothing was said since they were done; which of them move.
+        self._tasks: tuple[Task, Progress, Array] | None = None
+        self._moving = np.zeros(0, bool)
+        # They hang on this simulator's model, so that no other process could use them.
+        self._start = Kept(self._model.start, on_disk=False)
+        self._place = Kept(_placed, on_disk=False, donate_argnums=(1,))
+        self._begin = Kept(self._begun, on_disk=False, donate_argnums=(0,))
+        self._go_on = Kept(self._gone_on, on_disk=False, donate_argnums=(1,))
+        self._prepared: frozenset[int] = frozenset()
+        self._merge = Kept(_merged, on_disk=False)
+        self._settle = jax.jit(self._simulate, donate_argnums=1)
         self._rollout = jax.jit(self._follow, donate_argnums=1)
 
     def reset(self, scenarios: Sequence[Scenario]) -> World:
@@ -104,24 +120,18 @@ class MjxSimulator:
         count = len(world.kind)
         if only is not None and (self.world is None or len(self.world.kind) != count or len(only) != count):
             raise InputError(f"MjxSimulator: some of {count} worlds can be replaced only where there are as many")
-        world = jax.tree.map(jnp.asarray, world)
+        world = jax.tree.map(lambda a: a if isinstance(a, jax.Array) else jax.device_put(a), world)
         fields, qpos, ctrl = self._start(world)
+        new = fields, world
         if only is None:
             if self._data is None or self._data.qpos.shape[0] != count:
                 self._data = self._model.make_data(count)
-            changed = jnp.ones(count, bool)
-        else:
-            changed = jnp.asarray(only)
-            fields, world = jax.tree.map(functools.partial(where, changed), (fields, world), (self._fields, self.world))
-        data = self._data
-        self._data = data.replace(
-            qpos=where(changed, qpos, data.qpos),
-            ctrl=where(changed, ctrl, data.ctrl),
-            qvel=where(changed, jnp.zeros_like(data.qvel), data.qvel),
-            qacc_warmstart=where(changed, jnp.zeros_like(data.qvel), data.qacc_warmstart),
-        )
-        self._fields, self.world = fields, world
-        return world
+            self._tasks, self._moving = None, np.zeros(count, bool)
+        changed = jax.device_put(np.ones(count, bool) if only is None else np.array(only))
+        data, self._data = self._data, None
+        old = new if only is None else (self._fields, self.world)
+        self._data, (self._fields, self.world) = self._place(changed, data, qpos, ctrl, new, old)
+        return self.world
 
     def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Execute an action in every world and let the bodies come to rest; see `Simulator.execute`.
@@ -129,8 +139,49 @@ class MjxSimulator:
         Raises:
           InputError: the simulator was not reset, there are not as many actions as worlds, or a kind is unknown.
         """
-        check_actions(self.engine, actions, self._count())
-        return self._act(actions, active)
+        self.begin(actions, active)
+        found = self._advanced(self._count())[1]
+        self._moving[:] = False
+        return found
+
+    def begin(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> None:
+        """Begin with actions; worlds that are not active go on with what they are at.
+
+        Args:
+          actions: of any kinds; fields with a leading axis for the worlds.
+          active: in which worlds; all by default. None of them may be moving.
+
+        Raises:
+          InputError: as `execute`, or one of the worlds is moving.
+        """
+        count = self._count()
+        check_actions(self.engine, actions, count)
+        begins = np.ones(count, bool) if active is None else np.array(active)
+        if np.any(begins & self._moving):
+            raise InputError(f"MjxSimulator: world {np.argmax(begins & self._moving)} is moving; advance it to its end")
+        data, self._data = self._data, None
+        self._data, *new = self._begin(data, actions, jax.device_put(begins))
+        if self._moving.any():
+            new = self._merge(jax.device_put(self._moving), self._tasks, tuple(new))
+        self._tasks, self._moving = tuple(new), self._moving | begins
+
+    def advance(self, least: int) -> tuple[Bool[np.ndarray, " worlds"], Outcome]:
+        """Step what moves until some more worlds are done; `world` has then what became of these.
+
+        Args:
+          least: how many, at least; all that move where they are fewer.
+
+        Returns:
+          Which worlds are done, and were not before; and what came of their actions: of others the outcome says
+          nothing.
+
+        Raises:
+          InputError: the simulator was not reset.
+        """
+        self._count()
+        done, outcome = jax.device_get(self._advanced(least))
+        self._moving = self._moving & ~done
+        return done, outcome
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Let time pass, with the robot where it is, until everything is at rest; see `Simulator.settle`.
@@ -138,7 +189,42 @@ class MjxSimulator:
         Raises:
           InputError: the simulator was not reset.
         """
-        return self._act(None, active)
+        active = jnp.ones(self._count(), bool) if active is None else jnp.asarray(active)
+        data, self._data = self._data, None
+        self._data, self.world, outcome = self._settle(self._fields, data, self.world, None, active)
+        return outcome
+
+    def programs(self, world: World) -> list[Program]:
+        """All that is compiled to reset, and to act in, worlds of these shapes; see `preparing.Prepares`."""
+        count = len(world.kind)
+        mask = jax.ShapeDtypeStruct((count,), bool)
+        actions = jax.tree.map(lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), no_action())
+
+        # Tracing takes its time, and who lowers does it.
+        @functools.cache
+        def shapes() -> tuple[Any, Any, Any]:
+            start = jax.eval_shape(self._model.start, world)
+            data, *tasks = jax.eval_shape(self._begun, self._model.data_shapes(count), actions, mask)
+            return start, data, tuple(tasks)
+
+        def going() -> Callable[[], None] | None:
+            (fields, _, _), data, tasks = shapes()
+            return self._go_on.begin(fields, data, world, tasks, np.int32(count))
+
+        def placing() -> Callable[[], None] | None:
+            (fields, qpos, ctrl), data, _ = shapes()
+            return self._place.begin(mask, data, qpos, ctrl, (fields, world), (fields, world))
+
+        begins = {
+            "kernels": lambda: self._model.kernels(count),
+            "simulate": going,
+            "motions": lambda: self._begin.begin(shapes()[1], actions, mask),
+            "reset": lambda: self._start.begin(world),
+            "next episodes": placing,
+            "next motions": lambda: self._merge.begin(mask, shapes()[2], shapes()[2]),
+        }
+        known, self._prepared = self._prepared, self._prepared | {count}
+        return [Program(name, lambda: count in known, begin) for name, begin in begins.items()]
 
     def simulate(self, world: World, actions: Action | None) -> tuple[World, Outcome]:
         """What actions would make of worlds: `load` and `execute` without memory, to be traced.
@@ -186,58 +272,74 @@ class MjxSimulator:
             raise InputError("MjxSimulator: reset it before use")
         return len(self.world.kind)
 
-    def _act(self, actions: Action | None, active: Bool[Array, " worlds"] | None) -> Outcome:
-        active = jnp.ones(self._count(), bool) if active is None else jnp.asarray(active)
+    def _advanced(self, least: int) -> tuple[Array, Outcome]:
+        """Which worlds are done now, and what came of it."""
         data, self._data = self._data, None
-        self._data, self.world, outcome = self._execute(self._fields, data, self.world, actions, active)
-        return outcome
-
-    def _simulate(self, fields: BodyFields, data: Any, world: World, actions: Action | None, active: Array):
-        """`execute` or `settle`, compiled: the state, the world and what came of it."""
-        idle = data.ctrl
-        if actions is None:
-            task = waiting(data, active)
-        else:
-            task, start = acting(data, actions, active, self._model.robot, self.config.simulator)
-            data = data.replace(qpos=data.qpos.at[:, :ROBOT].set(where(task.moves, start, data.qpos[:, :ROBOT])))
-        data = data.replace(
-            qvel=where(task.moves, jnp.zeros_like(data.qvel), data.qvel),
-            qacc_warmstart=where(task.moves, jnp.zeros_like(data.qvel), data.qacc_warmstart),
+        self._data, self.world, self._tasks, done, outcome = self._go_on(
+            self._fields, data, self.world, self._tasks, np.int32(least)
         )
-        last = len(task.controls) - 1
-        chunk = self.config.chunk
-        one_step = self._one_step(fields, task)
+        return done, outcome
 
-        def one(state, i):
-            row = jax.lax.dynamic_index_in_dim(task.controls, jnp.minimum(i, last), keepdims=False)
-            return one_step(state, i, row), None
+    def _begun(self, data: Any, actions: Action, active: Array) -> tuple[Any, Task, Progress, Array]:
+        """`begin`, compiled, where nothing else moves: the state, the tasks, and how far they are.
 
-        def some(carry):
-            i, state = carry
-            return i + chunk, jax.lax.scan(one, state, i + jnp.arange(chunk))[0]
+        The last says where nothing is to be said of a world that is done.
+        """
+        task, start = acting(data, actions, active, self._model.robot, self.config.simulator)
+        data = data.replace(qpos=data.qpos.at[:, :ROBOT].set(where(task.moves, start, data.qpos[:, :ROBOT])))
+        data = _at_rest(data, task.moves)
+        return data, task, begin(task, data), ~active
 
-        begun = (jnp.int32(0), (data, begin(task, data)))
-        _, (data, progress) = jax.lax.while_loop(lambda carry: ~jnp.all(carry[1][1].done), some, begun)
+    def _gone_on(self, fields: BodyFields, data: Any, world: World, tasks: tuple[Task, Progress, Array], least: Array):
+        """`advance`, compiled: the state, the worlds, the tasks, which are done, and what came of them."""
+        task, progress, known = tasks
+        chunk, step = self.config.chunk, self._one_step(fields, task)
 
+        def some(state):
+            return jax.lax.scan(lambda state, _: (step(state), None), state, None, chunk)[0]
+
+        def waits(state):
+            done = state[1].done
+            return (jnp.sum(done & ~known) < least) & ~jnp.all(done)
+
+        data, progress = jax.lax.while_loop(waits, some, (data, progress))
+        ended = progress.done & ~known
         # What moved is stopped. Where all was undone, the robot is again told what it was told before.
-        controlled = where(progress.diverged, idle, task.controls[last])
-        resting = data.replace(qvel=where(task.moves, jnp.zeros_like(data.qvel), data.qvel))
+        told = where(progress.diverged, task.idle, task.controls[-1])
+        resting = _at_rest(data, ended & task.moves)
         touch = self._model.step(fields, resting)
         in_hand = self._model.holds_target(touch._impl)
-        data = touch.replace(qpos=resting.qpos, qvel=resting.qvel, ctrl=controlled, time=resting.time)
-        data = data.replace(qacc_warmstart=jnp.zeros_like(data.qvel))
-        return data, *verdicts(self.shelf, self.config.simulator, task, progress, world, data.qpos, in_hand)
+        data = touch.replace(
+            qpos=resting.qpos, qvel=resting.qvel, ctrl=where(ended, told, data.ctrl), time=resting.time
+        )
+        warm = resting.qacc_warmstart
+        data = data.replace(qacc_warmstart=where(ended, jnp.zeros_like(warm), warm))
+        # Of the others nothing is to be said, and nothing to be taken over.
+        mine = task.replace(moves=task.moves & ended, kind=jnp.where(ended, task.kind, ActionKind.NONE))
+        simulator = self.config.simulator
+        world, outcome = verdicts(self.shelf, simulator, mine, progress, world, data.qpos, in_hand)
+        return data, world, (task, progress, known | ended), ended, outcome
+
+    def _simulate(self, fields: BodyFields, data: Any, world: World, actions: Action | None, active: Array):
+        """`execute` or `settle` as a whole: the state, the world and what came of it."""
+        if actions is None:
+            task = waiting(data, active)
+            data = _at_rest(data, task.moves)
+            tasks = task, begin(task, data), ~active
+        else:
+            data, task, progress, known = self._begun(data, actions, active)
+            tasks = task, progress, known
+        data, world, _, _, outcome = self._gone_on(fields, data, world, tasks, jnp.int32(len(active)))
+        return data, world, outcome
 
     def _follow(self, fields: BodyFields, data: Any, world: World, controls: Array):
         """`follow`, compiled."""
         worlds, steps = len(world.kind), len(controls)
         everywhere = jnp.ones(worlds, bool)
-        task = waiting(data, everywhere).replace(length=jnp.full(worlds, steps + 1, jnp.int32))
-        one_step = self._one_step(fields, task)
+        task = waiting(data, everywhere).replace(controls=controls, length=jnp.full(worlds, steps + 1, jnp.int32))
+        step = self._one_step(fields, task)
         state = (data, begin(task, data))
-        (data, progress), _ = jax.lax.scan(
-            lambda state, step: (one_step(state, *step), None), state, (jnp.arange(steps), controls)
-        )
+        (data, progress), _ = jax.lax.scan(lambda state, _: (step(state), None), state, None, steps)
         world, fallen = taken_over(self.shelf, world, data.qpos, everywhere)
         failure = jnp.where(progress.diverged, int(Failure.UNSTABLE), int(Failure.NONE)).astype(jnp.int32)
         none = ~everywhere
@@ -247,3 +349,23 @@ class MjxSimulator:
     def _one_step(self, fields: BodyFields, task: Task):
         step = functools.partial(self._model.step, fields)
         return functools.partial(advance, self.config.simulator, step, self._model.robot, task)
+
+
+def _placed(
+    changed: Bool[Array, " worlds"], data: Any, qpos: Array, ctrl: Array, new: tuple[Any, World], old: tuple[Any, World]
+) -> tuple[Any, tuple[Any, World]]:
+    """`load`, compiled: the state, and fields and worlds, where some are changed and at rest."""
+    data = _at_rest(data, changed).replace(qpos=where(changed, qpos, data.qpos), ctrl=where(changed, ctrl, data.ctrl))
+    return data, jax.tree.map(functools.partial(where, changed), new, old)
+
+
+def _at_rest(data: Any, which: Bool[Array, " worlds"]) -> Any:
+    """The state, with nothing moving in these worlds."""
+    still = jnp.zeros_like(data.qvel)
+    return data.replace(qvel=where(which, still, data.qvel), qacc_warmstart=where(which, still, data.qacc_warmstart))
+
+
+def _merged(keep: Bool[Array, " worlds"], old: tuple[Task, Progress, Array], new: tuple[Task, Progress, Array]):
+    """What worlds are at: the old where it is to be kept, the new elsewhere."""
+    task, progress = merged(keep, old[:2], new[:2])
+    return task, progress, jnp.where(keep, old[2], new[2])

@@ -37,6 +37,7 @@ class Task(flax.struct.PyTreeNode):
       kind: of the action; NONE where there is none.
       object: index of the body that the action is about.
       before: the configuration before the action, which a diverged world gets back, shape (W, nq).
+      idle: what the robot was told before, shape (W, 9).
     """
 
     controls: jax.Array
@@ -48,6 +49,7 @@ class Task(flax.struct.PyTreeNode):
     kind: jax.Array
     object: jax.Array
     before: jax.Array
+    idle: jax.Array
 
 
 class Progress(flax.struct.PyTreeNode):
@@ -89,7 +91,7 @@ def commands(reference: Reference) -> Float[Array, "worlds steps 9"]:
 def waiting(data: Any, active: Bool[Array, " worlds"]) -> Task:
     """Hold still: the robot is told what it was told before."""
     none = jnp.zeros(len(active), jnp.int32)
-    return Task(data.ctrl[None], none, none, none, none > 0, active, none, none, data.qpos)
+    return Task(data.ctrl[None], none, none, none, none > 0, active, none, none, data.qpos, data.ctrl)
 
 
 def acting(
@@ -133,7 +135,18 @@ def acting(
         opens = jnp.where(this, reference.opens, opens)
         goes_home |= this & each.returns_home
         moves |= this
-    return Task(controls, length, closed, opens, goes_home, moves, kind, actions.object, data.qpos), start
+    return Task(controls, length, closed, opens, goes_home, moves, kind, actions.object, data.qpos, data.ctrl), start
+
+
+def merged(
+    keep: Bool[Array, " worlds"], old: tuple[Task, Progress], new: tuple[Task, Progress]
+) -> tuple[Task, Progress]:
+    """Tasks and progress: the old ones in the worlds to keep, the new ones in the others."""
+    controls = jnp.where(keep[None, :, None], old[0].controls, new[0].controls)
+    task, progress = jax.tree.map(
+        lambda a, b: where(keep, a, b), (old[0].replace(controls=keep), old[1]), (new[0].replace(controls=keep), new[1])
+    )
+    return task.replace(controls=controls), progress
 
 
 def begin(task: Task, data: Any) -> Progress:
@@ -150,10 +163,8 @@ def advance(
     home: Float[Array, " 9"],
     task: Task,
     state: tuple[Any, Progress],
-    i: Int[Array, ""],
-    row: Float[Array, "worlds 9"],
 ) -> tuple[Any, Progress]:
-    """One time step, the `i`-th, of all worlds that are not done.
+    """One time step of all worlds that are not done, each the next of its own task.
 
     Args:
       config: when a world is at rest.
@@ -161,11 +172,10 @@ def advance(
       home: the robot's home configuration.
       task: what they are to do.
       state: where they are, and how far they have come.
-      i: number of the step, counted from 0.
-      row: what the actuators are told.
     """
     data, progress = state
-    frozen = progress.done
+    frozen, i = progress.done, progress.steps
+    row = task.controls[jnp.minimum(i, len(task.controls) - 1), jnp.arange(len(i))]
     goes_home = task.home & (i == task.length) & ~frozen
     robot = jnp.broadcast_to(home, (len(frozen), ROBOT))
     qpos = data.qpos.at[:, :ROBOT].set(where(goes_home, robot, data.qpos[:, :ROBOT]))

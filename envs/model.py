@@ -315,19 +315,22 @@ def mass_and_inertia(body: Body) -> tuple[float, Float[np.ndarray, " 3"]]:
     return float(mass), inertia
 
 
-def with_bodies(model: mujoco.MjModel, bodies: Sequence[Body | None], skin: float = MARGIN) -> mujoco.MjModel:
+def with_bodies(
+    model: mujoco.MjModel, bodies: Sequence[Body | None], skin: float = MARGIN, mass: float = 1.0
+) -> mujoco.MjModel:
     """A copy of the model whose slots have the shapes and masses of `bodies`; poses are part of the state, not of it.
 
     Args:
       model: the compiled model.
       bodies: one for each slot, the target last; None leaves a slot empty.
       skin: how much smaller the contact geometry is than the bodies [m]; 0 for pictures.
+      mass: of the bodies, as a multiple of what it is.
     """
     model = copy.copy(model)
     for i, body in enumerate(bodies):
         index = model.body(f"body{i}").id
-        mass, inertia = mass_and_inertia(body) if body else (EMPTY_MASS, np.full(3, EMPTY_INERTIA))
-        model.body_mass[index], model.body_inertia[index] = mass, inertia
+        own, inertia = mass_and_inertia(body) if body else (EMPTY_MASS, np.full(3, EMPTY_INERTIA))
+        model.body_mass[index], model.body_inertia[index] = mass * own, mass * inertia
         model.body_gravcomp[index] = 0.0 if body else 1.0
         for shape in in_order():
             used = body is not None and body.shape == shape.name

@@ -34,6 +34,7 @@ from mechsearch_jax.envs.outcome import Failure, Outcome
 from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, check_actions, controls
 from mechsearch_jax.envs.world import BODIES, TARGET, World, bodies_of, fallen_over, from_scenario, slots
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.preparing import Program, motions
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference
 from mechsearch_jax.workspace.camera import Camera
@@ -68,12 +69,22 @@ class NativeWorld:
       world: the present state; None before the first `reset` or `load`.
     """
 
-    def __init__(self, shelf: Shelf | None = None, camera: Camera | None = None, config: SimulatorConfig | None = None):
+    def __init__(
+        self,
+        shelf: Shelf | None = None,
+        camera: Camera | None = None,
+        config: SimulatorConfig | None = None,
+        blank: mujoco.MjModel | None = None,
+    ):
+        """Args:
+        shelf, camera, config: the defaults if left out.
+        blank: the compiled model of these, which is not changed; compiled anew if left out.
+        """
         self.shelf = shelf or Shelf()
         self.camera = camera or Camera()
         self.config = config or SimulatorConfig()
         self.world: World | None = None
-        self._blank = models.compile_model(self.shelf, self.camera, self.config.motion.timestep)
+        self._blank = blank or models.compile_model(self.shelf, self.camera, self.config.motion.timestep)
         self._data = mujoco.MjData(self._blank)
         self._model = self._blank
         self._bodies: list[Body | None] = [None] * BODIES
@@ -107,7 +118,7 @@ class NativeWorld:
           InputError: its kind is unknown.
         """
         kind = kind_of(int(action.kind))
-        self._recorder = _Recorder(self._data, self.config.trace_every)
+        self._record()
         motion = reference_motion(kind, action, self.config.motion)
         if motion is None:
             return self._finish(Failure.NONE, True)
@@ -125,7 +136,7 @@ class NativeWorld:
 
     def settle(self) -> Outcome:
         """Let time pass, with the robot where it is, until everything is at rest or the time for that is over."""
-        self._recorder = _Recorder(self._data, self.config.trace_every)
+        self._record()
         before = copy.copy(self._data)
         settled = self._come_to_rest()
         if self._recorder.diverged:
@@ -145,41 +156,18 @@ class NativeWorld:
         target = found.pop(TARGET)
         return Scenario(name, tuple(found.values()), target)
 
-    def place(self, bodies: list[Body | None], friction: float = 1.0) -> None:
+    def place(self, bodies: list[Body | None], friction: float = 1.0, mass: float = 1.0) -> None:
         """Start from bodies, everything at rest and the robot at home; `world` stays what it was.
 
         Args:
           bodies: in their slots.
-          friction: sliding friction of everything, as a multiple of what it is.
+          friction, mass: sliding friction of everything, and masses of the bodies, as multiples of what they are.
         """
         self._bodies = bodies
-        self._model = models.with_bodies(self._blank, bodies)
+        self._model = models.with_bodies(self._blank, bodies, mass=mass)
         self._model.geom_friction[:, 0] *= friction
         self._data = models.initial_state(self._model, bodies)
         self._go_home()
-
-    def rehearse(self, kind: Kind, reference: Reference, index: int) -> tuple[bool, bool]:
-        """What becomes of a motion once everything is at rest: whether it is carried out, and whether it does no harm.
-
-        Nothing is computed with JAX, so that a callback of JAX may ask; `world` stays what it was.
-
-        Args:
-          kind: of the action.
-          reference: of the arm, as NumPy arrays.
-          index: slot of the object that the action moves.
-        """
-        self._recorder = _Recorder(self._data, self.config.trace_every)
-        self._come_to_rest()
-        gone, lay = self._fallen(), self._target_lies()
-        failure, *_ = self._perform(kind, reference, index)
-        if self._recorder.diverged:
-            return False, False
-        held, fallen = False, self._fallen()
-        if kind.takes_target:
-            told = self._retrieval(gone)
-            failure, held, fallen = failure or told.failure, told.held, told.fallen
-        toppled = self._target_lies() and not (lay or held)
-        return not failure, not (toppled or (fallen & ~gone).any())
 
     def drive(self, controls: Float[np.ndarray, "steps 9"], at_once: bool = False) -> Float[np.ndarray, "steps 9"]:
         """Step with one row of controls per step from where everything is, and let the bodies come to rest.
@@ -195,7 +183,7 @@ class NativeWorld:
         """
         if at_once:
             self._set_robot(controls[0, :ARM], float(controls[0, ARM]))
-        self._recorder = _Recorder(self._data, self.config.trace_every)
+        self._record()
         states = self._run(np.ascontiguousarray(controls))
         self._come_to_rest()
         return states[:, 1 : 1 + ROBOT]
@@ -214,6 +202,10 @@ class NativeWorld:
     def holds_target(self) -> tuple[bool, bool]:
         """Whether both fingers press on the target, and whether it is outside the shelf."""
         return self._holds(TARGET), bool(self._data.joint(f"body{TARGET}").qpos[0] < self.shelf.front)
+
+    def _record(self) -> None:
+        """Begin a trace."""
+        self._recorder = _Recorder(self._data, self.config.trace_every)
 
     def _target_lies(self) -> bool:
         """Whether there is a target that has fallen over."""
@@ -487,6 +479,10 @@ class NativeSimulator:
         check_actions(self.engine, actions, len(self._worlds))
         actions = jax.device_get(actions)
         return self._each(active, lambda i: self._worlds[i].execute(_row(actions, i)))
+
+    def programs(self, world: World) -> list[Program]:
+        """The motions of all kinds of action; see `preparing.Prepares`."""
+        return motions(self.config.motion)
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Let time pass in every active world; see `Simulator.settle`.

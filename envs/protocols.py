@@ -74,6 +74,11 @@ class EpisodeProtocol(Protocol):
         """In which slots the episode ends before anything is executed, and why."""
         ...
 
+    @property
+    def once(self) -> bool:
+        """Whether what was decided is executed once, whatever becomes of it."""
+        ...
+
     def execute(self, simulator: Simulator, choices: Mapping[int, Choice]) -> Execution:
         """Execute what was decided, in one slot at least."""
         ...
@@ -84,6 +89,7 @@ class Strict:
     """Every action counts, whatever becomes of it, and the target has to be taken out."""
 
     name: ProtocolName = "strict"
+    once: bool = True
 
     def problem(self, config: ProblemConfig) -> ProblemConfig:
         return config
@@ -114,6 +120,7 @@ class PublishedCode:
     """
 
     name: ProtocolName = "published-code"
+    once: bool = False
 
     def problem(self, config: ProblemConfig) -> ProblemConfig:
         """A found target has the candidates' grasps, and no others."""
@@ -176,15 +183,18 @@ class WithTruePose:
 def _executed(simulator: Simulator, choices: Mapping[int, Choice]) -> Outcome:
     """What the simulator says of actions in some worlds."""
     assert simulator.world is not None
-    count = len(simulator.world.kind)
+    return jax.device_get(simulator.execute(*chosen_actions(choices, len(simulator.world.kind))))
+
+
+def chosen_actions(choices: Mapping[int, Choice], count: int) -> tuple[Action, Array]:
+    """The actions of all of so many worlds, and which of them were chosen."""
     actions: Action = jax.tree.map(
         lambda a: np.broadcast_to(a, (count, *np.shape(a))).copy(), jax.device_get(no_action())
     )
     for row, choice in choices.items():
         for name in Action.__dataclass_fields__:
             getattr(actions, name)[row] = getattr(choice.action, name)
-    active = np.isin(np.arange(count), list(choices))
-    return jax.device_get(simulator.execute(*jax.device_put((actions, active))))
+    return jax.device_put((actions, np.isin(np.arange(count), list(choices))))
 
 
 def _is_bad(choice: Choice, outcome: Outcome, row: int) -> bool:

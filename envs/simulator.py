@@ -17,6 +17,7 @@ from mechsearch_jax.envs import model as models
 from mechsearch_jax.envs.outcome import Outcome
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.preparing import Program
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.workspace.scenario import Scenario
@@ -125,6 +126,36 @@ class Simulator(Protocol):
         ...
 
 
+@runtime_checkable
+class Flowing(Protocol):
+    """A `Simulator` some of whose worlds begin with an action while others are still moving."""
+
+    def begin(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> None:
+        """Begin with actions in the worlds that are active, none of which may be moving; the others go on."""
+        ...
+
+    def advance(self, least: int) -> tuple[Bool[np.ndarray, " worlds"], Outcome]:
+        """Step what moves until at least so many more worlds are done, or all that move.
+
+        Returns:
+          Which are done that were not before, and what came of their actions; of others the outcome says nothing.
+        """
+        ...
+
+
+@runtime_checkable
+class Prepares(Protocol):
+    """What knows the programs that it will call."""
+
+    def programs(self, world: World) -> Sequence[Program]:
+        """Those for so many worlds, the longest first.
+
+        Args:
+          world: of all worlds, or its shapes.
+        """
+        ...
+
+
 def check_actions(name: str, actions: Action, worlds: int) -> None:
     """Check that there is an action of a known kind for each world.
 
@@ -148,8 +179,10 @@ def controls(reference: Reference) -> Float[np.ndarray, "steps 9"]:
     One row for each step until the motion is over.
     """
     length = int(reference.length)
-    arm = np.asarray(reference.q[:length], float) + LAG * np.asarray(reference.velocity[:length], float)
-    fingers = np.asarray(reference.fingers[:length], float)[:, None]
+    # Cut on the host: on a device every length would be compiled.
+    told = (reference.q, reference.velocity, reference.fingers)
+    q, velocity, fingers = (np.asarray(a, float)[:length] for a in jax.device_get(told))
+    arm, fingers = q + LAG * velocity, fingers[:, None]
     return np.concatenate([arm, fingers, fingers], axis=1)
 
 

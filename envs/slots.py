@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import flax.struct
@@ -20,15 +20,18 @@ from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.compiled import kept
-from mechsearch_jax.envs.episode_log import Choice, chosen
+from mechsearch_jax.envs.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.policy_numbers import as_pytree, mould, numbers, with_numbers
 from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
-from mechsearch_jax.envs.verdicts import Verdict, judge, judge_many, swept_free
+from mechsearch_jax.envs.verdicts import Verdict, graspable_many, judge, judge_many, judged_sets, swept_free
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
+from mechsearch_jax.planner.belief import without_grasps
 from mechsearch_jax.planner.moved_target import nearest_candidate
+from mechsearch_jax.planner.trials import AsksTwice, TrialResult, Trials, TrialScenes, choose, decide, scenes_of
+from mechsearch_jax.preparing import Program, program
 from mechsearch_jax.workspace.camera import Camera
 
 
@@ -103,14 +106,19 @@ class OneSlot:
       action: what was decided at the last look, to be executed before the next; of kind NONE before the first.
     """
 
-    def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser) -> None:
+    def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, trials: Trials | None = None) -> None:
+        """Args:
+        problem: of the episode.
+        policy, recogniser: need not be traceable.
+        trials: what tries actions out before one is made; nothing if left out.
+        """
         self.snapshot: Snapshot | None = None
         self.observation: Observation | None = None
         self.belief = initial_belief(problem)
         self.decision: Decision | None = None
         self.action: Action = no_action()
         self._problem, self._usual, self._recogniser = problem, policy, recogniser
-        self._policy = policy
+        self._policy, self._trials = policy, trials
 
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
         """See `Slots`."""
@@ -139,7 +147,7 @@ class OneSlot:
         if not rows:
             return {}
         assert self.observation is not None
-        self.decision = self._policy(keys[0], self._problem, self.belief, self.observation)
+        self.decision = decide(self._policy, self._trials, keys[0], self._problem, self.belief, self.observation)
         self.action = self.decision.action
         return {0: jax.device_get(chosen(self.decision))}
 
@@ -177,15 +185,24 @@ class ManySlots:
     scenes take their places, which cost next to nothing.
     """
 
-    def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, world: World, at_once: int) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        policy: Policy,
+        recogniser: Recogniser,
+        world: World,
+        at_once: int,
+        trials: Trials | None = None,
+    ) -> None:
         """Args:
         problem: of all episodes.
         policy: of all slots that have none of their own.
         recogniser: must be traceable, as the policy.
-        world: of all slots, for what recognisers make of it.
+        world: of all slots, or its shapes, for what recognisers make of it.
         at_once: how many slots are looked at or decided upon in one computation.
+        trials: what tries actions out before one is made; nothing if left out.
         """
-        self._problem = problem
+        self._problem, self._trials = problem, trials
         self._policy, self._mould = as_pytree(policy), mould(policy)
         self._recogniser = recogniser
         self._at_once = at_once
@@ -193,16 +210,54 @@ class ManySlots:
         self._numbers = [numbers(self._policy)] * self._count
         # Policies that were looked at, by what tells objects apart while they are kept.
         self._known: dict[int, tuple[Policy, tuple[np.ndarray, ...]]] = {}
-        one = jax.tree.map(lambda a: a[0], world)
+        one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), world)
         seen = jax.eval_shape(
             lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), one
         )
         empty = PlannerState(initial_belief(problem), seen, no_action())
-        self._state: PlannerState = jax.tree.map(lambda a: jnp.zeros((self._count, *a.shape), a.dtype), empty)
+        self._state: PlannerState = jax.tree.map(
+            lambda a: jax.device_put(np.zeros((self._count, *a.shape), a.dtype)), empty
+        )
+
+    def programs(self, world: World) -> list[Program]:
+        """All that is compiled for these slots, the longest first.
+
+        Args:
+          world: of all slots, or its shapes.
+        """
+        rows = jax.ShapeDtypeStruct((self._at_once,), jnp.int32)
+        keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), self._count))
+        own = tuple(jax.ShapeDtypeStruct((self._at_once, *a.shape), a.dtype) for a in numbers(self._policy))
+        few = jax.tree.map(lambda a: jax.ShapeDtypeStruct((self._at_once, *a.shape[1:]), a.dtype), world)
+        active = jax.ShapeDtypeStruct((self._at_once,), bool)
+        done = jax.tree.map(lambda a: jax.ShapeDtypeStruct((self._at_once, *a.shape), a.dtype), no_action())
+        fresh = jax.ShapeDtypeStruct((self._count,), bool)
+        problem, state = self._problem, self._state
+        twice = [("search", True), ("search", False), ("retrieval", False)]
+        questions = twice if isinstance(self._policy, AsksTwice) else [("__call__", False)]
+        asked = [(self._policy, own, problem, state, keys, rows, *how) for how in questions]
+
+        def choosing(question: tuple[Any, ...]) -> Callable[[], None] | None:
+            decision, _ = _propose.returns(*question)
+            results = None
+            if self._trials is not None and decision.alternatives is not None:
+                results = jax.ShapeDtypeStruct(decision.alternatives.worth.shape, np.int32)
+            return _choose.begin(decision, results)
+
+        return [
+            *(program("plan", _propose, *question) for question in asked),
+            *(Program("small ones", lambda: False, functools.partial(choosing, question)) for question in asked),
+            program("look", _look, problem, state, world, keys, rows, self._recogniser, problem.camera),
+            program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
+            program("small ones", _told, problem.poses, state.belief.exists, world),
+            program("small ones", _forget, problem, state, fresh),
+            program("small ones", _note, state, done, rows),
+            program("small ones", _some_worlds, world, rows),
+        ]
 
     def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
         """See `Slots`."""
-        self._state = _forget(self._problem, self._state, jnp.asarray(fresh))
+        self._state = _forget(self._problem, self._state, jax.device_put(np.asarray(fresh)))
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
         """See `Slots`."""
@@ -223,17 +278,58 @@ class ManySlots:
         return _known(self._problem, self._state.belief, world)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
-        """See `Slots`."""
-        found: dict[int, Choice] = {}
-        for some, padded in self._chunks(rows):
+        """See `Slots`.
+
+        Only where a target is found is asked whether to take it out, and only where it is not taken out is planned.
+        What is worth trying out is tried in all slots together.
+        """
+        if not isinstance(self._policy, AsksTwice):
+            return self._ask("__call__", keys, rows)
+        there = np.asarray(self._state.belief.found)
+        choices = self._ask("retrieval", keys, [r for r in rows if there[r]])
+        choices = {r: choice for r, choice in choices.items() if takes_target(choice)}
+        choices |= self._ask("search", keys, [r for r in rows if there[r] and r not in choices])
+        return choices | self._ask("search", keys, [r for r in rows if not there[r]], hidden=True)
+
+    def _ask(self, question: str, keys: Array, rows: Sequence[int], hidden: bool = False) -> dict[int, Choice]:
+        """What the policy answers to a question in some slots, after trials; see `_propose`."""
+        chunks = list(self._chunks(rows))
+        proposed = []
+        for some, padded in chunks:
             # Rows beyond the end decide by anything.
             told = [self._numbers[r] for r in some] + [self._numbers[some[0]]] * (self._at_once - len(some))
             own = tuple(np.stack(values) for values in zip(*told, strict=True))
-            decided = _decide(self._policy, own, self._problem, self._state, keys, padded)
+            proposed.append(_propose(self._policy, own, self._problem, self._state, keys, padded, question, hidden))
+        found: dict[int, Choice] = {}
+        for (some, padded), (decision, _), results in zip(
+            chunks, proposed, self._tried([len(some) for some, _ in chunks], proposed), strict=True
+        ):
+            decided = _choose(decision, results)
             self._state = _note(self._state, decided.action, padded)
             choice = jax.device_get(decided)
             found |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(some)}
         return found
+
+    def _tried(
+        self, counts: Sequence[int], proposed: Sequence[tuple[Decision, TrialScenes]]
+    ) -> Sequence[Int[np.ndarray, "n k"] | None]:
+        """What becomes of the alternatives of decisions in chunks of slots; None where nothing is tried.
+
+        Args:
+          counts: how many rows of each chunk there are; the others are beyond the end.
+          proposed: decisions and scenes of each chunk.
+        """
+        if self._trials is None or any(decision.alternatives is None for decision, _ in proposed) or not proposed:
+            return [None] * len(proposed)
+        rows = [
+            jax.tree.map(lambda a, count=count: a[:count], jax.device_get((scenes, decision.alternatives)))
+            for count, (decision, scenes) in zip(counts, proposed, strict=True)
+        ]
+        scenes, alternatives = jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)
+        results = self._trials(self._problem, scenes, alternatives.actions, alternatives.worth)
+        blank = np.full((self._at_once, results.shape[1]), TrialResult.UNKNOWN, np.int32)
+        parts = np.split(results, np.cumsum(counts)[:-1])
+        return [np.concatenate([part, blank[len(part) :]]).astype(np.int32) for part in parts]
 
     def took(self, actions: Mapping[int, Action]) -> None:
         """See `Slots`."""
@@ -253,7 +349,8 @@ class ManySlots:
         """See `Slots`."""
         found: dict[int, Verdict] = {}
         for some, padded in self._chunks(rows):
-            verdicts = judge_many(self._problem, _some_worlds(world, padded), padded < self._count)
+            active = jax.device_put(np.asarray(padded) < self._count)
+            verdicts = judge_many(self._problem, _some_worlds(world, padded), active)
             found |= dict(zip(some, verdicts, strict=False))
         return found
 
@@ -263,7 +360,12 @@ class ManySlots:
             some = rows[i : i + self._at_once]
             padded = np.full(self._at_once, self._count, np.int32)
             padded[: len(some)] = some
-            yield some, jnp.asarray(padded)
+            yield some, jax.device_put(padded)
+
+
+def _strong(tree: Any) -> Any:
+    """The same, with nothing of a weak type: what takes it is compiled once, whatever a policy returns."""
+    return jax.tree.map(lambda a: jax.lax.convert_element_type(a, jnp.result_type(a)), tree)
 
 
 def _some(tree: Any, rows: Int[Array, " n"]) -> Any:
@@ -271,7 +373,7 @@ def _some(tree: Any, rows: Int[Array, " n"]) -> Any:
     return jax.tree.map(lambda a: a[jnp.minimum(rows, a.shape[0] - 1)], tree)
 
 
-@jax.jit
+@kept()
 def _some_worlds(world: World, rows: Int[Array, " n"]) -> World:
     """The worlds in the slots `rows`, empty ones for rows beyond the end."""
     here = _some(world, rows)
@@ -291,7 +393,7 @@ def _told(poses: Array, exists: Bool[Array, "slots x"], world: World) -> tuple[A
     return jnp.sum(exists, axis=1), jnp.take_along_axis(exists, nearest[:, None], axis=1)[:, 0]
 
 
-@jax.jit
+@kept()
 def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"]) -> PlannerState:
     """Let the fresh slots know nothing."""
     belief, action = jax.tree.map(
@@ -302,13 +404,13 @@ def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"])
     return state.replace(belief=belief, action=action)
 
 
-@jax.jit
+@kept()
 def _note(state: PlannerState, action: Action, rows: Int[Array, " n"]) -> PlannerState:
     """Keep what was decided in the slots `rows` until the next look."""
     return state.replace(action=jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state.action, action))
 
 
-@functools.partial(jax.jit, static_argnames=("recogniser", "camera"))
+@kept(static_argnames=("recogniser", "camera"))
 def _look(
     problem: Problem,
     state: PlannerState,
@@ -332,27 +434,43 @@ def _look(
     return jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state, new)
 
 
-@jax.jit
-def _decide(
+@kept(static_argnames=("question", "hidden"))
+def _propose(
     policy: Policy,
     own: tuple[Array, ...],
     problem: Problem,
     state: PlannerState,
     keys: Array,
     rows: Int[Array, " n"],
-) -> Choice:
-    """What the policy decides in the slots `rows`, with the numbers in `own`, shape (n,) each, in place of its own."""
+    question: str,
+    hidden: bool,
+) -> tuple[Decision, TrialScenes]:
+    """What the policy decides in the slots `rows` before trials, and the scenes to try it in.
+
+    The numbers in `own`, shape (n,) each, are in place of the policy's own. The question is "__call__", or one of those
+    of a policy that `AsksTwice`, and `hidden` whether the target is found in none of the slots; both static.
+    """
 
     def one(values, key, mine):
-        return chosen(with_numbers(policy, values)(key, problem, mine.belief, mine.observation))
+        ask = getattr(with_numbers(policy, values), question)
+        return _strong((ask(key, problem, mine.belief, mine.observation), scenes_of(mine.belief, mine.observation)))
 
     mine, active = _some(state, rows), rows < keys.shape[0]
     # Where the target is not found and can be nowhere, and nothing stands, a decision costs next to nothing.
     belief = mine.belief.replace(exists=mine.belief.exists & active[:, None], found=mine.belief.found & active)
+    belief = without_grasps(belief) if hidden else belief
     objects = mine.observation.objects
     objects = objects.replace(valid=objects.valid & active[:, None])
     seen = mine.observation.replace(objects=objects)
     return jax.vmap(one)(own, _some(keys, rows), mine.replace(belief=belief, observation=seen))
+
+
+@kept()
+def _choose(decisions: Decision, results: Int[Array, "n k"] | None) -> Choice:
+    """What decisions come down to after trials, of which there may have been none."""
+    if results is not None:
+        decisions = jax.vmap(choose)(decisions, results)
+    return jax.vmap(chosen)(decisions)
 
 
 @kept()
@@ -361,7 +479,7 @@ def _swept_free(problem: Problem, seen: Observation, active: Bool[Array, ""]) ->
     return swept_free(problem.target_grasps, seen.objects, seen.target_pose, active & seen.target_visible)
 
 
-@jax.jit
+@kept()
 def _swept_free_many(problem: Problem, state: PlannerState, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
     """The same in the slots `rows`; False for rows beyond the end."""
     active = rows < state.belief.found.shape[0]

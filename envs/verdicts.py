@@ -66,9 +66,13 @@ def judge_many(problem: Problem, worlds: World, active: Bool[Array, " n"]) -> li
     """The verdicts on several scenes; fields of `worlds` have a leading axis. Next to nothing is computed, and the
     verdict is no, where `active` is false.
     """
-    sets = problem.target_grasps, paper_grasps(problem.shelf, problem.gripper, problem.target)
-    found = jax.device_get(_graspable_many(sets, problem.camera, worlds, active))
+    found = jax.device_get(graspable_many(judged_sets(problem), problem.camera, worlds, active))
     return [Verdict(*map(bool, each)) for each in zip(*found, strict=True)]
+
+
+def judged_sets(problem: Problem) -> tuple[TargetGrasps, TargetGrasps]:
+    """The sets of grasps that a `Verdict` is about, in its order."""
+    return problem.target_grasps, paper_grasps(problem.shelf, problem.gripper, problem.target)
 
 
 def swept_free(
@@ -105,8 +109,8 @@ def _graspable(grasps: TargetGrasps, objects: Superquadrics, pose: Float[Array, 
     return best_grasp(grasps, objects, pose).success
 
 
-@jax.jit
-def _graspable_many(
+@kept()
+def graspable_many(
     sets: Sequence[TargetGrasps], camera: Camera, worlds: World, active: Bool[Array, " n"]
 ) -> list[Bool[Array, " n"]]:
     """For each set of grasps whether one of them is free, in each of the worlds."""

@@ -1,4 +1,4 @@
-"""Jitted functions whose compiled forms may be kept on disk, so that a new process neither traces nor lowers them.
+"""Jitted functions that are compiled beforehand, many at the same time, and kept on disk for the next process.
 
 JAX's own cache of compilations spares the compiling alone: to find an entry a function is traced and lowered first, and
 for a planner that takes longer than all the rest. Here an entry is found by what a function would be traced from: the
@@ -16,6 +16,7 @@ import os
 import threading
 import uuid
 from collections.abc import Callable, Hashable, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,11 @@ class _Keeping:
         self.executables: Executables | None = None
         self.untraced: Any = None
 
+    def outside(self) -> None:
+        """Take note that nothing is being traced."""
+        if self.untraced is None:
+            self.untraced = get_opaque_trace_state()
+
 
 _KEEPING = _Keeping()
 _TRACING = threading.RLock()
@@ -62,24 +68,41 @@ def keep_in(folder: Path | None) -> None:
 
 
 class Kept:
-    """A jitted function that is looked up on disk before it is traced, where a program keeps what it compiles.
+    """A jitted function that can be compiled before it is called, and is looked up on disk before it is traced.
 
-    Anywhere else, inside of other transformations, for arguments on another device than the first, and for arguments
-    that cannot be told apart on disk (`identity.identity`), it is what `jax.jit` makes of it.
+    What was prepared with `begin` or `prepare` is called as it is. Where a program keeps what it compiles, all is
+    prepared at the latest when it is called. Anywhere else, inside of other transformations, and for arguments on
+    another device than the first, it is what `jax.jit` makes of it. Arguments that cannot be told apart on disk
+    (`identity.identity`) are compiled in every process.
     """
 
-    def __init__(self, function: Callable[..., Any], static_argnames: Sequence[str]) -> None:
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        static_argnames: Sequence[str] = (),
+        *,
+        on_disk: bool = True,
+        donate_argnums: Sequence[int] = (),
+    ) -> None:
         """Args:
-        function: a function of a module.
-        static_argnames: as of `jax.jit`.
+        function: a function of a module; any where it is not kept on disk.
+        static_argnames, donate_argnums: as of `jax.jit`.
+        on_disk: whether it may be kept there: it depends on nothing but its arguments.
         """
         functools.update_wrapper(self, function)
-        self.jitted = jax.jit(function, static_argnames=tuple(static_argnames))
+        self._options: dict[str, Any] = {
+            "static_argnames": tuple(static_argnames),
+            "donate_argnums": tuple(donate_argnums),
+        }
+        self.jitted = jax.jit(function, **self._options)
         self._static = frozenset(static_argnames)
         self._positions = tuple(inspect.signature(function).parameters)
         self._name = f"{function.__module__}.{function.__qualname__}"
-        self._loaded: dict[Hashable, Any] = {}
-        self._lock = threading.Lock()
+        self._on_disk = on_disk
+        # What runs a call, or will once it is compiled, by what tells calls apart in this process.
+        self._loaded: dict[Hashable, Future[Any]] = {}
+        # What was lowered here returns, as shapes.
+        self._returned: dict[Hashable, Any] = {}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         found = self._executable(args, kwargs)
@@ -92,23 +115,65 @@ class Kept:
         """Whatever else a jitted function offers, such as `lower`."""
         return getattr(self.jitted, name)
 
-    def prepare(self, *args: Any, **kwargs: Any) -> None:
-        """Load or compile what a call with these arguments needs, without calling it. May run in several threads.
+    def begin(self, *args: Any, **kwargs: Any) -> Callable[[], None] | None:
+        """Lower what a call with these arguments needs, without calling it.
 
-        Without a folder to keep executables in, nothing happens: the first call compiles.
+        Args:
+          *args, **kwargs: as of a call; where they are data, `jax.ShapeDtypeStruct` will do.
+
+        Returns:
+          What compiles it, or reads it from disk: to be called once, in any thread, since nothing in it needs Python.
+          None where nothing is left to do, and for arguments that only `jax.jit` serves.
+
+        Raises:
+          Exception: whatever is wrong with the function; then a call says so, too.
         """
-        self._executable(args, kwargs)
+        _KEEPING.outside()
+        key = self._key(args, kwargs)
+        mine: Future[Any] = Future()
+        if key is None or self._loaded.setdefault(key, mine) is not mine:
+            return None
+        try:
+            compiling = self._compiling(key, args, kwargs)
+        except BaseException as error:
+            self._failed(key, error)
+            raise
+
+        def finish() -> None:
+            try:
+                mine.set_result(compiling())
+            except BaseException as error:
+                self._failed(key, error)
+                raise
+
+        return finish
+
+    def prepare(self, *args: Any, **kwargs: Any) -> None:
+        """Load or compile what a call with these arguments needs, without calling it. May run in several threads."""
+        finish = self.begin(*args, **kwargs)
+        if finish is not None:
+            finish()
+
+    def returns(self, *args: Any, **kwargs: Any) -> Any:
+        """The shapes of what a call returns for which `begin` was called, so that what takes it can be prepared, too.
+
+        What is read from disk is waited for.
+
+        Raises:
+          KeyError: `begin` was not called for such arguments, or did not succeed.
+        """
+        key = self._key(args, kwargs)
+        found = self._returned[key] if key in self._returned else self._loaded[key].result().out_info
+        return jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type), found)
 
     def is_ready(self, *args: Any, **kwargs: Any) -> bool:
         """Whether `prepare` with these arguments has nothing to compile; what was kept may still have to be read."""
-        asked = self._asked(args, kwargs)
-        if asked is None:
+        _KEEPING.outside()
+        key = self._key(args, kwargs)
+        if key is None or key in self._loaded:
             return True
-        executables, key, described = asked
-        if key in self._loaded:
-            return True
-        said = described()
-        return said is None or executables.has(self._name, said)
+        said = self._said(args, kwargs)
+        return said is not None and _KEEPING.executables is not None and _KEEPING.executables.has(self._name, said)
 
     def _split(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any], Any]:
         """The arguments that are data, by position and by name, and those that are static."""
@@ -118,80 +183,106 @@ class Kept:
         moving = tuple(arg for arg, fixed in zip(args, places, strict=True) if not fixed)
         return moving, {name: value for name, value in kwargs.items() if name not in self._static}, tuple(static)
 
-    def _asked(
-        self, args: tuple[Any, ...], kwargs: dict[str, Any]
-    ) -> tuple[Executables, Hashable, Callable[[], str | None]] | None:
-        """Where to look, what a call is known by in this process, and what on disk; None where nothing is kept."""
-        executables = _KEEPING.executables
-        if executables is None or get_opaque_trace_state() != _KEEPING.untraced or len(args) > len(self._positions):
+    def _key(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Hashable | None:
+        """What a call is known by in this process; None where it is left to `jax.jit`."""
+        if get_opaque_trace_state() != _KEEPING.untraced or len(args) > len(self._positions):
             return None
+        told = self._told(args, kwargs)
+        if told is None or told[-1][-1] == "True":
+            return None
+        return (_KEEPING.executables, *told)
+
+    def _told(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...] | None:
+        """What a call is compiled for: structure, shapes, static arguments, settings; None for what is no array."""
         moving, named, static = self._split(args, kwargs)
         leaves, tree = jax.tree.flatten((moving, named))
         if not all(_plain(leaf) for leaf in leaves):
             return None
-        shapes = tuple(_shape(leaf) for leaf in leaves)
         settings = tuple(str(getattr(jax.config, name)) for name in SETTINGS)
-        if settings[-1] == "True":
+        return tree, tuple(_shape(leaf) for leaf in leaves), static, settings
+
+    def _said(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> str | None:
+        """What a call is known by on disk; None where it cannot be told apart there, or nothing is kept."""
+        if _KEEPING.executables is None or not self._on_disk:
             return None
-
-        def described() -> str | None:
-            try:
-                return identity((tree, shapes, static, settings))
-            except Unidentified:
-                return None
-
-        return executables, (executables, tree, shapes, static, settings), described
+        try:
+            return identity(self._told(args, kwargs))
+        except Unidentified:
+            return None
 
     def _executable(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """What runs a call; None where it is left to `jax.jit`."""
-        asked = self._asked(args, kwargs)
-        if asked is None:
+        if not self._loaded and _KEEPING.executables is None:
             return None
-        executables, key, described = asked
-        if key not in self._loaded:
-            with self._lock:
-                mine = self._loaded.setdefault((key, threading.Lock), threading.Lock())
-            # Other calls of this function may be compiled at the same time, the same call only once.
-            with mine:
-                if key not in self._loaded:
-                    self._loaded[key] = self._found(executables, described(), args, kwargs)
-        return self._loaded[key]
+        key = self._key(args, kwargs)
+        if key is None:
+            return None
+        if key not in self._loaded and _KEEPING.executables is not None:
+            self.prepare(*args, **kwargs)
+        found = self._loaded.get(key)
+        # Where another thread could not compile it, this one finds out why.
+        return None if found is None or found.exception() is not None else found.result()
 
-    def _found(self, executables: Executables, said: str | None, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        if said is None:
-            return None
-        moving, named, _ = self._split(args, kwargs)
-        found = executables.load(self._name, said, jax.tree.structure((moving, named)))
-        if found is None:
-            found = self._compiled(args, kwargs)
+    def _failed(self, key: Hashable, error: BaseException) -> None:
+        self._loaded.pop(key).set_exception(error)
+
+    def _compiling(self, key: Hashable, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Callable[[], Any]:
+        """What gives the executable of a call: all that needs Python is done."""
+        said, executables = self._said(args, kwargs), _KEEPING.executables
+        if said is None or executables is None:
+            return functools.partial(_compile, self._lowered(key, args, kwargs))
+
+        def load() -> Any:
+            moving, named, _ = self._split(args, kwargs)
+            return executables.load(self._name, said, jax.tree.structure((moving, named)))
+
+        def compile_and_save(lowered: Any) -> Any:
+            found = _compile(lowered)
             executables.save(self._name, said, found)
-        return found
+            return found
 
-    def _compiled(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """The function, compiled for some arguments, such that it can be kept.
+        if executables.has(self._name, said):
+            # What is damaged is compiled all the same, where it is found to be.
+            return lambda: load() or compile_and_save(self._lowered(key, args, kwargs, alone=True))
+        return functools.partial(compile_and_save, self._lowered(key, args, kwargs, alone=True))
 
-        What JAX reads from its own cache cannot be written a second time, so that it must not be found there: the name
-        of a program counts.
+    def _lowered(self, key: Hashable, args: tuple[Any, ...], kwargs: dict[str, Any], alone: bool = False) -> Any:
+        """The function, lowered for some arguments.
+
+        Args:
+          key: of the call.
+          args, kwargs: of a call.
+          alone: such that it can be kept. What JAX reads from its own cache cannot be written a second time, so that it
+            must not be found there: the name of a program counts.
         """
+        jitted = self.jitted
+        if alone:
 
-        @functools.wraps(self.__wrapped__)
-        def fresh(*args, **kwargs):
-            return self.__wrapped__(*args, **kwargs)
+            @functools.wraps(self.__wrapped__)
+            def fresh(*args, **kwargs):
+                return self.__wrapped__(*args, **kwargs)
 
-        fresh.__name__ = f"{fresh.__name__}_{uuid.uuid4().hex[:8]}"
+            fresh.__name__ = f"{fresh.__name__}_{uuid.uuid4().hex[:8]}"
+            jitted = jax.jit(fresh, **self._options)
         # One after the other, so that the first is compiled, for which Python is not needed, as the next is traced.
         with _TRACING:
-            lowered = jax.jit(fresh, static_argnames=tuple(self._static)).lower(*args, **kwargs)
-            _forget_source(lowered)
-        # On a CPU with `CPU_OPTIONS`, where XLA knows them and nobody else has a say.
-        if jax.devices()[0].platform == "cpu" and not os.environ.get("XLA_FLAGS"):
-            try:
-                return lowered.compile(compiler_options=CPU_OPTIONS)
-            except Exception as error:
-                # What an unknown option raises differs between versions.
-                if not any(option in str(error) for option in CPU_OPTIONS):
-                    raise
-        return lowered.compile()
+            lowered = jitted.lower(*args, **kwargs)
+            self._returned[key] = lowered.out_info
+            if alone:
+                _forget_source(lowered)
+        return lowered
+
+
+def _compile(lowered: Any) -> Any:
+    """Compile, on a CPU with `CPU_OPTIONS`, where XLA knows them and nobody else has a say."""
+    if jax.devices()[0].platform == "cpu" and not os.environ.get("XLA_FLAGS"):
+        try:
+            return lowered.compile(compiler_options=CPU_OPTIONS)
+        except Exception as error:
+            # What an unknown option raises differs between versions.
+            if not any(option in str(error) for option in CPU_OPTIONS):
+                raise
+    return lowered.compile()
 
 
 def kept(*, static_argnames: Sequence[str] = ()) -> Callable[[Callable[..., Any]], Kept]:

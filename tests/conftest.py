@@ -43,7 +43,7 @@ GROUPS = {
         "test_envs_batch_episode",
         "test_envs_protocols",
         "test_envs_verdicts",
-        "test_envs_warm_up",
+        "test_preparing",
         "test_readme",
         "test_docs",
     ),

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import textwrap
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +59,8 @@ def test_a_second_process_traces_nothing(folder):
     assert file.name.startswith("scaled-")
     again = another_process()
     assert again.is_ready(Camera(), VALUES)
+    again.prepare(Camera(), VALUES)
+    assert again.returns(Camera(), VALUES)["sum"] == jax.ShapeDtypeStruct((), jnp.float32)
     second = again(Camera(), VALUES)
     again(Camera(), jnp.asarray(VALUES))
     assert TRACED == []
@@ -155,13 +158,48 @@ def test_a_damaged_entry_is_compiled_anew(folder, damage):
 
 def test_nothing_is_kept_unless_a_program_asks_for_it():
     function, values = another_process(), np.ones(7, np.float32)
-    function.prepare(Camera(), values)
-    assert TRACED == []
-    assert function.is_ready(Camera(), values)
     function(Camera(), values)
     assert TRACED == ["scaled"]
     function(Camera(), values)
     assert TRACED == ["scaled"]
+
+
+def test_what_is_prepared_in_memory_is_what_is_called():
+    """With shapes in the place of data; lowered first, compiled in another thread, and not traced again."""
+    function, values = another_process(), np.ones(11, np.float32)
+    called = function.jitted._cache_size()
+    assert not function.is_ready(Camera(), values)
+    finish = function.begin(Camera(), jax.ShapeDtypeStruct((11,), jnp.float32))
+    assert TRACED == ["scaled"]
+    assert function.begin(Camera(), values) is None
+    assert function.returns(Camera(), values)["scaled"] == jax.ShapeDtypeStruct((11,), jnp.float32)
+    threading.Thread(target=finish).start()
+    # Who calls it before it is compiled waits for it.
+    result = function(Camera(), values)
+    assert TRACED == ["scaled"]
+    assert function.jitted._cache_size() == called
+    expected = jax.jit(scaled, static_argnames="camera")(Camera(), values)
+    jax.tree.map(np.testing.assert_array_equal, as_numbers(result), as_numbers(expected))
+
+
+def test_what_is_wrong_with_what_is_prepared_is_said_there_and_by_a_call():
+    def wrong(values):
+        raise ValueError("wrong")
+
+    function = Kept(wrong, on_disk=False)
+    for _ in range(2):
+        with pytest.raises(ValueError, match="wrong"):
+            function.begin(VALUES)
+    with pytest.raises(ValueError, match="wrong"):
+        function(VALUES)
+
+
+def test_what_depends_on_more_than_its_arguments_stays_out_of_the_folder(folder):
+    for factor in (2.0, 3.0):
+        function = Kept(lambda values, factor=factor: values * factor, on_disk=False)
+        function.prepare(VALUES)
+        assert float(function(VALUES)[0]) == factor
+    assert not folder.exists()
 
 
 def test_inside_of_transformations_it_is_a_jitted_function(folder):
@@ -224,7 +262,7 @@ class Colour(compiled.Kept):
 
 
 def test_identities_are_of_values():
-    same = [(Shelf(), Shelf()), (np.ones(2), np.ones(2)), ({"a": 1, "b": 2.0}, {"b": 2.0, "a": 1})]
+    same = [(Shelf(), Shelf()), (np.ones(2), np.ones(2)), ({"a": 1, "b": 2.0}, {"a": 1, "b": 2.0})]
     other = [
         (Shelf(), dataclasses.replace(Shelf(), board=0.5)),
         (np.ones(2), np.ones(3)),
@@ -254,9 +292,10 @@ SEARCH = """
     import jax
     from mechsearch_jax.envs.episodes import run_episode, target_of
     from mechsearch_jax.envs.native import NativeSimulator
-    from mechsearch_jax.envs.warm_up import first_decision, prepared
+    from mechsearch_jax.preparing import first_decision, prepared
     from mechsearch_jax.planner import search_for_grasp
     from mechsearch_jax.planner.cache import cached_problem, keep_compilations
+    from mechsearch_jax.robot.motion import MotionConfig
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
     traced = []
@@ -269,7 +308,7 @@ SEARCH = """
     keep_compilations()
     scene = load_scenario(example_scenarios()["first-light"])
     problem, policy = cached_problem(target_of(scene)), search_for_grasp(sequences=2, horizon=1)
-    with prepared(first_decision(problem, policy), print):
+    with prepared(first_decision(problem, policy, MotionConfig()), print):
         episode = run_episode(0, scene, problem, policy, NativeSimulator(), max_steps=1)
     names = "update_belief", "_plan", "target_pixels", "_told", "_keys_at"
     print(*(f"{name} {traced.count(name)}" for name in names))
@@ -299,9 +338,9 @@ def run(script, folder):
 @pytest.mark.slow
 def test_a_second_start_traces_nothing_that_ran_before(tmp_path):
     *lines, counts, first = run(SEARCH, tmp_path)
-    assert lines == ["compiling the plan and the belief, once: 2 left", *lines[1:]]
-    assert sorted(lines[1:])[0].startswith("compiled the ")
-    assert lines[-1].endswith(": 0 left")
+    assert lines[0].startswith("compiling: plan, belief, motion of ")
+    assert lines[0].endswith("; 0 of 6 done")
+    assert lines[-1] == "compiling; 6 of 6 done"
     # What was prepared is what was called.
     assert counts == "update_belief 1 _plan 1 target_pixels 1 _told 1 _keys_at 1"
     *lines, counts, second = run(SEARCH, tmp_path)

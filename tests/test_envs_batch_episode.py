@@ -136,6 +136,71 @@ def test_a_slot_is_free_for_the_next_as_soon_as_its_episode_ends(problem):
     assert ("plan", 1) in stages
 
 
+class FlowingStage(Stage):
+    """The same, in which actions take their time: that of the last slot is over first, one after the other."""
+
+    def __init__(self, *told):
+        super().__init__(*told)
+        self.under_way = {}
+        self.asked = []
+
+    def begin(self, actions, active):
+        rows = np.flatnonzero(active).tolist()
+        assert not self.under_way.keys() & set(rows)
+        self.under_way |= {row: jax.tree.map(lambda a, row=row: a[row], actions) for row in rows}
+
+    def advance(self, least):
+        self.asked.append((least, len(self.under_way)))
+        done = sorted(self.under_way, reverse=True)[:least]
+        actions = jax.tree.map(lambda a: np.stack([a] * len(self.names)), jax.device_get(no_action()))
+        for row in done:
+            for all_of_it, mine in zip(jax.tree.leaves(actions), jax.tree.leaves(self.under_way.pop(row)), strict=True):
+                all_of_it[row] = mine
+        mask = np.isin(np.arange(len(self.names)), done)
+        return mask, jax.device_get(self.execute(actions, mask))
+
+
+def test_a_slot_that_has_acted_goes_on_while_others_still_act(problem):
+    told = ({"hidden": reveal}, {"two": Failure.DROPPED})
+    starts = [TWO, OPEN, HIDDEN, dataclasses.replace(OPEN, name="open again")]
+    flowing = FlowingStage(*told)
+    episodes, together = run(problem, starts, flowing, 2)
+    assert [without_times(e) for e in episodes] == [
+        without_times(e) | {"config": e.config | {"simulator": "Stage"}}
+        for e in run(problem, starts, Stage(*told), 2)[0]
+    ]
+    # The other slot has run three episodes when the first action of the first is over.
+    assert [next(filter(None, names)) for names in flowing.executed] == [
+        "open",
+        "hidden",
+        "hidden",
+        "open again",
+        "two",
+        "two",
+    ]
+    assert flowing.asked == [(1, 2)] * 4 + [(1, 1)] * 2
+    assert together == [1, 1, 1, 1]
+    assert all(step.timings["simulate"] > 0 for e in episodes for step in e.steps if step.action)
+
+
+def test_nothing_is_compiled_in_the_rounds(problem):
+    """All that is traced, lowered or compiled is, before the first episode begins; whatever becomes of them."""
+    rounds, compiled = [], []
+
+    def note(event, seconds, **about):
+        if rounds and event.startswith("/jax/core/compile/"):
+            compiled.append((rounds[-1], event.rpartition("/")[2], about.get("fun_name")))
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    stages = {"busy": lambda stage, count: rounds.append(stage), "compiling": lambda text: None}
+    try:
+        run(problem, [TWO, OPEN, HIDDEN], FlowingStage({"hidden": reveal}), 2, **stages)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
+    assert {"recognise", "plan", "judge", "simulate"} <= set(rounds)
+    assert compiled == []
+
+
 def test_one_slot_runs_episodes_one_after_the_other(problem):
     stage = Stage({"hidden": reveal})
     episodes, together = run(problem, [OPEN, HIDDEN, OPEN], stage, 1)

@@ -8,7 +8,7 @@ import pytest
 from mechsearch_jax.compiled import _KEEPING
 from mechsearch_jax.envs import cell
 from mechsearch_jax.envs.method import Method
-from mechsearch_jax.envs.rehearsals import rehearsal
+from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.planner.settings import Settings, load_settings
@@ -44,7 +44,7 @@ def test_a_file_says_workcell_and_planner(file):
     theirs = Method(config=settings.config, workcell=settings.workcell).policy()
     mine = searcher._policy
     assert mine.config == theirs.config
-    assert mine.rehearsal is theirs.rehearsal is rehearsal("physics")
+    assert (mine.tries, searcher._trials) == (theirs.tries, rehearsal("physics")) == (True, rehearsal("physics"))
     assert (mine.predict, mine.objective, mine.plan) == (theirs.predict, theirs.objective, theirs.plan)
 
 
@@ -53,7 +53,7 @@ def test_what_is_given_goes_before_the_file(file):
     searcher = cell.load_searcher(file, camera=camera, keep=False, rehearsal="none", max_steps=7, seed=3)
     assert searcher.workcell.camera == camera
     assert (searcher.config.max_steps, searcher.config.planner.gamma) == (7, 0.8)
-    assert searcher._policy.rehearsal is None
+    assert (searcher._policy.tries, searcher._trials) == (False, None)
     with pytest.raises(InputError, match="option speed is unknown"):
         cell.load_searcher(file, keep=False, speed=1.0)
 

@@ -89,7 +89,7 @@ def test_the_row_of_a_job_is_that_of_its_episode():
 def test_a_policy_of_another_module_is_found(tmp_path, monkeypatch):
     source = (
         "class Mine:",
-        "    def __init__(self, config, *, push_model, later_push_model, rehearsal):",
+        "    def __init__(self, config, *, push_model, later_push_model, tries):",
         "        self.known = config.gamma, push_model is later_push_model",
         "    def __call__(self, key, problem, belief, observation): ...",
     )

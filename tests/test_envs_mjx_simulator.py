@@ -16,7 +16,7 @@ import pytest
 from test_envs_simulator import BOARD, pick_and_place, pose, push, scene, standing, take_out
 
 from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
-from mechsearch_jax.envs import mjx_step, model, simulator
+from mechsearch_jax.envs import mjx_step, model, simulator, warp_kernels
 from mechsearch_jax.envs.batch_model import BodyFields, body_fields
 from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
 from mechsearch_jax.envs.native import NativeWorld
@@ -24,6 +24,7 @@ from mechsearch_jax.envs.outcome import Failure, Overflow
 from mechsearch_jax.envs.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import TARGET, from_scenario, slots
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.preparing import prepare
 from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -225,6 +226,81 @@ def test_a_push_ends_where_the_native_simulator_has_it_and_other_worlds_stay(sim
 
 
 @pytest.mark.slow
+def test_worlds_need_not_wait_for_each_other_and_nothing_is_left_to_compile(sim, monkeypatch):
+    """What is prepared is all: of JAX, and of Warp's kernels. Each world is what it is in a batch that waits."""
+    starts = [scene(BOX), scene(BOX, BOTTLE), scene(BOX)]
+    actions = stack(sideways(0.05), sideways(0.12), out_of_reach())
+    sim = MjxSimulator(sim.shelf, sim.camera, sim.config)
+    shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct((3, *a.shape), a.dtype), from_scenario(starts[0]))
+    prepare(sim.programs(shapes), lambda text: None)
+    from warp._src.context import Module
+
+    compiled, compiling = [], Module._compile
+
+    def noted(module, *args, **options):
+        if compiling(module, *args, **options):
+            compiled.append(module.name)
+
+    monkeypatch.setattr(Module, "_compile", noted)
+    sim.reset(starts)
+
+    def note(event, seconds, **about):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(about.get("fun_name"))
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        outcome = sim.execute(actions)
+        together = jax.device_get(sim.world)
+        sim.reset(starts)
+        sim.begin(actions, jax.device_put(np.array([True, False, False])))
+        with pytest.raises(InputError, match="world 0 is moving"):
+            sim.begin(actions)
+        assert sim.advance(1)[0].tolist() == [True, False, False]
+        # Of two that begin, one has nothing to do, and is done at once.
+        sim.begin(actions, jax.device_put(np.array([False, True, True])))
+        done, told = sim.advance(1)
+        assert done.tolist() == [False, False, True]
+        assert told.reason(2) == "unreachable"
+        sim.begin(actions, jax.device_put(np.array([True, False, False])))
+        steps = [sim.advance(1) for _ in range(2)]
+        sim.replace({0: starts[1]})
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
+    assert [done.tolist() for done, _ in steps] in (
+        [[True, False, False], [False, True, False]],
+        [[False, True, False], [True, False, False]],
+    )
+    (late,) = [told for done, told in steps if done[1]]
+    assert int(late.steps[1]) == int(outcome.steps[1])
+    for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(jax.device_get(sim.world)), strict=True):
+        np.testing.assert_array_equal(a[1:], b[1:])
+    np.testing.assert_array_equal(sim.world.position[0], from_scenario(starts[1]).position)
+    assert compiled == []
+
+
+def test_who_compiles_kernels_says_where_it_cannot(tmp_path, monkeypatch):
+    import warp
+
+    monkeypatch.setattr(warp.config, "kernel_cache_dir", str(tmp_path))
+    wait = warp_kernels.compile_kernels(model.compile_model(Shelf(), Camera(), 0.004), ("nothing",), 2, 128, 320, "cpu")
+    with pytest.warns(UserWarning, match="kernels are compiled one by one when they are needed: .*nothing"):
+        wait()
+    assert not list(tmp_path.iterdir())
+
+
+def test_kernels_that_were_compiled_are_not_compiled_again(tmp_path, monkeypatch):
+    import warp
+
+    monkeypatch.setattr(warp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(warp_kernels.sys, "executable", "true")
+    asked = model.compile_model(Shelf(), Camera(), 0.004), ("geom_size",), 2, 128, 320, "cpu"
+    warp_kernels.compile_kernels(*asked)()
+    assert warp_kernels.compile_kernels(*asked) is None
+    assert warp_kernels.compile_kernels(*asked[:2], 3, *asked[3:]) is not None
+
+
+@pytest.mark.slow
 def test_all_kinds_at_once_agree_with_the_native_simulator(sim):
     picked = pick_and_place(pose(0.59, 0.1, 0.1), pose(0.5, 0.22, 0.1))
     off_the_board = pick_and_place(pose(0.596, 0.1, 0.1), pose(0.39, 0.1, 0.1))
@@ -240,7 +316,7 @@ def test_all_kinds_at_once_agree_with_the_native_simulator(sim):
     ]
     sim.reset([start for start, _ in cases])
     outcomes = sim.execute(stack(*[action for _, action in cases]))
-    assert sim._execute._cache_size() <= 2
+    assert sim._go_on._cache_size() <= 2
     for i, (start, action) in enumerate(cases):
         outcome, world = native_of(start, action)
         assert outcomes.reason(i) == outcome.reason()
@@ -255,14 +331,14 @@ def test_all_kinds_at_once_agree_with_the_native_simulator(sim):
     assert outcomes.fallen[5, 0]
 
     # The world goes on from there, without a new compilation; what fell before spoils no retrieval.
-    compiled = sim._execute._cache_size()
+    compiled = sim._go_on._cache_size()
     again = sim.execute(stack(*[taken] * len(cases)), jnp.arange(len(cases)) == 5)
     assert again.reason(5) is None
     assert bool(again.held[5])
     assert bool(again.retrieved[5])
     assert bool(again.fallen[5, 0])
     assert not bool(again.fallen[5, TARGET])
-    assert sim._execute._cache_size() == compiled
+    assert sim._go_on._cache_size() == compiled
 
 
 @pytest.mark.slow

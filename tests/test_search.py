@@ -16,9 +16,9 @@ from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs.cell import load_searcher
 from mechsearch_jax.envs.compile_clock import CompileClock
-from mechsearch_jax.envs.physics_rehearsal import NativeRehearsal
 from mechsearch_jax.envs.simulated_camera import observe
 from mechsearch_jax.envs.snapshot import Snapshot, oracle
+from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
@@ -26,7 +26,7 @@ from mechsearch_jax.geometry.transforms import compose
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.perception.plausibility import image_faults
-from mechsearch_jax.planner import Decision, initial_belief, update_belief
+from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.impasse import impasse
 from mechsearch_jax.planner.presets import standard
 from mechsearch_jax.planner.rollout import no_sequences
@@ -194,9 +194,10 @@ def test_where_the_arm_cannot_do_what_was_decided_on_others_are_drawn(problem):
     assert len(drawn) == 2 * DRAWS == len({str(key) for key in drawn})
 
 
-def test_a_policy_is_given_its_rehearsal_itself(problem):
-    with pytest.raises(InputError, match="give it the rehearsal"):
-        Searcher(policy=idle, rehearsal=lambda *args: None)
+def test_what_a_policy_does_not_propose_cannot_be_tried(problem):
+    with pytest.raises(InputError, match="the policy proposes nothing to be tried; make it with tries=True"):
+        Searcher(policy=search_for_grasp(), rehearsal=NativeTrials())
+    assert Searcher(policy=search_for_grasp(tries=True), rehearsal=NativeTrials())._policy.tries
     with pytest.raises(InputError, match="push_model would have no effect"):
         Searcher(policy=idle, push_model=QuasiStatic())
 
@@ -211,15 +212,16 @@ def test_an_option_that_would_have_no_effect_is_refused():
 
 
 def test_what_a_configuration_names_and_a_slot_holds_decides():
-    simulated = NativeRehearsal()
+    simulated = NativeTrials()
     searcher = Searcher(config=standard(gamma=0.5, push_model="quasi-static"), rehearsal=simulated)
-    assert searcher._policy.rehearsal is simulated
+    assert searcher._trials is simulated
+    assert searcher._policy.tries
     assert searcher._policy.config.gamma == 0.5
     assert searcher._policy.predict.push_model is own_push_model("quasi-static")
 
 
 def test_where_nothing_is_tried_out_it_says_so(problem):
-    plain, bold = Searcher(), Searcher(rehearsal=NativeRehearsal())
+    plain, bold = Searcher(), Searcher(rehearsal=NativeTrials())
     for searcher in (plain, bold):
         searcher.problem, searcher.recogniser = problem, lambda *images: seen(OPEN)
     assert "no action is tried out before it is made" in plain.check().notices[0]

@@ -143,7 +143,7 @@ def transfers(
     T_world_gripper: Float[Array, "w 4 4"],
     T_world_object: Float[Array, "w 4 4"],
     wanted: Bool[Array, " w"],
-) -> Bool[Array, "w-1"]:
+) -> Bool[Array, " places"]:
     """To which of several places an object can be taken from where it is grasped.
 
     The arm has to follow both ways closely, in one configuration: between them it is outside the shelf, where it may

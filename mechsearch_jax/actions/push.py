@@ -235,7 +235,7 @@ class Push:
             jnp.asarray(np.repeat(owner, d)),
         )
         grippers = gripper_clouds(tables).points
-        return masked_vmap(one, usable.reshape(-1), grippers, (possible, bodies), rows, block=8).reshape(n, v, d)
+        return masked_vmap(one, usable.reshape(-1), grippers, (possible, bodies), rows, block=64).reshape(n, v, d)
 
     def draft(self, key, space: ActionSpace, tables: ActionTables, scene, possible, ways, index, way, wanted) -> Draft:
         """The push, and the space that it sweeps between its ends."""

@@ -57,10 +57,11 @@ def _run(
     """Run the episode; what was told of it, and what was recorded."""
     from mechsearch_jax.envs.episodes import run_episode
     from mechsearch_jax.envs.simulator import SimulatorConfig
-    from mechsearch_jax.envs.warm_up import first_decision, prepared
+    from mechsearch_jax.preparing import first_decision, prepared
 
     policy, workcell = chosen.policy(), chosen.workcell
-    with prepared(first_decision(problem, policy), lambda text: console.print(text, style="dim")):
+    first = first_decision(problem, policy, SimulatorConfig().motion)
+    with prepared(first, lambda text: console.print(text, style="dim")):
         # These take long to import, and meanwhile what the first decision needs is read or compiled.
         from mechsearch_jax.envs.narration import Narrator
         from mechsearch_jax.envs.native import NativeSimulator
@@ -83,6 +84,7 @@ def _run(
             chosen.options(),
             narrator,
             chosen.terms,
+            chosen.trials(),
         )
     return episode, narrator, recorder
 

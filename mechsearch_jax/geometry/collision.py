@@ -15,7 +15,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Integer
+from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.collision_kernel import collide, kernel_available
@@ -55,7 +55,7 @@ def clouds_of(points: Float[Array, "c 3 p"]) -> Clouds:
 
 def collisions(
     clouds: Clouds,
-    cloud: Integer[Array | np.ndarray, " m"],
+    cloud: Int[Array | np.ndarray, " m"],
     T_world_cloud: Float[Array, "m 4 4"],
     scene: Superquadrics,
     mask: Bool[Array, "m n"],

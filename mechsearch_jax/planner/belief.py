@@ -119,6 +119,15 @@ def update_belief(
     )
 
 
+def without_grasps(belief: Belief) -> Belief:
+    """What is known while the target is not found, without the grasps that it then could be taken out with.
+
+    They would be masked out all the same; a program that is traced without them has nothing to compute of them.
+    """
+    grasps = belief.grasps
+    return belief.replace(grasps=grasps.replace(feasible=grasps.feasible[..., :0], q=grasps.q[..., :0, :, :]))
+
+
 def possible_poses(
     belief: Belief, exists: Bool[Array, " x"], target_at: Bool[Array, " x"] | None = None
 ) -> Bool[Array, " y"]:

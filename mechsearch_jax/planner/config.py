@@ -160,7 +160,7 @@ class Config:
       problem: how the problem is built.
       planner: how the planner decides.
       push_model: name of what predicts pushes; see `dynamics.named`, and `envs.push_models` for "physics".
-      rehearsal: name of what tries actions out before one is made; see `envs.rehearsals`. The paper tries nothing.
+      rehearsal: name of what tries actions out before one is made; see `envs.trials`. The paper tries nothing.
       max_steps: T, actions in an episode.
     """
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import flax.struct
@@ -18,23 +18,25 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array
 
+from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.belief import Belief
+from mechsearch_jax.planner.belief import Belief, without_grasps
 from mechsearch_jax.planner.config import PlannerConfig
 from mechsearch_jax.planner.imitation import IMITATIONS, Slots
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import Predict, PredictByKind
 from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import Propose, guided_draw
-from mechsearch_jax.planner.rehearsal import Rehearsal, rehearsed
-from mechsearch_jax.planner.retrieval import GraspChoice, take_out
+from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at, worth_trying
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
+from mechsearch_jax.planner.trials import grasps_to_try, in_turn, sequences_to_try
 
 
 class Policy(Protocol):
@@ -61,7 +63,7 @@ class PolicyFactory(Protocol):
         *,
         push_model: PushModel | None = None,
         later_push_model: PushModel | None = None,
-        rehearsal: Rehearsal | None = None,
+        tries: bool = False,
     ) -> Policy:
         """A policy with a configuration and models, of which it may take what it likes.
 
@@ -69,7 +71,7 @@ class PolicyFactory(Protocol):
           config: how it decides.
           push_model: predicts pushes; the learned one if left out.
           later_push_model: predicts those that are not the first action of a sequence; `push_model` if left out.
-          rehearsal: tries actions out before one is made; if left out, nothing does.
+          tries: whether its decisions are to hold what is worth trying out; see `trials`.
         """
         ...
 
@@ -85,11 +87,14 @@ class Plan(Protocol):
 class Search(flax.struct.PyTreeNode):
     """The engine as a `Policy`: takes a found target out as soon as a grasp will do, and else plans.
 
+    It also is a policy that `trials.AsksTwice`.
+
     Attributes:
       config: how it decides.
       propose, predict, objective: the slots; static.
       plan: how it plans with them; static.
-      rehearsal: tries actions out before one is made; static. None where nothing does: a grasp then has to hit nothing.
+      tries: whether its decisions hold what is worth trying out; static. What it decides does not depend on that: a
+        grasp has to hit nothing, unless `trials.choose` finds one that succeeds.
     """
 
     config: PlannerConfig
@@ -97,52 +102,87 @@ class Search(flax.struct.PyTreeNode):
     predict: Predict = flax.struct.field(pytree_node=False)
     objective: Objective = flax.struct.field(pytree_node=False)
     plan: Plan = flax.struct.field(pytree_node=False, default=plan)
-    rehearsal: Rehearsal | None = flax.struct.field(pytree_node=False, default=None)
+    tries: bool = flax.struct.field(pytree_node=False, default=False)
 
     @property
     def _planning(self) -> Search:
-        """What a plan depends on: it is the same, and compiled once, whatever tries it out."""
-        return self.replace(rehearsal=None)
+        """What a plan depends on: it is the same, and compiled once, whether or not anything is tried out."""
+        return self.replace(tries=False)
 
-    def prepare(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> None:
-        """Load or compile what a plan with such arguments needs, without planning; see `compiled.Kept.prepare`."""
-        _plan.prepare(self._planning, key, problem, belief, observation)
+    def begin(
+        self, key: Array, problem: Problem, belief: Belief, observation: Observation
+    ) -> Callable[[], None] | None:
+        """Lower what a plan with such arguments needs, without planning; see `compiled.Kept.begin`."""
+        return _plan.begin(self._planning, key, problem, _as_known(belief), observation)
 
     def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
         """Whether nothing has to be compiled for a plan with such arguments; see `compiled.Kept.is_ready`."""
-        return _plan.is_ready(self._planning, key, problem, belief, observation)
+        return _plan.is_ready(self._planning, key, problem, _as_known(belief), observation)
 
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """See `Policy`."""
-        if not isinstance(belief.found, Tracer):
+        if not isinstance(belief.found, Tracer) and not belief.found:
             # Outside of any transformation, what is not needed is neither computed nor compiled.
-            if not belief.found:
-                return self._searched(key, problem, belief, observation)
-            grasp = take_out(self.rehearsal, problem, observation.objects, belief.found_pose)
-            # The belief may be known where the observation is traced.
-            if not isinstance(grasp.success, Tracer):
-                if not grasp.success:
-                    return self._searched(key, problem, belief, observation)
-                return _take_out(self._planning, observation, grasp)
+            return self.search(key, problem, belief, observation)
+        grasp = self.retrieval(key, problem, belief, observation)
+        able = grasp.action.kind == ActionKind.RETRIEVE
+        # The belief may be known where the observation is traced.
+        if not isinstance(able, Tracer):
+            if able:
+                return grasp
+            return _grasps_first(grasp, self.search(key, problem, belief, observation))
         # Both are computed, each with next to nothing to do where it does not count. A `cond` would under `vmap` give
         # every scene of a batch a problem of its own, and what they share could no longer be computed together.
-        grasp = take_out(self.rehearsal, problem, observation.objects, belief.found_pose, belief.found)
-        able = belief.found & grasp.success
         rest = observation.objects.replace(valid=observation.objects.valid & ~able)
-        planned = self._searched(
+        planned = self.search(
             key,
             problem,
             belief.replace(exists=belief.exists & ~able, found=belief.found & ~able),
             observation.replace(objects=rest),
         )
-        return jax.tree.map(lambda a, b: jnp.where(able, a, b), _take_out(self._planning, observation, grasp), planned)
+        if planned.alternatives is not None:
+            # What is planned for a target that is taken out has no objects.
+            planned = planned.replace(alternatives=planned.alternatives.replace(now=observation.objects))
+        both = _grasps_first(grasp, planned)
+        grasp = grasp.replace(alternatives=both.alternatives)
+        return jax.tree.map(lambda a, b: jnp.where(able, a, b), grasp, both)
 
-    def _searched(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
-        """What is planned, tried out if anything does."""
-        decision = _plan(self._planning, key, problem, belief, observation)
-        if self.rehearsal is None:
+    def retrieval(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
+        """Whether to take the target out where it is found: an action of kind RETRIEVE, or else of kind NONE.
+
+        Args:
+          key, problem, belief, observation: as of a `Policy`; the key is not used.
+        """
+        # Called the same as elsewhere where the target is known to be found, so that nothing is compiled twice.
+        active = (belief.found,) if isinstance(belief.found, Tracer) else ()
+        look = worth_trying if self.tries else graspable_at
+        grasp = look(problem, observation.objects, belief.found_pose, *active)
+        return _retrieval(self, belief, observation, grasp)
+
+    def search(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
+        """What is planned, as if no grasp would do.
+
+        Args:
+          key, problem, belief, observation: as of a `Policy`.
+        """
+        decision = _plan(self._planning, key, problem, _as_known(belief), observation)
+        if not self.tries:
             return decision
-        return rehearsed(self.rehearsal, problem, observation.objects, belief.found_pose, belief.found, decision)
+        reached = jnp.float32(self.objective.reached)
+        return decision.replace(alternatives=sequences_to_try(decision.sequences, observation.objects, reached))
+
+
+def _as_known(belief: Belief) -> Belief:
+    """The belief as a plan takes it: for a target that is known not to be found there is a program of its own."""
+    hidden = not isinstance(belief.found, Tracer) and jnp.ndim(belief.found) == 0 and not belief.found
+    return without_grasps(belief) if hidden else belief
+
+
+def _grasps_first(grasp: Decision, planned: Decision) -> Decision:
+    """What is planned, where grasps of the target may be tried before."""
+    if grasp.alternatives is None or planned.alternatives is None:
+        return planned
+    return planned.replace(alternatives=in_turn(grasp.alternatives, planned.alternatives))
 
 
 @kept()
@@ -152,15 +192,23 @@ def _plan(search: Search, key: Array, problem: Problem, belief: Belief, observat
 
 
 @kept()
-def _take_out(search: Search, observation: Observation, grasp: GraspChoice) -> Decision:
+def _retrieval(search: Search, belief: Belief, observation: Observation, grasp: GraspChoice) -> Decision:
+    """The decision to take a found target out with a grasp, or the first of several, that hits nothing."""
+    reached, objects = search.objective.reached, observation.objects
+    alternatives = None
+    if search.tries:
+        alternatives = grasps_to_try(grasp.action, grasp.feasible & belief.found, objects, reached)
+        grasp = jax.tree.map(lambda a: a[0], grasp)
+    able = belief.found & grasp.success
     return Decision(
-        action=grasp.action,
-        value=jnp.float32(0.0),
-        cost=jnp.float32(search.objective.reached),
+        action=jax.tree.map(lambda a, b: jnp.where(able, a, b), grasp.action, no_action()),
+        value=jnp.where(able, 0.0, jnp.inf),
+        cost=jnp.float32(reached),
         predicted_cost=jnp.float32(jnp.nan),
-        predicted=observation.objects,
-        sequences=no_sequences(search.config, observation.objects),
+        predicted=objects,
+        sequences=no_sequences(search.config, objects),
         refused=jnp.int32(0),
+        alternatives=alternatives,
     )
 
 
@@ -180,7 +228,7 @@ def search(
     *,
     push_model: PushModel | None = None,
     later_push_model: PushModel | None = None,
-    rehearsal: Rehearsal | None = None,
+    tries: bool = False,
     objective: Objective,
     propose: Propose = guided_draw,
     **changes: Any,
@@ -190,7 +238,7 @@ def search(
     Args:
       config: how it decides; the defaults if left out.
       push_model, later_push_model: predict pushes.
-      rehearsal: tries actions out before one is made.
+      tries: whether decisions hold what is worth trying out.
       objective: what it makes small.
       propose: samples an action in a state.
       **changes: fields of `config` that are to be different.
@@ -201,7 +249,7 @@ def search(
     push_model = push_model or own_push_model("learned")
     config = dataclasses.replace(_planner_config(config), **changes)
     slots = Slots(propose, PredictByKind(push_model, later_push_model or push_model), objective)
-    return Search(config=config, rehearsal=rehearsal, **IMITATIONS[config.imitates](slots)._asdict())
+    return Search(config=config, tries=tries, **IMITATIONS[config.imitates](slots)._asdict())
 
 
 # Minds the grasp while it searches: f and g together (equation 2).

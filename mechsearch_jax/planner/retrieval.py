@@ -1,8 +1,7 @@
 """How a target that has been found is taken out: the best of a dense set of grasps.
 
-Without a `Rehearsal` a grasp counts if nothing is hit on the whole way in and out. But many that hit something only
-brush it, or push aside what is free to move. So a few grasps are tried out, the clearest first, and the first is made
-that takes the target out.
+A grasp counts if nothing is hit on the whole way in and out. But many that hit something only brush it, or push aside
+what is free to move. So a few grasps are worth trying out, the clearest first; see `trials`.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.compiled import kept
@@ -25,7 +23,7 @@ from mechsearch_jax.geometry.transforms import compose, upright_pose
 from mechsearch_jax.graspability import INFEASIBLE, grasp_hits
 from mechsearch_jax.planner.found_target import found_grasps, found_hits
 from mechsearch_jax.planner.problem import Problem, TargetGrasps
-from mechsearch_jax.planner.rehearsal import TRIES, Rehearsal, Rehearsed
+from mechsearch_jax.planner.trials import TRIES
 
 # By how much objects are grown to find the grasp that keeps furthest from them [m].
 CLEARANCES = (0.004, 0.008, 0.012, 0.02)
@@ -42,49 +40,17 @@ class GraspChoice(flax.struct.PyTreeNode):
 
     Attributes:
       success: whether there is a grasp with which neither gripper, target nor arm hits anything on the whole way from
-        outside the shelf and out again, or, as `take_out` tells it, one that succeeded in a rehearsal.
+        outside the shelf and out again.
       feasible: whether arm and shelf allow the grasp.
       hits: number of objects that the grasp hits; `graspability.INFEASIBLE` if it is not feasible.
-      action: takes it out with the best grasp: the first that succeeded in a rehearsal, or of those that hit fewest the
-        one whose straight way keeps furthest from the objects.
+      action: takes it out with the best grasp: of those that hit fewest the one whose straight way keeps furthest from
+        the objects.
     """
 
     success: jax.Array
     feasible: jax.Array
     hits: jax.Array
     action: Action
-
-
-def take_out(
-    rehearsal: Rehearsal | None,
-    problem: Problem,
-    scene: Superquadrics,
-    pose: Float[Array, "3"],
-    *active: Bool[Array, ""],
-) -> GraspChoice:
-    """How to take out a target at a pose: as `graspable_at` says, or with what of `worth_trying` succeeds.
-
-    Where none of these does, one that hits nothing is made all the same.
-
-    Args:
-      rehearsal: tries out; None where only grasps count that hit nothing.
-      problem, scene, pose: as in `graspable_at`.
-      *active: nothing, or its last argument; so it is called, and compiled, as elsewhere.
-    """
-    if rehearsal is None:
-        return graspable_at(problem, scene, pose, *active)
-    tried = worth_trying(problem, scene, pose, *active)
-    here = active[0] if active else True
-    told = rehearsal(problem, scene, pose, here, tried.action, tried.feasible, (ActionKind.RETRIEVE,))
-    return _first_that_works(tried, tried.feasible, told)
-
-
-@kept()
-def _first_that_works(tried: GraspChoice, asked: Bool[Array, " k"], told: Int[Array, " k"]) -> GraspChoice:
-    """What succeeded, or the best of those that were tried where nothing did."""
-    works = asked & (told == Rehearsed.SUCCEEDED)
-    best = jax.tree.map(lambda a: a[jnp.argmax(works)], tried)
-    return best.replace(success=best.success | jnp.any(works))
 
 
 @kept()

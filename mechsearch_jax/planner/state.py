@@ -54,7 +54,7 @@ class Sequences(flax.struct.PyTreeNode):
 
     Attributes:
       actions: shape (S, M), of kind NONE from where a sequence found nothing more to do; all of them where the first
-        was refused because it did harm in a rehearsal.
+        was refused because it did harm in a trial.
       cost: J after each action, shape (S, M).
       value: equation 2 of the best prefix, shape (S,); infinite if there was no first action, or it was refused.
       length: number of actions in that prefix, shape (S,).
@@ -69,11 +69,29 @@ class Sequences(flax.struct.PyTreeNode):
     after: Superquadrics
 
 
+class Alternatives(flax.struct.PyTreeNode):
+    """What a decision could be instead, for trials to choose from, the best first; K of them.
+
+    Attributes:
+      actions: shape (K,).
+      worth: which of them are any, and worth a trial, shape (K,).
+      sequence: which of the decision's sequences each begins, shape (K,); -1 for a grasp that may take the target out.
+      now: the objects as they are, fields (N, ...).
+      reached: J where the target can be taken out.
+    """
+
+    actions: Action
+    worth: jax.Array
+    sequence: jax.Array
+    now: Superquadrics
+    reached: jax.Array
+
+
 class Decision(flax.struct.PyTreeNode):
     """What to do next, and everything that was considered.
 
     Attributes:
-      action: what to do next; of kind NONE if nothing is possible or all that was rehearsed was refused, of kind
+      action: what to do next; of kind NONE if nothing is possible or all that was tried out was refused, of kind
         RETRIEVE if the target can be taken out.
       value: equation 2 of the sequence it begins: the change of the cost, negative is good; 0 for a retrieval, infinite
         where nothing is done.
@@ -82,7 +100,8 @@ class Decision(flax.struct.PyTreeNode):
       predicted: the objects as they are expected to be after the action, without the target, fields (N, ...).
       sequences: all sampled sequences, the chosen one first, then the best; none has a first action where none was
         sampled.
-      refused: how many of the best sequences began with what did harm in a rehearsal.
+      refused: how many of the best sequences began with what did harm in a trial.
+      alternatives: what else could be done; None where the policy has not said.
     """
 
     action: Action
@@ -92,3 +111,4 @@ class Decision(flax.struct.PyTreeNode):
     predicted: Superquadrics
     sequences: Sequences
     refused: jax.Array | int = 0
+    alternatives: Alternatives | None = None

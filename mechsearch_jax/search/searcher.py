@@ -47,10 +47,12 @@ from mechsearch_jax.planner.impasse import impasse
 from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.presets import standard
 from mechsearch_jax.planner.problem import NOWHERE, Problem
-from mechsearch_jax.planner.rehearsal import Rehearsal
 from mechsearch_jax.planner.state import Decision
+from mechsearch_jax.planner.trials import Trials, decide
 from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.preparing import first_decision, prepared
 from mechsearch_jax.robot.free_motion import check_joints
+from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.search import warming
 from mechsearch_jax.search.images import Images, alike
 from mechsearch_jax.search.slots import UNTRIED, filled, tries_nothing
@@ -99,7 +101,7 @@ class Searcher:
         policy: Policy | None = None,
         push_model: PushModel | None = None,
         later_push_model: PushModel | None = None,
-        rehearsal: Rehearsal | None = None,
+        rehearsal: Trials | None = None,
         recogniser: Callable[[Problem], Any] = Recogniser,
         trajectories: TrajectoryConfig | None = None,
     ):
@@ -112,12 +114,12 @@ class Searcher:
             `envs.cell.load_searcher` makes all of that from a file.
           seed: of all random numbers.
           policy: what decides; by default search-for-grasp with the planner's part of `config`. One that is given has
-            that part, its models and its rehearsal itself.
+            that part and its models itself.
           push_model, later_push_model: predict pushes, the latter those that are not the first action of a sequence; by
             default what `config` names.
-          rehearsal: tries that policy's actions out before one is made, such as
-            `envs.physics_rehearsal.NativeRehearsal()`. If left out, nothing does, and the target is only taken out
-            where nothing is touched; `check` and each step's reason say so.
+          rehearsal: tries the policy's actions out before one is made, such as `envs.trials.native.NativeTrials()`. If
+            left out, nothing does, and the target is only taken out where nothing is touched; `check` and each step's
+            reason say so.
           recogniser: makes what recognises of a problem, with the signature of `Recogniser`.
           trajectories: how motions are made, where a controller should stop, and when recognition is too doubtful to
             move; the default if left out.
@@ -129,13 +131,12 @@ class Searcher:
         slots: dict[str, Any] = {
             "push_model": push_model,
             "later_push_model": later_push_model,
-            "rehearsal": rehearsal,
         }
         self.workcell = workcell or Workcell()
         check_camera(self.workcell.camera, self.workcell.shelf)
         self.config = config or standard(rehearsal="none")
         self._seed = seed
-        self._policy = filled(policy, self.config, slots)
+        self._policy, self._trials = filled(policy, self.config, rehearsal, slots), rehearsal
         self._make_recogniser = recogniser
         self._trajectories = trajectories
         self._state: State | None = None
@@ -182,7 +183,7 @@ class Searcher:
             warnings.insert(0, NOWHERE)
         elif reach < LEAST_REACH:
             warnings.append(f"shelf: the arm can grasp the target at {100 * reach:.0f}% of its possible poses only")
-        return Check(reach, tuple(warnings), (UNTRIED,) if tries_nothing(self._policy) else ())
+        return Check(reach, tuple(warnings), (UNTRIED,) if tries_nothing(self._policy, self._trials) else ())
 
     def warm_up(
         self,
@@ -211,28 +212,31 @@ class Searcher:
         stage()
         problem, key = self.problem, jax.random.key(0)
         images = warming.images(self.workcell.camera, self.workcell.shelf, colour, mask, target_id)
-        stage()
-        seen = jax.block_until_ready(self.recogniser(key, *images))
-        hidden, found = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
-        stage()
-        belief = update_belief(problem, initial_belief(problem), hidden)
-        jax.block_until_ready(update_belief(problem, belief, hidden, hidden, no_action()))
-        stage()
-        twin = self._twin()
-        step = twin._looking(hidden, images)
-        stage()
-        twin._state = dataclasses.replace(twin._now, handed=False, acted=True)
-        taken = twin._looking(found, images)
-        stage()
-        impasse(problem, step.belief, hidden.objects)
-        action = taken.decision.action
-        warming.motions(problem, action, twin._trajectories.motion if twin._trajectories else None)
-        rehearsal = getattr(self._policy, "rehearsal", None)
-        if rehearsal is not None:
-            warming.trials(rehearsal, problem, hidden, action)
-        for each in (step, taken):
-            each.to_json()
-            _ = each.picture
+        config = self._trajectories.motion if self._trajectories else None
+        first = first_decision(problem, self._policy, config or MotionConfig(gripper=problem.gripper))
+        # What takes longest is compiled while the rest is gone through, which waits for it where it needs it.
+        with prepared(first, lambda text: None):
+            stage()
+            seen = jax.block_until_ready(self.recogniser(key, *images))
+            hidden, found = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
+            stage()
+            belief = update_belief(problem, initial_belief(problem), hidden)
+            jax.block_until_ready(update_belief(problem, belief, hidden, hidden, no_action()))
+            stage()
+            twin = self._twin()
+            step = twin._looking(hidden, images)
+            stage()
+            twin._state = dataclasses.replace(twin._now, handed=False, acted=True)
+            taken = twin._looking(found, images)
+            stage()
+            impasse(problem, step.belief, hidden.objects)
+            action = taken.decision.action
+            warming.motions(problem, action, config)
+            if self._trials is not None:
+                warming.trials(self._trials, problem, belief, hidden, action)
+            for each in (step, taken):
+                each.to_json()
+                _ = each.picture
 
     def _twin(self) -> Searcher:
         """A searcher at the beginning of a search, that shares all but how far it is, and makes any motion."""
@@ -334,7 +338,8 @@ class Searcher:
         problem, arm = self.problem, self.workcell.arm
         for draw in range(DRAWS):
             # The first is that of a policy by itself.
-            decision = self._policy(jax.random.fold_in(key, draw) if draw else key, problem, belief, observation)
+            drawn = jax.random.fold_in(key, draw) if draw else key
+            decision = decide(self._policy, self._trials, drawn, problem, belief, observation)
             done = motion(problem, belief, observation, decision, depth, joints, arm, self._trajectories)
             if not done.blocked or kind_of(int(decision.action.kind)).takes_target:
                 break
@@ -349,7 +354,11 @@ class Searcher:
                 "to go on)"
             )
             return Motion(kind_of(ActionKind.NONE).name, f"{done.reason}; not done: {why}", None)
-        untried = "; not tried out before" if tries_nothing(self._policy) and done.trajectory is not None else ""
+        untried = (
+            "; not tried out before"
+            if tries_nothing(self._policy, self._trials) and done.trajectory is not None
+            else ""
+        )
         return done._replace(reason=done.reason + untried)
 
     def acted(self, ok: bool = True) -> None:

@@ -8,24 +8,26 @@ from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner.config import Config
 from mechsearch_jax.planner.policies import Policy, Search, search_for_grasp
+from mechsearch_jax.planner.trials import Trials
 
-# What is said of a policy that has no rehearsal.
+# What is said where no action is tried out.
 UNTRIED = (
     "rehearsal: no action is tried out before it is made, so that less is found and retrieved than the results say; "
-    "envs.cell.load_searcher, or rehearsal=NativeRehearsal(), tries them in simulation"
+    "envs.cell.load_searcher, or rehearsal=NativeTrials(), tries them in simulation"
 )
 
 
-def tries_nothing(policy: Policy) -> bool:
-    """Whether it is known that a policy tries no action out before it is made."""
-    return isinstance(policy, Search) and policy.rehearsal is None
+def tries_nothing(policy: Policy, trials: Trials | None) -> bool:
+    """Whether it is known that no action of a policy is tried out before it is made."""
+    return isinstance(policy, Search) and (trials is None or not policy.tries)
 
 
-def filled(policy: Policy | None, config: Config, slots: dict[str, Any]) -> Policy:
+def filled(policy: Policy | None, config: Config, trials: Trials | None, slots: dict[str, Any]) -> Policy:
     """The policy that is given, or search-for-grasp with what is given for it.
 
     Raises:
-      InputError: a slot is given beside a policy, or the configuration names what no slot holds.
+      InputError: a push model is given beside a policy, what is to be tried has a policy that does not propose it, or
+        the configuration names what is not given.
     """
     given = [name for name, value in slots.items() if value is not None]
     if policy is not None:
@@ -34,11 +36,16 @@ def filled(policy: Policy | None, config: Config, slots: dict[str, Any]) -> Poli
                 f"Searcher: {' and '.join(given)} would have no effect beside a policy, which has its own; give it the "
                 f"{given[0]} when it is made, and leave the keyword out"
             )
+        if trials is not None and isinstance(policy, Search) and not policy.tries:
+            raise InputError(
+                "Searcher: rehearsal would have no effect, for the policy proposes nothing to be tried; make it with "
+                "tries=True"
+            )
         return policy
-    if config.rehearsal != "none" and slots["rehearsal"] is None:
+    if config.rehearsal != "none" and trials is None:
         raise InputError(
             f'Searcher: config names the rehearsal "{config.rehearsal}", and none is given; use '
-            "mechsearch_jax.envs.cell.load_searcher, give rehearsal=NativeRehearsal() (envs.physics_rehearsal), or a "
+            "mechsearch_jax.envs.cell.load_searcher, give rehearsal=NativeTrials() (envs.trials.native), or a "
             'config with rehearsal="none"'
         )
     if slots["push_model"] is None:
@@ -52,4 +59,4 @@ def filled(policy: Policy | None, config: Config, slots: dict[str, Any]) -> Poli
         raise InputError(
             'Searcher: config names the push model "quasi-static", and another is given; leave out one of them'
         )
-    return search_for_grasp(config.planner, **slots)
+    return search_for_grasp(config.planner, tries=trials is not None, **slots)

@@ -18,8 +18,9 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.planner.belief import Belief
 from mechsearch_jax.planner.problem import Problem
-from mechsearch_jax.planner.rehearsal import PLANNED, TRIES, Rehearsal
+from mechsearch_jax.planner.trials import PLANNED, Trials, scenes_of
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.search.images import Images
 from mechsearch_jax.workspace.camera import Camera
@@ -112,11 +113,11 @@ def motions(problem: Problem, action: Action, config: MotionConfig | None) -> No
         reference_motion(kind, action, config or MotionConfig(gripper=problem.gripper))
 
 
-def trials(rehearsal: Rehearsal, problem: Problem, observation: Observation, action: Action) -> None:
+def trials(tries: Trials, problem: Problem, belief: Belief, observation: Observation, action: Action) -> None:
     """Have one action of each kind that is planned tried out; where it is none that the arm can make, that fails."""
-    many: Action = jax.tree.map(lambda a: jnp.broadcast_to(a[None], (TRIES, *a.shape)), action)
-    kinds = np.resize(np.array([int(kind) for kind in PLANNED], np.int32), TRIES)
-    many = many.replace(kind=jnp.asarray(kinds), object=jnp.zeros(TRIES, jnp.int32))
-    pose = jnp.zeros(3, jnp.float32)
-    asked = jnp.ones(TRIES, bool)
-    rehearsal(problem, observation.objects, pose, jnp.array(False), many, asked, PLANNED)
+    count = len(PLANNED)
+    many: Action = jax.tree.map(lambda a: np.broadcast_to(a, (1, count, *a.shape)), jax.device_get(action))
+    kinds = np.array([[int(kind) for kind in PLANNED]], np.int32)
+    many = many.replace(kind=kinds, object=np.zeros((1, count), np.int32))
+    scene = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get(scenes_of(belief, observation)))
+    tries(problem, scene, many, np.ones((1, count), bool))

@@ -75,7 +75,14 @@ def run_episode(path, method, recognition, rehearsal="physics", seed=0):
     see = recogniser(recognition, target)
     simulator = NativeSimulator(threads=1)
     return episodes.run_episode(
-        seed, scenario, cached_problem(target), chosen.policy(), simulator, see, options=chosen.options()
+        seed,
+        scenario,
+        cached_problem(target),
+        chosen.policy(),
+        simulator,
+        see,
+        options=chosen.options(),
+        trials=chosen.trials(),
     )
 
 

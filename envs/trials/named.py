@@ -1,16 +1,16 @@
-"""Rehearsals by name, as policies take them."""
+"""What tries actions out, by name."""
 
 from __future__ import annotations
 
 import functools
 
 from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner.rehearsal import Rehearsal
+from mechsearch_jax.planner.trials import Trials
 
 
 @functools.cache
-def rehearsal(name: str) -> Rehearsal | None:
-    """The rehearsal of a name; the same object for the same name, so that nothing is compiled twice.
+def rehearsal(name: str) -> Trials | None:
+    """What tries actions out before one is made; the same object for the same name.
 
     Args:
       name: "physics", a simulation, or "none": None.
@@ -23,6 +23,6 @@ def rehearsal(name: str) -> Rehearsal | None:
     if name != "physics":
         raise InputError(f'rehearsal "{name}" is unknown; use none, physics')
     # Where it is not asked for, the simulator is not imported.
-    from mechsearch_jax.envs.physics_rehearsal import NativeRehearsal
+    from mechsearch_jax.envs.trials.native import NativeTrials
 
-    return NativeRehearsal()
+    return NativeTrials()

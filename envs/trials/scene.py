@@ -1,0 +1,206 @@
+"""A scene in which everything has come to rest, and in which actions are tried out, each from the same state.
+
+Bodies at rest are asleep: MuJoCo leaves them out until something touches them. So a trial costs what the arm costs, and
+what it moves.
+"""
+
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import copy
+import functools
+import math
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mechsearch_jax.actions import Kind
+from mechsearch_jax.envs import model as models
+from mechsearch_jax.envs.native import NativeWorld
+from mechsearch_jax.envs.outcome import Failure
+from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, controls
+from mechsearch_jax.envs.world import BODIES, TARGET
+from mechsearch_jax.planner.trials import TrialResult
+from mechsearch_jax.robot.motion import Reference
+from mechsearch_jax.shapes import in_order
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, rotation_matrix
+from mechsearch_jax.workspace.shelf import Shelf
+
+# So many steps pass between looks at whether it is known what becomes of an action.
+BLOCK = 100
+# So many pass between looks at whether all is at rest after it.
+REST_BLOCK = 25
+# What is so far below the board does not come back [m].
+BELOW = 0.05
+# A target that leans further than this falls over [rad].
+TIPPED = math.radians(45)
+# Fingers that come closer to the middle than this have nothing between them [m].
+EMPTY = 1e-3
+
+
+@functools.cache
+def blank_model(shelf: Shelf, timestep: float) -> mujoco.MjModel:
+    """The model with empty slots, in which what is at rest sleeps; not to be changed."""
+    model = models.compile_model(shelf, Camera(), timestep)
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+    # Little is awake at a time.
+    model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    return model
+
+
+class TrialScene(NativeWorld):
+    """Bodies at rest. What is tried in it does not change it, and may be tried in several threads at once.
+
+    Attributes:
+      diverged: whether the simulation did before everything was at rest; nothing can be tried then.
+    """
+
+    def __init__(
+        self,
+        shelf: Shelf,
+        config: SimulatorConfig,
+        bodies: list[Body | None],
+        friction: float = 1.0,
+        mass: float = 1.0,
+    ):
+        """Let bodies come to rest.
+
+        Args:
+          shelf: where.
+          config: how it is simulated.
+          bodies: in their slots.
+          friction, mass: sliding friction of everything, and masses of the bodies, as multiples of what they are.
+
+        Raises:
+          ValueError, mujoco.FatalError: MuJoCo cannot build the scene.
+        """
+        super().__init__(shelf, config=config, blank=blank_model(shelf, config.motion.timestep))
+        self.place(bodies, friction, mass)
+        self._model.opt.sleep_tolerance = config.rest_speed
+        self._hide_what_is_no_body()
+        self._rest_again(np.empty((0, 0)))
+        self.diverged = self._recorder.diverged
+        self._gone, self._lay = self._fallen(), self._target_lies()
+        if not self.diverged:
+            self._fall_asleep()
+
+    def attempt(
+        self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool] = lambda: True
+    ) -> TrialResult | None:
+        """What becomes of an action; None where that is not needed any more. Nothing is computed with JAX.
+
+        Args:
+          kind: of the action.
+          reference: of the arm, as NumPy arrays.
+          index: slot of the object that the action moves.
+          needed: asked again and again whether anybody still wants to know.
+        """
+        if self.diverged:
+            return TrialResult.UNKNOWN
+        here = copy.copy(self)
+        here._data = copy.copy(self._data)
+        here._record()
+        return here._attempted(kind, reference, index, needed)
+
+    def _attempted(
+        self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool]
+    ) -> TrialResult | None:
+        start = np.asarray(reference.start, float)
+        self._set_robot(start[:ARM], float(start[ARM]))
+        commands = controls(reference)
+        states = np.empty((0, 0))
+        for first in range(0, len(commands), BLOCK):
+            block = self._run(np.ascontiguousarray(commands[first : first + BLOCK]))
+            states = np.concatenate([states, block]) if first else block
+            if not needed():
+                return None
+            if self._recorder.diverged:
+                return TrialResult.UNKNOWN
+            if self._harm_is_certain(kind):
+                return TrialResult.HARMFUL
+            if kind.takes_target and self._fails_for_certain(states, reference):
+                return TrialResult.FAILED
+        failed = self._tracking_error(states, reference) > self.config.tracking_bound
+        if kind.holds_object:
+            failed |= not self._slip(states, reference, index) < self.config.slip
+        if kind.returns_home:
+            self._go_home()
+        self._rest_again(states)
+        if self._recorder.diverged:
+            return TrialResult.UNKNOWN
+        held, fallen = False, self._fallen()
+        if kind.takes_target:
+            taken = self._retrieval(self._gone)
+            failed, held, fallen = failed or taken.failure is not Failure.NONE, taken.held, taken.fallen
+        toppled = self._target_lies() and not (self._lay or held)
+        if toppled or (fallen & ~self._gone).any():
+            return TrialResult.HARMFUL
+        return TrialResult.FAILED if failed else TrialResult.SUCCEEDED
+
+    def _hide_what_is_no_body(self) -> None:
+        """Leave out geometry that stands for nothing, or is hidden inside of a body."""
+        for i, body in enumerate(self._bodies):
+            for shape in in_order():
+                if body is None or body.shape != shape.name:
+                    geom = self._model.geom(models.geometry_name(shape, i)).id
+                    self._model.geom_contype[geom] = self._model.geom_conaffinity[geom] = 0
+
+    def _fall_asleep(self) -> None:
+        """Let all bodies sleep where they are, until they are touched."""
+        positions = self._data.qpos.copy()
+        self._go_home()
+        # One more step without motion, and they sleep.
+        self._data.tree_asleep[1:] = np.maximum(self._data.tree_asleep[1:], -1)
+        mujoco.mj_step(self._model, self._data)
+        self._data.qpos[:] = positions
+        self._data.qvel[:] = 0.0
+
+    def _rest_again(self, states: Float[np.ndarray, "steps size"]) -> None:
+        """Hold the robot still until no body has moved for as long as `settle_block`, or the time for that is over.
+
+        Args:
+          states: those before, whose last ones count, too.
+        """
+        hold = np.tile(self._data.ctrl, (REST_BLOCK, 1))
+        quiet = self._quiet(states)
+        for _ in range(self.config.settle_steps // REST_BLOCK):
+            now = self._quiet(self._run(hold))
+            quiet = now + (quiet if now == REST_BLOCK else 0)
+            if quiet >= self.config.settle_block or self._recorder.diverged:
+                break
+        self._data.qvel[:] = 0.0
+
+    def _quiet(self, states: Float[np.ndarray, "steps size"]) -> int:
+        """In how many of the last states all bodies were at rest."""
+        limit = self.config.rest_speed * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
+        if not len(states):
+            return 0
+        first = 1 + self._model.nq + ROBOT
+        speed = np.abs(states[:, first : first + 6 * BODIES]).reshape(-1, BODIES, 6)
+        moves = np.flatnonzero(~(speed < limit).all(axis=(1, 2)))
+        return len(states) - 1 - int(moves[-1]) if len(moves) else len(states)
+
+    def _harm_is_certain(self, kind: Kind) -> bool:
+        """Whether something has left the board, or a target that stood and is not to be taken out cannot but fall."""
+        deep = self._data.qpos[ROBOT:].reshape(BODIES, 7)[:, 2] < self.shelf.board - BELOW
+        if (deep & self._there & ~self._gone).any():
+            return True
+        if kind.takes_target or self._lay or self._bodies[TARGET] is None:
+            return False
+        up = rotation_matrix(self._data.joint(f"body{TARGET}").qpos[3:])[2, 2]
+        return bool(abs(up) < math.cos(TIPPED))
+
+    def _fails_for_certain(self, states: Float[np.ndarray, "steps size"], reference: Reference) -> bool:
+        """Whether an attempt to take the target out cannot succeed any more."""
+        if self._tracking_error(states, reference) > self.config.tracking_bound:
+            return True
+        return len(states) > int(reference.closed) and bool((self._data.qpos[ARM:ROBOT] < EMPTY).all())
+
+    @property
+    def _there(self) -> Bool[np.ndarray, " 9"]:
+        return np.array([body is not None for body in self._bodies])

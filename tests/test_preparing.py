@@ -1,0 +1,93 @@
+"""What a first decision needs is prepared while other things begin, and who waits is told for what."""
+
+import threading
+import time
+
+import pytest
+
+from mechsearch_jax.actions import KINDS
+from mechsearch_jax.planner import search_for_grasp
+from mechsearch_jax.preparing import Program, first_decision, prepare, prepared
+from mechsearch_jax.robot.motion import MotionConfig
+
+
+def program(name, ready=False, prepare=lambda: None):
+    return Program(name, lambda: ready, lambda: prepare)
+
+
+def test_what_is_compiled_is_named_with_how_many_are_left():
+    lines = []
+    with prepared([program("a"), program("b", ready=True), program("c")], lines.append):
+        pass
+    assert lines[0] == "compiling: a, c; 0 of 2 done"
+    assert lines[1] in ("compiling: a; 1 of 2 done", "compiling: c; 1 of 2 done")
+    assert lines[2:] == ["compiling; 2 of 2 done"]
+
+
+def test_programs_are_lowered_in_order_and_compiled_at_the_same_time():
+    order, both = [], threading.Barrier(2, timeout=60)
+
+    def begin(name):
+        order.append(name)
+        return both.wait
+
+    prepare([Program(name, lambda: False, lambda name=name: begin(name)) for name in ("a", "b")], lambda line: None)
+    assert order == ["a", "b"]
+    assert not both.broken
+
+
+def test_nothing_is_said_where_everything_is_there():
+    lines, prepared_ones = [], []
+    with prepared([program("a", True, lambda: prepared_ones.append("a"))], lines.append):
+        pass
+    assert lines == []
+    assert prepared_ones == ["a"]
+
+
+def test_the_block_runs_meanwhile():
+    met = threading.Event()
+    with prepared([program("a", prepare=lambda: met.wait(60))], lambda line: None):
+        met.set()
+
+
+def test_what_is_wrong_is_said_by_who_calls_it():
+    def fail():
+        raise ValueError("cannot be compiled")
+
+    lines = []
+    with prepared([program("a", prepare=fail)], lines.append):
+        pass
+    assert lines == ["compiling: a; 0 of 1 done"]
+
+
+def test_an_error_in_the_block_is_the_blocks_own():
+    with pytest.raises(KeyError), prepared([program("a")], lambda line: None):
+        raise KeyError("b")
+
+
+def test_a_policy_of_a_users_own_is_compiled_when_it_is_called(problem):
+    def names(policy):
+        return [program.name for program in first_decision(problem, policy, MotionConfig())]
+
+    others = ["belief", *(f"motion of {kind.name}" for kind in KINDS.values())]
+    assert names(lambda *_: None) == others
+    assert names(search_for_grasp()) == ["plan", *others]
+
+
+def test_no_more_is_compiled_at_once_than_there_are_cores(monkeypatch):
+    """Where there are two, the third begins when one of the first two is over, and what it waits for is not claimed."""
+    monkeypatch.setenv("MECHSEARCH_CORES", "2")
+    first, begun = threading.Event(), []
+
+    def begin(name):
+        begun.append(name)
+        return lambda: first.wait(60) if name != "b" else None
+
+    programs = [Program(name, lambda: False, lambda name=name: begin(name)) for name in ("a", "b", "c", "d")]
+    with prepared(programs, lambda line: None):
+        while begun != ["a", "b", "c"]:
+            time.sleep(0.01)
+        time.sleep(0.1)
+        assert begun == ["a", "b", "c"]
+        first.set()
+    assert begun == ["a", "b", "c", "d"]
