@@ -19,7 +19,7 @@ from mechsearch_jax.robot.motion import (
     push_reference,
     retrieve_reference,
 )
-from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 
 GRIPPER, SHELF = Gripper(), Shelf()
 Q7 = jnp.float32(math.radians(30))
@@ -78,7 +78,7 @@ def test_a_full_hand_is_taken_to_the_first_place_in_reach():
     assert not bool(find(pose((0.9, 0.4, 0.5)))[1])
 
 
-def test_the_arm_enters_where_it_follows_the_whole_way():
+def test_the_gripper_enters_where_the_arm_follows_and_what_it_sweeps_leaves_the_shelf_alone():
     T = jnp.stack(
         [
             pose((x, y, z), yaw)
@@ -89,11 +89,22 @@ def test_the_arm_enters_where_it_follows_the_whole_way():
         ]
     )
     mask = jnp.arange(len(T)) % 5 != 0
-    found = jax.jit(lambda T, mask: entry.arm_enters(SHELF, GRIPPER, 4, T, jnp.full(len(T), Q7), mask))(T, mask)
+    # Next to nothing, and what hangs so far down that it touches the board at the lower poses only.
+    hanging = np.linspace((0.0, 0.0, 0.0), (0.12, 0.0, 0.0), 50)
+    clouds = jnp.float32(np.stack([np.zeros((50, 3)), hanging])).swapaxes(1, 2)
+    cloud = np.arange(len(T)) % 2
+    find = jax.jit(
+        lambda T, mask: entry.gripper_enters(SHELF, GRIPPER, 4, clouds, cloud, T, jnp.full(len(T), Q7), mask)
+    )
+    found = np.asarray(find(T, mask))
     follows = jax.jit(jax.vmap(lambda path: entry.arm_follows(path, Q7, SHELF)))
-    whole = follows(jax.vmap(lambda T: entry.way_in(T, GRIPPER.nearest_outside, GRIPPER, 3, 4))(T))
-    np.testing.assert_array_equal(found, np.asarray(whole) & np.asarray(mask))
-    assert 5 < int(found.sum()) < len(T)
+    whole = np.asarray(follows(jax.vmap(lambda T: entry.way_in(T, GRIPPER.nearest_outside, GRIPPER, 3, 4))(T)))
+    points = np.einsum("kij,kpj->kpi", np.asarray(T)[:, :3, :3], np.asarray(clouds).swapaxes(1, 2)[cloud])
+    points += np.asarray(T)[:, None, :3, 3]
+    touches = np.asarray(hits_shelf(SHELF, jnp.asarray(points))).any(axis=1)
+    np.testing.assert_array_equal(found, whole & ~touches & np.asarray(mask))
+    assert 5 < found.sum() < len(T)
+    assert (whole & touches & np.asarray(mask)).any()
 
 
 def in_one_configuration(q, T_path_free=None):

@@ -1,0 +1,104 @@
+"""How large the program of one decision is: what takes so long to compile, and on a GPU to start.
+
+The budget is what was counted when it was last set. It may rise only with a gain that was measured, and that the commit
+which raises it names; whoever makes the program smaller lowers it.
+"""
+
+import collections
+import math
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import mechsearch_jax as ms
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import policies
+from mechsearch_jax.planner.belief import without_grasps
+
+# Equations and loops (`while`, `scan` and `cond`) of one decision: 30 sequences of 3 actions, 9 slots. The programs for
+# a CPU and for a GPU differ, and so do those for a target that is hidden and for one that has been found.
+BUDGET = {
+    ("cpu", "hidden"): (16_824, 58),
+    ("cpu", "found"): (18_572, 74),
+    ("gpu", "hidden"): (17_669, 44),
+    ("gpu", "found"): (19_035, 56),
+}
+# Versions of JAX write the same program with a few equations more or less.
+SLACK = 1.01
+LOOPS = ("while", "scan", "cond")
+
+
+def inner(value):
+    """The programs that a parameter of an equation holds."""
+    if hasattr(value, "jaxpr"):
+        yield value.jaxpr
+    elif hasattr(value, "eqns"):
+        yield value
+    elif isinstance(value, (tuple, list)):
+        for part in value:
+            yield from inner(part)
+
+
+def primitives(program):
+    """How often each primitive occurs; what is called twice counts twice."""
+    counts = collections.Counter()
+    for equation in program.eqns:
+        counts[equation.primitive.name] += 1
+        for value in equation.params.values():
+            for part in inner(value):
+                counts += primitives(part)
+    return counts
+
+
+def test_what_is_inside_loops_and_calls_counts_each_time():
+    @jax.jit
+    def twice(x):
+        return x * 2.0
+
+    def program(x):
+        x = jax.lax.fori_loop(0, 3, lambda i, x: x + 1.0, twice(x), unroll=False)
+        x = jax.lax.cond(x > 0.0, twice, lambda x: x, x)
+        return jax.lax.while_loop(lambda x: x < 5.0, twice, x)
+
+    counts = primitives(jax.make_jaxpr(program)(1.0).jaxpr)
+    assert counts["mul"] == 3
+    assert counts["cond"] == 1
+    assert counts["while"] + counts["scan"] == 2
+
+
+def decision(problem, belief):
+    """The program of a decision for a belief."""
+    settings = ms.search_for_grasp(sequences=30, horizon=3)
+    seen = Observation(objects=superquadric.empty(8), target_visible=jnp.array(False), target_pose=jnp.zeros(3))
+    plan = lambda key, problem, belief: policies._plan.__wrapped__(settings, key, problem, belief, seen)  # noqa: E731
+    return jax.make_jaxpr(plan)(jax.random.key(0), problem, belief).jaxpr
+
+
+@pytest.mark.parametrize(
+    ("device", "target"),
+    [
+        ("cpu", "hidden"),
+        ("gpu", "found"),
+        pytest.param("cpu", "found", marks=pytest.mark.slow),
+        pytest.param("gpu", "hidden", marks=pytest.mark.slow),
+    ],
+)
+def test_a_decision_stays_within_its_budget(monkeypatch, problem, device, target):
+    belief = ms.initial_belief(problem)
+    if target == "hidden":
+        belief = without_grasps(belief)
+    # Tracing for a GPU needs none. What was traced before for the other device must not be found again.
+    monkeypatch.setattr(jax, "default_backend", lambda: device)
+    jax.clear_caches()
+    try:
+        counts = primitives(decision(problem, belief))
+    finally:
+        jax.clear_caches()
+    equations, loops = BUDGET[device, target]
+    found = counts.total(), sum(counts[name] for name in LOOPS)
+    allowed = math.floor(SLACK * equations), loops
+    assert found[0] <= allowed[0] and found[1] <= allowed[1], (  # noqa: PT018
+        f"{found} equations and loops for {device}, {target}, of {allowed}: they may rise only with a measured gain"
+    )
