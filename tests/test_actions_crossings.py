@@ -13,6 +13,7 @@ from mechsearch_jax.actions.config import CLOSED, OPEN, ActionConfig, ActionSpac
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.dynamics import rigid
 from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.collision import collisions
 from mechsearch_jax.geometry.transforms import make, transform, translate, upright_pose, yaw_rotation
 from mechsearch_jax.graspability import FoundGrasps, GraspConfig, grasp_hits, grasp_tables, gripper_rotation
 from mechsearch_jax.planner import found_target
@@ -94,13 +95,49 @@ def least_gauge(scene, points, grown=0.0):
     return np.min((x ** (2 / e2) + y ** (2 / e2)) ** (e2 / e1) + z ** (2 / e1))
 
 
-def test_the_gripper_hits_on_its_crossing_what_a_float64_reference_says(space, tables):
-    rng = np.random.default_rng(0)
-    hits = jax.jit(
-        lambda T, scene: approach.crossing_hits(
-            space, tables, OPEN, jnp.array([WRIST]), T[None], scene, scene.valid[None]
-        )[0, 0]
+def touched(tables, opening, T, scene, still=False):
+    """Which objects the gripper touches at poses (C, 4, 4), on its straight way in to them or where it is."""
+    cloud = np.full(len(T), approach.cloud_index(tables, opening, WRIST, still))
+    mask = jnp.broadcast_to(scene.valid, (len(T), scene.capacity))
+    return collisions(approach.gripper_clouds(tables), cloud, T, scene, mask)
+
+
+def open_hand_hits(space, tables, T, scene):
+    """Whether the open gripper hits anything on its crossing to a pose."""
+    places, crosses = approach.crossing_places(space, T[None])
+    return crosses[0] & jnp.any(touched(tables, OPEN, places[0], scene, still=True))
+
+
+def push_from(T, way=(0.0, 0.0, 0.0)):
+    way = jnp.float32(way)
+    action = no_action()
+    return action.replace(
+        kind=jnp.int32(push.CODE), T_world_gripper=T, T_world_place=translate(T, way), displacement=way
     )
+
+
+def absent(scene):
+    return scene.replace(valid=jnp.zeros(scene.capacity, bool))
+
+
+def meets(space, tables, scene, after, action, moved=True, pushes=True):
+    """`push.gripper_meets`; where all objects are moved, only those on the ways in and back count."""
+    moved = jnp.broadcast_to(jnp.asarray(moved), scene.capacity)
+    return push.gripper_meets(space, tables, scene, after, action, jnp.int32(WRIST), moved, jnp.asarray(pushes))
+
+
+def closed_hand_hits(space, tables, T, scene):
+    """Whether a push from a pose meets anything on its way in along x."""
+    return meets(space, tables, scene, absent(scene), push_from(T))
+
+
+HANDS = pytest.mark.parametrize(("opening", "judge"), [(OPEN, open_hand_hits), (CLOSED, closed_hand_hits)])
+
+
+@HANDS
+def test_the_gripper_hits_on_its_crossing_what_a_float64_reference_says(space, tables, opening, judge):
+    rng = np.random.default_rng(0)
+    hits = jax.jit(lambda T, scene: judge(space, tables, T, scene))
     seen = []
     for _ in range(60):
         T = pose((rng.uniform(0.6, 0.76), 0.1, 0.5), rng.uniform(-40, 40), rng.uniform(20, 30))
@@ -110,91 +147,168 @@ def test_the_gripper_hits_on_its_crossing_what_a_float64_reference_says(space, t
             (half, tips[0] - rng.uniform(-0.06, 0.16), tips[1] + rng.uniform(-0.1, 0.1)),
             shape=str(rng.choice(["box", "cylinder"])),
         )
-        points = swept(T, GRIPPER.max_opening, float(tables.q7[OPEN, WRIST]))
+        points = swept(T, GRIPPER.max_opening if opening == OPEN else 0.0, float(tables.q7[opening, WRIST]))
         found = bool(hits(T, scene))
         # Clouds have gaps: what is touched less than a centimetre deep may be missed.
         if least_gauge(scene, points) > 1.0 + 1e-3:
             assert not found
         elif float(crossing_length(T, 0.374, GRIPPER)) > 0.03 and least_gauge(scene, points, -0.01) < 1.0:
-            assert found
+            # A push may begin to touch something where its straight way in begins: that is proposals' to look at.
+            assert found or (opening == CLOSED and touched(tables, opening, T[None], scene).any())
         seen.append(found)
     assert 5 < sum(seen) < 50
 
 
-def test_where_there_is_no_crossing_nothing_is_hit(space, tables):
+@HANDS
+def test_where_there_is_no_crossing_nothing_is_hit(space, tables, opening, judge):
     T = pose((0.56, 0.1, 0.5))
     scene = in_the_way(T, 0.1)
-    mask = scene.valid[None]
-    assert not approach.crossing_hits(space, tables, OPEN, jnp.array([WRIST]), T[None], scene, mask).any()
+    assert touched(tables, opening, approach.crossing_places(space, T[None])[0][0], scene, still=True).any()
+    assert not judge(space, tables, T, scene)
 
 
 @pytest.mark.parametrize("ends", ["start", "end"])
 def test_a_push_past_a_post_that_only_its_crossing_touches_is_impossible(space, tables, ends):
-    way = jnp.float32([0.0, 0.25, 0.0])
-    T = pose(DEEP)
-    end = translate(T, way)
+    action = push_from(pose(DEEP), (0.0, 0.25, 0.0))
+    T, end = action.T_world_gripper, action.T_world_place
     scene = in_the_way(T if ends == "start" else end)
-    action = no_action().replace(kind=jnp.int32(push.CODE), T_world_gripper=T, T_world_place=end, displacement=way)
-    wrist, free = jnp.int32(WRIST), scene.replace(valid=jnp.zeros(2, bool))
-    judge = jax.jit(lambda a, b: push.crossings_hit(space, tables, a, b, action, wrist, jnp.array(True)))
-    approaches = jnp.stack([T, end])
-    clear = approach.gripper_hits(tables, CLOSED, jnp.array([WRIST] * 2), approaches, scene, jnp.ones((2, 2), bool))
-    assert not clear[:, 0].any()
-    assert bool(judge(scene, scene))
-    assert bool(judge(scene, free)) == (ends == "start")
-    assert bool(judge(free, scene)) == (ends == "end")
-    assert not bool(judge(free, free))
+    free = absent(scene)
+    judge = jax.jit(lambda a, b, pushes: meets(space, tables, a, b, action, pushes=pushes))
+    assert not touched(tables, CLOSED, jnp.stack([T, end]), scene).any()
+    assert bool(judge(scene, scene, True))
+    assert bool(judge(scene, free, True)) == (ends == "start")
+    assert bool(judge(free, scene, True)) == (ends == "end")
+    assert not bool(judge(free, free, True))
+    assert not bool(judge(scene, scene, False))
 
 
-@pytest.mark.parametrize("ends", ["grasp", "place"])
-def test_a_pick_past_a_post_that_only_its_crossing_touches_is_impossible(space, tables, ends):
-    T, place = pose(DEEP), pose((DEEP[0], DEEP[1] + 0.15, DEEP[2]))
-    post = in_the_way(T if ends == "grasp" else place)
+def beside(T, side, shift=0.0):
+    """A post that the fingers of a closed hand at a pose have sunk into, or stand apart from by a shift [m]."""
+    x, y, _ = np.asarray(T)[:3, 3]
+    return standing(((0.02, 0.02, 0.06), x, y + side * shift))
+
+
+def test_a_push_meets_what_it_leaves_in_place_and_not_what_it_moves(space, tables):
+    # No crossing, so that the way in along x is no matter.
+    action = push_from(pose((0.5, 0.1, SHELF.board + 0.05), 0.0), (0.0, 0.15, 0.0))
+    judge = jax.jit(lambda scene, moved: meets(space, tables, scene, absent(scene), action, moved))
+    for share in (1 / 3, 2 / 3, 1.0):
+        scene = beside(translate(action.T_world_gripper, share * action.displacement), 1.0)
+        assert bool(judge(scene, False))
+        assert not bool(judge(scene, True))
+    assert not bool(judge(beside(action.T_world_place, 1.0, 0.15), False))
+
+
+def test_a_push_meets_on_its_way_back_what_it_moved_beside_its_own(space, tables):
+    action = push_from(pose((0.5, 0.1, SHELF.board + 0.05), 0.0), (0.0, 0.15, 0.0))
+    nothing = absent(beside(action.T_world_place, 1.0))
+    judge = jax.jit(
+        lambda after, index, moved: meets(space, tables, nothing, after, action.replace(object=index), moved)
+    )
+    own, another = jnp.int32(0), jnp.int32(1)
+    in_the_hand = beside(action.T_world_place, 1.0)
+    assert bool(judge(in_the_hand, another, True))
+    assert not bool(judge(in_the_hand, own, True))
+    assert not bool(judge(in_the_hand, another, False))
+    # What touches the hand, because the hand has pushed it, is not in its way back.
+    reach = next(
+        d
+        for d in np.arange(0.0, 0.1, 0.001)
+        if not touched(tables, CLOSED, action.T_world_place[None], beside(action.T_world_place, 1.0, d)).any()
+    )
+    touching = beside(action.T_world_place, 1.0, reach - 0.004)
+    assert touched(tables, CLOSED, action.T_world_place[None], touching).any()
+    assert not bool(judge(touching, another, True))
+
+
+@pytest.fixture
+def an_arm_that_gets_anywhere(monkeypatch):
+    """What the gripper and its load hit is all that can be in the way."""
+
+    def ways_in(T, q7, gripper, crossings, waypoints):
+        return jnp.zeros((crossings + waypoints, 7)), jnp.array(True), jnp.float32(gripper.outside[0])
+
+    monkeypatch.setattr(pick_and_place, "ways_in", ways_in)
+    monkeypatch.setattr(pick_and_place, "arm_hits", lambda q, scene: jnp.zeros((len(q), scene.capacity), bool))
+    monkeypatch.setattr(pick_and_place, "arm_hits_shelf", lambda q, shelf: jnp.zeros(len(q), bool))
+    monkeypatch.setattr(pick_and_place, "hits_shelf", lambda shelf, points: jnp.zeros(points.shape[:-1], bool))
+
+
+def transfer(space, tables, post, places):
+    """Whether a body of some half size at `DEEP` can be taken to places, with or without a post: compiled."""
+    T = jnp.stack([pose(DEEP), *places])
     body = standing(((0.02, 0.02, 0.06), DEEP[0], DEEP[1]))
-    scene = jax.tree.map(lambda a, b: jnp.stack([a[0], b[0]]), body, post)
-    alone = scene.replace(valid=jnp.array([True, False]))
-    action = no_action().replace(kind=jnp.int32(pick_and_place.CODE), T_world_gripper=T, T_world_place=place)
 
     @jax.jit
-    def free(scene, outside):
-        after = rigid.pick_and_place(scene, action.object, T, place)
-        return pick_and_place.crossings_free(
-            space, tables, scene, after, action, jnp.int32(WRIST), outside, jnp.array(True)
-        )
+    def able(half, post_there, wanted=True):
+        scene = jax.tree.map(lambda a, b: jnp.stack([a[0], b[0]]), body.replace(size=body.size.at[0].set(half)), post)
+        scene = scene.replace(valid=jnp.array([True, False]).at[1].set(post_there))
+        index = jnp.int32(0)
+        held = make(rigid.in_hand(scene, index, T[0]), scene.position[0])
+        put = [rigid.pick_and_place(scene, index, T[0], place) for place in places]
+        objects = jnp.stack([held, *(make(after.rotation[0], after.position[0]) for after in put)])
+        cloud = superquadric.sample_surface(scene.size[0], scene.exponents[0], space.config.object_points)
+        wanted = jnp.broadcast_to(jnp.asarray(wanted), len(T))
+        return pick_and_place.transfers(space, tables, scene, index, cloud, jnp.int32(WRIST), T, objects, wanted)
 
-    both = jnp.stack([T, place])
-    clear = approach.gripper_hits(tables, OPEN, jnp.array([WRIST] * 2), both, scene, jnp.ones((2, 2), bool))
-    assert not clear[:, 1].any()
-    out = jnp.full(2, GRIPPER.outside[0])
-    assert bool(free(alone, out))
-    assert not bool(free(scene, out))
+    return able
 
 
+SMALL = (0.02, 0.02, 0.06)
+
+
+@pytest.mark.usefixtures("an_arm_that_gets_anywhere")
+@pytest.mark.parametrize("ends", ["grasp", "place"])
+def test_a_pick_past_a_post_that_only_its_crossing_touches_is_impossible(space, tables, ends):
+    T, place, other = (pose((DEEP[0], DEEP[1] + y, DEEP[2])) for y in (0.0, 0.15, -0.15))
+    post = in_the_way(T if ends == "grasp" else place)
+    able = transfer(space, tables, post, [place, other])
+    wider = post.replace(size=post.size + space.config.clearance)
+    assert not touched(tables, OPEN, jnp.stack([T, place, other]), wider).any()
+    half = jnp.float32(SMALL)
+    assert able(half, False).tolist() == [True, True]
+    # Past what is in the way of the grasp it goes nowhere; past what is in the way of a place, to the others.
+    assert able(half, True).tolist() == [False, ends == "place"]
+    # And nowhere if it is not wanted there, or not at all.
+    assert able(half, False, jnp.array([True, False, True])).tolist() == [False, True]
+    assert able(half, False, jnp.array([False, True, True])).tolist() == [False, False]
+
+
+@pytest.mark.usefixtures("an_arm_that_gets_anywhere")
 def test_what_is_held_must_get_past_too_and_out_of_the_shelf(space, tables):
     """Lower than the hand, but not than what hangs from it."""
     T, place = pose(DEEP), pose((DEEP[0], DEEP[1] + 0.15, DEEP[2]))
     post = in_the_way(T, -0.045)
-    action = no_action().replace(kind=jnp.int32(pick_and_place.CODE), T_world_gripper=T, T_world_place=place)
-
-    @jax.jit
-    def free(half, post_there):
-        body = standing(((0.02, 0.02, 0.06), DEEP[0], DEEP[1]))
-        body = body.replace(size=body.size.at[0].set(half))
-        scene = jax.tree.map(lambda a, b: jnp.stack([a[0], b[0]]), body, post)
-        scene = scene.replace(valid=jnp.array([True, False]).at[1].set(post_there))
-        after = rigid.pick_and_place(scene, action.object, T, place)
-        out = jnp.full(2, GRIPPER.outside[0])
-        return pick_and_place.crossings_free(
-            space, tables, scene, after, action, jnp.int32(WRIST), out, jnp.array(True)
-        )
-
-    small = jnp.float32([0.02, 0.02, 0.06])
-    hand = approach.crossing_hits(space, tables, OPEN, jnp.array([WRIST]), T[None], post, post.valid[None])
-    assert not hand.any()
-    assert bool(free(small, False))
-    assert not bool(free(small, True))
+    able = transfer(space, tables, post, [place])
+    assert not open_hand_hits(space, tables, T, post)
+    assert able(jnp.float32(SMALL), False).all()
+    assert not able(jnp.float32(SMALL), True).any()
     # Longer than there is room for between the gripper's place outside and the shelf.
-    assert not bool(free(jnp.float32([0.2, 0.02, 0.06]), False))
+    assert not able(jnp.float32([0.2, 0.02, 0.06]), False).any()
+
+
+@pytest.mark.parametrize("what", ["ways_in", "arm_hits", "arm_hits_shelf", "hits_shelf", "turns"])
+@pytest.mark.usefixtures("an_arm_that_gets_anywhere")
+def test_a_pick_is_impossible_where_the_arm_is(space, tables, monkeypatch, what):
+    place = pose((DEEP[0], DEEP[1] + 0.15, DEEP[2]))
+    post = in_the_way(place)
+    free = transfer(space, tables, post, [place])(jnp.float32(SMALL), False)
+    assert free.all()
+    still = pick_and_place.ways_in
+    turned = pick_and_place.LARGEST_TRANSFER + 0.1
+
+    def fails(T, *rest):
+        q, reachable, outside = still(T, *rest)
+        there = T[1, 3] > DEEP[1] + 0.1
+        return (q + turned * there, reachable, outside) if what == "turns" else (q, reachable & ~there, outside)
+
+    replacement = {
+        "arm_hits": lambda q, scene: jnp.ones((len(q), scene.capacity), bool),
+        "arm_hits_shelf": lambda q, shelf: jnp.ones(len(q), bool),
+        "hits_shelf": lambda shelf, points: jnp.ones(points.shape[:-1], bool),
+    }.get(what, fails)
+    monkeypatch.setattr(pick_and_place, "ways_in" if what == "turns" else what, replacement)
+    assert not transfer(space, tables, post, [place])(jnp.float32(SMALL), False).any()
 
 
 def test_a_retrieval_past_a_post_that_only_its_crossing_touches_hits_it(grasps):

@@ -37,10 +37,12 @@ def least_implicit(objects, k, points):
 def test_h_is_that_of_a_brute_force_reference(problem, objects, hits):
     tables = problem.grasps
     pose, grasp, T = (np.asarray(a) for a in (tables.pair_pose, tables.pair_grasp, tables.T_world_target))
+    T_target_gripper = np.asarray(tables.T_target_gripper)
     chosen = np.random.default_rng(0).choice(len(pose), 150, replace=False)
     for pair in chosen:
         cloud = np.asarray(tables.clouds[grasp[pair]], np.float64).T
-        world = cloud @ T[pose[pair], :3, :3].T.astype(np.float64) + T[pose[pair], :3, 3]
+        placed = T[pose[pair]].astype(np.float64) @ T_target_gripper[grasp[pair]].astype(np.float64)
+        world = cloud @ placed[:3, :3].T + placed[:3, 3]
         for k in np.flatnonzero(objects.valid):
             least = least_implicit(objects, k, world)
             if abs(least - 1) > 1e-3:
