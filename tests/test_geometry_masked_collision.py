@@ -130,8 +130,7 @@ def compiled(way, *axes, own=False, first=0):
     def run(*arguments):
         with pytest.MonkeyPatch.context() as patch:
             if way == "kernel":
-                patch.setattr(collision, "on_cpu", lambda: False)
-                patch.setattr(collision, "kernel_available", lambda: True)
+                patch.setattr(collision, "uses_kernel", lambda: True)
                 patch.setattr(collision, "collide", functools.partial(collision_kernel.collide, interpret=True))
             else:
                 # So few at once that there are several blocks.
@@ -139,10 +138,8 @@ def compiled(way, *axes, own=False, first=0):
                     patch.setattr(collision, name, size)
                 patch.setattr(collision, "FEW", 1 << 30 if way == "gauges" else 0)
             if way == "loops of a gpu":
-                for module in (masked, collision):
-                    patch.setattr(module, "on_cpu", lambda: False)
+                patch.setattr(masked, "on_cpu", lambda: False)
                 patch.setattr(masked, "GPU_BLOCKS", 2)
-                patch.setattr(collision, "kernel_available", lambda: False)
 
             def decide(points, gap, cloud, T, scene, mask):
                 clouds = clouds_of(points)
@@ -404,7 +401,7 @@ def test_the_kernel_lowers_for_a_gpu():
     rng = np.random.default_rng(10)
     clouds = clouds_of(jnp.asarray(random_clouds(rng)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(collision, "on_cpu", lambda: False)
+        patch.setattr(collision, "uses_kernel", lambda: True)
         run = jax.jit(lambda cloud, T, scene, mask: collision.collisions(clouds, cloud, T, scene, mask))
         traced = run.trace(np.zeros(6, np.int32), random_poses(rng), random_scene(rng), np.ones((6, 4), bool))
     assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()

@@ -8,18 +8,21 @@ graze the surface.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Integer, UInt8
 
 from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.geometry.collision_kernel import collide, kernel_available
-from mechsearch_jax.geometry.masked import Entry, block_size, entry_of, for_each, merged, on_cpu, put, taken
+from mechsearch_jax.geometry.collision_kernel import collide, uses_kernel
+from mechsearch_jax.geometry.masked import block_size, entry_of, for_each, merged, put, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import inverse, make, matmul
 
@@ -84,85 +87,115 @@ def collisions(
 
 def _collide(first: int, mask: Bool[Array, "*batch m n"], shared: tuple | None, rows: tuple) -> Array:
     """See `collisions`; the axes of a batch may be in front."""
-    batch, (m, n), total = mask.shape[:-2], mask.shape[-2:], mask.size
-    clouds, T_world_cloud, objects, own = rows
-    if not on_cpu() and kernel_available():
-        if shared is not None:
-            own = tuple(a.reshape(*[1] * len(batch), *a.shape) for a in shared[:2])
-        return collide(mask, *own, clouds, T_world_cloud, objects)
+    if mask.size == 0:
+        return mask
+    if uses_kernel():
+        lead = mask.ndim - 2
+        own = rows[3] if shared is None else tuple(a.reshape(*[1] * lead, *a.shape) for a in shared[:2])
+        return collide(mask, *own, *rows[:3])
+    m, n = mask.shape[-2:]
+    pairs = _AllPairs(mask.shape, shared, *rows)
+    state = jnp.where(mask.reshape(-1), OPEN, APART)
+    state = pairs.decided(state, _near, BOXES)
+    if first:
+        state = pairs.decided(state, functools.partial(_bounded, count=first), CLOUDS)
+    if m * n > FEW:
+        state = pairs.decided(state, _bounded, CLOUDS)
+    state = pairs.decided(state, _gauged, GAUGES)
+    return (state == HIT).reshape(mask.shape)
 
-    class Pairs(NamedTuple):
-        """Pairs of a cloud and an object, and the cloud's pose in the object's frame, as 3 x 4 numbers."""
 
-        relative: Array
-        size: Array
-        exponents: Array
-        entry: Entry
-        cloud: Array
+class _Pairs(NamedTuple):
+    """K pairs of a placed cloud and an object.
 
-        def table(self, i: int) -> Array:
-            if shared is not None:
-                return taken(shared[i], self.cloud)
-            return self.entry.of(own[i], (self.cloud, own[i].shape[len(batch)]))
+    Attributes:
+      relative: the cloud's pose in the object's frame, shape (K, 3, 4).
+      size, exponents: of the object.
+      table: a part of what is known of the clouds: points (0), boxes (1), with a leading axis K.
+      gap: of `Clouds`, where all of a batch share them.
+    """
 
-    def pairs(index):
-        entry, width = entry_of(index, batch, m * n), jnp.uint32(n)
-        j = jax.lax.rem(index, width)
-        k = jax.lax.rem(jax.lax.div(index, width), jnp.uint32(m))
-        numbers = entry.of(objects, (j, n))
-        relative = matmul(numbers[:, :12].reshape(-1, 3, 4), entry.of(T_world_cloud, (k, m)))
-        return Pairs(relative, numbers[:, 12:15], numbers[:, 15:], entry, entry.of(clouds, (k, m)))
+    relative: Float[Array, "k 3 4"]
+    size: Float[Array, "k 3"]
+    exponents: Float[Array, "k 2"]
+    table: Callable[[int], Array]
+    gap: Array | float
 
-    def near(index):
-        """Whether the boxes around clouds and objects overlap, along the axes of the clouds'."""
-        here = pairs(index)
-        box = here.table(1)
-        rotation = here.relative[:, :, :3]
-        reach = jnp.sum(jnp.abs(rotation) * here.size[:, :, None], axis=1)
-        centre = -jnp.sum(rotation * here.relative[:, :, 3:], axis=1)
-        return jnp.where(jnp.all((centre - reach < box[:, 1]) & (centre + reach > box[:, 0]), axis=1), OPEN, APART)
-
-    def coordinates(here, count):
-        """Magnitudes of the points' coordinates in half-extents, (3, K, P)."""
-        points = here.table(0)
+    def coordinates(self, count: int = 0) -> Float[Array, "3 k p"]:
+        """Magnitudes of the points' coordinates in half-extents; of the first `count` points, if that is not 0."""
+        points = self.table(0)
         points = points[..., :count] if count else points
-        rows = jnp.moveaxis(here.relative / here.size[:, :, None], 1, 0)
+        rows = jnp.moveaxis(self.relative / self.size[:, :, None], 1, 0)
         x, y, z = jnp.moveaxis(points, 1, 0)
         return jnp.abs(rows[..., :1] * x[None] + rows[..., 1:2] * y[None] + (rows[..., 2:3] * z[None] + rows[..., 3:]))
 
-    def bounded(count):
-        def bounds(index):
-            here = pairs(index)
-            least, most = _bounds(coordinates(here, count), here.exponents)
-            if count:
-                assert shared is not None
-                # The gauge is a norm, at most the length over the least half-extent, or twice that below 2-norms.
-                twice = jnp.where(jnp.max(here.exponents, axis=1) > 1.0, 2.0, 1.0)
-                least = least - twice * shared[2] / jnp.min(here.size, axis=1)
-            return jnp.where(most < 1.0, HIT, jnp.where(least < 1.0, OPEN, APART))
 
-        return bounds
+@dataclasses.dataclass(frozen=True, eq=False)
+class _AllPairs:
+    """All pairs of placed clouds and objects, for a CPU, which looks closer and closer at fewer and fewer of them.
 
-    def gauged(index):
-        here = pairs(index)
-        least = jnp.min(superquadric.unit_gauge(coordinates(here, 0), here.exponents.T[:, :, None]), axis=1)
-        return jnp.where(least < 1.0, HIT, APART)
+    Attributes:
+      shape: of the mask.
+      shared: points, boxes and gap of the clouds, where all of a batch share them.
+      clouds, T_world_cloud, objects, own: see `collisions`, with the axes of the batch in front.
+    """
 
-    def decide(state, test, block):
-        """Look closer at what is open."""
+    shape: tuple[int, ...]
+    shared: tuple | None
+    clouds: Array
+    T_world_cloud: Array
+    objects: Array
+    own: tuple | None
+
+    def decided(self, state: UInt8[Array, " all"], test: Callable[[_Pairs], Array], block: int) -> UInt8[Array, " all"]:
+        """What is known of the pairs after a test of those that are open."""
+        last = jnp.uint32(math.prod(self.shape) - 1)
 
         def body(state, index, active):
-            return put(state, index, test(jax.lax.min(index, jnp.uint32(total - 1))))
+            return put(state, index, test(self._at(jax.lax.min(index, last))))
 
         return for_each(state == OPEN, body, state, block_size(block))
 
-    state = decide(jnp.where(mask.reshape(-1), OPEN, APART), near, BOXES)
-    if first:
-        state = decide(state, bounded(first), CLOUDS)
-    if m * n > FEW:
-        state = decide(state, bounded(0), CLOUDS)
-    state = decide(state, gauged, GAUGES)
-    return (state == HIT).reshape(mask.shape)
+    def _at(self, index: Integer[Array, " k"]) -> _Pairs:
+        batch, (m, n) = self.shape[:-2], self.shape[-2:]
+        entry, width = entry_of(index, batch, m * n), jnp.uint32(n)
+        j = jax.lax.rem(index, width)
+        k = jax.lax.rem(jax.lax.div(index, width), jnp.uint32(m))
+        numbers, cloud = entry.of(self.objects, (j, n)), entry.of(self.clouds, (k, m))
+        relative = matmul(numbers[:, :12].reshape(-1, 3, 4), entry.of(self.T_world_cloud, (k, m)))
+
+        def table(i: int) -> Array:
+            if self.shared is not None:
+                return taken(self.shared[i], cloud)
+            assert self.own is not None
+            return entry.of(self.own[i], (cloud, self.own[i].shape[len(batch)]))
+
+        gap = 0.0 if self.shared is None else self.shared[2]
+        return _Pairs(relative, numbers[:, 12:15], numbers[:, 15:], table, gap)
+
+
+def _near(pairs: _Pairs) -> UInt8[Array, " k"]:
+    """Whether the boxes around clouds and objects overlap, along the axes of the clouds'."""
+    box, rotation = pairs.table(1), pairs.relative[:, :, :3]
+    reach = jnp.sum(jnp.abs(rotation) * pairs.size[:, :, None], axis=1)
+    centre = -jnp.sum(rotation * pairs.relative[:, :, 3:], axis=1)
+    return jnp.where(jnp.all((centre - reach < box[:, 1]) & (centre + reach > box[:, 0]), axis=1), OPEN, APART)
+
+
+def _bounded(pairs: _Pairs, count: int = 0) -> UInt8[Array, " k"]:
+    """What bounds on the gauge tell, of all points or of the first `count`."""
+    least, most = _bounds(pairs.coordinates(count), pairs.exponents)
+    if count:
+        # The gauge is a norm, at most the length over the least half-extent, or twice that below 2-norms.
+        twice = jnp.where(jnp.max(pairs.exponents, axis=1) > 1.0, 2.0, 1.0)
+        least = least - twice * pairs.gap / jnp.min(pairs.size, axis=1)
+    return jnp.where(most < 1.0, HIT, jnp.where(least < 1.0, OPEN, APART))
+
+
+def _gauged(pairs: _Pairs) -> UInt8[Array, " k"]:
+    """What the gauge of all points tells."""
+    least = jnp.min(superquadric.unit_gauge(pairs.coordinates(), pairs.exponents.T[:, :, None]), axis=1)
+    return jnp.where(least < 1.0, HIT, APART)
 
 
 def _bounds(scaled: Float[Array, "3 k p"], exponents: Float[Array, "k 2"]) -> tuple[Float[Array, " k"], ...]:

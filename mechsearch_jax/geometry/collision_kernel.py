@@ -19,8 +19,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.extend
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
+
+from mechsearch_jax.geometry.masked import on_cpu
 
 Function = Callable[[Array], Array]
 
@@ -61,6 +64,13 @@ def kernel_available() -> bool:
     except ImportError:
         return False
     return hasattr(triton, "CompilerParams") and hasattr(triton, "elementwise_inline_asm")
+
+
+def uses_kernel() -> bool:
+    """Whether what is being traced is meant for an NVIDIA GPU, and the kernel can be had."""
+    if on_cpu() or jax.default_backend() != "gpu" or not kernel_available():
+        return False
+    return "rocm" not in jax.extend.backend.get_backend().platform_version.lower()
 
 
 def collide(
