@@ -162,10 +162,9 @@ def transfers(
       T_world_object: the object in the hand where it is grasped, and at the places.
       wanted: of which of them it is asked.
     """
-    n, ways, p, gripper = scene.capacity, len(T_world_gripper), OBJECT_PLACES, space.gripper
+    n, gripper = scene.capacity, space.gripper
     others = scene.replace(valid=scene.valid & (jnp.arange(n) != index))
-    swept, still = (cloud_index(tables, OPEN, wrist, at_rest) for at_rest in (False, True))
-    grippers = gripper_clouds(tables)
+    swept, clouds = cloud_index(tables, OPEN, wrist), gripper_clouds(tables).points
 
     def follows(clouds, own, T):
         others, q7, swept = own
@@ -176,23 +175,57 @@ def transfers(
         return reachable & ~touches, q[0], outside
 
     own = (others, tables.q7[OPEN, wrist], swept)
-    able, q, outside = masked_vmap(follows, wanted, grippers.points, own, T_world_gripper, block=32)
+    able, q, outside = masked_vmap(follows, wanted, clouds, own, T_world_gripper, block=32)
     able &= jnp.all(jnp.abs(q - q[:1]) < LARGEST_TRANSFER, axis=-1)
     able &= able[0]
+    able &= ~_gripper_meets(space, tables, others, wrist, T_world_gripper, able)
+    able &= ~_object_meets(space, others, scene.size[index], cloud, T_world_gripper, T_world_object, outside, able)
+    return able[1:] & able[0]
 
-    # The gripper's approach to the places, at a distance from others, and its ways along x.
-    wider = scene.replace(size=scene.size + space.config.clearance)
-    objects = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wider, scene)
+
+def _gripper_meets(
+    space: ActionSpace,
+    tables: ActionTables,
+    others: Superquadrics,
+    wrist: Int[Array, ""],
+    T_world_gripper: Float[Array, "w 4 4"],
+    wanted: Bool[Array, " w"],
+) -> Bool[Array, " w"]:
+    """Whether the gripper hits others on its approach to a place, at a distance from them, or on its way along x.
+
+    What it meets on its approach to the grasp, which comes first, was looked at before.
+    """
+    n, ways = others.capacity, len(T_world_gripper)
+    swept, still = (cloud_index(tables, OPEN, wrist, at_rest) for at_rest in (False, True))
+    wider = others.replace(size=others.size + space.config.clearance)
+    objects = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wider, others)
     crossings, crosses = crossing_places(space, T_world_gripper)
     places = jnp.concatenate([T_world_gripper[1:], crossings.reshape(-1, 4, 4)])
     at_rest = np.arange(len(places)) >= ways - 1
     near = jnp.where(at_rest[:, None], np.arange(2 * n)[None] >= n, np.arange(2 * n)[None] < n)
-    asked = jnp.concatenate([able[1:], jnp.repeat(able & crosses, CROSSING_PLACES)])
-    mask = asked[:, None] & near & jnp.tile(others.valid, 2)[None]
-    by_gripper = jnp.any(collisions(grippers, jnp.where(at_rest, still, swept), places, objects, mask), axis=1)
-    hit = jnp.any(by_gripper[ways - 1 :].reshape(ways, -1), axis=1) | jnp.pad(by_gripper[: ways - 1], (1, 0))
+    asked = jnp.concatenate([wanted[1:], jnp.repeat(wanted & crosses, CROSSING_PLACES)])
+    mask = asked[:, None] & near & objects.valid[None]
+    cloud = jnp.where(at_rest, still, swept)
+    hits = jnp.any(collisions(gripper_clouds(tables), cloud, places, objects, mask), axis=1)
+    approach, on_crossing = jnp.split(hits, [ways - 1])
+    return jnp.any(on_crossing.reshape(ways, CROSSING_PLACES), axis=1) | jnp.pad(approach, (1, 0))
 
-    # The object on its way to the places, and along x.
+
+def _object_meets(
+    space: ActionSpace,
+    others: Superquadrics,
+    size: Float[Array, " 3"],
+    cloud: Float[Array, "p 3"],
+    T_world_gripper: Float[Array, "w 4 4"],
+    T_world_object: Float[Array, "w 4 4"],
+    outside: Float[Array, " w"],
+    wanted: Bool[Array, " w"],
+) -> Bool[Array, " w"]:
+    """Whether the object in the hand hits others on its way to a place, or along x, or is still in the shelf then.
+
+    What it meets on its way from the grasp, which comes first, was looked at before.
+    """
+    ways, p, gripper = len(T_world_gripper), OBJECT_PLACES, space.gripper
     back = -T_world_gripper[:, :3, 2]
     into = swept_places(T_world_object[1:], back[1:], gripper.approach)
     length = crossing_length(T_world_gripper, outside, gripper)
@@ -200,18 +233,16 @@ def transfers(
     shift = jnp.broadcast_to((gripper.approach * back)[:, None], (ways, p, 3))
     shift = shift.at[..., 0].add(-length[:, None] * share[None])
     along = translate(jnp.broadcast_to(T_world_object[:, None], (ways, p, 4, 4)), shift)
-    ahead = jnp.sum(jnp.abs(T_world_object[:, 0, :3]) * scene.size[index][None], axis=-1)
+    ahead = jnp.sum(jnp.abs(T_world_object[:, 0, :3]) * size[None], axis=-1)
     inside = along[:, -1, 0, 3] + ahead > space.shelf.front
     places = jnp.concatenate([into.reshape(-1, 4, 4), along.reshape(-1, 4, 4)])
-    asked = jnp.concatenate([jnp.repeat((able & ~hit)[1:], SWEPT_PLACES), jnp.repeat(able & ~hit & (length > 0.0), p)])
+    asked = jnp.concatenate([jnp.repeat(wanted[1:], SWEPT_PLACES), jnp.repeat(wanted & (length > 0.0), p)])
     mask = asked[:, None] & others.valid[None]
     body = clouds_of(cloud.T[None])
-    by_object = jnp.any(collisions(body, np.zeros(len(places), np.int32), places, scene, mask, own=True), axis=1)
-    by_sweep, on_crossing = jnp.split(by_object, [(ways - 1) * SWEPT_PLACES])
-    hit |= jnp.any(on_crossing.reshape(ways, p), axis=1)
-    hit |= jnp.pad(jnp.any(by_sweep.reshape(ways - 1, SWEPT_PLACES), axis=1), (1, 0))
-    free = able & ~hit & ~inside
-    return free[1:] & free[0]
+    hits = jnp.any(collisions(body, np.zeros(len(places), np.int32), places, others, mask, own=True), axis=1)
+    by_sweep, on_crossing = jnp.split(hits, [(ways - 1) * SWEPT_PLACES])
+    met = jnp.any(on_crossing.reshape(ways, p), axis=1) | inside
+    return met | jnp.pad(jnp.any(by_sweep.reshape(ways - 1, SWEPT_PLACES), axis=1), (1, 0))
 
 
 @dataclasses.dataclass(frozen=True)

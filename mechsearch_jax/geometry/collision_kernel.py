@@ -73,6 +73,27 @@ def uses_kernel() -> bool:
     return "rocm" not in jax.extend.backend.get_backend().platform_version.lower()
 
 
+def _relative(o: Sequence[Array], T: Sequence[Sequence[Array]]) -> list[list[Array]]:
+    """A cloud's pose in an object's frame, 3 x 4 numbers, from what is known of both."""
+    return [
+        [
+            sum(o[4 * row + k] * T[k][column] for k in range(3)) + (o[4 * row + 3] if column == 3 else 0.0)
+            for column in range(4)
+        ]
+        for row in range(3)
+    ]
+
+
+def _boxes_overlap(relative: Sequence[Sequence[Array]], size: Sequence[Array], box: Sequence[Array]) -> Array:
+    """Whether the boxes around a cloud and an object overlap, along the axes of the cloud's."""
+    overlap = jnp.bool_(True)
+    for k in range(3):
+        reach = sum(jnp.abs(relative[row][k]) * size[row] for row in range(3))
+        centre = -sum(relative[row][k] * relative[row][3] for row in range(3))
+        overlap &= (centre - reach < box[3 + k]) & (centre + reach > box[k])
+    return overlap
+
+
 def collide(
     mask: Bool[Array, "*batch m n"],
     points: Array,
@@ -136,19 +157,8 @@ def collide(
                 @pl.when(asked_ref[b, i, j].astype(jnp.int32) > 0)
                 def _():
                     o = [objects_ref[in_objects, j, k] for k in range(17)]
-                    relative = [
-                        [
-                            sum(o[4 * row + k] * T[k][column] for k in range(3))
-                            + (o[4 * row + 3] if column == 3 else 0.0)
-                            for column in range(4)
-                        ]
-                        for row in range(3)
-                    ]
-                    near = jnp.bool_(True)
-                    for k in range(3):
-                        reach = sum(jnp.abs(relative[row][k]) * o[12 + row] for row in range(3))
-                        centre = -sum(relative[row][k] * relative[row][3] for row in range(3))
-                        near &= (centre - reach < box[3 + k]) & (centre + reach > box[k])
+                    relative = _relative(o, T)
+                    near = _boxes_overlap(relative, o[12:15], box)
 
                     @pl.when(near)
                     def _():
