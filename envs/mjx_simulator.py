@@ -130,8 +130,9 @@ class MjxSimulator:
         changed = jax.device_put(np.ones(count, bool) if only is None else np.array(only))
         data, self._data = self._data, None
         old = new if only is None else (self._fields, self.world)
-        self._data, (self._fields, self.world) = self._place(changed, data, qpos, ctrl, new, old)
-        return self.world
+        self._data, (self._fields, placed) = self._place(changed, data, qpos, ctrl, new, old)
+        self.world = placed
+        return placed
 
     def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Execute an action in every world and let the bodies come to rest; see `Simulator.execute`.

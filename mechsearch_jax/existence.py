@@ -449,7 +449,8 @@ def _counted(
     """Pixels of the full resolution that a target shows at doubtful places, by a closer look; 0 at the others."""
 
     def counted(shared, closer, T):
-        return _pixels(*shared, target, closer, T, config)
+        tables, camera = shared
+        return _pixels(tables, camera, target, closer, T, config)
 
     T, mask = tables.T_world_target.reshape(-1, 4, 4), doubtful.reshape(-1)
     return masked_vmap(counted, mask, (tables, camera), closer, T, block=64).reshape(doubtful.shape)

@@ -75,13 +75,8 @@ def uses_kernel() -> bool:
 
 def _relative(o: Sequence[Array], T: Sequence[Sequence[Array]]) -> list[list[Array]]:
     """A cloud's pose in an object's frame, 3 x 4 numbers, from what is known of both."""
-    return [
-        [
-            sum(o[4 * row + k] * T[k][column] for k in range(3)) + (o[4 * row + 3] if column == 3 else 0.0)
-            for column in range(4)
-        ]
-        for row in range(3)
-    ]
+    rotated = [[jnp.asarray(sum(o[4 * row + k] * T[k][j] for k in range(3))) for j in range(4)] for row in range(3)]
+    return [[*numbers[:3], numbers[3] + o[4 * row + 3]] for row, numbers in enumerate(rotated)]
 
 
 def _boxes_overlap(relative: Sequence[Sequence[Array]], size: Sequence[Array], box: Sequence[Array]) -> Array:
