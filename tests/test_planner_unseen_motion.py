@@ -221,6 +221,7 @@ def test_an_episode_tells_the_belief_what_it_did(problem, monkeypatch):
     monkeypatch.setattr(slots.OneSlot, "_snapshot", lambda self, world: None)
     choice = Choice(push(), jnp.float32(3.0), jnp.float32(2.0), jnp.int32(1))
     monkeypatch.setattr(slots, "chosen", lambda decision: choice)
+    monkeypatch.setattr(slots, "decide", lambda policy, trials, *arguments: policy(*arguments))
 
     @dataclasses.dataclass
     class Decided:

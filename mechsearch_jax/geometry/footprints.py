@@ -8,12 +8,15 @@ from typing import NamedTuple
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
 
 ROUND_EXPONENT = 0.6
 QUARTER_TURN = math.pi / 2
+
+Numbers = Array | np.ndarray
 
 
 class Footprints(flax.struct.PyTreeNode):
@@ -60,7 +63,7 @@ class Headings(NamedTuple):
     round: Bool[Array, "*batch"]
 
 
-def headings(rotation: Float[Array, "*batch 3 3"], exponents: Float[Array, "*batch 2"]) -> Headings:
+def headings(rotation: Float[Numbers, "*batch 3 3"], exponents: Float[Numbers, "*batch 2"]) -> Headings:
     """How objects with some `R_world_object` and exponents stand."""
     up = jnp.abs(rotation[..., 2, :])
     vertical = jnp.argmax(up, axis=-1)
