@@ -307,7 +307,7 @@ class _Clock:
                 timings["compile"] = round(timings.get("compile", 0.0) + compiled / len(rows), 6)
 
     def timings(self, row: int) -> dict[str, float]:
-        """Those of a slot since it was last asked for."""
+        """Those of a slot since it was last read."""
         found, self._timings[row] = self._timings[row], {}
         return found
 

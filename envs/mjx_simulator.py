@@ -306,19 +306,19 @@ class MjxSimulator:
         data, progress = jax.lax.while_loop(waits, some, (data, progress))
         ended = progress.done & ~known
         # What moved is stopped. Where all was undone, the robot is again told what it was told before.
-        told = where(progress.diverged, task.idle, task.controls[-1])
+        controls = where(progress.diverged, task.idle, task.controls[-1])
         resting = _at_rest(data, ended & task.moves)
         touch = self._model.step(fields, resting)
         in_hand = self._model.holds_target(touch._impl)
         data = touch.replace(
-            qpos=resting.qpos, qvel=resting.qvel, ctrl=where(ended, told, data.ctrl), time=resting.time
+            qpos=resting.qpos, qvel=resting.qvel, ctrl=where(ended, controls, data.ctrl), time=resting.time
         )
         warm = resting.qacc_warmstart
         data = data.replace(qacc_warmstart=where(ended, jnp.zeros_like(warm), warm))
         # Of the others nothing is to be said, and nothing to be taken over.
-        mine = task.replace(moves=task.moves & ended, kind=jnp.where(ended, task.kind, ActionKind.NONE))
+        ending = task.replace(moves=task.moves & ended, kind=jnp.where(ended, task.kind, ActionKind.NONE))
         simulator = self.config.simulator
-        world, outcome = verdicts(self.shelf, simulator, mine, progress, world, data.qpos, in_hand)
+        world, outcome = verdicts(self.shelf, simulator, ending, progress, world, data.qpos, in_hand)
         return data, world, (task, progress, known | ended), ended, outcome
 
     def _simulate(self, fields: BodyFields, data: Any, world: World, actions: Action | None, active: Array):

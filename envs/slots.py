@@ -235,7 +235,7 @@ class ManySlots:
         problem, state = self._problem, self._state
         twice = [("search", True), ("search", False), ("retrieval", False)]
         questions = twice if isinstance(self._policy, AsksTwice) else [("__call__", False)]
-        asked = [(self._policy, own, problem, state, keys, rows, *how) for how in questions]
+        calls = [(self._policy, own, problem, state, keys, rows, *how) for how in questions]
 
         def choosing(question: tuple[Any, ...]) -> Callable[[], None] | None:
             decision, _ = _propose.returns(*question)
@@ -245,8 +245,8 @@ class ManySlots:
             return _choose.begin(decision, results)
 
         return [
-            *(program("plan", _propose, *question) for question in asked),
-            *(Program("small ones", lambda: False, functools.partial(choosing, question)) for question in asked),
+            *(program("plan", _propose, *question) for question in calls),
+            *(Program("small ones", lambda: False, functools.partial(choosing, question)) for question in calls),
             program("look", _look, problem, state, world, keys, rows, self._recogniser, problem.camera),
             program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
             program("small ones", _told, problem.poses, state.belief.exists, world),
@@ -280,7 +280,7 @@ class ManySlots:
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`.
 
-        Only where a target is found is asked whether to take it out, and only where it is not taken out is planned.
+        Whether to take a target out is decided only where it is found, and a plan made only where it is not taken out.
         What is worth trying out is tried in all slots together.
         """
         if not isinstance(self._policy, AsksTwice):

@@ -50,8 +50,8 @@ def compile_kernels(
     folder = tempfile.TemporaryDirectory()
     file = Path(folder.name) / "model.mjb"
     mujoco.mj_saveModel(model, str(file))
-    told: dict[str, Any] = {"batched": list(batched), "worlds": worlds, "contacts": contacts, "rows": rows}
-    what = repr((told, device, warp.get_device(device).name, warp.__version__, mujoco.__version__))
+    sizes: dict[str, Any] = {"batched": list(batched), "worlds": worlds, "contacts": contacts, "rows": rows}
+    what = repr((sizes, device, warp.get_device(device).name, warp.__version__, mujoco.__version__))
     digest = hashlib.sha256(what.encode() + file.read_bytes()).hexdigest()[:32]
     note = Path(str(warp.config.kernel_cache_dir)) / f"step-{digest}"
     if note.exists():
@@ -64,7 +64,7 @@ def compile_kernels(
             sys.executable,
             "-m",
             __spec__.name,
-            json.dumps(told | {"model": str(file), "device": device, "threads": cores()}),
+            json.dumps(sizes | {"model": str(file), "device": device, "threads": cores()}),
         ],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -122,18 +122,18 @@ def modules_of_a_step(
     return list(found)
 
 
-def main(told: str) -> None:
-    """Compile what a step launches; `told` is what `compile_kernels` writes."""
+def main(settings: str) -> None:
+    """Compile what a step launches; `settings` is what `compile_kernels` writes."""
     import warp
     from mujoco.mjx.warp import forward
     from warp._src.context import Module
 
-    asked = json.loads(told)
-    threads, device = asked.pop("threads"), asked["device"]
-    load, model = Module.load, mujoco.MjModel.from_binary_path(asked.pop("model"))
+    sizes = json.loads(settings)
+    threads, device = sizes.pop("threads"), sizes["device"]
+    load, model = Module.load, mujoco.MjModel.from_binary_path(sizes.pop("model"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = modules_of_a_step(model, **asked)
+        found = modules_of_a_step(model, **sizes)
     # What calls a step from JAX is a module, too, even where it has no kernels.
     found.append((warp.get_module(forward.ffi.__name__), None if device != "cpu" else 1))
     with ThreadPoolExecutor(threads) as pool:

@@ -130,8 +130,8 @@ class Kept:
         """
         _KEEPING.outside()
         key = self._key(args, kwargs)
-        mine: Future[Any] = Future()
-        if key is None or self._loaded.setdefault(key, mine) is not mine:
+        compilation: Future[Any] = Future()
+        if key is None or self._loaded.setdefault(key, compilation) is not compilation:
             return None
         try:
             compiling = self._compiling(key, args, kwargs)
@@ -141,7 +141,7 @@ class Kept:
 
         def finish() -> None:
             try:
-                mine.set_result(compiling())
+                compilation.set_result(compiling())
             except BaseException as error:
                 self._failed(key, error)
                 raise
@@ -187,12 +187,12 @@ class Kept:
         """What a call is known by in this process; None where it is left to `jax.jit`."""
         if get_opaque_trace_state() != _KEEPING.untraced or len(args) > len(self._positions):
             return None
-        told = self._told(args, kwargs)
-        if told is None or told[-1][-1] == "True":
+        call = self._call_key(args, kwargs)
+        if call is None or call[-1][-1] == "True":
             return None
-        return (_KEEPING.executables, *told)
+        return (_KEEPING.executables, *call)
 
-    def _told(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...] | None:
+    def _call_key(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...] | None:
         """What a call is compiled for: structure, shapes, static arguments, settings; None for what is no array."""
         moving, named, static = self._split(args, kwargs)
         leaves, tree = jax.tree.flatten((moving, named))
@@ -206,7 +206,7 @@ class Kept:
         if _KEEPING.executables is None or not self._on_disk:
             return None
         try:
-            return identity(self._told(args, kwargs))
+            return identity(self._call_key(args, kwargs))
         except Unidentified:
             return None
 

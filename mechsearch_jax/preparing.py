@@ -79,7 +79,7 @@ def motions(config: MotionConfig) -> list[Program]:
 
 
 @contextlib.contextmanager
-def prepared(programs: Sequence[Program], told: Callable[[str], None]) -> Iterator[None]:
+def prepared(programs: Sequence[Program], report: Callable[[str], None]) -> Iterator[None]:
     """Prepare programs in threads while the block runs; who calls one before it is ready waits for it.
 
     As many are compiled at the same time as there are cores. What is wrong with a program is said by who calls it.
@@ -87,7 +87,7 @@ def prepared(programs: Sequence[Program], told: Callable[[str], None]) -> Iterat
 
     Args:
       programs: the longest first.
-      told: is given a line when programs have to be compiled, and whenever one was: which are left, and how many are
+      report: is given a line when programs have to be compiled, and whenever one was: which are left, and how many are
         done.
     """
     missing = [program.name for program in programs if not program.is_ready()]
@@ -97,7 +97,7 @@ def prepared(programs: Sequence[Program], told: Callable[[str], None]) -> Iterat
 
     def say() -> None:
         left = f": {', '.join(dict.fromkeys(missing))}" if missing else ""
-        told(f"compiling{left}; {count - len(missing)} of {count} done")
+        report(f"compiling{left}; {count - len(missing)} of {count} done")
 
     def over(name: str, future: Future[None]) -> None:
         free.release()
@@ -130,7 +130,7 @@ def prepared(programs: Sequence[Program], told: Callable[[str], None]) -> Iterat
         lowering.result()
 
 
-def prepare(programs: Sequence[Program], told: Callable[[str], None]) -> None:
+def prepare(programs: Sequence[Program], report: Callable[[str], None]) -> None:
     """Prepare programs, and wait for all of them; see `prepared`."""
-    with prepared(programs, told):
+    with prepared(programs, report):
         pass

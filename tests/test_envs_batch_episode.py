@@ -139,10 +139,10 @@ def test_a_slot_is_free_for_the_next_as_soon_as_its_episode_ends(problem):
 class FlowingStage(Stage):
     """The same, in which actions take their time: that of the last slot is over first, one after the other."""
 
-    def __init__(self, *told):
-        super().__init__(*told)
+    def __init__(self, *settings):
+        super().__init__(*settings)
         self.under_way = {}
-        self.asked = []
+        self.calls = []
 
     def begin(self, actions, active):
         rows = np.flatnonzero(active).tolist()
@@ -150,24 +150,24 @@ class FlowingStage(Stage):
         self.under_way |= {row: jax.tree.map(lambda a, row=row: a[row], actions) for row in rows}
 
     def advance(self, least):
-        self.asked.append((least, len(self.under_way)))
+        self.calls.append((least, len(self.under_way)))
         done = sorted(self.under_way, reverse=True)[:least]
         actions = jax.tree.map(lambda a: np.stack([a] * len(self.names)), jax.device_get(no_action()))
         for row in done:
-            for all_of_it, mine in zip(jax.tree.leaves(actions), jax.tree.leaves(self.under_way.pop(row)), strict=True):
-                all_of_it[row] = mine
+            for all_of_it, one in zip(jax.tree.leaves(actions), jax.tree.leaves(self.under_way.pop(row)), strict=True):
+                all_of_it[row] = one
         mask = np.isin(np.arange(len(self.names)), done)
         return mask, jax.device_get(self.execute(actions, mask))
 
 
 def test_a_slot_that_has_acted_goes_on_while_others_still_act(problem):
-    told = ({"hidden": reveal}, {"two": Failure.DROPPED})
+    settings = ({"hidden": reveal}, {"two": Failure.DROPPED})
     starts = [TWO, OPEN, HIDDEN, dataclasses.replace(OPEN, name="open again")]
-    flowing = FlowingStage(*told)
+    flowing = FlowingStage(*settings)
     episodes, together = run(problem, starts, flowing, 2)
     assert [without_times(e) for e in episodes] == [
         without_times(e) | {"config": e.config | {"simulator": "Stage"}}
-        for e in run(problem, starts, Stage(*told), 2)[0]
+        for e in run(problem, starts, Stage(*settings), 2)[0]
     ]
     # The other slot has run three episodes when the first action of the first is over.
     assert [next(filter(None, names)) for names in flowing.executed] == [
@@ -178,7 +178,7 @@ def test_a_slot_that_has_acted_goes_on_while_others_still_act(problem):
         "two",
         "two",
     ]
-    assert flowing.asked == [(1, 2)] * 4 + [(1, 1)] * 2
+    assert flowing.calls == [(1, 2)] * 4 + [(1, 1)] * 2
     assert together == [1, 1, 1, 1]
     assert all(step.timings["simulate"] > 0 for e in episodes for step in e.steps if step.action)
 

@@ -259,9 +259,9 @@ def test_worlds_need_not_wait_for_each_other_and_nothing_is_left_to_compile(sim,
         assert sim.advance(1)[0].tolist() == [True, False, False]
         # Of two that begin, one has nothing to do, and is done at once.
         sim.begin(actions, jax.device_put(np.array([False, True, True])))
-        done, told = sim.advance(1)
+        done, refused = sim.advance(1)
         assert done.tolist() == [False, False, True]
-        assert told.reason(2) == "unreachable"
+        assert refused.reason(2) == "unreachable"
         sim.begin(actions, jax.device_put(np.array([True, False, False])))
         steps = [sim.advance(1) for _ in range(2)]
         sim.replace({0: starts[1]})
@@ -271,7 +271,7 @@ def test_worlds_need_not_wait_for_each_other_and_nothing_is_left_to_compile(sim,
         [[True, False, False], [False, True, False]],
         [[False, True, False], [True, False, False]],
     )
-    (late,) = [told for done, told in steps if done[1]]
+    (late,) = [outcome for done, outcome in steps if done[1]]
     assert int(late.steps[1]) == int(outcome.steps[1])
     for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(jax.device_get(sim.world)), strict=True):
         np.testing.assert_array_equal(a[1:], b[1:])
@@ -294,10 +294,10 @@ def test_kernels_that_were_compiled_are_not_compiled_again(tmp_path, monkeypatch
 
     monkeypatch.setattr(warp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setattr(warp_kernels.sys, "executable", "true")
-    asked = model.compile_model(Shelf(), Camera(), 0.004), ("geom_size",), 2, 128, 320, "cpu"
-    warp_kernels.compile_kernels(*asked)()
-    assert warp_kernels.compile_kernels(*asked) is None
-    assert warp_kernels.compile_kernels(*asked[:2], 3, *asked[3:]) is not None
+    arguments = model.compile_model(Shelf(), Camera(), 0.004), ("geom_size",), 2, 128, 320, "cpu"
+    warp_kernels.compile_kernels(*arguments)()
+    assert warp_kernels.compile_kernels(*arguments) is None
+    assert warp_kernels.compile_kernels(*arguments[:2], 3, *arguments[3:]) is not None
 
 
 @pytest.mark.slow

@@ -98,7 +98,7 @@ class TrialScene(NativeWorld):
           kind: of the action.
           reference: of the arm, as NumPy arrays.
           index: slot of the object that the action moves.
-          needed: asked again and again whether anybody still wants to know.
+          needed: called again and again; whether the result is still wanted.
         """
         if self.diverged:
             return TrialResult.UNKNOWN

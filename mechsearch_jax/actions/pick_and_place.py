@@ -160,7 +160,7 @@ def transfers(
       wrist: index of the wrist angle.
       T_world_gripper: where it is grasped, and the gripper at the places.
       T_world_object: the object in the hand where it is grasped, and at the places.
-      wanted: of which of them it is asked.
+      wanted: which of them are looked at.
     """
     n, gripper = scene.capacity, space.gripper
     others = scene.replace(valid=scene.valid & (jnp.arange(n) != index))
@@ -203,8 +203,8 @@ def _gripper_meets(
     places = jnp.concatenate([T_world_gripper[1:], crossings.reshape(-1, 4, 4)])
     at_rest = np.arange(len(places)) >= ways - 1
     near = jnp.where(at_rest[:, None], np.arange(2 * n)[None] >= n, np.arange(2 * n)[None] < n)
-    asked = jnp.concatenate([wanted[1:], jnp.repeat(wanted & crosses, CROSSING_PLACES)])
-    mask = asked[:, None] & near & objects.valid[None]
+    active = jnp.concatenate([wanted[1:], jnp.repeat(wanted & crosses, CROSSING_PLACES)])
+    mask = active[:, None] & near & objects.valid[None]
     cloud = jnp.where(at_rest, still, swept)
     hits = jnp.any(collisions(gripper_clouds(tables), cloud, places, objects, mask), axis=1)
     approach, on_crossing = jnp.split(hits, [ways - 1])
@@ -236,8 +236,8 @@ def _object_meets(
     ahead = jnp.sum(jnp.abs(T_world_object[:, 0, :3]) * size[None], axis=-1)
     inside = along[:, -1, 0, 3] + ahead > space.shelf.front
     places = jnp.concatenate([into.reshape(-1, 4, 4), along.reshape(-1, 4, 4)])
-    asked = jnp.concatenate([jnp.repeat(wanted[1:], SWEPT_PLACES), jnp.repeat(wanted & (length > 0.0), p)])
-    mask = asked[:, None] & others.valid[None]
+    active = jnp.concatenate([jnp.repeat(wanted[1:], SWEPT_PLACES), jnp.repeat(wanted & (length > 0.0), p)])
+    mask = active[:, None] & others.valid[None]
     body = clouds_of(cloud.T[None])
     hits = jnp.any(collisions(body, np.zeros(len(places), np.int32), places, others, mask, own=True), axis=1)
     by_sweep, on_crossing = jnp.split(hits, [(ways - 1) * SWEPT_PLACES])

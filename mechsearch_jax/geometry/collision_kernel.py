@@ -1,6 +1,6 @@
 """Point clouds against superquadrics on an NVIDIA GPU: one kernel for all pairs, of which most are left out.
 
-A program of the kernel has one placed cloud. It looks at the objects of which it is asked one after the other, at boxes
+A program of the kernel has one placed cloud. It looks at the objects that are wanted one after the other, at boxes
 first, and evaluates the gauge at all points only where these overlap.
 
 The gauge is computed with logarithms, where a power is a product and a p-norm of two numbers is
@@ -14,9 +14,10 @@ within a relative 1e-5 of the exact one, beside the rounding of a point's coordi
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.extend
@@ -121,62 +122,99 @@ def collide(
     size = min(POINTS, pl.next_power_of_2(points.shape[-1]))
     # A point that is there twice changes no minimum.
     points = jnp.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, -points.shape[-1] % size)], mode="edge")
-    steps = points.shape[-1] // size
-    asked = jnp.pad(mask, [(0, 0)] * (lead + 1) + [(0, width - n)]).reshape(-1, m, width).astype(jnp.int8)
-    arrays = [points, boxes.reshape(*boxes.shape[:-2], 6), cloud, T_world_cloud.reshape(*T_world_cloud.shape[:-2], 16)]
-    arrays.append(objects)
-    shapes = [a.shape[:lead] for a in arrays]
-    flat = [a.reshape(-1, *a.shape[lead:]) for a in arrays]
-    log2, exp2 = (jnp.log2, jnp.exp2) if interpret else (special("lg2"), special("ex2"))
-
-    def place(shape: tuple[int, ...], b: Array) -> Array | int:
-        """The row of an array that belongs to an element of the batch."""
-        index: Any = 0
-        for k, length in enumerate(shape):
-            if length > 1:
-                index = index + b // math.prod(batch[k + 1 :]) % batch[k] * math.prod(shape[k + 1 :])
-        return index
-
-    def kernel(asked_ref, points_ref, boxes_ref, cloud_ref, T_ref, objects_ref, out_ref):
-        b, i = pl.program_id(1), pl.program_id(0)
-        in_points, in_boxes, in_cloud, in_T, in_objects = (place(shape, b) for shape in shapes)
-        out_ref[b, i, :] = jnp.zeros(width, jnp.int8)
-
-        @pl.when(jnp.max(asked_ref[b, i, :].astype(jnp.int32)) > 0)
-        def _():
-            c = cloud_ref[in_cloud, i]
-            T = [[T_ref[in_T, i, 4 * row + column] for column in range(4)] for row in range(3)]
-            box = [boxes_ref[in_boxes, c, k] for k in range(6)]
-
-            def each(j, _):
-                @pl.when(asked_ref[b, i, j].astype(jnp.int32) > 0)
-                def _():
-                    o = [objects_ref[in_objects, j, k] for k in range(17)]
-                    relative = _relative(o, T)
-                    near = _boxes_overlap(relative, o[12:15], box)
-
-                    @pl.when(near)
-                    def _():
-                        rows = [[number / o[12 + row] for number in relative[row]] for row in range(3)]
-                        powers = [2.0 / o[16], 2.0 / o[15], 0.5 * o[16], 0.5 * o[15]]
-
-                        def step(s, least):
-                            x, y, z = (points_ref[in_points, c, k, pl.ds(s * size, size)] for k in range(3))
-                            scaled = [r[0] * x + (r[1] * y + (r[2] * z + r[3])) for r in rows]
-                            return jnp.minimum(least, log_gauge(scaled, powers, log2, exp2))
-
-                        least = jax.lax.fori_loop(0, steps, step, jnp.full(size, jnp.inf, jnp.float32))
-                        out_ref[b, i, j] = (jnp.min(least) < 0.0).astype(jnp.int8)
-
-                return 0
-
-            jax.lax.fori_loop(0, n, each, 0)
-
+    wanted = jnp.pad(mask, [(0, 0)] * (lead + 1) + [(0, width - n)]).reshape(-1, m, width).astype(jnp.int8)
+    boxes, T = boxes.reshape(*boxes.shape[:-2], 6), T_world_cloud.reshape(*T_world_cloud.shape[:-2], 16)
+    arrays = [points, boxes, cloud, T, objects]
+    settings = _Settings(
+        batch=batch,
+        shapes=tuple(a.shape[:lead] for a in arrays),
+        objects=n,
+        size=size,
+        log2=jnp.log2 if interpret else special("lg2"),
+        exp2=jnp.exp2 if interpret else special("ex2"),
+    )
     out = pl.pallas_call(
-        kernel,
-        out_shape=jax.ShapeDtypeStruct(asked.shape, jnp.int8),
+        functools.partial(_kernel, settings),
+        out_shape=jax.ShapeDtypeStruct(wanted.shape, jnp.int8),
         grid=(m, math.prod(batch)),
         compiler_params=triton.CompilerParams(num_warps=WARPS, num_stages=1),
         interpret=interpret,
-    )(asked, *flat)
+    )(wanted, *(a.reshape(-1, *a.shape[lead:]) for a in arrays))
     return out[..., :n].reshape(mask.shape) > 0
+
+
+class _Settings(NamedTuple):
+    """What is static about the kernel.
+
+    Attributes:
+      batch: sizes of its axes.
+      shapes: the same of each array, 1 where it does not vary along an axis.
+      objects: how many there are.
+      size: points in one step.
+      log2, exp2: of base 2.
+    """
+
+    batch: tuple[int, ...]
+    shapes: tuple[tuple[int, ...], ...]
+    objects: int
+    size: int
+    log2: Function
+    exp2: Function
+
+    def rows(self, element: Array) -> list[Any]:
+        """The row of each array that belongs to an element of the batch."""
+        rows = []
+        for shape in self.shapes:
+            row: Any = 0
+            for k, length in enumerate(shape):
+                if length > 1:
+                    row = row + element // math.prod(self.batch[k + 1 :]) % length * math.prod(shape[k + 1 :])
+            rows.append(row)
+        return rows
+
+
+def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, objects, out) -> None:
+    """One program: a placed cloud of an element of the batch against all objects; the arrays are references."""
+    from jax.experimental import pallas as pl
+
+    b, i = pl.program_id(1), pl.program_id(0)
+    in_points, in_boxes, in_cloud, in_T, in_objects = settings.rows(b)
+    out[b, i, :] = jnp.zeros(out.shape[-1], jnp.int8)
+
+    @pl.when(jnp.max(wanted[b, i, :].astype(jnp.int32)) > 0)
+    def _():
+        c = cloud[in_cloud, i]
+        T = [[T_world_cloud[in_T, i, 4 * row + column] for column in range(4)] for row in range(3)]
+        box = [boxes[in_boxes, c, k] for k in range(6)]
+
+        def each(j, _):
+            @pl.when(wanted[b, i, j].astype(jnp.int32) > 0)
+            def _():
+                numbers = [objects[in_objects, j, k] for k in range(17)]
+                relative = _relative(numbers, T)
+
+                @pl.when(_boxes_overlap(relative, numbers[12:15], box))
+                def _():
+                    out[b, i, j] = _inside(settings, points, in_points, c, relative, numbers[12:]).astype(jnp.int8)
+
+            return 0
+
+        jax.lax.fori_loop(0, settings.objects, each, 0)
+
+
+def _inside(
+    settings: _Settings, points, row, cloud, relative: Sequence[Sequence[Array]], shape: Sequence[Array]
+) -> Array:
+    """Whether a point of a cloud is inside an object, given by half-extents and exponents."""
+    from jax.experimental import pallas as pl
+
+    rows = [[number / shape[k] for number in relative[k]] for k in range(3)]
+    powers = [2.0 / shape[4], 2.0 / shape[3], 0.5 * shape[4], 0.5 * shape[3]]
+
+    def step(s, least):
+        x, y, z = (points[row, cloud, k, pl.ds(s * settings.size, settings.size)] for k in range(3))
+        scaled = [r[0] * x + (r[1] * y + (r[2] * z + r[3])) for r in rows]
+        return jnp.minimum(least, log_gauge(scaled, powers, settings.log2, settings.exp2))
+
+    first = jnp.full(settings.size, jnp.inf, jnp.float32)
+    return jnp.min(jax.lax.fori_loop(0, points.shape[-1] // settings.size, step, first)) < 0.0

@@ -216,9 +216,9 @@ def masked_vmap(
         def evaluate(shared, own, rows, index):
             entry = entry_of(index, batch, n)
             row = jax.tree.map(lambda a: entry.of(a, (jax.lax.rem(index, width), n)), rows)
-            mine = jax.tree.map(entry.of, own)
+            apart = jax.tree.map(entry.of, own)
             varies = jax.tree.map(lambda a: 0 if any(k > 1 for k in a.shape[: len(batch)]) else None, own)
-            return jax.vmap(function, (None, varies, 0), axis_size=len(index))(shared, mine, row)
+            return jax.vmap(function, (None, varies, 0), axis_size=len(index))(shared, apart, row)
 
         def body(result, index, active):
             values = evaluate(shared, own, rows, jax.lax.min(index, jnp.uint32(total - 1)))

@@ -43,13 +43,13 @@ class LaterPlacementsStay:
     inner: Predict
 
     def __call__(self, problem: Problem, state: State, sample: Sample, first: Bool[Array, ""]) -> Prediction:
-        told = self.inner(problem, state, sample, first)
+        prediction = self.inner(problem, state, sample, first)
         held = functools.reduce(
             jnp.logical_or, [sample.action.kind == code for code, kind in KINDS.items() if kind.holds_object]
         )
         stays = held & ~first
-        scene = jax.tree.map(lambda old, new: jnp.where(stays, old, new), state.scene, told.scene)
-        return told.replace(scene=scene, moved=told.moved & ~stays)
+        scene = jax.tree.map(lambda old, new: jnp.where(stays, old, new), state.scene, prediction.scene)
+        return prediction.replace(scene=scene, moved=prediction.moved & ~stays)
 
 
 def _own(slots: Slots) -> Slots:
