@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import flax.struct
@@ -42,6 +43,8 @@ COARSE = 320
 # What a pose where no grasp is feasible counts for, in objects hit: one more than the eight objects of a scene and its
 # target. It does not depend on how many slots a scene has; whoever hits as many might as well have no grasp.
 INFEASIBLE = 10
+# How many feasible pairs there are, and how many at a pose, is rounded up to multiples of these.
+PAIRS_STEP, POSE_STEP = 1024, 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +103,10 @@ class GraspTables(flax.struct.PyTreeNode):
       still_gripper: what the open gripper takes up with each wrist, in its own frame as rows, shape (W, 3, S) [m].
       still_target: surface of the target in its own frame as rows, shape (3, R) [m].
       T_world_target: candidate poses, shape (X, 4, 4).
-      pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose.
+      pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose. After them the last one is repeated, so
+        that the shape seldom changes where the shelf stands a little elsewhere.
+      pair_valid: false for what is repeated, shape (K,).
+      pose_pairs: the pairs of each candidate pose, and K where there are no more, shape (X, P).
       found_grasp: the grasps of a target that has been found, shape (F,): all of them, or none in tables of candidates.
       gap: how far a point of a cloud may be from the nearest of its first `COARSE` [m].
     """
@@ -116,6 +122,8 @@ class GraspTables(flax.struct.PyTreeNode):
     T_world_target: jax.Array
     pair_pose: jax.Array
     pair_grasp: jax.Array
+    pair_valid: jax.Array
+    pose_pairs: jax.Array
     found_grasp: jax.Array
     gap: jax.Array
 
@@ -233,16 +241,40 @@ def grasp_tables(
         T_world_target=poses,
         pair_pose=jnp.zeros(0, jnp.int32),
         pair_grasp=jnp.zeros(0, jnp.int32),
+        pair_valid=jnp.zeros(0, bool),
+        pose_pairs=jnp.zeros((len(poses), 0), jnp.int32),
         found_grasp=jnp.zeros(0, jnp.int32),
         gap=jnp.float32(max(_gap(cloud.T, COARSE) for cloud in clouds)),
     )
     if candidates:
         judge = jax.jit(lambda tables: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))
         pose, grasp = np.nonzero(np.asarray(judge(tables)))
-        tables = tables.replace(pair_pose=jnp.int32(pose), pair_grasp=jnp.int32(grasp))
+        tables = tables.replace(**_padded_pairs(pose, grasp, len(poses)))
     else:
-        tables = tables.replace(T_world_target=poses[:0], found_grasp=jnp.arange(len(clouds), dtype=jnp.int32))
+        tables = tables.replace(
+            T_world_target=poses[:0],
+            pose_pairs=tables.pose_pairs[:0],
+            found_grasp=jnp.arange(len(clouds), dtype=jnp.int32),
+        )
     return tables
+
+
+def _padded_pairs(
+    pose: Int[np.ndarray, " pairs"], grasp: Int[np.ndarray, " pairs"], poses: int
+) -> dict[str, jax.Array]:
+    """The fields of `GraspTables` that say which grasps are feasible at which of the candidate poses."""
+    rows = len(pose) + -len(pose) % PAIRS_STEP
+    count = np.bincount(pose, minlength=poses)
+    place = np.arange(len(pose)) - np.repeat(np.cumsum(count) - count, count)
+    width = int(count.max(initial=0))
+    pose_pairs = np.full((poses, width + -width % POSE_STEP), rows, np.int32)
+    pose_pairs[pose, place] = np.arange(len(pose))
+    return {
+        "pair_pose": jnp.int32(np.pad(pose, (0, rows - len(pose)), mode="edge")) if rows else jnp.int32(pose),
+        "pair_grasp": jnp.int32(np.pad(grasp, (0, rows - len(pose)), mode="edge")) if rows else jnp.int32(grasp),
+        "pair_valid": jnp.asarray(np.arange(rows) < len(pose)),
+        "pose_pairs": jnp.asarray(pose_pairs),
+    }
 
 
 def _gap(points: np.ndarray, first: int) -> float:
@@ -270,21 +302,25 @@ class Pairs(NamedTuple):
     Attributes:
       pose: index of the pose, the candidates first and then the found one, shape (K,), in ascending order.
       allowed: whether arm and shelf allow the grasp, shape (K,).
-      poses: how many poses there are.
+      pose_pairs: the rows of each candidate pose, and their number where there are no more, shape (X, P).
+      candidates: number of rows of the candidates.
+      found: whether there is the pose of a found target, too.
     """
 
     pose: Int[Array, " k"]
     allowed: Bool[Array, " k"]
-    poses: int
+    pose_pairs: Int[Array, "x p"]
+    candidates: int
+    found: bool
 
 
 def pairs(candidates: GraspTables, found: FoundGrasps | None = None) -> Pairs:
     """The rows of H; those of the candidates alone where nothing is said of a found target."""
-    poses, known = candidates.T_world_target.shape[0], candidates.pair_pose.shape[0]
+    pose, allowed, table = candidates.pair_pose, candidates.pair_valid, candidates.pose_pairs
     if found is None:
-        return Pairs(candidates.pair_pose, jnp.ones(known, bool), poses)
-    pose = jnp.concatenate([candidates.pair_pose, jnp.full(found.feasible.shape, poses, jnp.int32)])
-    return Pairs(pose, jnp.concatenate([jnp.ones(known, bool), found.feasible]), poses + 1)
+        return Pairs(pose, allowed, table, len(pose), False)
+    both = jnp.concatenate([pose, jnp.full(found.feasible.shape, len(table), jnp.int32)])
+    return Pairs(both, jnp.concatenate([allowed, found.feasible]), table, len(pose), True)
 
 
 def no_hits(rows: Pairs, capacity: int) -> Bool[Array, "k n"]:
@@ -316,7 +352,7 @@ def grasp_hits(
     fresh = scene.valid if moved is None else moved & scene.valid
     if found is None:
         grasp, T_world_target = tables.pair_grasp, tables.T_world_target[tables.pair_pose]
-        counts = exists[tables.pair_pose]
+        counts = exists[tables.pair_pose] & tables.pair_valid
     else:
         grasp, T_world_target = tables.found_grasp, found.T_world_target[None]
         counts = found.feasible & exists
@@ -327,23 +363,35 @@ def grasp_hits(
     return jnp.where(moved[None], hit, previous)
 
 
+def _per_pose(reduce: Callable[[Array], Array], rows: Pairs, hits: Bool[Array, "k n"]) -> Shaped[Array, " y"]:
+    """What a function makes of how many objects the grasps of each pose hit: of (*batch, P) numbers, -1 where a grasp
+    is not feasible."""
+    count = jnp.where(rows.allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), -1)
+    candidates, found = jnp.split(count, [rows.candidates])
+    known = reduce(jnp.append(candidates, -1)[rows.pose_pairs])
+    return jnp.append(known, reduce(found)) if rows.found else known
+
+
 def graspability(rows: Pairs, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:
     """g at all poses from H: 1 minus the least number of objects that a feasible grasp hits (equation 17).
 
     A pose where no grasp is feasible counts as hitting `INFEASIBLE` objects, however many slots there are.
     """
-    count = jnp.where(rows.allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), INFEASIBLE)
-    least = jax.ops.segment_min(count, rows.pose, num_segments=rows.poses, indices_are_sorted=True)
-    return 1 - jnp.minimum(least, INFEASIBLE)
+
+    def least(count):
+        return jnp.min(jnp.where(count < 0, INFEASIBLE, count), axis=-1, initial=INFEASIBLE)
+
+    return 1 - _per_pose(least, rows, hits)
 
 
 def crowding(rows: Pairs, hits: Bool[Array, "k n"]) -> Float[Array, " y"]:
     """Mean number of objects that the feasible grasps of each pose hit; 0 where none is feasible."""
-    pose, allowed, y = rows
-    count = jnp.where(allowed, jnp.sum(hits, axis=1, dtype=jnp.float32), 0.0)
-    total = jax.ops.segment_sum(count, pose, num_segments=y, indices_are_sorted=True)
-    grasps = jax.ops.segment_sum(allowed.astype(jnp.float32), pose, num_segments=y, indices_are_sorted=True)
-    return total / jnp.maximum(grasps, 1.0)
+
+    def mean(count):
+        feasible = jnp.maximum(jnp.sum(count >= 0, axis=-1), 1)
+        return jnp.sum(jnp.maximum(count, 0), axis=-1) / feasible.astype(jnp.float32)
+
+    return _per_pose(mean, rows, hits)
 
 
 def split_found(values: Shaped[Array, " y"]) -> tuple[Shaped[Array, " x"], Shaped[Array, ""]]:

@@ -38,7 +38,7 @@ def test_h_is_that_of_a_brute_force_reference(problem, objects, hits):
     tables = problem.grasps
     pose, grasp, T = (np.asarray(a) for a in (tables.pair_pose, tables.pair_grasp, tables.T_world_target))
     T_target_gripper = np.asarray(tables.T_target_gripper)
-    chosen = np.random.default_rng(0).choice(len(pose), 150, replace=False)
+    chosen = np.random.default_rng(0).choice(int(tables.pair_valid.sum()), 150, replace=False)
     for pair in chosen:
         cloud = np.asarray(tables.clouds[grasp[pair]], np.float64).T
         placed = T[pose[pair]].astype(np.float64) @ T_target_gripper[grasp[pair]].astype(np.float64)
@@ -79,7 +79,7 @@ def test_nothing_is_in_the_way_on_an_empty_shelf(problem):
 
 def test_the_arm_reaches_every_feasible_grasp_and_its_pregrasp(problem):
     tables = problem.grasps
-    chosen = np.random.default_rng(0).choice(len(tables.pair_pose), 200, replace=False)
+    chosen = np.random.default_rng(0).choice(int(tables.pair_valid.sum()), 200, replace=False)
     pose, grasp = np.asarray(tables.pair_pose)[chosen], np.asarray(tables.pair_grasp)[chosen]
     T = transforms.compose(tables.T_world_target[pose], tables.T_target_gripper[grasp])
     for distance in (0.0, problem.gripper.approach):

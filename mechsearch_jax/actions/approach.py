@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions.config import ActionSpace, ActionTables
-from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
+from mechsearch_jax.actions.unseen_space import PossibleSpace, cloud_enters
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.collision import Clouds, clouds_of
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import transform, translate
+from mechsearch_jax.geometry.transforms import translate
 from mechsearch_jax.robot.entry import crossing_length, crossing_poses
 
 # Number of poses on each stretch of a motion where it is followed closely.
@@ -66,6 +66,6 @@ def approach_enters(tables: ActionTables, possible: PossibleSpace, cloud, T, mas
 
     def entering(clouds, possible, row):
         T, cloud = row
-        return jnp.any(enters(possible, transform(T, taken(clouds, cloud[None])[0].T)))
+        return cloud_enters(possible, T, taken(clouds, cloud[None])[0])
 
     return masked_vmap(entering, mask, gripper_clouds(tables).points, possible, (T, jnp.asarray(cloud)))

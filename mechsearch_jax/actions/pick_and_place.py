@@ -36,7 +36,7 @@ from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, crossing_length, ways_in
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.robot.motion import MotionConfig, Reference, pick_and_place_reference
-from mechsearch_jax.workspace.shelf import hits_shelf
+from mechsearch_jax.workspace.shelf import cloud_hits_shelf, hits_shelf
 
 CODE = 2
 # How far a joint may turn between where an object is taken out of the shelf and where it is brought in [rad].
@@ -171,7 +171,7 @@ def transfers(
         q, reachable, outside = ways_in(T, q7, gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS)
         # Poses 5 cm apart at most.
         touches = jnp.any(arm_hits(q[::2], others)) | jnp.any(arm_hits_shelf(q, space.shelf))
-        touches |= jnp.any(hits_shelf(space.shelf, transform(T, taken(clouds, swept[None])[0].T)))
+        touches |= cloud_hits_shelf(space.shelf, T, taken(clouds, swept[None])[0])
         return reachable & ~touches, q[0], outside
 
     own = (others, tables.q7[OPEN, wrist], swept)

@@ -23,12 +23,12 @@ from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace, Act
 from mechsearch_jax.actions.push_starts import PushStarts, object_pushes, push_starts
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.types import Action, Draft, Prediction, Ways
-from mechsearch_jax.actions.unseen_space import PossibleSpace, enters
+from mechsearch_jax.actions.unseen_space import PossibleSpace, cloud_enters
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.collision import collisions
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import back_off, make, transform, translate
+from mechsearch_jax.geometry.transforms import back_off, make, translate
 from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import (
     CLOSE_CROSSINGS,
@@ -39,7 +39,7 @@ from mechsearch_jax.robot.entry import (
     way_in,
 )
 from mechsearch_jax.robot.motion import MotionConfig, Reference, push_reference
-from mechsearch_jax.workspace.shelf import hits_shelf
+from mechsearch_jax.workspace.shelf import cloud_hits_shelf
 
 CODE = 1
 # Number of places on the way of a push that are tested for collision.
@@ -197,7 +197,7 @@ class Push:
             into, out = crossing_poses(jnp.stack([T, end]), outside, gripper, FEW_CROSSINGS)
             way = jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)])
             follows = arm_follows(jnp.concatenate([into, way, out[::-1]]), q7, space.shelf)
-            return follows & ~jnp.any(hits_shelf(space.shelf, transform(end, taken(clouds, cloud[None])[0].T)))
+            return follows & ~cloud_hits_shelf(space.shelf, end, taken(clouds, cloud[None])[0])
 
         q7, cloud = jnp.repeat(tables.q7[CLOSED, wrist], d), np.repeat(cloud_index(tables, CLOSED, wrist), d)
         rows = (jnp.repeat(T, d, axis=0), ends.reshape(-1, 4, 4), q7, jnp.asarray(cloud))
@@ -219,23 +219,23 @@ class Push:
 
         def one(grippers, own, row):
             T, shift, gripper, owner = row
-            possible, bodies = own
+            possible, poses, bodies = own
             way = shift[None] * jnp.linspace(0.0, 1.0, PLACES)[:, None]
-            points = transform(T, taken(grippers, gripper[None])[0].T)
-            both = jnp.concatenate([points, taken(bodies, owner[None])[0].T])
-            return jnp.any(enters(possible, both[None] + way[:, None]))
+            along = [
+                translate(jnp.broadcast_to(pose, (PLACES, 4, 4)), way) for pose in (T, taken(poses, owner[None])[0])
+            ]
+            own_clouds = [taken(grippers, gripper[None]), taken(bodies, owner[None])]
+            entered = [cloud_enters(possible, *pair) for pair in zip(along, own_clouds, strict=True)]
+            return jnp.any(entered[0] | entered[1])
 
-        bodies = jnp.swapaxes(
-            transform(make(scene.rotation, scene.position)[:, None], jnp.swapaxes(clouds, 1, 2)), 1, 2
-        )
         rows = (
             jnp.repeat(ways.T_world_gripper.reshape(-1, 4, 4), d, axis=0),
             shift.reshape(-1, 3),
             jnp.asarray(np.repeat(cloud_index(tables, CLOSED, wrist), d)),
             jnp.asarray(np.repeat(owner, d)),
         )
-        grippers = gripper_clouds(tables).points
-        return masked_vmap(one, usable.reshape(-1), grippers, (possible, bodies), rows, block=64).reshape(n, v, d)
+        grippers, own = gripper_clouds(tables).points, (possible, make(scene.rotation, scene.position), clouds)
+        return masked_vmap(one, usable.reshape(-1), grippers, own, rows, block=64).reshape(n, v, d)
 
     def draft(self, key, space: ActionSpace, tables: ActionTables, scene, possible, ways, index, way, wanted) -> Draft:
         """The push, and the space that it sweeps between its ends."""

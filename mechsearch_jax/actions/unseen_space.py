@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mechsearch_jax.geometry.transforms import transform_rows
+
 
 class PossibleSpace(flax.struct.PyTreeNode):
     """Where a target that has not been ruled out would stand, as a raster at the spacing of the candidate poses.
@@ -31,22 +33,36 @@ def widen(cells: Bool[Array, "r c"]) -> Bool[Array, "r c"]:
     return jax.lax.reduce_window(cells, False, jax.lax.bitwise_or, (3, 3), (1, 1), "SAME")
 
 
-def _cells(space: PossibleSpace, points):
-    """Row and column of the cells of world points (N, 3), and whether they are on the raster and not above a target."""
-    index = jnp.round((points[:, :2] - space.origin[None]) / space.cell[None]).astype(jnp.int32)
-    shape = jnp.array(space.occupied.shape)[None]
-    inside = jnp.all((index >= 0) & (index < shape), axis=-1) & (points[:, 2] < space.top)
-    return jnp.clip(index, 0, shape - 1), inside
+def _cells(space: PossibleSpace, x: Float[Array, "*batch"], y: Float[Array, "*batch"], z: Float[Array, "*batch"]):
+    """Row and column of the cells of world points, and whether they are on the raster and not above a target."""
+    rows, columns = space.occupied.shape
+    row, column = (
+        jnp.round((at - space.origin[axis]) / space.cell[axis]).astype(jnp.int32) for axis, at in enumerate((x, y))
+    )
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & (z < space.top)
+    return jnp.clip(row, 0, rows - 1), jnp.clip(column, 0, columns - 1), inside
 
 
-def enters(space: PossibleSpace, points: Float[Array, "... 3"]) -> Bool[Array, "..."]:
+def _enters(space: PossibleSpace, x, y, z):
+    row, column, inside = _cells(space, x, y, z)
+    return space.occupied[row, column] & inside
+
+
+def enters(space: PossibleSpace, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
     """Whether world points lie in possible space."""
-    index, inside = _cells(space, points.reshape(-1, 3))
-    return (space.occupied[index[:, 0], index[:, 1]] & inside).reshape(points.shape[:-1])
+    return _enters(space, points[..., 0], points[..., 1], points[..., 2])
+
+
+def cloud_enters(
+    space: PossibleSpace, T_world_cloud: Float[Array, "*batch 4 4"], cloud: Float[Array, "*#batch 3 p"]
+) -> Bool[Array, "*batch"]:
+    """Whether a point of a placed cloud, given as rows of coordinates in its own frame, lies in possible space."""
+    return jnp.any(_enters(space, *transform_rows(T_world_cloud, cloud)), axis=-1)
 
 
 def risk(space: PossibleSpace, points: Float[Array, "... 3"]) -> Float[Array, ""]:
     """Share of the possible poses at which the target would be touched by world points."""
-    index, inside = _cells(space, points.reshape(-1, 3))
-    touched = jnp.zeros(space.occupied.shape, bool).at[index[:, 0], index[:, 1]].max(inside)
+    x, y, z = points.reshape(-1, 3).T
+    row, column, inside = _cells(space, x, y, z)
+    touched = jnp.zeros(space.occupied.shape, bool).at[row, column].max(inside)
     return jnp.sum(jnp.where(widen(touched), space.chance, 0.0))

@@ -1,7 +1,9 @@
 """Point clouds against superquadrics on an NVIDIA GPU: one kernel for all pairs, of which most are left out.
 
-A program of the kernel has one placed cloud. It looks at the objects that are wanted one after the other, at boxes
-first, and evaluates the gauge at all points only where these overlap.
+A program of the kernel has a few placed clouds. For each it looks at the wanted objects one after the other, at boxes
+first, and evaluates the gauge at all points only where these overlap. Which objects are wanted, and which collide, are
+the bits of one word for each placed cloud: hardly any of the millions of clouds of a batch has a wanted pair, and to
+pass by the others has to cost next to nothing.
 
 The gauge is computed with logarithms, where a power is a product and a p-norm of two numbers is
 
@@ -22,7 +24,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.extend
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+import numpy as np
+from jaxtyping import Array, Bool, Int32
 
 from mechsearch_jax.geometry.masked import on_cpu
 
@@ -31,6 +34,12 @@ Function = Callable[[Array], Array]
 TINY = 1e-30
 # Points of a cloud in one step, a power of 2, and warps of 32 threads that share it.
 POINTS, WARPS = 256, 2
+# Placed clouds of a program, as many as leave so many programs, a power of 2 at most. A GPU begins a program in about a
+# nanosecond, and one with fewer placed clouds is done sooner.
+PLACED, PROGRAMS = 16, 2**17
+# Objects whose bits share a word, and what each of these bits counts.
+BITS = 32
+BIT_VALUES = (np.uint32(1) << np.arange(BITS, dtype=np.uint32)).view(np.int32)
 
 
 def log_gauge(point: Sequence[Array], powers: Sequence[Array] | Array, log: Function, exp: Function) -> Array:
@@ -118,29 +127,45 @@ def collide(
     batch, (m, n) = mask.shape[:-2], mask.shape[-2:]
     if 0 in mask.shape:
         return mask
-    lead, width = len(batch), pl.next_power_of_2(n)
+    lead, count = len(batch), math.prod(batch)
     size = min(POINTS, pl.next_power_of_2(points.shape[-1]))
+    placed = min(PLACED, pl.next_power_of_2(max(count * m // PROGRAMS, 1)))
     # A point that is there twice changes no minimum.
     points = jnp.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, -points.shape[-1] % size)], mode="edge")
-    wanted = jnp.pad(mask, [(0, 0)] * (lead + 1) + [(0, width - n)]).reshape(-1, m, width).astype(jnp.int8)
+    wanted = _packed(mask.reshape(count, m, n), m + -m % placed)
     boxes, T = boxes.reshape(*boxes.shape[:-2], 6), T_world_cloud.reshape(*T_world_cloud.shape[:-2], 16)
     arrays = [points, boxes, cloud, T, objects]
     settings = _Settings(
         batch=batch,
         shapes=tuple(a.shape[:lead] for a in arrays),
         objects=n,
+        placed=placed,
         size=size,
         log2=jnp.log2 if interpret else special("lg2"),
         exp2=jnp.exp2 if interpret else special("ex2"),
     )
-    out = pl.pallas_call(
+    hits = pl.pallas_call(
         functools.partial(_kernel, settings),
-        out_shape=jax.ShapeDtypeStruct(wanted.shape, jnp.int8),
-        grid=(m, math.prod(batch)),
+        out_shape=jax.ShapeDtypeStruct(wanted.shape, jnp.int32),
+        grid=(wanted.shape[-1] // placed, count, wanted.shape[1]),
         compiler_params=triton.CompilerParams(num_warps=WARPS, num_stages=1),
         interpret=interpret,
     )(wanted, *(a.reshape(-1, *a.shape[lead:]) for a in arrays))
-    return out[..., :n].reshape(mask.shape) > 0
+    return _unpacked(hits, m, n).reshape(mask.shape)
+
+
+def _packed(mask: Bool[Array, "b m n"], rows: int) -> Int32[Array, "b words {rows}"]:
+    """Rows of bits as words of `BITS` each; after the last row there are some of zeros."""
+    b, m, n = mask.shape
+    words = math.ceil(n / BITS)
+    bits = jnp.pad(mask, ((0, 0), (0, rows - m), (0, words * BITS - n))).reshape(b, rows, words, BITS)
+    return jnp.swapaxes(jnp.sum(jnp.where(bits, BIT_VALUES[None, None, None], 0), axis=-1, dtype=jnp.int32), 1, 2)
+
+
+def _unpacked(words: Int32[Array, "b words rows"], m: int, n: int) -> Bool[Array, "b {m} {n}"]:
+    """What `_packed` made words of."""
+    bits = jnp.swapaxes(words[..., :m], 1, 2)[..., None] & BIT_VALUES[None, None, None] != 0
+    return bits.reshape(len(words), m, -1)[..., :n]
 
 
 class _Settings(NamedTuple):
@@ -150,6 +175,7 @@ class _Settings(NamedTuple):
       batch: sizes of its axes.
       shapes: the same of each array, 1 where it does not vary along an axis.
       objects: how many there are.
+      placed: placed clouds of a program.
       size: points in one step.
       log2, exp2: of base 2.
     """
@@ -157,6 +183,7 @@ class _Settings(NamedTuple):
     batch: tuple[int, ...]
     shapes: tuple[tuple[int, ...], ...]
     objects: int
+    placed: int
     size: int
     log2: Function
     exp2: Function
@@ -174,32 +201,48 @@ class _Settings(NamedTuple):
 
 
 def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, objects, out) -> None:
-    """One program: a placed cloud of an element of the batch against all objects; the arrays are references."""
+    """One program: a few placed clouds of an element of the batch against the objects of a word.
+
+    The arrays are references.
+    """
     from jax.experimental import pallas as pl
 
-    b, i = pl.program_id(1), pl.program_id(0)
+    b, w, first = pl.program_id(1), pl.program_id(2), pl.program_id(0) * settings.placed
     in_points, in_boxes, in_cloud, in_T, in_objects = settings.rows(b)
-    out[b, i, :] = jnp.zeros(out.shape[-1], jnp.int8)
+    rows = pl.ds(first, settings.placed)
+    out[b, w, rows] = jnp.zeros(settings.placed, jnp.int32)
 
-    @pl.when(jnp.max(wanted[b, i, :].astype(jnp.int32)) > 0)
-    def _():
-        c = cloud[in_cloud, i]
-        T = [[T_world_cloud[in_T, i, 4 * row + column] for column in range(4)] for row in range(3)]
-        box = [boxes[in_boxes, c, k] for k in range(6)]
+    def look(k, _):
+        i = first + k
+        word = wanted[b, w, i]
 
-        def each(j, _):
-            @pl.when(wanted[b, i, j].astype(jnp.int32) > 0)
-            def _():
-                numbers = [objects[in_objects, j, k] for k in range(17)]
+        @pl.when(word != 0)
+        def _():
+            c = cloud[in_cloud, i]
+            T = [[T_world_cloud[in_T, i, 4 * row + column] for column in range(4)] for row in range(3)]
+            box = [boxes[in_boxes, c, k] for k in range(6)]
+
+            def at_boxes(bit, hits):
+                numbers = [objects[in_objects, w * BITS + bit, k] for k in range(17)]
                 relative = _relative(numbers, T)
 
-                @pl.when(_boxes_overlap(relative, numbers[12:15], box))
-                def _():
-                    out[b, i, j] = _inside(settings, points, in_points, c, relative, numbers[12:]).astype(jnp.int8)
+                def at_points(hits):
+                    hit = _inside(settings, points, in_points, c, relative, numbers[12:])
+                    return hits | jax.lax.shift_left(hit.astype(jnp.int32), bit)
 
-            return 0
+                return jax.lax.cond(_boxes_overlap(relative, numbers[12:15], box), at_points, lambda hits: hits, hits)
 
-        jax.lax.fori_loop(0, settings.objects, each, 0)
+            def each(bit, hits):
+                is_wanted = jax.lax.shift_right_logical(word, bit) & 1 != 0
+                return jax.lax.cond(is_wanted, functools.partial(at_boxes, bit), lambda hits: hits, hits)
+
+            out[b, w, i] = jax.lax.fori_loop(0, min(settings.objects, BITS), each, jnp.int32(0))
+
+        return 0
+
+    @pl.when(jnp.max(jnp.abs(wanted[b, w, rows])) > 0)
+    def _():
+        jax.lax.fori_loop(0, settings.placed, look, 0)
 
 
 def _inside(

@@ -32,6 +32,19 @@ def transform(T_a_b: Float[Array, "... 4 4"], points: Float[Array, "... 3"]) -> 
     return rotate(T_a_b[..., :3, :3], points) + T_a_b[..., :3, 3]
 
 
+def transform_rows(
+    T_a_b: Float[Array, "*batch 4 4"], cloud: Float[Array, "*#batch 3 p"]
+) -> list[Float[Array, "*batch p"]]:
+    """x, y and z in frame a of a cloud that is given as rows of coordinates in frame b.
+
+    Every coordinate is an expression of its own, so that nothing of the size of the cloud is kept where only a sum or a
+    minimum over its points is wanted.
+    """
+    x, y, z = (cloud[..., k, :] for k in range(3))
+    rows = (T_a_b[..., row, :, None] for row in range(3))
+    return [r[..., 0, :] * x + r[..., 1, :] * y + r[..., 2, :] * z + r[..., 3, :] for r in rows]
+
+
 def compose(T_a_b: Float[Array, "... 4 4"], T_b_c: Float[Array, "... 4 4"]) -> Float[Array, "... 4 4"]:
     """`T_a_c`."""
     return matmul(T_a_b, T_b_c)

@@ -16,10 +16,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.masked import masked_vmap, taken
-from mechsearch_jax.geometry.transforms import transform, translate
+from mechsearch_jax.geometry.transforms import translate
 from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
 from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
-from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
+from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf
 
 # How far in front of the shelf the gripper has to be to count as outside [m]: a target in the hand is outside then,
 # and so are the hand and its open fingers, of which one is up to 4 cm ahead where the hand is turned by 45 degrees.
@@ -150,7 +150,6 @@ def gripper_enters(
     def enters(clouds, _, row):
         T, q7, cloud = row
         path = way_in(T, gripper.nearest_outside, gripper, FEW_CROSSINGS, waypoints)
-        touches = hits_shelf(shelf, transform(T, taken(clouds, cloud[None])[0].T))
-        return arm_follows(path, q7, shelf) & ~jnp.any(touches)
+        return arm_follows(path, q7, shelf) & ~cloud_hits_shelf(shelf, T, taken(clouds, cloud[None])[0])
 
     return masked_vmap(enters, mask, clouds, None, (T_world_gripper, q7, jnp.asarray(cloud)))

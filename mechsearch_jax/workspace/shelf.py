@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.errors import InputError, check_range
+from mechsearch_jax.geometry.transforms import transform_rows
 
 # Nothing is farther from the robot, and no board thicker [m].
 FARTHEST, THICKEST = 10.0, 0.5
@@ -78,7 +79,19 @@ def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*
 
     Everything beyond the front edge has to be inside the free box, or counts as in the shelf.
     """
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    return _in_shelf(shelf, points[..., 0], points[..., 1], points[..., 2])
+
+
+def cloud_hits_shelf(
+    shelf: Shelf, T_world_cloud: Float[Array, "*batch 4 4"], cloud: Float[Array, "*#batch 3 p"]
+) -> Bool[Array, "*batch"]:
+    """Whether a point of a placed cloud, given as rows of coordinates in its own frame, is in the shelf."""
+    return jnp.any(_in_shelf(shelf, *transform_rows(T_world_cloud, cloud)), axis=-1)
+
+
+def _in_shelf(
+    shelf: Shelf, x: Float[Array, "*batch"], y: Float[Array, "*batch"], z: Float[Array, "*batch"]
+) -> Bool[Array, "*batch"]:
     inside = (
         (x <= shelf.back)
         & (y >= shelf.right + shelf.side_margin)
