@@ -39,7 +39,7 @@ from mechsearch_jax.workspace.target import Target
 
 WRIST_ORIGIN = math.pi / 4
 # So many points of a cloud are looked at first.
-COARSE = 320
+COARSE = 256
 # What a pose where no grasp is feasible counts for, in objects hit: one more than the eight objects of a scene and its
 # target. It does not depend on how many slots a scene has; whoever hits as many might as well have no grasp.
 INFEASIBLE = 10

@@ -91,8 +91,10 @@ def _collide(first: int, mask: Bool[Array, "*batch m n"], shared: tuple | None, 
         return mask
     if uses_kernel():
         lead = mask.ndim - 2
-        own = rows[3] if shared is None else tuple(a.reshape(*[1] * lead, *a.shape) for a in shared[:2])
-        return collide(mask, *own, *rows[:3])
+        if shared is None:
+            return collide(mask, *rows[3], jnp.inf, *rows[:3])
+        points, boxes = (a.reshape(*[1] * lead, *a.shape) for a in shared[:2])
+        return collide(mask, points, boxes, shared[2], *rows[:3], first)
     m, n = mask.shape[-2:]
     pairs = _AllPairs(mask.shape, shared, *rows)
     state = jnp.where(mask.reshape(-1), OPEN, APART)

@@ -1,7 +1,8 @@
 """Point clouds against superquadrics on an NVIDIA GPU: one kernel for all pairs, of which most are left out.
 
-A program of the kernel has a few placed clouds. For each it looks at the wanted objects one after the other, at boxes
-first, and evaluates the gauge at all points only where these overlap. Which objects are wanted, and which collide, are
+A program of the kernel has a few placed clouds. For each it looks at the wanted objects one after the other: at boxes,
+where these overlap at the first points of the cloud, and at the others only where the first ones are neither inside nor
+so far outside that no other can be. Which objects are wanted, and which collide, are
 the bits of one word for each placed cloud: hardly any of the millions of clouds of a batch has a wanted pair, and to
 pass by the others has to cost next to nothing.
 
@@ -32,14 +33,15 @@ from mechsearch_jax.geometry.masked import on_cpu
 Function = Callable[[Array], Array]
 
 TINY = 1e-30
+# By how much the gauge of a point has to be above what is possible before it counts as above.
+ROUNDING = 1e-4
 # Points of a cloud in one step, a power of 2, and warps of 32 threads that share it.
 POINTS, WARPS = 256, 2
 # Placed clouds of a program, as many as leave so many programs, a power of 2 at most. A GPU begins a program in about a
 # nanosecond, and one with fewer placed clouds is done sooner.
 PLACED, PROGRAMS = 16, 2**17
-# Objects whose bits share a word, and what each of these bits counts.
+# Objects whose bits share a word.
 BITS = 32
-BIT_VALUES = (np.uint32(1) << np.arange(BITS, dtype=np.uint32)).view(np.int32)
 
 
 def log_gauge(point: Sequence[Array], powers: Sequence[Array] | Array, log: Function, exp: Function) -> Array:
@@ -103,9 +105,11 @@ def collide(
     mask: Bool[Array, "*batch m n"],
     points: Array,
     boxes: Array,
+    gap: Array | float,
     cloud: Array,
     T_world_cloud: Array,
     objects: Array,
+    first: int = 0,
     interpret: bool = False,
 ) -> Bool[Array, "*batch m n"]:
     """Which of the masked pairs collide.
@@ -114,9 +118,11 @@ def collide(
       mask: pairs of a placed cloud and an object.
       points: clouds as rows of coordinates in their own frames, shape (*batch, C, 3, P) [m].
       boxes: their least and largest coordinates, shape (*batch, C, 2, 3) [m].
+      gap: how far a point may be from the nearest one of the first `first` of its cloud, shape () [m].
       cloud: which of them each placed cloud is, shape (*batch, M).
       T_world_cloud: where it is, shape (*batch, M, 4, 4).
       objects: `T_object_world` (12 numbers), half-extents and exponents, shape (*batch, N, 17).
+      first: see `gap`; 0 where nothing is known. Static.
       interpret: run it as JAX operations on any device, slowly: for tests.
 
     What does not vary along an axis of the batch has a length of 1 there.
@@ -133,7 +139,10 @@ def collide(
     # A point that is there twice changes no minimum.
     points = jnp.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, -points.shape[-1] % size)], mode="edge")
     wanted = _packed(mask.reshape(count, m, n), m + -m % placed)
-    boxes, T = boxes.reshape(*boxes.shape[:-2], 6), T_world_cloud.reshape(*T_world_cloud.shape[:-2], 16)
+    # What is not known of the gaps makes no point far enough away.
+    gaps = jnp.full((*boxes.shape[:-2], 1), gap if 0 < first <= size else jnp.inf, boxes.dtype)
+    boxes = jnp.concatenate([boxes.reshape(*boxes.shape[:-2], 6), gaps], axis=-1)
+    T = T_world_cloud.reshape(*T_world_cloud.shape[:-2], 16)
     arrays = [points, boxes, cloud, T, objects]
     settings = _Settings(
         batch=batch,
@@ -155,17 +164,22 @@ def collide(
 
 
 def _packed(mask: Bool[Array, "b m n"], rows: int) -> Int32[Array, "b words {rows}"]:
-    """Rows of bits as words of `BITS` each; after the last row there are some of zeros."""
-    b, m, n = mask.shape
-    words = math.ceil(n / BITS)
-    bits = jnp.pad(mask, ((0, 0), (0, rows - m), (0, words * BITS - n))).reshape(b, rows, words, BITS)
-    return jnp.swapaxes(jnp.sum(jnp.where(bits, BIT_VALUES[None, None, None], 0), axis=-1, dtype=jnp.int32), 1, 2)
+    """Rows of bits as words of at most `BITS` each; after the last row there are some of zeros."""
+    parts = jnp.split(mask, list(range(BITS, mask.shape[-1], BITS)), axis=-1)
+    words = [jnp.sum(jnp.where(bits, _bit_values(bits), 0), axis=-1, dtype=jnp.int32) for bits in parts]
+    return jnp.pad(jnp.stack(words, axis=1), ((0, 0), (0, 0), (0, rows - mask.shape[1])))
 
 
 def _unpacked(words: Int32[Array, "b words rows"], m: int, n: int) -> Bool[Array, "b {m} {n}"]:
     """What `_packed` made words of."""
-    bits = jnp.swapaxes(words[..., :m], 1, 2)[..., None] & BIT_VALUES[None, None, None] != 0
-    return bits.reshape(len(words), m, -1)[..., :n]
+    parts = np.split(np.arange(n), list(range(BITS, n, BITS)))
+    bits = [words[:, k, :m, None] & _bit_values(part[None, None]) != 0 for k, part in enumerate(parts)]
+    return jnp.concatenate(bits, axis=-1)
+
+
+def _bit_values(bits: Array | np.ndarray) -> Int32[np.ndarray, "1 1 n"]:
+    """What each bit of a word counts."""
+    return (np.uint32(1) << np.arange(bits.shape[-1], dtype=np.uint32)).view(np.int32)[None, None]
 
 
 class _Settings(NamedTuple):
@@ -220,14 +234,14 @@ def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, ob
         def _():
             c = cloud[in_cloud, i]
             T = [[T_world_cloud[in_T, i, 4 * row + column] for column in range(4)] for row in range(3)]
-            box = [boxes[in_boxes, c, k] for k in range(6)]
+            box, gap = [boxes[in_boxes, c, k] for k in range(6)], boxes[in_boxes, c, 6]
 
             def at_boxes(bit, hits):
                 numbers = [objects[in_objects, w * BITS + bit, k] for k in range(17)]
                 relative = _relative(numbers, T)
 
                 def at_points(hits):
-                    hit = _inside(settings, points, in_points, c, relative, numbers[12:])
+                    hit = _inside(settings, points, in_points, c, gap, relative, numbers[12:])
                     return hits | jax.lax.shift_left(hit.astype(jnp.int32), bit)
 
                 return jax.lax.cond(_boxes_overlap(relative, numbers[12:15], box), at_points, lambda hits: hits, hits)
@@ -246,7 +260,7 @@ def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, ob
 
 
 def _inside(
-    settings: _Settings, points, row, cloud, relative: Sequence[Sequence[Array]], shape: Sequence[Array]
+    settings: _Settings, points, row, cloud, gap: Array, relative: Sequence[Sequence[Array]], shape: Sequence[Array]
 ) -> Array:
     """Whether a point of a cloud is inside an object, given by half-extents and exponents."""
     from jax.experimental import pallas as pl
@@ -254,10 +268,24 @@ def _inside(
     rows = [[number / shape[k] for number in relative[k]] for k in range(3)]
     powers = [2.0 / shape[4], 2.0 / shape[3], 0.5 * shape[4], 0.5 * shape[3]]
 
-    def step(s, least):
-        x, y, z = (points[row, cloud, k, pl.ds(s * settings.size, settings.size)] for k in range(3))
+    def least_of(k):
+        x, y, z = (points[row, cloud, axis, pl.ds(k * settings.size, settings.size)] for axis in range(3))
         scaled = [r[0] * x + (r[1] * y + (r[2] * z + r[3])) for r in rows]
-        return jnp.minimum(least, log_gauge(scaled, powers, settings.log2, settings.exp2))
+        return log_gauge(scaled, powers, settings.log2, settings.exp2)
 
-    first = jnp.full(settings.size, jnp.inf, jnp.float32)
-    return jnp.min(jax.lax.fori_loop(0, points.shape[-1] // settings.size, step, first)) < 0.0
+    def others(_):
+        least = jax.lax.fori_loop(
+            1,
+            points.shape[-1] // settings.size,
+            lambda k, least: jnp.minimum(least, least_of(k)),
+            jnp.full(settings.size, jnp.inf, jnp.float32),
+        )
+        return (jnp.min(least) < 0.0).astype(jnp.int32)
+
+    least = jnp.min(least_of(0))
+    # The gauge is a norm, at most the length over the least half-extent, or twice that below 2-norms.
+    reach = jnp.where(jnp.maximum(shape[3], shape[4]) > 1.0, 2.0 * gap, gap)
+    beyond = reach / jnp.minimum(jnp.minimum(shape[0], shape[1]), shape[2])
+    inside = least < 0.0
+    settled = inside | (jnp.exp2(least) > 1.0 + ROUNDING + beyond)
+    return jax.lax.cond(settled, lambda hit: hit, others, inside.astype(jnp.int32)) > 0
