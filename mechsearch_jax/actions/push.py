@@ -79,12 +79,13 @@ def motion_free(
     q, follows = arm_path(jnp.concatenate([into, way[1:], back[::-1][1:]]), action.q7, space.shelf)
     begins, ends = len(into), len(into) + n - 1
     # Poses 5 cm apart at most, of which those before the push see the objects where they were.
-    poses = np.concatenate([np.arange(len(q))[part] for part in (slice(0, begins, 2), slice(begins, ends, 3))])
-    both = arm_hits(q[np.concatenate([poses, np.arange(ends, len(q), 2)])], _joined(scene, after))
-    into, along, back = np.split(np.arange(len(both)), [len(range(0, begins, 2)), len(poses)])
-    hits = jnp.any(both[into], axis=0) | (jnp.any(both[along], axis=0) & jnp.concatenate([still, still]))
+    stretches = q[:begins:2], q[begins:ends:3], q[ends::2]
+    both = arm_hits(jnp.concatenate(stretches), _joined(scene, after))
+    first, second = len(stretches[0]), len(stretches[0]) + len(stretches[1])
+    into, along, back = (jnp.any(part, axis=0) for part in (both[:first], both[first:second], both[second:]))
     now = np.arange(2 * scene.capacity) < scene.capacity
-    return follows & ~jnp.any(jnp.where(now, hits, jnp.any(both[back], axis=0)))
+    hits = jnp.where(now, into | (along & jnp.concatenate([still, still])), back)
+    return follows & ~jnp.any(hits)
 
 
 def _joined(*scenes: Superquadrics) -> Superquadrics:

@@ -156,7 +156,7 @@ class _AllPairs:
         def body(state, index, active):
             return put(state, index, test(self._at(jax.lax.min(index, last))))
 
-        return for_each(state == OPEN, body, state, block_size(block))
+        return for_each(state == OPEN, body, state, block_size(block, len(state)))
 
     def _at(self, index: Integer[Array, " k"]) -> _Pairs:
         batch, (m, n) = self.shape[:-2], self.shape[-2:]

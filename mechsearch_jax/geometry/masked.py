@@ -20,6 +20,9 @@ from jaxtyping import Array, Bool, Integer
 # A GPU needs that many times as large blocks to be busy. With eight times as many, so that a single decision has no
 # block but the first, it takes a third longer: what is masked then costs more than looking for what is not.
 GPU_BLOCKS = 64
+# Where there are so many entries, as in a batch, up to so many times as many again: what is masked costs little then,
+# beside the hundreds of rounds that smaller blocks take.
+MANY, LARGER = 2**22, 4
 # Indices are 32 bits wide.
 LARGEST_INDEX = 2**31 - 1
 # How many entries of a mask are counted together before those that are true are looked for among them.
@@ -87,9 +90,9 @@ def on_cpu() -> bool:
     return (device if isinstance(device, str) else device.platform if device else jax.default_backend()) == "cpu"
 
 
-def block_size(entries: int) -> int:
-    """How many entries to evaluate at once where a CPU would be given so many."""
-    return entries if on_cpu() else entries * GPU_BLOCKS
+def block_size(entries: int, total: int = 0) -> int:
+    """How many of `total` entries to evaluate at once where a CPU would be given `entries`."""
+    return entries if on_cpu() else entries * GPU_BLOCKS * min(max(total // MANY, 1), LARGER)
 
 
 def for_each(mask: Bool[Array, " n"], body: Callable[[Carry, Array, Array], Carry], carry: Carry, block: int) -> Carry:
@@ -208,7 +211,7 @@ def masked_vmap(
     def run(mask, shared, both):
         batch, n, total = mask.shape[:-1], mask.shape[-1], mask.size
         own, rows = both
-        size = block_size(block)
+        size = block_size(block, total)
         if total <= size and not on_cpu():
             return _everywhere(function, mask, shared, own, rows)
         width = jnp.uint32(n)

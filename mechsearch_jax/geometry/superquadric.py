@@ -10,6 +10,8 @@ to 2, convex; neither overflows in float32 however far away the point is, and bo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -107,7 +109,9 @@ def gauge(
     return unit_gauge(jnp.moveaxis(jnp.abs(points / size), -1, 0), jnp.moveaxis(exponents, -1, 0))
 
 
-def unit_gauge(scaled: Float[Array, "3 ..."], exponents: Float[Array, "2 ..."]) -> Float[Array, "..."]:
+def unit_gauge(
+    scaled: Float[Array, "3 ..."] | Sequence[Array], exponents: Float[Array, "2 ..."]
+) -> Float[Array, "..."]:
     """`gauge` of points whose coordinates are given as magnitudes in half-extents, along the first axis, as e1, e2."""
     x, y, z = scaled
     e1, e2 = exponents

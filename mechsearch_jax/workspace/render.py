@@ -37,9 +37,14 @@ def cast(
       The ray parameter of the crossing, infinite for a miss; differentiable in all arguments where it is finite.
     """
     enter, leave = _slab_chord(size, origin, direction)
+    # One coordinate after the other: a vector would be kept for every pixel in every step.
+    begin, ray = origin / size, direction / size
+
+    def gauge(t):
+        return superquadric.unit_gauge([jnp.abs(begin[k] + t * ray[k]) for k in range(3)], exponents)
 
     def value_and_slope(t):
-        return jax.jvp(lambda t: superquadric.gauge(size, exponents, origin + t * direction), (t,), (jnp.ones_like(t),))
+        return jax.jvp(gauge, (t,), (jnp.ones_like(t),))
 
     def newton(_, t):
         value, slope = value_and_slope(t)
