@@ -200,7 +200,7 @@ def test_objects_are_drawn_by_their_weights(sampled, draw):
     share, even_share = (np.mean(s.action.object == 0) for s in (samples, even))
     assert 0.2 < even_share < 0.8
     expected = 4 * even_share / (4 * even_share + 1 - even_share)
-    assert share == pytest.approx(expected, abs=4 * np.sqrt(0.25 / len(samples.risk)))
+    assert share == pytest.approx(expected, abs=4 * np.sqrt(0.25 / len(samples.action.object)))
     assert share > even_share + 0.1
 
 

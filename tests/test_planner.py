@@ -11,6 +11,7 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionConfig, ActionKind
 from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.sampler import contact_risk
 from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.dynamics.learned import LearnedPush
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
@@ -20,6 +21,7 @@ from mechsearch_jax.geometry import masked, superquadric
 from mechsearch_jax.graspability import GraspConfig, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
+from mechsearch_jax.planner.belief import possible_space
 from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.imitation import LaterPlacementsStay
 from mechsearch_jax.planner.objective import SearchAndGrasp, SearchForGrasp
@@ -182,7 +184,7 @@ def test_what_is_picked_later_stays_where_it_is_in_the_published_code(problem):
 
     def shift(kind, first):
         action = no_action().replace(kind=jnp.int32(kind))
-        sample = Sample(action, jnp.int32(0), jnp.float32(0.0))
+        sample = Sample(action, jnp.int32(0))
         told = LaterPlacementsStay(shifts)(problem, state, sample, jnp.array(first))
         assert bool(told.possible)
         assert np.any(told.moved) == np.any(told.scene.position != state.scene.position)
@@ -200,7 +202,7 @@ def test_later_actions_are_drawn_in_the_present_scene_in_the_published_code(prob
     def draws_where_it_stands(key, problem, belief, objective, guided_fraction, state):
         T = jnp.eye(4).at[:3, 3].set(state.scene.position[0])
         action = no_action().replace(kind=jnp.int32(ActionKind.PUSH), T_world_gripper=T)
-        return Sample(action, jnp.int32(0), jnp.float32(0.0))
+        return Sample(action, jnp.int32(0))
 
     def moves(problem, state, sample, first):
         scene = state.scene
@@ -235,10 +237,10 @@ def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(
     belief = planner.initial_belief(problem)
 
     def counts(key, problem, belief, objective, guided_fraction, state):
-        return Sample(no_action(), jnp.int32(0), jax.random.uniform(key))
+        return Sample(no_action().replace(q7=jax.random.uniform(key)), jnp.int32(0))
 
     def seldom(problem, state, sample, first):
-        return Prediction(state.scene, state.scene.valid, sample.risk < 0.3)
+        return Prediction(state.scene, state.scene.valid, sample.action.q7 < 0.3)
 
     def share(first, **changes):
         config = dataclasses.replace(CONFIG, **changes)
@@ -460,16 +462,28 @@ def charges_of(rollout, root, keys):
 
 def test_what_may_touch_the_target_is_charged_for(decision, root, problem):
     action = jax.tree.map(lambda a: a[0, 0], decision[2].sequences.actions)
+
+    def somewhere(key, *_):
+        x, y = jax.random.uniform(key, (2,), minval=jnp.array([0.45, -0.2]), maxval=jnp.array([0.75, 0.4]))
+        places = jnp.broadcast_to(jnp.eye(4).at[:3, 3].set(jnp.array([x, y, 0.45])), (5, 4, 4))
+        return Sample(action, jnp.int32(0), places, places)
+
     policy = dataclasses.replace(
         POLICY,
         config=dataclasses.replace(CONFIG, unseen_contact_penalty=0.5, first_draws=1),
-        propose=lambda key, *_: Sample(action, jnp.int32(0), jax.random.uniform(key)),
+        propose=somewhere,
         predict=lambda _, state, *__: Prediction(state.scene, state.scene.valid, jnp.array(True)),
     )
     keys = jax.random.split(jax.random.key(0), 5)
-    risk = np.array([jax.random.uniform(key) for key in keys])
-    charges = charges_of(rollout_of(problem, decision[1], policy), root, keys)
-    np.testing.assert_allclose(charges, 0.5 * risk, rtol=1e-6)
+    belief = decision[1]
+    possible = possible_space(problem, belief, root.exists)
+    risk = jax.jit(jax.vmap(lambda s: contact_risk(problem.space, problem.actions, root.scene, possible, s)))
+    share = np.asarray(risk(jax.vmap(somewhere)(keys)))
+    assert len(np.unique(share)) > 2
+    charges = charges_of(rollout_of(problem, belief, policy), root, keys)
+    np.testing.assert_allclose(charges, 0.5 * share, rtol=1e-6)
+    policy = dataclasses.replace(policy, propose=lambda *_: Sample(action, jnp.int32(0)))
+    assert not charges_of(rollout_of(problem, belief, policy), root, keys).any()
 
 
 def test_what_is_dear_is_not_chosen():

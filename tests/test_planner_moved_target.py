@@ -64,7 +64,7 @@ def states(problem, belief, objects):
     action = no_action().replace(kind=jnp.int32(ActionKind.PUSH), object=jnp.int32(8))
     moving = dataclasses.replace(
         rollout,
-        propose=lambda *_: Sample(action, jnp.int32(0), jnp.float32(0.0)),
+        propose=lambda *_: Sample(action, jnp.int32(0)),
         predict=lambda *_: Prediction(pushed, root.is_target, jnp.array(True)),
     )
     changes, _, _ = moving.act(jnp.array(True), root, jax.random.key(0))

@@ -54,7 +54,7 @@ class Line(Rollout):
 def to_either_side(key, problem, belief, objective, guided_fraction, state):
     side = jnp.where(jax.random.bernoulli(key), STEP, -STEP)
     action = no_action().replace(kind=jnp.int32(ActionKind.PUSH), displacement=jnp.array([0.0, 1.0, 0.0]) * side)
-    return Sample(action, jnp.int32(0), jnp.float32(0.0))
+    return Sample(action, jnp.int32(0))
 
 
 def moves(problem, state, sample, first):

@@ -100,10 +100,29 @@ def sample_action(
         draft = jax.tree.map(lambda a, b, i=i: jnp.where(chosen == i, a, b), drafts[i], draft)
     able = possible_at_all & draft.possible
     kind = jnp.where(able, draft.action.kind, ActionKind.NONE).astype(jnp.int32)
-    opening = jnp.array([kind.opening for kind in SAMPLED_KINDS])[chosen]
-    cloud = tables.clouds[opening, draft.wrist].T
-    body = superquadric.sample_surface(scene.size[index], scene.exponents[index], space.config.object_points)
+    return Sample(draft.action.replace(kind=kind), draft.wrist, draft.grippers, draft.bodies)
+
+
+def contact_risk(
+    space: ActionSpace, tables: ActionTables, scene: Superquadrics, possible: PossibleSpace, sample: Sample
+) -> Float[Array, ""]:
+    """Share of the possible poses at which a sampled action would touch the target; 0 where none is possible.
+
+    Args:
+      space: static.
+      tables: constants of the problem.
+      scene: the objects that the action was sampled for.
+      possible: where the target may be.
+      sample: the action.
+    """
+    if sample.grippers is None or sample.bodies is None:
+        return jnp.float32(0.0)
+    action = sample.action
+    opening = jnp.select([action.kind == kind.code for kind in SAMPLED_KINDS], [k.opening for k in SAMPLED_KINDS])
+    size, exponents = scene.size[action.object], scene.exponents[action.object]
+    body = superquadric.sample_surface(size, exponents, space.config.object_points)
+    gripper = tables.clouds[opening, sample.wrist].T
     swept = jnp.concatenate(
-        [transform(draft.grippers[:, None], cloud[None]), transform(draft.bodies[:, None], body[None])], axis=1
+        [transform(sample.grippers[:, None], gripper[None]), transform(sample.bodies[:, None], body[None])], axis=1
     )
-    return Sample(draft.action.replace(kind=kind), draft.wrist, jnp.where(able, risk(possible, swept), 0.0))
+    return jnp.where(action.kind == ActionKind.NONE, 0.0, risk(possible, swept))

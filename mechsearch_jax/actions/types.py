@@ -37,12 +37,14 @@ class Sample(flax.struct.PyTreeNode):
     Attributes:
       action: the action; of kind NONE where none is possible.
       wrist: index of its wrist angle.
-      risk: share of the possible poses at which it would touch the target.
+      grippers, bodies: places of the gripper and of the object that touch what is there, shape (PLACES, 4, 4); None for
+        an action that touches nothing.
     """
 
     action: Action
     wrist: jax.Array
-    risk: jax.Array
+    grippers: jax.Array | None = None
+    bodies: jax.Array | None = None
 
 
 class Draft(flax.struct.PyTreeNode):

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.actions.candidates import candidates, no_candidates
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
+from mechsearch_jax.actions.sampler import contact_risk
 from mechsearch_jax.actions.types import Action, Prediction, Sample
 from mechsearch_jax.existence import existence, no_views, object_views
 from mechsearch_jax.geometry.masked import on_cpu
@@ -172,7 +173,12 @@ class Rollout:
             "available": state.available & ~spent,
             "alive": acted,
         }
-        return changes, action, self.config.unseen_contact_penalty * sample.risk
+        return changes, action, self.config.unseen_contact_penalty * self.risk(state, sample)
+
+    def risk(self, state: State, sample: Sample) -> Float[Array, ""]:
+        """Share of the possible poses at which an action would touch the target, where it was drawn."""
+        possible = possible_space(self.problem, self.belief, state.exists)
+        return contact_risk(self.problem.space, self.problem.actions, self.drawn_in(state).scene, possible, sample)
 
     def step(self, states: State, keys: Array, time: Int[Array, ""]):
         """All sequences by one action: the states after it, and what is to be kept of the ones before it."""
@@ -225,8 +231,14 @@ def _one_after_the_other(attempt: Attempt, state: State, draws: Int[Array, ""], 
 def _at_once(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
     """The first attempt that is possible, of all of them: for a GPU, on which waiting for the first takes longer."""
     number = jnp.arange(most, dtype=jnp.int32)
-    here = state.replace(scene=state.scene.replace(valid=state.scene.valid & state.alive))
-    sample, found = jax.vmap(lambda i: attempt(here, i))(number)
+
+    def one(i):
+        # Attempts that do not count find no object and nothing that can be moved, and so have little to do.
+        counts = state.alive & (i < draws)
+        scene = state.scene.replace(valid=state.scene.valid & counts)
+        return attempt(state.replace(scene=scene, available=state.available & counts), i)
+
+    sample, found = jax.vmap(one)(number)
     works = found.possible & (number < draws)
     sample, found = jax.tree.map(lambda a: a[jnp.argmax(works)], (sample, found))
     return sample, found.replace(possible=jnp.any(works))
