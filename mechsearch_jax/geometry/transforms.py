@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import operator
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -70,14 +71,21 @@ def inverse(T_a_b: Float[Array, "*batch 4 4"]) -> Float[Array, "*batch 4 4"]:
     return make(rotation, -rotate(rotation, T_a_b[..., :3, 3]))
 
 
-def translate(T_a_b: Float[Array, "*batch 4 4"], offset: Float[Array, "*batch 3"]) -> Float[Array, "*batch 4 4"]:
+def translate(T_a_b: Float[Array, "*#batch 4 4"], offset: Float[Array, "*#batch 3"]) -> Float[Array, "*batch 4 4"]:
     """The same frame moved by an offset given in frame a."""
-    return T_a_b.at[..., :3, 3].add(offset)
+    return _moved(T_a_b, offset[..., None])
 
 
-def back_off(T_a_b: Float[Array, "*batch 4 4"], distance: Float[Array, "*batch"]) -> Float[Array, "*batch 4 4"]:
+def back_off(T_a_b: Float[Array, "*#batch 4 4"], distance: Float[Array, "*#batch"]) -> Float[Array, "*batch 4 4"]:
     """The same frame moved by a distance along its own -z."""
-    return T_a_b.at[..., :3, 3].add(-distance[..., None] * T_a_b[..., :3, 2])
+    return _moved(T_a_b, -distance[..., None, None] * T_a_b[..., :3, 2:3])
+
+
+def _moved(T_a_b: Float[Array, "... 4 4"], offset: Float[Array, "... 3 1"]) -> Float[Array, "... 4 4"]:
+    """A sum of two arrays, which becomes part of what reads it; an array that is written into is copied."""
+    T_a_b, offset = align((T_a_b, 2), (offset, 2))
+    width = [(0, 0, 0)] * (offset.ndim - 2) + [(0, 1, 0), (3, 0, 0)]
+    return T_a_b + jax.lax.pad(offset, jnp.zeros((), offset.dtype), width)
 
 
 def yaw_rotation(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:

@@ -10,15 +10,16 @@ gripper's frame, and the free space of the shelf is a prism along x. Links 2 to 
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.masked import masked_vmap, taken
-from mechsearch_jax.geometry.transforms import translate
-from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
-from mechsearch_jax.robot.kinematics import line_poses, path_kinematics
+from mechsearch_jax.geometry.transforms import back_off, translate
+from mechsearch_jax.robot.gripper import Gripper, joints_hit_shelf
+from mechsearch_jax.robot.kinematics import path_joints, path_kinematics, still_ahead
 from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf
 
 # How far in front of the shelf the gripper has to be to count as outside [m]: a target in the hand is outside then,
@@ -58,11 +59,29 @@ def crossing_poses(
 ) -> Float[Array, "*batch {count} 4 4"]:
     """Evenly spaced poses on the crossing to a pose's pre-grasp, which is left out; the first is outside."""
     T = jnp.asarray(T_world_gripper)
-    share = (jnp.arange(count, 0, -1) / count).reshape((1,) * (T.ndim - 2) + (count,))
-    length = crossing_length(T, outside, gripper)[..., None] * share
-    back = -gripper.approach * T[..., None, :3, 2]
-    back = jnp.broadcast_to(back, (*length.shape, 3)).at[..., 0].add(-length)
-    return translate(jnp.broadcast_to(T[..., None, :, :], (*length.shape, 4, 4)), back)
+    return _before(T, crossing_length(T, outside, gripper), np.full(count, gripper.approach), _to_cross(count))
+
+
+def _to_cross(count: int) -> Float[np.ndarray, " {count}"]:
+    """How much of the crossing is still ahead at each pose on it."""
+    return np.arange(count, 0, -1) / count
+
+
+def _before(
+    T_world_gripper: Float[Array, "*batch 4 4"],
+    crossing: Float[Array, "*#batch"],
+    back: Float[np.ndarray, " w"],
+    to_cross: Float[np.ndarray, " w"],
+) -> Float[Array, "*batch w 4 4"]:
+    """Poses on a way in: moved back along the gripper's z [m], and along x by a share of the crossing [m].
+
+    They differ in their positions only, and come from one formula: what is joined of parts is written to memory.
+    """
+    T = T_world_gripper[..., None, :, :]
+    across = crossing[..., None] * jnp.asarray(to_cross, T.dtype).reshape(*[1] * crossing.ndim, -1)
+    along_x = np.float32([1.0, 0.0, 0.0]).reshape(*[1] * across.ndim, 3)
+    moved = back_off(T, jnp.asarray(back, T.dtype).reshape(*[1] * (T.ndim - 3), -1))
+    return translate(moved, -across[..., None] * along_x)
 
 
 def way_in(
@@ -81,8 +100,20 @@ def way_in(
       crossings: number of poses on the crossing, the pre-grasp not among them.
       waypoints: number of poses on the approach, both ends included; the first is row `crossings`.
     """
-    line = line_poses(T_world_gripper, jnp.float32(gripper.approach), waypoints)
-    return jnp.concatenate([crossing_poses(T_world_gripper, outside, gripper, crossings), line])
+    return _ways_in(jnp.asarray(T_world_gripper), outside, gripper, crossings, waypoints)
+
+
+def _ways_in(
+    T_world_gripper: Float[Array, "*batch 4 4"],
+    outside: float | Float[Array, "*#batch"],
+    gripper: Gripper,
+    crossings: int,
+    waypoints: int,
+) -> Float[Array, "*batch {crossings}+{waypoints} 4 4"]:
+    """`way_in` for poses that may have leading axes."""
+    back = gripper.approach * np.append(np.ones(crossings), still_ahead(waypoints))
+    to_cross = np.append(_to_cross(crossings), np.zeros(waypoints))
+    return _before(T_world_gripper, crossing_length(T_world_gripper, outside, gripper), back, to_cross)
 
 
 def ways_in(
@@ -101,10 +132,17 @@ def ways_in(
       reachable: whether the arm follows the way from any of the places.
       outside: the place [m].
     """
-    paths = jnp.stack([way_in(T_world_gripper, x, gripper, crossings, waypoints) for x in gripper.outside])
-    q, reachable = path_kinematics(paths, jnp.broadcast_to(q7, len(gripper.outside)))
-    best = jnp.argmax(reachable)
-    return q[best], reachable[best], jnp.float32(gripper.outside)[best]
+    places = jnp.float32(gripper.outside)
+    T = jnp.broadcast_to(T_world_gripper[None], (len(places), 4, 4))
+    paths = _ways_in(T, places, gripper, crossings, waypoints)
+    q, reachable = path_kinematics(paths, q7)
+    # The first that is reachable, or the first of all. Chosen one by one: an index would make the arm write all of them
+    # to memory.
+    best, outside = q[0], jnp.float32(gripper.outside[0])
+    for i, place in reversed(list(enumerate(gripper.outside))):
+        best = jax.lax.select(reachable[i], q[i], best)
+        outside = jax.lax.select(reachable[i], jnp.float32(place), outside)
+    return best, jnp.any(reachable), outside
 
 
 def arm_path(
@@ -114,13 +152,21 @@ def arm_path(
 
     It does if it stays in one configuration, and links 2 to 5 do not touch the shelf.
     """
-    q, reachable = path_kinematics(path, q7)
-    return q, reachable & ~jnp.any(arm_hits_shelf(q, shelf))
+    q, follows = _followed(path, q7, shelf)
+    return jnp.stack(q, axis=-1), follows
 
 
 def arm_follows(path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf) -> Bool[Array, ""]:
     """Whether the arm follows a path of gripper poses; see `arm_path`."""
-    return arm_path(path, q7, shelf)[1]
+    return _followed(path, q7, shelf)[1]
+
+
+def _followed(
+    path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf
+) -> tuple[list[Float[Array, " w"]], Bool[Array, ""]]:
+    """`arm_path`, with the angles of each joint in an array of their own."""
+    q, reachable = path_joints(path, q7)
+    return q, reachable & ~jnp.any(joints_hit_shelf(q, shelf))
 
 
 def gripper_enters(

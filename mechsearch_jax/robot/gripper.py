@@ -13,6 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -24,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.kinematics import Numbers
-from mechsearch_jax.workspace.shelf import Shelf, spheres_hit_shelf
+from mechsearch_jax.workspace.shelf import Shelf, placed_spheres_hit_shelf
 
 FINGER_BASE = 0.0584  # z of the fingers' frames in the hand frame [m]
 LONGEST = 1.0  # that a gripper opens or approaches [m]
@@ -280,20 +281,35 @@ def arm_points(q: Float[Numbers, "*batch 7"], count: int) -> tuple[Float[Array, 
       points: spheres of the given radii about these points fill the capsules, up to dents between them [m].
       radii: one for each point [m].
     """
-    links, points, radii = [], [], []
+    sums, radii = _spheres(count)
+    return jnp.moveaxis(_centres([jnp.asarray(q)[..., joint] for joint in range(5)], sums), 0, -1), jnp.asarray(radii)
+
+
+@functools.cache
+def _spheres(count: int) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, " n"]]:
+    """The spheres of `arm_points`: their centres as sums of `kinematics.turned_axes`, and their radii [m]."""
+    sums, radii = [], []
     for link in range(1, 5):
+        frame = kinematics.frame_in_turned_axes(link)
         for capsule in LINKS[link]:
             radius, half = capsule.size
             z = np.linspace(-half, half, count)[:, None]
-            points.append(capsule.T_frame_primitive[:3, 3] + z * capsule.T_frame_primitive[:3, 2])
+            points = capsule.T_frame_primitive[:3, 3] + z * capsule.T_frame_primitive[:3, 2]
+            sums.append(np.pad(points @ frame[:3] + frame[3], ((0, 0), (0, 10 - frame.shape[1]))))
             radii.append(np.full(count, radius))
-            links.append(np.full(count, link))
-    owner = np.concatenate(links)
-    frames = kinematics.link_frames(q, range(1, 5))[..., owner - 1, :, :]
-    local = np.concatenate(points).astype(np.float32).reshape((1,) * (frames.ndim - 3) + (-1, 3))
+    return np.concatenate(sums).T.astype(np.float32), np.concatenate(radii).astype(np.float32)
+
+
+def _centres(q: Sequence[Float[Array, "*batch"]], sums: Float[np.ndarray, "k n"]) -> Float[Array, "3 *batch n"]:
+    """Points that are given as sums of `kinematics.turned_axes`, in the base frame."""
+    axes = kinematics.turned_axes(q[: len(sums) // 2])
+    rank = axes[0].ndim
+    terms = [
+        axis[..., None] * share.reshape(*[1] * rank, -1) for axis, share in zip(axes, sums, strict=True) if share.any()
+    ]
+    shoulder = np.float32([0.0, 0.0, kinematics.JOINTS[0][2]]).reshape(3, *[1] * rank)
     # Written out: a CPU takes ten times as long for a sum over an axis in the middle.
-    world = frames[..., 3, :] + sum(frames[..., i, :] * local[..., i, None] for i in range(3))
-    return world, jnp.asarray(np.concatenate(radii), jnp.float32)
+    return functools.reduce(jnp.add, terms) + shoulder
 
 
 @functools.partial(jax.jit, static_argnames=("shelf", "count"))
@@ -307,7 +323,15 @@ def arm_hits_shelf(q: Float[Numbers, "*batch 7"], shelf: Shelf, count: int = 5) 
       shelf: the shelf.
       count: spheres for each capsule, see `arm_points`.
     """
-    return jnp.any(spheres_hit_shelf(shelf, *arm_points(q, count)), axis=-1)
+    q = jnp.asarray(q, jnp.float32)
+    return jnp.any(joints_hit_shelf([q[..., joint] for joint in range(5)], shelf, count), axis=-1)
+
+
+def joints_hit_shelf(q: Sequence[Float[Array, "*batch"]], shelf: Shelf, count: int = 5) -> Bool[Array, "*batch n"]:
+    """Which of the spheres about `arm_points` touch the shelf, for angles of each joint in an array of their own."""
+    sums, radii = _spheres(count)
+    x, y, z = _centres(q, sums)
+    return placed_spheres_hit_shelf(shelf, x, y, z, jnp.asarray(radii))
 
 
 def _moved(T: np.ndarray, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:

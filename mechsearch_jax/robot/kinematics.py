@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.transforms import back_off
 
 Numbers = Array | np.ndarray
 
@@ -48,7 +50,6 @@ HAND_ANGLE = -math.pi / 4
 FINGER_TIPS = 0.1034
 
 POSITION_TOLERANCE = 1e-4
-ROTATION_TOLERANCE = 1e-3
 # How far a joint may turn between neighbouring waypoints of a path [rad]: at rest, and for each metre and radian moved.
 STEP_FLOOR = 0.1
 STEP_PER_METRE = 6.0
@@ -84,10 +85,39 @@ def _frames(q: Float[Array, "*batch 7"]) -> list[tuple[Array, Array, Array, Arra
     return [*frames, (c * x + s * y, c * y - s * x, z, p + FLANGE * z)]
 
 
-def link_frames(q: Float[Numbers, "*batch 7"], links: Sequence[int]) -> Float[Array, "*batch n 4 3"]:
-    """Axes x, y and z and the origin of a few links in the base frame, counted from 0, for joint angles `q` [rad]."""
-    frames = _frames(jnp.asarray(q, jnp.float32))
-    return jnp.stack([jnp.stack(frames[link], axis=-2) for link in links], axis=-3)
+def turned_axes(q: Sequence[Float[Array, "*batch"]]) -> list[Float[Array, "3 *batch"]]:
+    """What the frames of the first links are made of: the axes x and y that each joint turns about its z, in order.
+
+    `frame_in_turned_axes` says how. With the coordinates in front, all of it is arithmetic of single numbers.
+
+    Args:
+      q: angles of the first joints [rad].
+    """
+    x, y, z = (
+        jnp.broadcast_to(jnp.asarray(axis, jnp.float32).reshape(3, *[1] * q[0].ndim), (3, *q[0].shape))
+        for axis in np.eye(3)
+    )
+    axes = []
+    for angle, (_, turns, _) in zip(q, JOINTS, strict=False):
+        y, z = {0: (y, z), 1: (z, -y), -1: (-z, y)}[turns]
+        c, s = (jax.lax.broadcast(a, (3,)) for a in (jnp.cos(angle), jnp.sin(angle)))
+        x, y = c * x + s * y, c * y - s * x
+        axes += [x, y]
+    return axes
+
+
+def frame_in_turned_axes(link: int) -> Float[np.ndarray, "4 k"]:
+    """Axes x, y and z and the origin of a link, counted from 0, as sums of its `turned_axes`, without the base's.
+
+    The origin is given from the shoulder, which joint 1 does not move.
+    """
+    x, y, z, p = np.zeros((4, 2 * (link + 1)))
+    for joint, (a, turns, d) in enumerate(JOINTS[: link + 1]):
+        p = p + a * x
+        y, z = {0: (y, z), 1: (z, -y), -1: (-z, y)}[turns]
+        x, y = np.eye(2 * (link + 1))[2 * joint : 2 * joint + 2]
+        p = p + d * z
+    return np.stack([x, y, z, p])
 
 
 def gripper_pose(q: Float[Numbers, "*batch 7"]) -> Float[Array, "*batch 4 4"]:
@@ -112,61 +142,101 @@ def inverse_kinematics(
     Returns:
       q: four solutions (two forearms times two shoulders, always in the same order) [rad]. Where there is none, the
         numbers are finite but mean nothing.
-      valid: which solutions lie within the joint limits and reproduce the pose to 1e-4 m and 1e-3 rad.
+      valid: which solutions lie within the joint limits and reproduce the pose to 1e-4 m; its rotation they reproduce
+        to rounding errors.
     """
     T = jnp.asarray(T_base_gripper, jnp.float32)
     q7 = jnp.broadcast_to(jnp.asarray(q7, jnp.float32), T.shape[:-2])
+    found = _solutions(T, q7)
+    rest = [jnp.broadcast_to(found.q4, found.wrist[0].shape), *found.wrist, jnp.broadcast_to(q7, found.wrist[0].shape)]
+    # A stack of joints and shoulders, in front of the forearms.
+    q = jnp.stack([jnp.stack([*shoulder, *rest]) for shoulder in found.shoulders], axis=1)
+    q = jnp.moveaxis(q, (2, 1, 0), (-3, -2, -1)).reshape(*T.shape[:-2], 4, 7)
+    valid = jnp.moveaxis(jnp.stack(found.valid, axis=1), (0, 1), (-2, -1))
+    return q, valid.reshape(*T.shape[:-2], 4)
 
-    # Frame 6 has its x axis along the offset from the wrist centre to the axis of joint 7, its z axis on joint 6.
-    turn = (HAND_ANGLE + q7)[..., None]
-    x6 = jnp.cos(turn) * T[..., :3, 0] - jnp.sin(turn) * T[..., :3, 1]
-    y6 = -T[..., :3, 2]
-    z6 = jnp.cross(x6, y6)
-    wrist = T[..., :3, 3] + (FLANGE + FINGER_TIPS) * y6 - _WRIST * x6
 
-    to_shoulder = _batch(np.array([0.0, 0.0, _SHOULDER], np.float32), wrist.ndim) - wrist
-    distance = jnp.sqrt(jnp.maximum(_dot(to_shoulder, to_shoulder), 1e-6))
-    at_elbow = _triangle_angle(_UPPER_SIDE, _FORE_SIDE, distance)
-    at_wrist = _triangle_angle(_FORE_SIDE, distance, _UPPER_SIDE)
-    q4 = at_elbow + math.atan2(_UPPER, _OFFSET) + math.atan2(_FORE, _OFFSET) - 2.0 * math.pi
+class _Solutions(NamedTuple):
+    """The four solutions for poses of shape (*batch), with an axis for the two forearms in front.
+
+    Attributes:
+      shoulders: angles of joints 1 to 3 for each of the two shoulders, (2, *batch) each [rad].
+      q4: angle of joint 4, which all share, (1, *batch) [rad].
+      wrist: angles of joints 5 and 6, which both shoulders share, (2, *batch) each [rad].
+      valid: for each of the shoulders.
+    """
+
+    shoulders: tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]
+    q4: Array
+    wrist: tuple[Array, Array]
+    valid: tuple[Array, Array]
+
+
+def _solutions(T: Float[Array, "*batch 4 4"], q7: Float[Array, "*#batch"]) -> _Solutions:
+    """See `inverse_kinematics`.
+
+    Written in single coordinates: a GPU makes one program of arithmetic that looks the same for every number of an
+    array, and several of what stacks and slices vectors.
+    """
+    # The axis of the forearms has a length of 1 until they part.
+    T, q7 = T[None], q7[None]
+    x, y, z, p = ([T[..., row, column] for row in range(3)] for column in range(4))
+    # Frame 6 has its x axis along the offset from the wrist centre to the axis of joint 7, its z axis on joint 6; its
+    # y axis is -z of the gripper.
+    c, s = jnp.cos(HAND_ANGLE + q7), jnp.sin(HAND_ANGLE + q7)
+    x6 = [c * a - s * b for a, b in zip(x, y, strict=True)]
+    z6 = [s * a + c * b for a, b in zip(x, y, strict=True)]
+    wrist = [o - (FLANGE + FINGER_TIPS) * a - _WRIST * b for o, a, b in zip(p, z, x6, strict=True)]
+    wrist[2] = wrist[2] - _SHOULDER
+
+    square = _dot(wrist, wrist)
+    distance = jnp.sqrt(jnp.maximum(square, 1e-6))
+    bent = _arccos((_UPPER_SIDE**2 + _FORE_SIDE**2 - square) / (2.0 * _UPPER_SIDE * _FORE_SIDE))
+    q4 = bent + (math.atan2(_UPPER, _OFFSET) + math.atan2(_FORE, _OFFSET) - 2.0 * math.pi)
+    c4, s4 = jnp.cos(q4), jnp.sin(q4)
 
     # The forearm's axis z5 = sin(q6) x6 + cos(q6) y6 makes a known angle with the line from the wrist to the shoulder.
-    along_x, along_y = _dot(to_shoulder, x6), _dot(to_shoulder, y6)
-    span = jnp.sqrt(jnp.maximum(along_x**2 + along_y**2, 1e-12))
-    opening = _arccos(-distance * jnp.cos(at_wrist + math.atan2(_OFFSET, _FORE)) / span)
+    along_x, along_y, along_z = -_dot(wrist, x6), _dot(wrist, z), -_dot(wrist, z6)
+    span = jnp.sqrt(jnp.maximum(along_x * along_x + along_y * along_y, 1e-12))
+    side = (square + (_FORE_SIDE**2 - _UPPER_SIDE**2)) / (2.0 * _FORE_SIDE)
+    side = jax.lax.clamp(-distance, side, distance)
+    height = jnp.sqrt(jnp.maximum(square - side * side, 0.0))
+    opening = _arccos((height * (_OFFSET / _FORE_SIDE) - side * (_FORE / _FORE_SIDE)) / span)
     middle = jnp.arctan2(along_x, along_y)
-    q6 = jnp.stack([middle + opening, middle - opening], axis=-1)
-    centre = float(JOINT_LOWER[5] + JOINT_UPPER[5]) / 2
-    q6 = jnp.mod(q6 - centre + math.pi, 2.0 * math.pi) - math.pi + centre
 
-    x6, y6, z6, to_shoulder = (v[..., None, :] for v in (x6, y6, z6, to_shoulder))
-    c, s = jnp.cos(q6)[..., None], jnp.sin(q6)[..., None]
-    x5, y5, z5 = c * x6 - s * y6, -z6, s * x6 + c * y6
+    sign = np.float32([1.0, -1.0]).reshape(2, *[1] * (q7.ndim - 1))
+    centre = float(JOINT_LOWER[5] + JOINT_UPPER[5]) / 2
+    q6 = middle + sign * opening
+    q6 = q6 - 2.0 * math.pi * jax.lax.round((q6 - centre) / (2.0 * math.pi))
+    c6, s6 = jnp.cos(q6), jnp.sin(q6)
 
     # The elbow lies in the plane of the forearm and the shoulder, off the forearm's axis towards the shoulder.
-    x4 = _normalised(to_shoulder - _dot(to_shoulder, z5)[..., None] * z5)
-    q5 = jnp.arctan2(-_dot(x4, y5), _dot(x4, x5))
-    q4 = jnp.broadcast_to(q4[..., None], q5.shape)
-    c, s = jnp.cos(q4)[..., None], jnp.sin(q4)[..., None]
-    y4 = z5
-    x3, y3, z3 = c * x4 - s * y4, -jnp.cross(x4, y4), s * x4 + c * y4
+    off = c6 * along_x - s6 * along_y
+    q5 = jnp.arctan2(along_z, off)
+    c5, s5 = jnp.cos(q5), jnp.sin(q5)
+    # Axes of frame 3, given in frame 6 with -y6 in place of y6, and from there in the base.
+    c56, c5s6 = c5 * c6, c5 * s6
+    x3 = c4 * c56 - s4 * s6, c4 * c5s6 + s4 * c6, c4 * s5
+    y3 = s5 * c6, s5 * s6, -c5
+    z3 = s4 * c56 + c4 * s6, s4 * c5s6 - c4 * c6, s4 * s5
+    z3_x, z3_y, z3_z = (_dot(z3, axis) for axis in zip(x6, z, z6, strict=True))
+    q1 = jnp.arctan2(z3_y, z3_x)
+    c1, s1 = jnp.cos(q1), jnp.sin(q1)
+    y1 = [c1 * axis[1] - s1 * axis[0] for axis in (x6, z, z6)]
+    q2 = jnp.arctan2(c1 * z3_x + s1 * z3_y, z3_z)
+    q3 = jnp.arctan2(_dot(x3, y1), _dot(y3, y1))
 
-    yaw = jnp.arctan2(z3[..., 1], z3[..., 0])
-    q1 = jnp.stack([yaw, jnp.where(yaw > 0.0, yaw - math.pi, yaw + math.pi)], axis=-1)
-    c, s = jnp.cos(q1), jnp.sin(q1)
-    x3, y3, z3 = (v[..., None, :] for v in (x3, y3, z3))
-    q2 = jnp.arctan2(c * z3[..., 0] + s * z3[..., 1], jnp.broadcast_to(z3[..., 2], c.shape))
-    q3 = jnp.arctan2(c * x3[..., 1] - s * x3[..., 0], c * y3[..., 1] - s * y3[..., 0])
-
-    q4, q5, q6 = (jnp.broadcast_to(angle[..., None], q1.shape) for angle in (q4, q5, q6))
-    q7 = jnp.broadcast_to(q7[..., None, None], q1.shape)
-    q = jnp.stack([q1, q2, q3, q4, q5, q6, q7], axis=-1).reshape(*T.shape[:-2], 4, 7)
-
-    error = gripper_pose(q) - T[..., None, :, :]
-    moved = jnp.sqrt(jnp.sum(error[..., :3, 3] ** 2, axis=-1))
-    turned = jnp.sqrt(jnp.sum(error[..., :3, :3] ** 2, axis=(-2, -1)) / 2)
-    within = jnp.all((q >= _batch(JOINT_LOWER, q.ndim)) & (q <= _batch(JOINT_UPPER, q.ndim)), axis=-1)
-    return q, within & (moved < POSITION_TOLERANCE) & (turned < ROTATION_TOLERANCE)
+    # The rotation is right by construction. What is out of reach shows in the plane of the forearm and the shoulder:
+    # there the line from the wrist to the shoulder is not the one that joint 4 makes.
+    off = jnp.sqrt(off * off + along_z * along_z) - (_OFFSET - _OFFSET * c4 - _UPPER * s4)
+    back = s6 * along_x + c6 * along_y + (_FORE - _OFFSET * s4 + _UPPER * c4)
+    reached = (off * off + back * back < POSITION_TOLERANCE**2) & _within(q4, 3) & _within(q7, 6)
+    reached &= _within(q2, 1) & _within(q5, 4) & _within(q6, 5)
+    # The other shoulder turns about the same axes to the same upper arm.
+    other = _opposite(q1), -q2, _opposite(q3)
+    shoulders = (q1, q2, q3), other
+    valid = [reached & _within(a[0], 0) & _within(a[2], 2) for a in shoulders]
+    return _Solutions(shoulders, q4, (q5, q6), (valid[0], valid[1]))
 
 
 @jax.jit
@@ -187,21 +257,43 @@ def path_kinematics(
       q: joint angles at the waypoints [rad]; finite, but meaningless, where the path is out of reach.
       reachable: whether there is such a solution.
     """
+    q, reachable = path_joints(T_base_gripper, q7)
+    return jnp.stack(q, axis=-1), reachable
+
+
+@jax.jit
+def path_joints(
+    T_base_gripper: Float[Numbers, "*batch waypoints 4 4"], q7: Float[Numbers, "*#batch"]
+) -> tuple[list[Float[Array, "*batch waypoints"]], Bool[Array, "*batch"]]:
+    """`path_kinematics`, with the angles of each joint in an array of their own."""
     T = jnp.asarray(T_base_gripper, jnp.float32)
     q7 = jnp.broadcast_to(jnp.asarray(q7, jnp.float32), T.shape[:-3])
-    q, valid = inverse_kinematics(T, jnp.broadcast_to(q7[..., None], T.shape[:-2]))
+    found = _solutions(T, q7[..., None])
 
-    step = jnp.diff(T, axis=-3)
-    moved = jnp.sqrt(jnp.sum(step[..., :3, 3] ** 2, axis=-1))
-    turned = jnp.sqrt(jnp.sum(step[..., :3, :3] ** 2, axis=(-2, -1)) / 2)
-    allowed = STEP_FLOOR + STEP_PER_METRE * moved + STEP_PER_RADIAN * turned
-    smooth = jnp.all(jnp.abs(jnp.diff(q, axis=-3)) < allowed[..., None, None], axis=(-3, -1))
-    reachable = jnp.all(valid, axis=-2) & smooth
+    step = T[..., 1:, :3, :] - T[..., :-1, :3, :]
+    step = step * step
+    moved = jnp.sqrt(jnp.sum(step[..., 3], axis=-1))
+    turned = jnp.sqrt(jnp.sum(step[..., :3], axis=(-2, -1)) / 2)
+    allowed = (STEP_FLOOR + STEP_PER_METRE * moved + STEP_PER_RADIAN * turned)[None]
+    # Joint 7 rests, and joint 2 turns as much in one shoulder as in the other.
+    q5, q6 = found.wrist
+    turn = jnp.maximum(jnp.maximum(_turn(found.q4), _turn(found.shoulders[0][1])), jnp.maximum(_turn(q5), _turn(q6)))
+    detour = _detour(found.q4, 3) + _detour(q5, 4) + _detour(q6, 5)
+    costs = []
+    for (q1, q2, q3), valid in zip(found.shoulders, found.valid, strict=True):
+        smooth = jnp.all(jnp.maximum(jnp.maximum(turn, _turn(q1)), _turn(q3)) < allowed, axis=-1)
+        cost = detour + _detour(q1, 0) + _detour(q2, 1) + _detour(q3, 2)
+        cost = jnp.sum(_or_never(valid, cost), axis=-1)
+        costs.append(_or_never(smooth, cost))
 
-    detour = jnp.sum((q - _batch(HOME, q.ndim)) ** 2, axis=(-3, -1))
-    best = jnp.argmin(jnp.where(reachable, detour, jnp.inf), axis=-1)
-    q = jnp.take_along_axis(q, best[..., None, None, None], axis=-2)[..., 0, :]
-    return q, jnp.any(reachable, axis=-1)
+    # The first of the cheapest, in the order of `inverse_kinematics`.
+    other = _at_every_waypoint(costs[1] < costs[0], T.shape[-3])
+    q = [jax.lax.select(other, b, a) for a, b in zip(*found.shoulders, strict=True)]
+    cost = jnp.minimum(*costs)
+    second = _at_every_waypoint(cost[1] < cost[0], T.shape[-3])
+    q = [jax.lax.select(second, a[1], a[0]) for a in (*q, q5, q6)]
+    q = [*q[:3], found.q4[0], *q[3:], _at_every_waypoint(q7, T.shape[-3])]
+    return q, jnp.minimum(cost[0], cost[1]) < jnp.inf
 
 
 def line_poses(
@@ -212,13 +304,22 @@ def line_poses(
     Raises:
       InputError: there are fewer than two waypoints.
     """
-    if waypoints < 2:
-        raise InputError(f"line_poses: {waypoints} waypoints make no line; ask for at least 2")
+    ahead = still_ahead(waypoints)
     T = jnp.asarray(T_base_gripper, jnp.float32)
     distance = jnp.broadcast_to(jnp.asarray(distance, jnp.float32), T.shape[:-2])
-    back = distance[..., None] * _batch(np.linspace(1.0, 0.0, waypoints, dtype=np.float32), distance.ndim + 1)
-    line = jnp.broadcast_to(T[..., None, :, :], (*T.shape[:-2], waypoints, 4, 4))
-    return line.at[..., :3, 3].add(-back[..., None] * T[..., None, :3, 2])
+    back = distance[..., None] * ahead.reshape(*[1] * distance.ndim, -1)
+    return back_off(T[..., None, :, :], back)
+
+
+def still_ahead(waypoints: int) -> Float[np.ndarray, " {waypoints}"]:
+    """How much of a straight approach is still ahead at each of its evenly spaced poses, both ends included.
+
+    Raises:
+      InputError: there are fewer than two waypoints.
+    """
+    if waypoints < 2:
+        raise InputError(f"straight approach: {waypoints} waypoints make no line; ask for at least 2")
+    return np.linspace(1.0, 0.0, waypoints, dtype=np.float32)
 
 
 def line_kinematics(
@@ -252,25 +353,40 @@ def _pose(x: Array, y: Array, z: Array, p: Array) -> Array:
     return jnp.concatenate([top, bottom], axis=-2)
 
 
-def _batch(constant: np.ndarray, rank: int) -> Array:
-    """A constant with as many axes as what it is combined with."""
-    return jnp.asarray(constant).reshape((1,) * (rank - constant.ndim) + constant.shape)
+def _at_every_waypoint(a: Array, count: int) -> Array:
+    """The same along a last axis."""
+    return jax.lax.broadcast_in_dim(a, (*a.shape, count), tuple(range(a.ndim)))
 
 
-def _dot(a: Array, b: Array) -> Array:
-    return jnp.sum(a * b, axis=-1)
+def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _normalised(a: Array) -> Array:
-    return a / jnp.sqrt(jnp.maximum(_dot(a, a), 1e-12))[..., None]
+def _within(q: Array, joint: int) -> Array:
+    """Whether angles of a joint lie within its limits."""
+    low, high = float(JOINT_LOWER[joint]), float(JOINT_UPPER[joint])
+    return jnp.abs(q) <= high if low == -high else (q >= low) & (q <= high)
+
+
+def _opposite(q: Array) -> Array:
+    return jax.lax.select(q > 0.0, q - math.pi, q + math.pi)
+
+
+def _or_never(possible: Array, cost: Array) -> Array:
+    """What something costs; more than anything where it is not possible."""
+    return jax.lax.select(possible, cost, jnp.full_like(cost, jnp.inf))
+
+
+def _turn(q: Array) -> Array:
+    """How far a joint turns between neighbouring waypoints."""
+    return jnp.abs(q[..., 1:] - q[..., :-1])
+
+
+def _detour(q: Array, joint: int) -> Array:
+    return jnp.square(q - float(HOME[joint]))
 
 
 def _arccos(cosine: Array) -> Array:
     """`arccos` that clips its argument: what is out of reach is recognised by the pose that it gives."""
-    cosine = jnp.clip(cosine, -1.0, 1.0)
+    cosine = jnp.minimum(jnp.maximum(cosine, -1.0), 1.0)
     return jnp.arctan2(jnp.sqrt((1.0 - cosine) * (1.0 + cosine)), cosine)
-
-
-def _triangle_angle(a: Array | float, b: Array | float, opposite: Array | float) -> Array:
-    """The angle between the sides `a` and `b` of a triangle."""
-    return _arccos(jnp.asarray((a * a + b * b - opposite * opposite) / (2.0 * a * b)))

@@ -112,7 +112,18 @@ def spheres_hit_shelf(
       centres: in the world [m].
       radii: above 0 [m].
     """
-    x, y, z = centres[..., 0], centres[..., 1], centres[..., 2]
+    x, y, z = (centres[..., axis] for axis in range(3))
+    return placed_spheres_hit_shelf(shelf, x, y, z, radii)
+
+
+def placed_spheres_hit_shelf(
+    shelf: Shelf,
+    x: Float[Array, "*batch n"],
+    y: Float[Array, "*batch n"],
+    z: Float[Array, "*batch n"],
+    radii: Float[Array, " n"],
+) -> Bool[Array, "*batch n"]:
+    """`spheres_hit_shelf` with each coordinate of the centres in an array of its own."""
     to_wall = jnp.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
     to_board = jnp.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
     beside = jnp.maximum(jnp.minimum(to_wall, to_board), 0.0)
