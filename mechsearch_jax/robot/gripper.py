@@ -296,7 +296,7 @@ def arm_points(q: Float[Numbers, "*batch 7"], count: int) -> tuple[Float[Array, 
     return world, jnp.asarray(np.concatenate(radii), jnp.float32)
 
 
-@functools.partial(jax.jit, static_argnames=("shelf", "count"))
+@functools.partial(jax.jit, static_argnames=("count",))
 def arm_hits_shelf(q: Float[Numbers, "*batch 7"], shelf: Shelf, count: int = 5) -> Bool[Array, "*batch"]:
     """Whether links 2 to 5 touch the shelf or come closer to it than the planner's margins.
 
