@@ -275,14 +275,9 @@ def _simulate(
     shelf, world, reference, active = jax.tree.map(np.asarray, (shelf, world, reference, active))
     lead = active.shape
     shelf, world, reference = jax.tree.map(lambda a: a.reshape(-1, *a.shape[len(lead) :]), (shelf, world, reference))
-    blank = _blank(_one_shelf(shelf, 0), config.motion.timestep)
+    blank = _blank(on_host(shelf, 0), config.motion.timestep)
     flat = _Rollouts(blank, config, threads).push(shelf, world, reference, active.reshape(-1))
     return jax.tree.map(lambda a: a.reshape((*lead, *a.shape[1:])), flat)
-
-
-def _one_shelf(shelves: Shelf, row: int) -> Shelf:
-    """One of several shelves, as somebody gave it."""
-    return on_host(jax.tree.map(lambda a: a[row], shelves))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -316,7 +311,7 @@ class _Rollouts:
             if name not in of_scene:
                 of_scene[name] = len(built)
                 slots = bodies_of(one)
-                model = models.with_bodies(_blank(_one_shelf(shelf, int(row)), self.config.motion.timestep), slots)
+                model = models.with_bodies(_blank(on_host(shelf, int(row)), self.config.motion.timestep), slots)
                 built.append(model)
                 first.append(_state_of(model, models.initial_state(model, slots)))
             scene[row] = of_scene[name]

@@ -93,14 +93,15 @@ class Shelf:
         )
 
 
-def on_host(shelf: Shelf) -> Shelf:
+def on_host(shelf: Shelf, *row: int) -> Shelf:
     """The shelf whose numbers a jitted function handed out, as it was given: with the shortest decimals that come to
     them.
 
     Args:
-      shelf: its leaves are single numbers in float32, as arrays of the host.
+      shelf: its leaves are arrays of the host, float32.
+      row: of several shelves, whose leaves have leading axes, which one is meant.
     """
-    return jax.tree.map(lambda number: float(str(np.float32(number))), shelf)
+    return jax.tree.map(lambda numbers: float(str(np.float32(numbers[row]))), shelf)
 
 
 def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
