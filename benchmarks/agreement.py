@@ -163,7 +163,7 @@ def _sampler(problem: Problem) -> Callable[[Array, World], Action]:
         occupied=jnp.zeros(grid, bool),
         chance=jnp.zeros(grid),
         origin=problem.poses[0, :2],
-        cell=jnp.float32(problem.target.cell(problem.shelf)[:2]),
+        cell=problem.cell,
         top=jnp.float32(problem.shelf.board),
     )
 

@@ -118,7 +118,7 @@ def graspable_at(shelf: Shelf, target: Target, gripper: Gripper | None = None) -
     return lambda pose: bool(_any_grasp(tables, shelf, gripper, target, jnp.asarray(pose, jnp.float32)))
 
 
-@functools.partial(jax.jit, static_argnames=("shelf", "gripper", "target"))
+@functools.partial(jax.jit, static_argnames=("gripper", "target"))
 def _any_grasp(
     tables: GraspTables, shelf: Shelf, gripper: Gripper, target: Target, pose: Float[Array, " 3"]
 ) -> Bool[Array, ""]:
@@ -247,7 +247,7 @@ class ScenarioGenerator:
     def _target_at(self, pose: np.ndarray) -> Body:
         x, y, yaw = (float(p) for p in pose)
         turn = (round(float(np.cos(yaw / 2)), 9), 0.0, 0.0, round(float(np.sin(yaw / 2)), 9))
-        height = self.target.height(self._shelf)
+        height = float(self.target.height(self._shelf))
         return Body(self.target.shape, self.target.half_size, (round(x, 6), round(y, 6), round(height, 6)), turn)
 
     def _hide(self, rng: np.random.Generator, scene: Scenario) -> Scenario | None:

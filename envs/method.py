@@ -51,7 +51,7 @@ class Method:
         Raises:
           InputError: there is no such policy, or its push model cannot be used.
         """
-        first, later = push_models(self.config.push_model)
+        first, later = push_models(self.config.push_model, self.workcell.shelf)
         return policy_factory(self.name)(
             self.config.planner,
             push_model=first,

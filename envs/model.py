@@ -226,18 +226,23 @@ def parking_place(slot: int) -> tuple[float, float, float]:
     return (-2.0, 0.02 * slot, 0.6)
 
 
-def shelf_boxes(shelf: Shelf) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """The shelf's boards as axis-aligned boxes: their lower and upper corners in the world [m]."""
+def shelf_corners(shelf: Shelf) -> dict[str, tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]]:
+    """The shelf's boards as axis-aligned boxes: their lower and upper corners in the world [m]; the shelf may be
+    traced."""
     t = shelf.thickness
     low, high = (shelf.front, shelf.right - t), (shelf.back + t, shelf.left + t)
-    boxes = {
+    return {
         "board": ((*low, shelf.board - t), (*high, shelf.board)),
         "ceiling": ((*low, shelf.ceiling), (*high, shelf.ceiling + t)),
         "back": ((shelf.back, low[1], shelf.board), (*high, shelf.ceiling)),
         "right": ((*low, shelf.board), (shelf.back, shelf.right, shelf.ceiling)),
         "left": ((shelf.front, shelf.left, shelf.board), (shelf.back, high[1], shelf.ceiling)),
     }
-    return {name: (np.array(a), np.array(b)) for name, (a, b) in boxes.items()}
+
+
+def shelf_boxes(shelf: Shelf) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """`shelf_corners` as arrays of the host."""
+    return {name: (np.array(low), np.array(high)) for name, (low, high) in shelf_corners(shelf).items()}
 
 
 def panda_shelf_mjcf(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> str:

@@ -47,7 +47,7 @@ from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference, push_reference
 from mechsearch_jax.shapes import by_shape, in_order
 from mechsearch_jax.workspace.camera import Camera
-from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.shelf import Shelf, on_host
 
 # An object that has moved by less than this [m], and turned by less than this [rad], was not pushed.
 STILL, STILL_TURN = 1e-3, 0.02
@@ -55,6 +55,10 @@ STILL, STILL_TURN = 1e-3, 0.02
 LOOSE, LOOSE_TURN = 5e-4, 0.01
 # No body is thinner [m]: contact geometry is smaller than the body by `model.MARGIN`.
 THINNEST = 2e-3
+
+# What of a shelf a simulation is about, and how far it may be off [m].
+WALLS = ("front", "back", "right", "left", "board", "ceiling", "thickness")
+SAME = 1e-6
 
 _PHYSICS = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
@@ -176,8 +180,9 @@ class NativePhysics:
         pushes = jnp.any(displacement != 0.0)
         poses = Poses(jax.ShapeDtypeStruct((BODIES, 3), jnp.float32), jax.ShapeDtypeStruct((BODIES, 3, 3), jnp.float32))
         told = jax.pure_callback(
-            functools.partial(_simulate, shelf, self.simulation, self.threads or cores()),
+            functools.partial(_simulate, self.simulation, self.threads or cores()),
             Simulated(poses, poses, jax.ShapeDtypeStruct((), jnp.bool_)),
+            shelf,
             world,
             reference,
             pushes & reachable,
@@ -194,9 +199,11 @@ class MjxPhysics:
     residual. On a CPU the same pushes always give the same results, on a GPU they do not.
 
     Attributes:
+      shelf: where it simulates; a model is made of its numbers. In any other shelf every push has an infinite residual.
       config: of the simulator.
     """
 
+    shelf: Shelf = dataclasses.field(default_factory=Shelf)
     config: MjxConfig = dataclasses.field(default_factory=lambda: MjxConfig(simulator=push_simulation()))
 
     def __call__(
@@ -215,8 +222,9 @@ class MjxPhysics:
         )
         world = jax.tree.map(lambda a, b: jnp.where(sound, a, b), world, jax.tree.map(jnp.zeros_like, world))
         one = jax.tree.map(lambda a: a[None], (world, action))
-        told = jax.tree.map(lambda a: a[0], _batched(shelf, self.config)(*one))
-        return _outcome(shelf, scene, world, told, pushes & (told.failed | ~sound))
+        told = jax.tree.map(lambda a: a[0], _batched(self.shelf, self.config)(*one))
+        other = jnp.any(jnp.stack([jnp.abs(getattr(shelf, name) - getattr(self.shelf, name)) > SAME for name in WALLS]))
+        return _outcome(shelf, scene, world, told, pushes & (told.failed | ~sound | other))
 
 
 def _finite(world: World, *others: Array) -> Bool[Array, ""]:
@@ -261,13 +269,14 @@ def _blank(shelf: Shelf, timestep: float) -> mujoco.MjModel:
 
 
 def _simulate(
-    shelf: Shelf, config: SimulatorConfig, threads: int, world: World, reference: Reference, active: Any
+    config: SimulatorConfig, threads: int, shelf: Shelf, world: World, reference: Reference, active: Any
 ) -> Simulated:
     """Simulate pushes on the host; any leading axes. It must not compute with JAX, which is waiting for it."""
-    world, reference, active = jax.tree.map(np.asarray, (world, reference, active))
+    shelf, world, reference, active = jax.tree.map(np.asarray, (shelf, world, reference, active))
     lead = active.shape
-    world, reference = jax.tree.map(lambda a: a.reshape(-1, *a.shape[len(lead) :]), (world, reference))
-    flat = _Rollouts(_blank(shelf, config.motion.timestep), config, threads).push(world, reference, active.reshape(-1))
+    shelf, world, reference = jax.tree.map(lambda a: a.reshape(-1, *a.shape[len(lead) :]), (shelf, world, reference))
+    blank = _blank(on_host(shelf, 0), config.motion.timestep)
+    flat = _Rollouts(blank, config, threads).push(shelf, world, reference, active.reshape(-1))
     return jax.tree.map(lambda a: a.reshape((*lead, *a.shape[1:])), flat)
 
 
@@ -276,7 +285,7 @@ class _Rollouts:
     """Steps many worlds at a time, each with a model of its own.
 
     Attributes:
-      blank: the model with empty slots.
+      blank: a model with empty slots; all shelves' are of the same size.
       config: of the simulation.
       threads: how many worlds are stepped at the same time.
     """
@@ -285,7 +294,7 @@ class _Rollouts:
     config: SimulatorConfig
     threads: int
 
-    def push(self, world: World, reference: Reference, active: Bool[np.ndarray, " n"]) -> Simulated:
+    def push(self, shelf: Shelf, world: World, reference: Reference, active: Bool[np.ndarray, " n"]) -> Simulated:
         """What becomes of pushes; see `_simulate`, with a single leading axis n."""
         count = len(active)
         start = Poses(world.position.copy(), world.rotation.copy())
@@ -298,11 +307,11 @@ class _Rollouts:
         first: list[np.ndarray] = []
         for row in np.flatnonzero(active & ~failed):
             one: World = jax.tree.map(lambda a, row=row: a[row], world)
-            name = b"".join(leaf.tobytes() for leaf in jax.tree.leaves(one))
+            name = b"".join(leaf[row].tobytes() for leaf in jax.tree.leaves((shelf, world)))
             if name not in of_scene:
                 of_scene[name] = len(built)
                 slots = bodies_of(one)
-                model = models.with_bodies(self.blank, slots)
+                model = models.with_bodies(_blank(on_host(shelf, int(row)), self.config.motion.timestep), slots)
                 built.append(model)
                 first.append(_state_of(model, models.initial_state(model, slots)))
             scene[row] = of_scene[name]

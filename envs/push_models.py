@@ -9,6 +9,7 @@ import jax
 
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
+from mechsearch_jax.workspace.shelf import Shelf
 
 
 class PushModels(NamedTuple):
@@ -24,14 +25,15 @@ class PushModels(NamedTuple):
 
 
 @functools.cache
-def push_models(name: str) -> PushModels:
-    """The push models of a name; the same objects for the same name, so that nothing is compiled twice.
+def push_models(name: str, shelf: Shelf | None = None) -> PushModels:
+    """The push models of a name; the same objects for the same arguments, so that nothing is compiled twice.
 
     "physics" simulates every push on a GPU. On a CPU that would take too long: the first action of every sequence is
     simulated there, and the others are predicted by the network.
 
     Args:
       name: "quasi-static", "learned" or "physics".
+      shelf: in which a GPU simulates; the default shelf if None. The others work in any.
 
     Raises:
       InputError: there is none of that name, its weights are missing or damaged, or Warp cannot be imported.
@@ -43,4 +45,5 @@ def push_models(name: str) -> PushModels:
 
     if jax.default_backend() == "cpu":
         return PushModels(NativePhysics(), own_push_model("learned"))
-    return PushModels(MjxPhysics(), MjxPhysics())
+    simulated = MjxPhysics(shelf or Shelf())
+    return PushModels(simulated, simulated)

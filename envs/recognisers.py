@@ -25,7 +25,7 @@ from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.assignment import assign
-from mechsearch_jax.perception.cloud import MARGIN, View, above_board, thinned_view
+from mechsearch_jax.perception.cloud import MARGIN, View, above_board
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
@@ -69,7 +69,7 @@ class Labeller(Protocol):
 
         Args:
           key: PRNG key.
-          shelf: static.
+          shelf: may be traced.
           points: in the world [m]; NaN where nothing was measured.
           of_target: where the detector sees the target; nowhere as long as it does not.
           masks: the true labels; a labeller that should not know them takes no more from them than the numbers that
@@ -157,7 +157,7 @@ class ImageRecogniser:
     depth: Depth = measured_depth
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
-        view, shelf = thinned_view(snapshot.camera, snapshot.shelf), snapshot.shelf
+        view, shelf = snapshot.view, snapshot.shelf
         keys = jax.random.split(key, 4)
         unseen = found_pixels(snapshot.camera) / view.stride**2
         image = labelled(keys[:2], self, view, shelf, snapshot.world, snapshot.target_seen, unseen)
@@ -167,7 +167,7 @@ class ImageRecogniser:
         return Observation(objects, snapshot.target_seen, pose)
 
 
-@kept(static_argnames=("recogniser", "view", "shelf", "unseen"))
+@kept(static_argnames=("recogniser", "unseen"))
 def labelled(
     keys: Key[Array, "2"],
     recogniser: ImageRecogniser,
@@ -181,7 +181,9 @@ def labelled(
 
     Args:
       keys: of the noise, and of the labeller.
-      recogniser, view, shelf: static.
+      recogniser: static.
+      view: which rays of a camera are cast.
+      shelf: what they see.
       world: the true state.
       target_seen: whether the detector sees the target; where it does not, nothing is said of its pixels.
       unseen: of how few pixels of the view the detector does not find the target; static.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from operator import add, sub
 
 import flax.struct
 import jax
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.compiled import kept
-from mechsearch_jax.envs.model import shelf_boxes
+from mechsearch_jax.envs.model import shelf_corners
 from mechsearch_jax.envs.world import BODIES, TARGET, World
 from mechsearch_jax.geometry.transforms import rotate
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
@@ -44,6 +45,8 @@ PALETTE = np.array(
 BACKGROUND_COLOUR = (1.0, 1.0, 1.0)
 LIGHT = (-0.62, 0.25, 0.74)
 AMBIENT = 0.55
+# Windows around the target have a multiple of so many rows and columns.
+WINDOW_BLOCK = 16
 # What the shelf is made of.
 _BOARD = shape_of("box")
 
@@ -109,8 +112,8 @@ def _cast_bodies(
 def cast_shelf(camera: Camera, shelf: Shelf, directions: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels"]:
     """Depth of the empty shelf along rays from the camera [m]; infinite where it is not."""
     depth = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
-    for low, high in shelf_boxes(shelf).values():
-        centre, half = (low + high) / 2, (high - low) / 2
+    for low, high in shelf_corners(shelf).values():
+        centre, half = ([sign(a, b) / 2 for a, b in zip(high, low, strict=True)] for sign in (add, sub))
         origin = [jnp.float32(camera.position[i] - centre[i]) for i in range(3)]
         towards = [directions[..., i] for i in range(3)]
         depth = jnp.minimum(depth, _BOARD.cut(origin, towards, jnp.array(half, jnp.float32), jnp))
@@ -140,12 +143,12 @@ def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, dept
     return jnp.where((owner == SHELF)[:, None], walls[wall], body).reshape(*flat, 3)
 
 
-@kept(static_argnames=("camera", "shelf"))
+@kept()
 def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Image:
     """The camera's image of the shelf and everything on it; the robot is out of the way.
 
     Args:
-      camera: the camera; static.
+      camera: the camera.
       world: the bodies.
       shelf: the shelf; the default shelf if None.
     """
@@ -164,18 +167,31 @@ def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Image:
     return Image(depth, owner, colour)
 
 
-@kept(static_argnames=("camera", "window"))
+def target_window(camera: Camera) -> int:
+    """Side of a window of a camera's image that holds a 0.1 m tall target anywhere on the shelf, in pixels.
+
+    Not for a traced camera. A camera that was calibrated again nearly always has the same.
+    """
+    side = math.ceil(0.36 * max(camera.fx, camera.fy) / WINDOW_BLOCK) * WINDOW_BLOCK
+    return min(side, max(camera.width, camera.height))
+
+
 def target_pixels(camera: Camera, world: World, window: int | None = None) -> Int[Array, ""]:
     """How many pixels of the target the camera sees: those of `observe`, counted in a window around the target only.
 
     The shelf hides nothing of what stands on it from this camera and is left out.
 
     Args:
-      camera: the camera; static.
+      camera: the camera.
       world: the bodies.
-      window: side of the window in pixels; by default it holds a 0.1 m tall target anywhere on the shelf.
+      window: side of the window; `target_window` if left out, which for a traced camera it must not be.
     """
-    window = window or min(math.ceil(0.36 * max(camera.fx, camera.fy)), max(camera.width, camera.height))
+    return pixels_in_window(camera, world, window or target_window(camera))
+
+
+@kept(static_argnames=("window",))
+def pixels_in_window(camera: Camera, world: World, window: int) -> Int[Array, ""]:
+    """`target_pixels` in a window of a given side in pixels, which is static."""
     centre, _ = project(camera, world.position[TARGET])
     corner = jnp.floor(centre - (window - 1) / 2)
     rows = corner[0] + jnp.arange(window)[:, None] + jnp.zeros((1, window))
@@ -185,7 +201,11 @@ def target_pixels(camera: Camera, world: World, window: int | None = None) -> In
     return jnp.sum(inside & (owner == TARGET))
 
 
-def is_found(camera: Camera, world: World) -> Bool[Array, ""]:
-    """Whether the detector sees the target: more of its pixels than `found_pixels`, 100 at 1280 x 720."""
+def is_found(camera: Camera, world: World, window: int | None = None) -> Bool[Array, ""]:
+    """Whether the detector sees the target: more of its pixels than `found_pixels`, 100 at 1280 x 720.
+
+    Args:
+      camera, world, window: as of `target_pixels`.
+    """
     # Of no weak type, so that what takes it is compiled once.
-    return jnp.asarray(target_pixels(camera, world) > found_pixels(camera), bool)
+    return jnp.asarray(target_pixels(camera, world, window) > found_pixels(camera), bool)

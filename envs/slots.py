@@ -22,7 +22,7 @@ from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.policy_numbers import as_pytree, mould, numbers, with_numbers
-from mechsearch_jax.envs.snapshot import Recogniser, Snapshot, true_target_pose
+from mechsearch_jax.envs.snapshot import Recogniser, Sight, Snapshot, sight_of, true_target_pose
 from mechsearch_jax.envs.verdicts import Verdict, graspable_many, judge, judge_many, judged_sets, swept_free
 from mechsearch_jax.envs.world import World
 from mechsearch_jax.errors import InputError
@@ -32,7 +32,6 @@ from mechsearch_jax.planner.belief import without_grasps
 from mechsearch_jax.planner.moved_target import nearest_candidate
 from mechsearch_jax.planner.trials import AsksTwice, TrialResult, Trials, TrialScenes, choose, decide, scenes_of
 from mechsearch_jax.preparing import Program, program
-from mechsearch_jax.workspace.camera import Camera
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,7 +203,7 @@ class ManySlots:
         """
         self._problem, self._trials = problem, trials
         self._policy, self._mould = as_pytree(policy), mould(policy)
-        self._recogniser = recogniser
+        self._recogniser, self._sight = recogniser, sight_of(problem.camera, problem.shelf)
         self._at_once = at_once
         self._count = len(world.kind)
         self._numbers = [numbers(self._policy)] * self._count
@@ -247,7 +246,7 @@ class ManySlots:
         return [
             *(program("plan", _propose, *question) for question in calls),
             *(Program("small ones", lambda: False, functools.partial(choosing, question)) for question in calls),
-            program("look", _look, problem, state, world, keys, rows, self._recogniser, problem.camera),
+            program("look", _look, problem, state, world, keys, rows, self._recogniser, self._sight),
             program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
             program("small ones", _told, problem.poses, state.belief.exists, world),
             program("small ones", _forget, problem, state, fresh),
@@ -274,7 +273,7 @@ class ManySlots:
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> Known:
         """See `Slots`."""
         for _, padded in self._chunks(rows):
-            self._state = _look(self._problem, self._state, world, keys, padded, self._recogniser, self._problem.camera)
+            self._state = _look(self._problem, self._state, world, keys, padded, self._recogniser, self._sight)
         return _known(self._problem, self._state.belief, world)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
@@ -410,7 +409,7 @@ def _note(state: PlannerState, action: Action, rows: Int[Array, " n"]) -> Planne
     return state.replace(action=jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state.action, action))
 
 
-@kept(static_argnames=("recogniser", "camera"))
+@kept(static_argnames=("recogniser",))
 def _look(
     problem: Problem,
     state: PlannerState,
@@ -418,15 +417,12 @@ def _look(
     keys: Array,
     rows: Int[Array, " n"],
     recogniser: Recogniser,
-    camera: Camera,
+    sight: Sight,
 ) -> PlannerState:
-    """Recognise and update the belief in the slots `rows`.
-
-    The simulated camera, which is the problem's, is static: of what a recogniser sees it decides about shapes.
-    """
+    """Recognise and update the belief in the slots `rows`, with the sight of the problem's camera."""
 
     def one(mine, here, key):
-        observation = recogniser(key, Snapshot(camera, problem.shelf, here))
+        observation = recogniser(key, Snapshot(problem.camera, problem.shelf, here, sight))
         belief = update_belief(problem, mine.belief, observation, mine.observation, mine.action)
         return PlannerState(belief, observation, no_action())
 

@@ -93,12 +93,12 @@ def swept_free(
 
     T_world_gripper = compose(T_world_target[None], tables.T_target_gripper)
 
-    def touches(_, own, row):
+    def touches(shelf, _, row):
         T, cloud = row
         return jnp.any(hits_shelf(shelf, transform(T, cloud.T)))
 
     wanted = jnp.broadcast_to(active, tables.q7.shape)
-    free = wanted & ~masked_vmap(touches, wanted, None, None, (T_world_gripper, tables.clouds))
+    free = wanted & ~masked_vmap(touches, wanted, shelf, None, (T_world_gripper, tables.clouds))
     found = no_grasps(grasps).replace(T_world_target=T_world_target, feasible=free)
     hits = grasp_hits(tables, found, scene, jnp.asarray(active)[None])
     return jnp.any(free & ~jnp.any(hits, axis=1))

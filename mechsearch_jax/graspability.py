@@ -247,8 +247,8 @@ def grasp_tables(
         gap=jnp.float32(max(_gap(cloud.T, COARSE) for cloud in clouds)),
     )
     if candidates:
-        judge = jax.jit(lambda tables: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))
-        pose, grasp = np.nonzero(np.asarray(judge(tables)))
+        judge = jax.jit(lambda tables, shelf: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))
+        pose, grasp = np.nonzero(np.asarray(judge(tables, shelf)))
         tables = tables.replace(**_padded_pairs(pose, grasp, len(poses)))
     else:
         tables = tables.replace(

@@ -116,7 +116,7 @@ class NativeTrials:
         return in_order(chosen, self.threads or cores(), make, attempt)
 
 
-@kept(static_argnames=("target", "shelf"))
+@kept(static_argnames=("target",))
 def _worlds(
     target: Target,
     shelf: Shelf,

@@ -52,7 +52,7 @@ def candidates(
     of the next.
 
     Args:
-      space: static.
+      space: all but the shelf is static.
       tables: constants of the problem.
       scene: the objects, fields (N, ...).
       possible: where the target may be.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import flax.struct
@@ -133,9 +134,15 @@ class ActionTables(flax.struct.PyTreeNode):
     pusher: jax.Array
 
 
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("shelf",),
+    meta_fields=("gripper", "config", "max_yaw", "waypoints", "wrists"),
+)
 @dataclasses.dataclass(frozen=True)
 class ActionSpace:
-    """All that is static about actions, gathered so that it can be passed on as one argument.
+    """What all actions share and no scene changes, gathered so that it can be passed on as one argument: a pytree, of
+    which all but the shelf is static.
 
     Attributes:
       shelf, gripper, config: as elsewhere.

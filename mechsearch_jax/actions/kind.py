@@ -56,7 +56,7 @@ class Kind(Protocol):
         """What an action of this kind does to the objects; called for actions of other kinds too, and then ignored.
 
         Args:
-          space: static.
+          space: all but the shelf is static.
           tables: constants of the problem.
           push_model: predicts pushes.
           scene: the objects, fields (N, ...).

@@ -106,7 +106,7 @@ def placement(
 
     Args:
       key: PRNG key.
-      space: static.
+      space: all but the shelf is static.
       tables: constants of the problem.
       scene: the objects.
       possible: where the target may be.
@@ -152,7 +152,7 @@ def transfers(
     nothing on their ways along x, and between them the object has to be outside the shelf.
 
     Args:
-      space: static.
+      space: all but the shelf is static.
       tables: constants of the problem.
       scene: the objects.
       index: the one that is picked.
@@ -166,16 +166,16 @@ def transfers(
     others = scene.replace(valid=scene.valid & (jnp.arange(n) != index))
     swept, clouds = cloud_index(tables, OPEN, wrist), gripper_clouds(tables).points
 
-    def follows(clouds, own, T):
-        others, q7, swept = own
+    def follows(shared, own, T):
+        (shelf, clouds), (others, q7, swept) = shared, own
         q, reachable, outside = ways_in(T, q7, gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS)
         # Poses 5 cm apart at most.
-        touches = jnp.any(arm_hits(q[::2], others)) | jnp.any(arm_hits_shelf(q, space.shelf))
-        touches |= cloud_hits_shelf(space.shelf, T, taken(clouds, swept[None])[0])
+        touches = jnp.any(arm_hits(q[::2], others)) | jnp.any(arm_hits_shelf(q, shelf))
+        touches |= cloud_hits_shelf(shelf, T, taken(clouds, swept[None])[0])
         return reachable & ~touches, q[0], outside
 
     own = (others, tables.q7[OPEN, wrist], swept)
-    able, q, outside = masked_vmap(follows, wanted, clouds, own, T_world_gripper, block=32)
+    able, q, outside = masked_vmap(follows, wanted, (space.shelf, clouds), own, T_world_gripper, block=32)
     able &= jnp.all(jnp.abs(q - q[:1]) < LARGEST_TRANSFER, axis=-1)
     able &= able[0]
     able &= ~_gripper_meets(space, tables, others, wrist, T_world_gripper, able)

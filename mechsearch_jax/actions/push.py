@@ -65,7 +65,7 @@ def motion_free(
     rule out most; this is for the few that are drawn.
 
     Args:
-      space: static.
+      space: all but the shelf is static.
       scene, after: the objects before and after the push.
       still: which objects it leaves in place.
       action: the push.
@@ -110,7 +110,7 @@ def gripper_meets(
     push's own, and along x against all objects as they are then.
 
     Args:
-      space: static.
+      space: all but the shelf is static.
       tables: constants of the problem.
       scene, after: the objects before and after the push.
       action: the push.
@@ -191,18 +191,19 @@ class Push:
 
         gripper, outside = space.gripper, space.gripper.nearest_outside
 
-        def leaves(clouds, _, row):
-            T, end, q7, cloud = row
+        def leaves(shared, _, row):
+            (shelf, clouds), (T, end, q7, cloud) = shared, row
             back = jnp.float32(gripper.approach)
             middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
             into, out = crossing_poses(jnp.stack([T, end]), outside, gripper, FEW_CROSSINGS)
             way = jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)])
-            follows = arm_follows(jnp.concatenate([into, way, out[::-1]]), q7, space.shelf)
-            return follows & ~cloud_hits_shelf(space.shelf, end, taken(clouds, cloud[None])[0])
+            follows = arm_follows(jnp.concatenate([into, way, out[::-1]]), q7, shelf)
+            return follows & ~cloud_hits_shelf(shelf, end, taken(clouds, cloud[None])[0])
 
         q7, cloud = jnp.repeat(tables.q7[CLOSED, wrist], d), np.repeat(cloud_index(tables, CLOSED, wrist), d)
         rows = (jnp.repeat(T, d, axis=0), ends.reshape(-1, 4, 4), q7, jnp.asarray(cloud))
-        return masked_vmap(leaves, jnp.repeat(near, d), gripper_clouds(tables).points, None, rows).reshape(-1, d)
+        shared = (space.shelf, gripper_clouds(tables).points)
+        return masked_vmap(leaves, jnp.repeat(near, d), shared, None, rows).reshape(-1, d)
 
     def swept_hits(self, space, scene, T, mask):
         """The hand is empty."""
@@ -287,11 +288,11 @@ class Push:
         spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
         spoiled |= gripper_meets(space, tables, scene, pushed.scene, action, wrist, moved, pushes & ~spoiled)
 
-        def free(_, own, row):
+        def free(space, own, _):
             return motion_free(space, *own)
 
         own = (scene, pushed.scene, scene.valid & ~moved, action)
-        follows = masked_vmap(free, (pushes & ~spoiled)[None], None, own, None)[0]
+        follows = masked_vmap(free, (pushes & ~spoiled)[None], space, own, None)[0]
         return Prediction(pushed.scene, moved, ~spoiled & follows)
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:

@@ -141,8 +141,8 @@ def object_pushes(
     _, first, alike = np.unique(told, axis=0, return_index=True, return_inverse=True)
     headings = starts.heading[first]
 
-    def clear(pusher, _, row):
-        one, T, heading = row
+    def clear(shared, _, row):
+        (shelf, pusher), (one, T, heading) = shared, row
         world = transform(T, pusher)
         level = (world[:, 2] > one.low - config.push_gap) & (world[:, 2] < one.high + config.push_gap)
         local = turned(-one.yaw, world[:, :2] - one.position[None])
@@ -158,7 +158,7 @@ def object_pushes(
 
     each = jax.tree.map(lambda a: jnp.repeat(a, len(first), axis=0), prints)
     rows = (each, T[:, first].reshape(-1, 4, 4), np.tile(headings, (n, 1)))
-    found = masked_vmap(clear, jnp.repeat(fresh, len(first)), tables.pusher, None, rows)
+    found = masked_vmap(clear, jnp.repeat(fresh, len(first)), (shelf, tables.pusher), None, rows)
     distance, contact = (a.reshape(n, len(first))[:, alike.reshape(-1)] for a in found)
     stable = contact <= jnp.maximum(leverage, LOW_CONTACT)
     back = -distance[..., None] * starts.heading[None]

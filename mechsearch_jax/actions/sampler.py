@@ -70,7 +70,7 @@ def sample_action(
 
     Args:
       key: PRNG key.
-      space: static.
+      space: all but the shelf is static.
       tables: constants of the problem.
       scene: the objects.
       possible: where the target may be. An object's actions that enter it are drawn only if it has no others.

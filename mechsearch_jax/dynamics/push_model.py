@@ -49,7 +49,7 @@ class PushModel(Protocol):
         """Predict a push; one of no length changes nothing.
 
         Args:
-          shelf: walls; static.
+          shelf: walls; may be traced.
           scene: objects before the push, fields (N, ...).
           pusher: surface of the closed gripper in its own frame, shape (P, 3) [m].
           T_world_gripper: where the push starts, shape (4, 4).

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import flax.struct
 import jax
@@ -83,7 +84,9 @@ def view(camera: Camera, rows: tuple[int, int], columns: tuple[int, int], stride
 
 
 def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride: int = STRIDE, block: int = 1) -> View:
-    """The part of the image in which things on the board can appear, up to 0.25 m above it. Not for a traced camera.
+    """The part of the image in which things on the board can appear, up to 0.25 m above it.
+
+    Not for a traced camera or shelf: they decide about shapes.
 
     Args:
       camera, shelf: the defaults if None.
@@ -118,8 +121,8 @@ def _in_blocks(first: int, end: int, size: int, stride: int, block: int) -> tupl
     return first, first + span
 
 
-def middle(shelf: Shelf) -> tuple[float, float, float]:
-    """The middle of the board's top [m]."""
+def middle(shelf: Shelf) -> tuple[Any, Any, Any]:
+    """The middle of the board's top [m]: numbers, or arrays where the shelf is traced."""
     return (shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board
 
 
@@ -136,7 +139,7 @@ def density(camera: Camera, shelf: Shelf) -> float:
 def thinned_view(camera: Camera, shelf: Shelf) -> View:
     """The shelf's part of a camera's image as networks are shown it: thinned to about the density of their training.
 
-    Not for a traced camera: which rays they are decides about shapes.
+    Not for a traced camera or shelf: which rays they are decides about shapes.
 
     Raises:
       InputError: the camera does not see the shelf.

@@ -21,7 +21,7 @@ class NoiseModel(Protocol):
 
         Args:
           key: PRNG key.
-          camera: the camera; static.
+          camera: the camera; may be traced.
           depth: along the optical axis [m]; infinite where nothing is.
         """
         ...
@@ -36,7 +36,7 @@ def depth_of(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h w
     """The depth of measured points [m]; NaN where nothing was measured.
 
     Args:
-      camera: static.
+      camera: whose image it is.
       points: what a `NoiseModel` made.
     """
     finite: Bool[Array, "h w"] = jnp.isfinite(points).all(axis=-1)
@@ -48,7 +48,7 @@ def measured_depth(camera: Camera, depth: Float[Array, "h w"], points: Float[Arr
     """The depth of measured points [m]; where nothing was measured infinite if nothing is there, else NaN.
 
     Args:
-      camera: static.
+      camera: whose image it is.
       depth: the true one [m]; infinite where nothing is.
       points: what a `NoiseModel` made of it.
     """

@@ -57,8 +57,8 @@ class Recogniser:
     """What a camera's images show: the objects' shapes and poses, and the target where it is seen.
 
     A callable `(key, depth, colour=None, mask=None, target_id=None) -> Observation` for `jit` and `vmap`, and a pytree,
-    so that it can be an argument of either. Networks' weights are its leaves, and where the camera stands; all else is
-    static. Not to be made inside of either: the camera decides about shapes.
+    so that it can be an argument of either. Networks' weights are its leaves, and where camera and shelf stand; all
+    else is static. Not to be made inside of either: camera and shelf decide about shapes.
 
     The image is looked at about as densely as in the networks' training, with 400 pixels to a metre at the middle of
     the board: of a finer one every second pixel, or third, and so on, of the part in which the shelf's space appears.
@@ -130,8 +130,8 @@ class Recogniser:
         return {name: view for name, view in views.items() if view is not None}
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        data = (self.segmenter, self.shapes, self.detector, self.camera, self.view)
-        return data, (self.shelf, self.target, self.refinement)
+        data = (self.segmenter, self.shapes, self.detector, self.camera, self.view, self.shelf)
+        return data, (self.target, self.refinement)
 
     @classmethod
     def tree_unflatten(cls, static: tuple[Any, ...], leaves: tuple[Any, ...]) -> Recogniser:
@@ -257,7 +257,7 @@ def _labels(
     Args:
       instances: as the mask has them.
       freed: the target's number, which the last instance takes.
-      shelf: static.
+      shelf: what they stand on.
       points: in the world [m].
     """
     body = jnp.where(instances == freed, OTHER, jnp.where(instances == INSTANCES - 1, freed, instances))

@@ -52,11 +52,11 @@ def nearness(camera: Camera, shelf: Shelf) -> Float[Array, ""]:
 
 
 def _away(camera: Camera, shelf: Shelf) -> Float[Array, ""]:
-    """`cloud.distance`, also of a camera that is traced."""
+    """`cloud.distance`, also of a camera and a shelf that are traced."""
     return jnp.linalg.norm(jnp.array(camera.position) - jnp.array(middle(shelf)))
 
 
-@functools.partial(jax.jit, static_argnames=("network", "shelf", "count", "config"))
+@functools.partial(jax.jit, static_argnames=("network", "count", "config"))
 def recognise(
     key: Key[Array, ""],
     network: RecognitionNetwork,
@@ -78,7 +78,7 @@ def recognise(
       camera: the camera of the image, a `View`'s as in training.
       points: in the world [m]; NaN invalidates the pixel, whose label is then MISSING.
       labels: a segment's number, or one of `perception.labels`.
-      shelf: the shelf; static.
+      shelf: the shelf; the default shelf if None.
       count: number of slots; static.
       config: how segments' clouds are drawn; static.
     """
@@ -125,7 +125,7 @@ class LabelledImage(flax.struct.PyTreeNode):
     of_target: jax.Array
 
 
-@kept(static_argnames=("shelf", "target", "refinement"))
+@kept(static_argnames=("target", "refinement"))
 def recognise_image(
     keys: Key[Array, "2"],
     image: LabelledImage,
@@ -145,7 +145,8 @@ def recognise_image(
       image: its pixels are the camera's.
       shapes: the network.
       camera: the camera of the image, a `View`'s as in training.
-      shelf, target, refinement: static.
+      shelf: what the objects are on.
+      target, refinement: static.
 
     Returns:
       Eight slots, of which slot i is instance i; and x, y [m] and yaw [rad] of the target, which mean nothing, but are

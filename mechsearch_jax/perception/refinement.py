@@ -410,7 +410,7 @@ def _supposed(scene_object: Superquadrics, hypothesis: Hypothesis, config: Refin
     )
 
 
-@functools.partial(jax.jit, static_argnames=("shelf", "config"))
+@functools.partial(jax.jit, static_argnames=("config",))
 def refine(
     camera: Camera,
     shelf: Shelf,
@@ -427,7 +427,7 @@ def refine(
 
     Args:
       camera: the camera of the depth image.
-      shelf: the shelf that the objects are on; static.
+      shelf: the shelf that the objects are on.
       scene: what a recogniser made of the points, fields (N, ...).
       points: observed points in the world [m]; what is not finite is left out.
       labels: the slot of `scene` that each point belongs to; others for what belongs to none.

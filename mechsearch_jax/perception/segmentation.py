@@ -9,7 +9,6 @@ from typing import Any, Protocol, cast
 import flax.struct
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.errors import InputError
@@ -32,7 +31,7 @@ class Segmenter(Protocol):
 
         Args:
           key: PRNG key.
-          shelf: static.
+          shelf: may be traced.
           points: in the world [m]; NaN invalidates the pixel.
           of_target: where the detector sees the target.
 
@@ -188,7 +187,8 @@ class NetworkSegmenter(flax.struct.PyTreeNode):
 
     def _as_trained(self, shelf: Shelf, points: Float[Array, "p 3"]) -> Float[Array, "p 3"]:
         """Points where they would be if the shelf stood where it stood in training: the network knows no other."""
-        if self.view is None or self.view.shelf == shelf:
+        if self.view is None:
             return points
-        shift = np.subtract(middle(self.view.shelf), middle(shelf))
-        return points + jnp.asarray(shift, points.dtype).reshape(1, 3)
+        # In the same precision both, so that points of that shelf itself stay exactly where they are.
+        known, here = (jnp.stack(middle(jax.tree.map(jnp.float32, one))) for one in (self.view.shelf, shelf))
+        return points + (known - here).reshape(1, 3)

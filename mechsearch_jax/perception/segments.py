@@ -104,7 +104,7 @@ def edge_marks(
     return jnp.where(hidden, HIDDEN_EDGE, jnp.where(ends, OUTLINE, INNER)).astype(jnp.int8)
 
 
-@functools.partial(jax.jit, static_argnames=("shelf", "count", "config"))
+@functools.partial(jax.jit, static_argnames=("count", "config"))
 def segment_clouds(
     key: Key[Array, ""],
     camera: Camera,
@@ -121,7 +121,7 @@ def segment_clouds(
       camera: the camera of the image; only its position counts.
       points: in the world [m]; those that are MISSING may be NaN.
       labels: a segment's number, or one of `perception.labels`.
-      shelf: the shelf; static.
+      shelf: the shelf; the default shelf if None.
       count: number of slots; static.
       config: how clouds are drawn; static.
     """

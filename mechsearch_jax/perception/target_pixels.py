@@ -93,7 +93,8 @@ def fitted_pose(
 
     Args:
       key: of the points that are drawn.
-      target, shelf, camera: static.
+      target: static.
+      shelf, camera: what it stands on, and what sees it.
       points: in the world [m].
       of_target: which are the target's; without any the pose means nothing, but is finite.
     """
@@ -110,7 +111,8 @@ def near_target(
     where something is seen there, the target is not.
 
     Args:
-      target, shelf: static.
+      target: static.
+      shelf: what it stands on.
       pose: x, y [m] and yaw [rad].
       points: in the world [m].
     """

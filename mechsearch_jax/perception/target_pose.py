@@ -61,7 +61,7 @@ def _descend(residuals, weight, start):
     return pose, cost
 
 
-@functools.partial(jax.jit, static_argnames=("target", "shelf"))
+@functools.partial(jax.jit, static_argnames=("target",))
 def target_pose(
     target: Target,
     shelf: Shelf,
@@ -76,7 +76,7 @@ def target_pose(
 
     Args:
       target: its known shape; static.
-      shelf: static.
+      shelf: what it stands on.
       camera_position: in the world [m].
       points: in the world [m], shape (P, 3).
       valid: which of them are the target's, shape (P,). If none are, the result means nothing, but is finite.

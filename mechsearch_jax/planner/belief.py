@@ -151,7 +151,7 @@ def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) 
         occupied=widen(grid > 0),
         chance=grid / jnp.maximum(jnp.sum(grid), 1),
         origin=problem.poses[0, :2],
-        cell=jnp.float32(problem.target.cell(problem.shelf)[:2]),
+        cell=problem.cell,
         top=jnp.float32(problem.shelf.board + 2 * problem.target.half_size[2]),
     )
 

@@ -35,6 +35,7 @@ VARIABLE = "MECHSEARCH_CACHE_DIR"
 CACHED_PROBLEMS = 6
 
 _TABLES = {"existence": ExistenceTables, "grasps": GraspTables, "actions": ActionTables, "retrieval": GraspTables}
+_ARRAYS = ("poses", "cell")
 
 
 def cache_folder() -> Path | None:
@@ -150,7 +151,7 @@ def _digest(arrays: dict[str, np.ndarray], key: str) -> str:
 
 
 def _save(problem: Problem, file: Path, key: str) -> None:
-    arrays = {"poses": np.asarray(problem.poses)}
+    arrays = {name: np.asarray(getattr(problem, name)) for name in _ARRAYS}
     for table in _TABLES:
         arrays |= {f"{table}.{name}": np.asarray(value) for name, value in vars(getattr(problem, table)).items()}
     with replacing(file) as target:
@@ -164,12 +165,12 @@ def _load(file: Path, key: str, parts: dict[str, Any]) -> Problem | None:
             arrays = {name: saved[name] for name in saved.files}
         if str(arrays.pop("digest")) != _digest(arrays, key):
             return None
-        poses = jax.device_put(arrays.pop("poses"))
+        places = {name: jax.device_put(arrays.pop(name)) for name in _ARRAYS}
         fields: dict[str, dict[str, jax.Array]] = {table: {} for table in _TABLES}
         for name, array in arrays.items():
             table, field = name.split(".")
             fields[table][field] = jax.device_put(array)
-        return Problem(poses=poses, **{table: kind(**fields[table]) for table, kind in _TABLES.items()}, **parts)
+        return Problem(**places, **{table: kind(**fields[table]) for table, kind in _TABLES.items()}, **parts)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
         return None
 

@@ -48,14 +48,14 @@ def found_grasps(
     tables, gripper, shelf = grasps.tables, grasps.gripper, grasps.shelf
     feasible = feasible_grasps(tables, shelf, gripper, grasps.config, T_world_target[None], active)[0]
 
-    def enters(_, own, row):
+    def enters(shelf, _, row):
         T, q7 = row
         path = way_in(T, gripper.nearest_outside, gripper, CROSSINGS, CLOSE_WAYPOINTS)
         q, follows = arm_path(path, q7, shelf)
         return follows, q[ARM_POSES]
 
     T = compose(T_world_target[None], tables.T_target_gripper)
-    able, q = masked_vmap(enters, feasible, None, None, (T, tables.q7), block=64)
+    able, q = masked_vmap(enters, feasible, shelf, None, (T, tables.q7), block=64)
     return FoundGrasps(T_world_target, feasible & able, q)
 
 

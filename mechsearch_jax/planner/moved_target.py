@@ -46,6 +46,6 @@ def candidate_of(problem: Problem, scene: Superquadrics, is_target: Bool[Array, 
 
 def beyond_candidates(problem: Problem, position: Float[Array, "n 3"]) -> Bool[Array, " n"]:
     """Which positions are more than `BEYOND` cells outside of what the candidate poses cover: nothing tells g there."""
-    places, cell = problem.poses[:, :2], jnp.float32(problem.target.cell(problem.shelf)[:2])
-    low, high = jnp.min(places, axis=0) - BEYOND * cell, jnp.max(places, axis=0) + BEYOND * cell
+    places, beyond = problem.poses[:, :2], BEYOND * problem.cell
+    low, high = jnp.min(places, axis=0) - beyond, jnp.max(places, axis=0) + beyond
     return jnp.any((position[:, :2] < low[None]) | (position[:, :2] > high[None]), axis=-1)

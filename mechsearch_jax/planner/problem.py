@@ -28,11 +28,12 @@ class TargetGrasps(flax.struct.PyTreeNode):
 
     Attributes:
       tables: their constants; they have no candidate poses.
-      shelf, gripper, target, config: static.
+      shelf: data.
+      gripper, target, config: static.
     """
 
     tables: GraspTables
-    shelf: Shelf = flax.struct.field(pytree_node=False)
+    shelf: Shelf
     gripper: Gripper = flax.struct.field(pytree_node=False)
     target: Target = flax.struct.field(pytree_node=False)
     config: GraspConfig = flax.struct.field(pytree_node=False)
@@ -55,8 +56,9 @@ class Problem(flax.struct.PyTreeNode):
       existence, grasps, actions: constants of f, of g and of the actions.
       retrieval: a denser set of grasps, for the target once it is found; it has no candidate poses.
       poses: the candidate poses X as x, y [m], yaw [rad], shape (X, 3).
-      camera: data, but for its image's size, so that another pose compiles nothing.
-      shelf, gripper, target, config: static.
+      cell: their spacing in x and y [m], shape (2,).
+      camera, shelf: data, but for the image's size, so that other poses compile nothing.
+      gripper, target, config: static.
     """
 
     existence: ExistenceTables
@@ -64,15 +66,16 @@ class Problem(flax.struct.PyTreeNode):
     actions: ActionTables
     retrieval: GraspTables
     poses: jax.Array
+    cell: jax.Array
     camera: Camera
-    shelf: Shelf = flax.struct.field(pytree_node=False)
+    shelf: Shelf
     gripper: Gripper = flax.struct.field(pytree_node=False)
     target: Target = flax.struct.field(pytree_node=False)
     config: ProblemConfig = flax.struct.field(pytree_node=False)
 
     @property
     def space(self) -> ActionSpace:
-        """The static part of the actions."""
+        """What all actions share: static but for the shelf."""
         return ActionSpace(
             shelf=self.shelf,
             gripper=self.gripper,
@@ -120,6 +123,7 @@ def build_problem(
         actions=action_tables(gripper, config.grasps.wrists, config.actions),
         retrieval=target_grasps(shelf, gripper, target, config.retrieval).tables,
         poses=jnp.asarray(target.candidate_poses(shelf)),
+        cell=jnp.float32(target.cell(shelf)[:2]),
         camera=camera,
         shelf=shelf,
         gripper=gripper,

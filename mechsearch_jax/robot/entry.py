@@ -184,7 +184,8 @@ def gripper_enters(
     The nearest place outside will do: what reaches a farther one passes it.
 
     Args:
-      shelf, gripper: static.
+      shelf: the shelf.
+      gripper: static.
       waypoints: poses on the approach; there are `FEW_CROSSINGS` on the crossing.
       clouds: what grippers sweep, in their own frames as rows of coordinates [m].
       cloud: which of them is swept on each way.
@@ -193,9 +194,9 @@ def gripper_enters(
       mask: which are looked at; false for the others.
     """
 
-    def enters(clouds, _, row):
-        T, q7, cloud = row
+    def enters(shared, _, row):
+        (shelf, clouds), (T, q7, cloud) = shared, row
         path = way_in(T, gripper.nearest_outside, gripper, FEW_CROSSINGS, waypoints)
         return arm_follows(path, q7, shelf) & ~cloud_hits_shelf(shelf, T, taken(clouds, cloud[None])[0])
 
-    return masked_vmap(enters, mask, clouds, None, (T_world_gripper, q7, jnp.asarray(cloud)))
+    return masked_vmap(enters, mask, (shelf, clouds), None, (T_world_gripper, q7, jnp.asarray(cloud)))

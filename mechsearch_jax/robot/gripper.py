@@ -312,7 +312,7 @@ def _centres(q: Sequence[Float[Array, "*batch"]], sums: Float[np.ndarray, "k n"]
     return functools.reduce(jnp.add, terms) + shoulder
 
 
-@functools.partial(jax.jit, static_argnames=("shelf", "count"))
+@functools.partial(jax.jit, static_argnames=("count",))
 def arm_hits_shelf(q: Float[Numbers, "*batch 7"], shelf: Shelf, count: int = 5) -> Bool[Array, "*batch"]:
     """Whether links 2 to 5 touch the shelf or come closer to it than the planner's margins.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +12,7 @@ from jaxtyping import Array, Float
 
 from mechsearch_jax.errors import InputError, check_range
 from mechsearch_jax.geometry.transforms import rotate
+from mechsearch_jax.workspace.leaves import are_given
 
 # More pixels along a side, or metres from the robot, no camera here has.
 LARGEST = 16384
@@ -59,8 +59,7 @@ class Camera:
         for name in ("width", "height"):
             check_range(f"Camera: {name}", getattr(self, name), 1, LARGEST, "pixels")
         # Rebuilt by JAX, the fields that are data hold whatever stands for their leaves, which is not checked.
-        data = [getattr(self, name) for name in _DATA]
-        if not all(map(_is_given, jax.tree.leaves(data, is_leaf=lambda part: part is None))):
+        if not are_given(*(getattr(self, name) for name in _DATA), arrays=True):
             return
         for name in ("fx", "fy"):
             check_range(f"Camera: {name}", getattr(self, name), 1e-3, 100 * LARGEST, "pixels")
@@ -95,11 +94,6 @@ class Camera:
             cx=self.cx / factor,
             cy=self.cy / factor,
         )
-
-
-def _is_given(leaf: Any) -> bool:
-    """Whether a leaf is what somebody gave, right or wrong, and not what JAX puts in its place."""
-    return isinstance(leaf, int | float | np.number | np.ndarray | str) and not isinstance(leaf, bool)
 
 
 def pixel_rays(

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.errors import InputError, check_range
 from mechsearch_jax.geometry.transforms import transform_rows
+from mechsearch_jax.workspace.leaves import are_given
 
 # Nothing is farther from the robot, and no board thicker [m].
 FARTHEST, THICKEST = 10.0, 0.5
+# The numbers of a shelf, and the pairs of them; all are data under `jit`.
+_NUMBERS = ("front", "back", "right", "left", "board", "ceiling", "thickness", "side_margin", "ceiling_margin")
+_RANGES = ("spawn_x", "spawn_y")
 
 
+@functools.partial(jax.tree_util.register_dataclass, data_fields=(*_NUMBERS, *_RANGES), meta_fields=())
 @dataclasses.dataclass(frozen=True)
 class Shelf:
     """Inner faces of the shelf in the robot's base frame [m]; +x points into the shelf, z up (docs/method.md,
     "Facts of the scene").
+
+    A pytree: where a jitted function takes it as an argument that is not static, a shelf that was measured again
+    compiles nothing. Outside of tracing it holds plain numbers, and is hashable.
 
     Attributes:
       front: x of the board's front edge.
@@ -46,6 +57,9 @@ class Shelf:
     spawn_y: tuple[float, float] = (-0.18, 0.38)
 
     def __post_init__(self):
+        # Rebuilt by JAX, it holds whatever stands for its leaves, which is not checked.
+        if not are_given(*(getattr(self, name) for name in (*_NUMBERS, *_RANGES))):
+            return
         for name in ("front", "back", "right", "left", "board", "ceiling"):
             check_range(f"Shelf: {name}", getattr(self, name), -FARTHEST, FARTHEST, "m")
         for name, least in (("thickness", 1e-3), ("side_margin", 0.0), ("ceiling_margin", 0.0)):
@@ -57,6 +71,11 @@ class Shelf:
             low, high = getattr(self, name)
             if not -FARTHEST <= low < high <= FARTHEST:
                 raise InputError(f"Shelf: {name} ({low}, {high}) must be two places in metres, the smaller first")
+        # Of one type, whatever number they were given as: another type compiles anew.
+        for name in _NUMBERS:
+            object.__setattr__(self, name, float(getattr(self, name)))
+        for name in _RANGES:
+            object.__setattr__(self, name, tuple(map(float, getattr(self, name))))
 
     def moved(self, shift: tuple[float, float, float]) -> Shelf:
         """The same shelf elsewhere, by a translation in the world [m]."""
@@ -72,6 +91,17 @@ class Shelf:
             spawn_x=(self.spawn_x[0] + x, self.spawn_x[1] + x),
             spawn_y=(self.spawn_y[0] + y, self.spawn_y[1] + y),
         )
+
+
+def on_host(shelf: Shelf, *row: int) -> Shelf:
+    """The shelf whose numbers a jitted function handed out, as it was given: with the shortest decimals that come to
+    them.
+
+    Args:
+      shelf: its leaves are arrays of the host, float32.
+      row: of several shelves, whose leaves have leading axes, which one is meant.
+    """
+    return jax.tree.map(lambda numbers: float(str(np.float32(numbers[row]))), shelf)
 
 
 def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:

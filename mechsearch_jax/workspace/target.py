@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from mechsearch_jax.errors import InputError, check_range
 from mechsearch_jax.shapes import shape_of
@@ -90,8 +90,8 @@ class Target:
     def exponents(self) -> tuple[float, float]:
         return shape_of(self.shape).exponents
 
-    def height(self, shelf: Shelf) -> float:
-        """z of the centre of a target that stands on the board [m]."""
+    def height(self, shelf: Shelf) -> float | Array:
+        """z of the centre of a target that stands on the board [m]; the shelf may be traced."""
         return shelf.board + self.half_size[2]
 
     def candidate_poses(self, shelf: Shelf) -> Float[np.ndarray, "x 3"]:
