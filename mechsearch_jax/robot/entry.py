@@ -79,7 +79,7 @@ def _before(
     """
     T = T_world_gripper[..., None, :, :]
     across = crossing[..., None] * jnp.asarray(to_cross, T.dtype).reshape(*[1] * crossing.ndim, -1)
-    along_x = np.float32([1.0, 0.0, 0.0]).reshape(*[1] * across.ndim, 3)
+    along_x = np.array([1.0, 0.0, 0.0], np.float32).reshape(*[1] * across.ndim, 3)
     moved = back_off(T, jnp.asarray(back, T.dtype).reshape(*[1] * (T.ndim - 3), -1))
     return translate(moved, -across[..., None] * along_x)
 

@@ -307,7 +307,7 @@ def _centres(q: Sequence[Float[Array, "*batch"]], sums: Float[np.ndarray, "k n"]
     terms = [
         axis[..., None] * share.reshape(*[1] * rank, -1) for axis, share in zip(axes, sums, strict=True) if share.any()
     ]
-    shoulder = np.float32([0.0, 0.0, kinematics.JOINTS[0][2]]).reshape(3, *[1] * rank)
+    shoulder = np.array([0.0, 0.0, kinematics.JOINTS[0][2]], np.float32).reshape(3, *[1] * rank)
     # Written out: a CPU takes ten times as long for a sum over an axis in the middle.
     return functools.reduce(jnp.add, terms) + shoulder
 

@@ -204,7 +204,7 @@ def _solutions(T: Float[Array, "*batch 4 4"], q7: Float[Array, "*#batch"]) -> _S
     opening = _arccos((height * (_OFFSET / _FORE_SIDE) - side * (_FORE / _FORE_SIDE)) / span)
     middle = jnp.arctan2(along_x, along_y)
 
-    sign = np.float32([1.0, -1.0]).reshape(2, *[1] * (q7.ndim - 1))
+    sign = np.array([1.0, -1.0], np.float32).reshape(2, *[1] * (q7.ndim - 1))
     centre = float(JOINT_LOWER[5] + JOINT_UPPER[5]) / 2
     q6 = middle + sign * opening
     q6 = q6 - 2.0 * math.pi * jax.lax.round((q6 - centre) / (2.0 * math.pi))
