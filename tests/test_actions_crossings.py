@@ -232,6 +232,7 @@ def an_arm_that_gets_anywhere(monkeypatch):
     monkeypatch.setattr(pick_and_place, "arm_hits", lambda q, scene: jnp.zeros((len(q), scene.capacity), bool))
     monkeypatch.setattr(pick_and_place, "arm_hits_shelf", lambda q, shelf: jnp.zeros(len(q), bool))
     monkeypatch.setattr(pick_and_place, "hits_shelf", lambda shelf, points: jnp.zeros(points.shape[:-1], bool))
+    monkeypatch.setattr(pick_and_place, "cloud_hits_shelf", lambda shelf, T, cloud: jnp.zeros(T.shape[:-2], bool))
 
 
 def transfer(space, tables, post, places):
@@ -287,7 +288,7 @@ def test_what_is_held_must_get_past_too_and_out_of_the_shelf(space, tables):
     assert not able(jnp.float32([0.2, 0.02, 0.06]), False).any()
 
 
-@pytest.mark.parametrize("what", ["ways_in", "arm_hits", "arm_hits_shelf", "hits_shelf", "turns"])
+@pytest.mark.parametrize("what", ["ways_in", "arm_hits", "arm_hits_shelf", "cloud_hits_shelf", "turns"])
 @pytest.mark.usefixtures("an_arm_that_gets_anywhere")
 def test_a_pick_is_impossible_where_the_arm_is(space, tables, monkeypatch, what):
     place = pose((DEEP[0], DEEP[1] + 0.15, DEEP[2]))
@@ -305,7 +306,7 @@ def test_a_pick_is_impossible_where_the_arm_is(space, tables, monkeypatch, what)
     replacement = {
         "arm_hits": lambda q, scene: jnp.ones((len(q), scene.capacity), bool),
         "arm_hits_shelf": lambda q, shelf: jnp.ones(len(q), bool),
-        "hits_shelf": lambda shelf, points: jnp.ones(points.shape[:-1], bool),
+        "cloud_hits_shelf": lambda shelf, T, cloud: jnp.ones(T.shape[:-2], bool),
     }.get(what, fails)
     monkeypatch.setattr(pick_and_place, "ways_in" if what == "turns" else what, replacement)
     assert not transfer(space, tables, post, [place])(jnp.float32(SMALL), False).any()
