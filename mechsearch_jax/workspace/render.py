@@ -37,11 +37,10 @@ def cast(
       The ray parameter of the crossing, infinite for a miss; differentiable in all arguments where it is finite.
     """
     enter, leave = _slab_chord(size, origin, direction)
-    # One coordinate after the other: a vector would be kept for every pixel in every step.
-    begin, ray = origin / size, direction / size
 
     def gauge(t):
-        return superquadric.unit_gauge([jnp.abs(begin[k] + t * ray[k]) for k in range(3)], exponents)
+        # One coordinate after the other: a vector would be kept for every pixel in every step.
+        return superquadric.unit_gauge([jnp.abs((origin[k] + t * direction[k]) / size[k]) for k in range(3)], exponents)
 
     def value_and_slope(t):
         return jax.jvp(gauge, (t,), (jnp.ones_like(t),))
