@@ -134,10 +134,10 @@ def _differ(a: Poses, b: Poses, distance: float, angle: float) -> Any:
     return (shift > distance**2) | (trace < 1.0 + 2.0 * math.cos(angle))
 
 
-def _outcome(shelf: Shelf, scene: Superquadrics, world: World, told: Simulated, failed: Array) -> PushOutcome:
+def _outcome(shelf: Shelf, scene: Superquadrics, world: World, simulated: Simulated, failed: Array) -> PushOutcome:
     """A `PushOutcome` from what was simulated."""
     n = scene.capacity
-    before, after = told.before, told.after
+    before, after = simulated.before, simulated.after
     turn = matmul(after.rotation, jnp.swapaxes(before.rotation, -1, -2))
     moved = (world.valid & _differ(before, after, STILL, STILL_TURN) & ~failed)[:n]
     position = rotate(turn, world.position - before.position) + after.position
@@ -179,7 +179,7 @@ class NativePhysics:
         reference, reachable = push_reference(T_world_gripper, displacement, q7, self.simulation.motion)
         pushes = jnp.any(displacement != 0.0)
         poses = Poses(jax.ShapeDtypeStruct((BODIES, 3), jnp.float32), jax.ShapeDtypeStruct((BODIES, 3, 3), jnp.float32))
-        told = jax.pure_callback(
+        simulated = jax.pure_callback(
             functools.partial(_simulate, self.simulation, self.threads or cores()),
             Simulated(poses, poses, jax.ShapeDtypeStruct((), jnp.bool_)),
             shelf,
@@ -188,7 +188,7 @@ class NativePhysics:
             pushes & reachable,
             vmap_method="broadcast_all",
         )
-        return _outcome(shelf, scene, world, told, told.failed | (pushes & ~reachable))
+        return _outcome(shelf, scene, world, simulated, simulated.failed | (pushes & ~reachable))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -222,9 +222,9 @@ class MjxPhysics:
         )
         world = jax.tree.map(lambda a, b: jnp.where(sound, a, b), world, jax.tree.map(jnp.zeros_like, world))
         one = jax.tree.map(lambda a: a[None], (world, action))
-        told = jax.tree.map(lambda a: a[0], _batched(self.shelf, self.config)(*one))
+        simulated = jax.tree.map(lambda a: a[0], _batched(self.shelf, self.config)(*one))
         other = jnp.any(jnp.stack([jnp.abs(getattr(shelf, name) - getattr(self.shelf, name)) > SAME for name in WALLS]))
-        return _outcome(shelf, scene, world, told, pushes & (told.failed | ~sound | other))
+        return _outcome(shelf, scene, world, simulated, pushes & (simulated.failed | ~sound | other))
 
 
 def _finite(world: World, *others: Array) -> Bool[Array, ""]:
@@ -257,8 +257,8 @@ def _batched(shelf: Shelf, config: MjxConfig) -> Callable[[World, Action], Simul
             lambda a, has: a if has else jnp.broadcast_to(a, (size, *a.shape)), (world, action), tuple(batched)
         )
         merged = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), full)
-        told = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), simulate(*merged))
-        return told, jax.tree.map(lambda _: True, told)
+        simulated = jax.tree.map(lambda a: a.reshape(size, -1, *a.shape[1:]), simulate(*merged))
+        return simulated, jax.tree.map(lambda _: True, simulated)
 
     return simulate
 
@@ -299,7 +299,7 @@ class _Rollouts:
         count = len(active)
         start = Poses(world.position.copy(), world.rotation.copy())
         failed = ~sound(world, reference) & active
-        told = Simulated(start, jax.tree.map(np.copy, start), failed)
+        simulated = Simulated(start, jax.tree.map(np.copy, start), failed)
         # The sequences of a plan begin in the same scene, which is built once, and comes to rest once.
         of_scene: dict[bytes, int] = {}
         scene = np.full(count, -1)
@@ -316,7 +316,7 @@ class _Rollouts:
                 first.append(_state_of(model, models.initial_state(model, slots)))
             scene[row] = of_scene[name]
         if not built:
-            return told
+            return simulated
         rows = np.flatnonzero(scene >= 0)
         scene = scene[rows]
 
@@ -337,11 +337,11 @@ class _Rollouts:
             _set_robot(states, home[scene], self.blank.nq)
             states, unsound = self._come_to_rest(pool, each, states, home[scene])
 
-        for kept, found in ((told.before, rest[scene]), (told.after, states)):
+        for kept, found in ((simulated.before, rest[scene]), (simulated.after, states)):
             now = self._poses(found)
             kept.position[rows], kept.rotation[rows] = now.position, now.rotation
         failed[rows] |= lost[scene] | broke | unsound
-        return told
+        return simulated
 
     def _poses(self, states: Float[np.ndarray, "n size"]) -> Poses:
         """Where the bodies are; anywhere in a state that is none."""
@@ -355,12 +355,12 @@ class _Rollouts:
         pool: mujoco.rollout.Rollout,
         each: Sequence[mujoco.MjModel],
         states: Float[np.ndarray, "n size"],
-        told: Sequence[Float[np.ndarray, "_ 9"]],
+        simulated: Sequence[Float[np.ndarray, "_ 9"]],
     ) -> tuple[np.ndarray, np.ndarray]:
         """The states after as many steps as each has rows, and where MuJoCo gave up before."""
-        lengths = np.array([len(rows) for rows in told])
+        lengths = np.array([len(rows) for rows in simulated])
         # All are stepped as long as the longest, holding still.
-        padded = np.stack([np.pad(rows, ((0, lengths.max() - len(rows)), (0, 0)), mode="edge") for rows in told])
+        padded = np.stack([np.pad(rows, ((0, lengths.max() - len(rows)), (0, 0)), mode="edge") for rows in simulated])
         trajectory = self._trajectory(pool, each, states, padded)
         return self._after(trajectory, lengths).copy(), self._stopped(states, trajectory, lengths)
 
@@ -368,9 +368,9 @@ class _Rollouts:
         """The states after so many steps of each."""
         return trajectory[np.arange(len(trajectory)), lengths - 1]
 
-    def _trajectory(self, pool, each, states, told) -> np.ndarray:
+    def _trajectory(self, pool, each, states, simulated) -> np.ndarray:
         data = [mujoco.MjData(self.blank) for _ in range(self.threads)]
-        trajectory, _ = pool.rollout(list(each), data, states, told)
+        trajectory, _ = pool.rollout(list(each), data, states, simulated)
         return trajectory
 
     def _stopped(self, states: np.ndarray, trajectory: np.ndarray, lengths: np.ndarray) -> Bool[np.ndarray, " n"]:
@@ -392,8 +392,8 @@ class _Rollouts:
         limit = config.rest_speed * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
         moving = np.arange(len(states))
         for _ in range(config.settle_steps // config.settle_block):
-            told = np.repeat(robot[moving, None], config.settle_block, axis=1)
-            trajectory = self._trajectory(pool, [each[i] for i in moving.tolist()], states[moving], told)
+            simulated = np.repeat(robot[moving, None], config.settle_block, axis=1)
+            trajectory = self._trajectory(pool, [each[i] for i in moving.tolist()], states[moving], simulated)
             lengths = np.full(len(moving), trajectory.shape[1])
             broke[moving] |= self._stopped(states[moving], trajectory, lengths)
             states[moving] = trajectory[:, -1]

@@ -182,7 +182,7 @@ def test_a_look_is_traced_once_for_both(two, name):
     world = jax.tree.map(lambda a: np.stack([a, a]), from_scenario(SCENE))
     policy, counted = search_for_grasp(PlannerConfig(sequences=2, horizon=1)), Counted()
     pools = [slots.ManySlots(problem, policy, counted, world, 2) for problem in two]
-    # Shapes alone are asked for in the beginning.
+    # In the beginning only shapes are needed.
     traced.clear()
     keys, rows = jax.random.split(KEY, 2), jnp.arange(2, dtype=jnp.int32)
     for pool, problem in zip(pools, two, strict=True):
@@ -218,7 +218,7 @@ def test_a_sight_that_was_given_is_what_is_found_without(two):
         assert given.view == found.view == thinned_view(*around)
         assert bool(given.target_seen) == bool(found.target_seen)
     blind = dataclasses.replace(Camera(), position=(0.6, 0.1, 0.6))
-    # Who is told what is true does not need to see anything.
+    # The oracle does not need to see anything.
     beside = Snapshot(blind, SHELF, world, sight_of(blind, SHELF))
     assert bool(oracle(KEY, beside).objects.valid.any())
     with pytest.raises(InputError, match="does not look into the shelf"):

@@ -91,10 +91,11 @@ def _collide(first: int, mask: Bool[Array, "*batch m n"], shared: tuple | None, 
         return mask
     if uses_kernel():
         lead = mask.ndim - 2
-        if shared is None:
-            return collide(mask, *rows[3], jnp.inf, *rows[:3])
-        points, boxes = (a.reshape(*[1] * lead, *a.shape) for a in shared[:2])
-        return collide(mask, points, boxes, shared[2], *rows[:3], first)
+        cloud, T_world_cloud, objects, own = rows
+        points, boxes = own if shared is None else (a.reshape(*[1] * lead, *a.shape) for a in shared[:2])
+        # Of clouds that differ along a batch no gaps are known, nor are they needed where `first` is 0.
+        gap = 0.0 if shared is None else shared[2]
+        return collide(mask, points, boxes, gap, cloud, T_world_cloud, objects, 0 if shared is None else first)
     m, n = mask.shape[-2:]
     pairs = _AllPairs(mask.shape, shared, *rows)
     state = jnp.where(mask.reshape(-1), OPEN, APART)

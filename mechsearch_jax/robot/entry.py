@@ -85,12 +85,12 @@ def _before(
 
 
 def way_in(
-    T_world_gripper: Float[Array, "4 4"],
-    outside: float | Float[Array, ""],
+    T_world_gripper: Float[Array, "*batch 4 4"],
+    outside: float | Float[Array, "*#batch"],
     gripper: Gripper,
     crossings: int,
     waypoints: int,
-) -> Float[Array, "{crossings}+{waypoints} 4 4"]:
+) -> Float[Array, "*batch {crossings}+{waypoints} 4 4"]:
     """Gripper poses from outside the shelf to a pose.
 
     Args:
@@ -100,20 +100,10 @@ def way_in(
       crossings: number of poses on the crossing, the pre-grasp not among them.
       waypoints: number of poses on the approach, both ends included; the first is row `crossings`.
     """
-    return _ways_in(jnp.asarray(T_world_gripper), outside, gripper, crossings, waypoints)
-
-
-def _ways_in(
-    T_world_gripper: Float[Array, "*batch 4 4"],
-    outside: float | Float[Array, "*#batch"],
-    gripper: Gripper,
-    crossings: int,
-    waypoints: int,
-) -> Float[Array, "*batch {crossings}+{waypoints} 4 4"]:
-    """`way_in` for poses that may have leading axes."""
+    T = jnp.asarray(T_world_gripper)
     back = gripper.approach * np.append(np.ones(crossings), still_ahead(waypoints))
     to_cross = np.append(_to_cross(crossings), np.zeros(waypoints))
-    return _before(T_world_gripper, crossing_length(T_world_gripper, outside, gripper), back, to_cross)
+    return _before(T, crossing_length(T, outside, gripper), back, to_cross)
 
 
 def ways_in(
@@ -134,7 +124,7 @@ def ways_in(
     """
     places = jnp.float32(gripper.outside)
     T = jnp.broadcast_to(T_world_gripper[None], (len(places), 4, 4))
-    paths = _ways_in(T, places, gripper, crossings, waypoints)
+    paths = way_in(T, places, gripper, crossings, waypoints)
     q, reachable = path_kinematics(paths, q7)
     # The first that is reachable, or the first of all. Chosen one by one: an index would make the arm write all of them
     # to memory.
