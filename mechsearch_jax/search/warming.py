@@ -82,7 +82,9 @@ def hidden(problem: Problem, seen: Observation) -> Observation:
 
 def in_the_open(problem: Problem, seen: Observation) -> Observation:
     """The target alone, where most of its grasps are feasible."""
-    counts = np.bincount(np.asarray(problem.grasps.pair_pose), minlength=len(problem.poses))
+    grasps = problem.grasps
+    pose = np.asarray(grasps.pair_pose)[np.asarray(grasps.pair_valid)]
+    counts = np.bincount(pose, minlength=len(problem.poses))
     pose = np.asarray(problem.poses)[int(np.argmax(counts))]
     objects = seen.objects.replace(valid=jnp.zeros(seen.objects.capacity, bool))
     return seen.replace(
