@@ -4,6 +4,7 @@
 falls into, so that the same commit is always the same run.
 """
 
+import gc
 import os
 import subprocess
 import sys
@@ -67,6 +68,9 @@ LONG_FIRST = (
     "test_envs_physics_push",
     "test_existence",
 )
+
+# What is traced stays, and there is much of it: Python looks through all of it for cycles, again and again.
+gc.set_threshold(50_000, 20, 100)
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_compilation_cache_dir", CACHE)
