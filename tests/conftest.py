@@ -4,6 +4,7 @@
 falls into, so that the same commit is always the same run.
 """
 
+import gc
 import os
 import subprocess
 import sys
@@ -14,7 +15,12 @@ from pathlib import Path
 # Two thirds of the tests' time is XLA's, and most of that is spent on making fast what runs once. XLA reads this when
 # JAX is first imported; a jaxlib that does not know a flag aborts, so it is asked first. `XLA_FLAGS=""` leaves all as
 # it is for users.
-QUICK = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
+QUICK = (
+    "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
+# There is a process for each core; threads of linear algebra beside it only wait for each other. The processes that are
+# started from here read this as they import NumPy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if "XLA_FLAGS" not in os.environ:
     asked = {**os.environ, "XLA_FLAGS": QUICK, "JAX_PLATFORMS": "cpu"}
     known = subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], env=asked, capture_output=True)
@@ -63,9 +69,14 @@ LONG_FIRST = (
     "test_existence",
 )
 
+# What is traced stays, and there is much of it: Python looks through all of it for cycles, again and again.
+gc.set_threshold(50_000, 20, 100)
+
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_compilation_cache_dir", CACHE)
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+# Small ones too: thousands of operations that run alone are compiled in every process, and again after its compiled
+# functions were dropped.
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def pytest_addoption(parser):

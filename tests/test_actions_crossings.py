@@ -97,11 +97,16 @@ def least_gauge(scene, points, grown=0.0):
 
 def touched(tables, opening, T, scene, still=False):
     """Which objects the gripper touches at poses (C, 4, 4), on its straight way in to them or where it is."""
-    cloud = np.full(len(T), approach.cloud_index(tables, opening, WRIST, still))
+    return touches(tables, jnp.full(len(T), approach.cloud_index(tables, opening, WRIST, still)), T, scene)
+
+
+@jax.jit
+def touches(tables, cloud, T, scene):
     mask = jnp.broadcast_to(scene.valid, (len(T), scene.capacity))
     return collisions(approach.gripper_clouds(tables), cloud, T, scene, mask)
 
 
+@jax.jit
 def open_hand_hits(space, tables, T, scene):
     """Whether the open gripper hits anything on its crossing to a pose."""
     places, crosses = approach.crossing_places(space, T[None])
@@ -120,6 +125,7 @@ def absent(scene):
     return scene.replace(valid=jnp.zeros(scene.capacity, bool))
 
 
+@jax.jit
 def meets(space, tables, scene, after, action, moved=True, pushes=True):
     """`push.gripper_meets`; where all objects are moved, only those on the ways in and back count."""
     moved = jnp.broadcast_to(jnp.asarray(moved), scene.capacity)
@@ -137,7 +143,6 @@ HANDS = pytest.mark.parametrize(("opening", "judge"), [(OPEN, open_hand_hits), (
 @HANDS
 def test_the_gripper_hits_on_its_crossing_what_a_float64_reference_says(space, tables, opening, judge):
     rng = np.random.default_rng(0)
-    hits = jax.jit(lambda T, scene: judge(space, tables, T, scene))
     seen = []
     for _ in range(60):
         T = pose((rng.uniform(0.6, 0.76), 0.1, 0.5), rng.uniform(-40, 40), rng.uniform(20, 30))
@@ -148,7 +153,7 @@ def test_the_gripper_hits_on_its_crossing_what_a_float64_reference_says(space, t
             shape=str(rng.choice(["box", "cylinder"])),
         )
         points = swept(T, GRIPPER.max_opening if opening == OPEN else 0.0, float(tables.q7[opening, WRIST]))
-        found = bool(hits(T, scene))
+        found = bool(judge(space, tables, T, scene))
         # Clouds have gaps: what is touched less than a centimetre deep may be missed.
         if least_gauge(scene, points) > 1.0 + 1e-3:
             assert not found
@@ -173,7 +178,7 @@ def test_a_push_past_a_post_that_only_its_crossing_touches_is_impossible(space, 
     T, end = action.T_world_gripper, action.T_world_place
     scene = in_the_way(T if ends == "start" else end)
     free = absent(scene)
-    judge = jax.jit(lambda a, b, pushes: meets(space, tables, a, b, action, pushes=pushes))
+    judge = lambda a, b, pushes: meets(space, tables, a, b, action, pushes=pushes)  # noqa: E731
     assert not touched(tables, CLOSED, jnp.stack([T, end]), scene).any()
     assert bool(judge(scene, scene, True))
     assert bool(judge(scene, free, True)) == (ends == "start")
@@ -191,7 +196,7 @@ def beside(T, side, shift=0.0):
 def test_a_push_meets_what_it_leaves_in_place_and_not_what_it_moves(space, tables):
     # No crossing, so that the way in along x is no matter.
     action = push_from(pose((0.5, 0.1, SHELF.board + 0.05), 0.0), (0.0, 0.15, 0.0))
-    judge = jax.jit(lambda scene, moved: meets(space, tables, scene, absent(scene), action, moved))
+    judge = lambda scene, moved: meets(space, tables, scene, absent(scene), action, moved)  # noqa: E731
     for share in (1 / 3, 2 / 3, 1.0):
         scene = beside(translate(action.T_world_gripper, share * action.displacement), 1.0)
         assert bool(judge(scene, False))
@@ -202,9 +207,7 @@ def test_a_push_meets_what_it_leaves_in_place_and_not_what_it_moves(space, table
 def test_a_push_meets_on_its_way_back_what_it_moved_beside_its_own(space, tables):
     action = push_from(pose((0.5, 0.1, SHELF.board + 0.05), 0.0), (0.0, 0.15, 0.0))
     nothing = absent(beside(action.T_world_place, 1.0))
-    judge = jax.jit(
-        lambda after, index, moved: meets(space, tables, nothing, after, action.replace(object=index), moved)
-    )
+    judge = lambda after, index, moved: meets(space, tables, nothing, after, action.replace(object=index), moved)  # noqa: E731
     own, another = jnp.int32(0), jnp.int32(1)
     in_the_hand = beside(action.T_world_place, 1.0)
     assert bool(judge(in_the_hand, another, True))
@@ -221,95 +224,87 @@ def test_a_push_meets_on_its_way_back_what_it_moved_beside_its_own(space, tables
     assert not bool(judge(touching, another, True))
 
 
-@pytest.fixture
-def an_arm_that_gets_anywhere(monkeypatch):
-    """What the gripper and its load hit is all that can be in the way."""
-
-    def ways_in(T, q7, gripper, crossings, waypoints):
-        return jnp.zeros((crossings + waypoints, 7)), jnp.array(True), jnp.float32(gripper.outside[0])
-
-    monkeypatch.setattr(pick_and_place, "ways_in", ways_in)
-    monkeypatch.setattr(pick_and_place, "arm_hits", lambda q, scene: jnp.zeros((len(q), scene.capacity), bool))
-    monkeypatch.setattr(pick_and_place, "arm_hits_shelf", lambda q, shelf: jnp.zeros(len(q), bool))
-    monkeypatch.setattr(pick_and_place, "hits_shelf", lambda shelf, points: jnp.zeros(points.shape[:-1], bool))
-    monkeypatch.setattr(pick_and_place, "cloud_hits_shelf", lambda shelf, T, cloud: jnp.zeros(T.shape[:-2], bool))
+ANYWHERE, FAULTS = 0, {"ways_in": 1, "arm_hits": 2, "arm_hits_shelf": 3, "cloud_hits_shelf": 4, "turns": 5}
+SMALL = (0.02, 0.02, 0.06)
 
 
-def transfer(space, tables, post, places):
-    """Whether a body of some half size at `DEEP` can be taken to places, with or without a post: compiled."""
-    T = jnp.stack([pose(DEEP), *places])
-    body = standing(((0.02, 0.02, 0.06), DEEP[0], DEEP[1]))
+@pytest.fixture(scope="module")
+def transfers(space, tables):
+    """Whether a body of some half size at `DEEP` can be taken to two places, with or without a post: compiled once.
 
-    @jax.jit
-    def able(half, post_there, wanted=True):
+    The arm gets anywhere and touches nothing, so that what the gripper and its load hit is all that can be in the way;
+    unless a number says what is wrong with it.
+    """
+    turned = pick_and_place.LARGEST_TRANSFER + 0.1
+
+    def able(space, tables, half, post, post_there, T, wanted, fault):
+        def fails(what):
+            return fault == FAULTS[what]
+
+        def ways_in(T, q7, gripper, crossings, waypoints):
+            there = T[1, 3] > DEEP[1] + 0.1
+            q = jnp.zeros((crossings + waypoints, 7)) + turned * (there & fails("turns"))
+            return q, ~(there & fails("ways_in")), jnp.float32(gripper.outside[0])
+
+        body = standing((SMALL, DEEP[0], DEEP[1]))
         scene = jax.tree.map(lambda a, b: jnp.stack([a[0], b[0]]), body.replace(size=body.size.at[0].set(half)), post)
         scene = scene.replace(valid=jnp.array([True, False]).at[1].set(post_there))
         index = jnp.int32(0)
         held = make(rigid.in_hand(scene, index, T[0]), scene.position[0])
-        put = [rigid.pick_and_place(scene, index, T[0], place) for place in places]
+        put = [rigid.pick_and_place(scene, index, T[0], place) for place in T[1:]]
         objects = jnp.stack([held, *(make(after.rotation[0], after.position[0]) for after in put)])
         cloud = superquadric.sample_surface(scene.size[0], scene.exponents[0], space.config.object_points)
-        wanted = jnp.broadcast_to(jnp.asarray(wanted), len(T))
-        return pick_and_place.transfers(space, tables, scene, index, cloud, jnp.int32(WRIST), T, objects, wanted)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(pick_and_place, "ways_in", ways_in)
+            arm_hits = lambda q, scene: jnp.full((len(q), scene.capacity), fails("arm_hits"))  # noqa: E731
+            patch.setattr(pick_and_place, "arm_hits", arm_hits)
+            patch.setattr(pick_and_place, "arm_hits_shelf", lambda q, shelf: jnp.full(len(q), fails("arm_hits_shelf")))
+            patch.setattr(pick_and_place, "cloud_hits_shelf", lambda shelf, T, cloud: fails("cloud_hits_shelf"))
+            return pick_and_place.transfers(space, tables, scene, index, cloud, jnp.int32(WRIST), T, objects, wanted)
 
-    return able
+    compiled = jax.jit(able)
+
+    def told(post, places, half, post_there, wanted=(True, True, True), fault=ANYWHERE):
+        # One program for all: a single place is asked about twice.
+        T = jnp.stack([pose(DEEP), *places, *places][:3])
+        return compiled(space, tables, jnp.float32(half), post, post_there, T, jnp.array(wanted), fault)
+
+    return told
 
 
-SMALL = (0.02, 0.02, 0.06)
-
-
-@pytest.mark.usefixtures("an_arm_that_gets_anywhere")
 @pytest.mark.parametrize("ends", ["grasp", "place"])
-def test_a_pick_past_a_post_that_only_its_crossing_touches_is_impossible(space, tables, ends):
+def test_a_pick_past_a_post_that_only_its_crossing_touches_is_impossible(space, tables, transfers, ends):
     T, place, other = (pose((DEEP[0], DEEP[1] + y, DEEP[2])) for y in (0.0, 0.15, -0.15))
     post = in_the_way(T if ends == "grasp" else place)
-    able = transfer(space, tables, post, [place, other])
+    able = functools.partial(transfers, post, [place, other], SMALL)
     wider = post.replace(size=post.size + space.config.clearance)
     assert not touched(tables, OPEN, jnp.stack([T, place, other]), wider).any()
-    half = jnp.float32(SMALL)
-    assert able(half, False).tolist() == [True, True]
+    assert able(False).tolist() == [True, True]
     # Past what is in the way of the grasp it goes nowhere; past what is in the way of a place, to the others.
-    assert able(half, True).tolist() == [False, ends == "place"]
+    assert able(True).tolist() == [False, ends == "place"]
     # And nowhere if it is not wanted there, or not at all.
-    assert able(half, False, jnp.array([True, False, True])).tolist() == [False, True]
-    assert able(half, False, jnp.array([False, True, True])).tolist() == [False, False]
+    assert able(False, (True, False, True)).tolist() == [False, True]
+    assert able(False, (False, True, True)).tolist() == [False, False]
 
 
-@pytest.mark.usefixtures("an_arm_that_gets_anywhere")
-def test_what_is_held_must_get_past_too_and_out_of_the_shelf(space, tables):
+def test_what_is_held_must_get_past_too_and_out_of_the_shelf(space, tables, transfers):
     """Lower than the hand, but not than what hangs from it."""
     T, place = pose(DEEP), pose((DEEP[0], DEEP[1] + 0.15, DEEP[2]))
     post = in_the_way(T, -0.045)
-    able = transfer(space, tables, post, [place])
+    able = functools.partial(transfers, post, [place])
     assert not open_hand_hits(space, tables, T, post)
-    assert able(jnp.float32(SMALL), False).all()
-    assert not able(jnp.float32(SMALL), True).any()
+    assert able(SMALL, False).all()
+    assert not able(SMALL, True).any()
     # Longer than there is room for between the gripper's place outside and the shelf.
-    assert not able(jnp.float32([0.2, 0.02, 0.06]), False).any()
+    assert not able((0.2, 0.02, 0.06), False).any()
 
 
-@pytest.mark.parametrize("what", ["ways_in", "arm_hits", "arm_hits_shelf", "cloud_hits_shelf", "turns"])
-@pytest.mark.usefixtures("an_arm_that_gets_anywhere")
-def test_a_pick_is_impossible_where_the_arm_is(space, tables, monkeypatch, what):
+@pytest.mark.parametrize("what", FAULTS)
+def test_a_pick_is_impossible_where_the_arm_is(transfers, what):
     place = pose((DEEP[0], DEEP[1] + 0.15, DEEP[2]))
-    post = in_the_way(place)
-    free = transfer(space, tables, post, [place])(jnp.float32(SMALL), False)
-    assert free.all()
-    still = pick_and_place.ways_in
-    turned = pick_and_place.LARGEST_TRANSFER + 0.1
-
-    def fails(T, *rest):
-        q, reachable, outside = still(T, *rest)
-        there = T[1, 3] > DEEP[1] + 0.1
-        return (q + turned * there, reachable, outside) if what == "turns" else (q, reachable & ~there, outside)
-
-    replacement = {
-        "arm_hits": lambda q, scene: jnp.ones((len(q), scene.capacity), bool),
-        "arm_hits_shelf": lambda q, shelf: jnp.ones(len(q), bool),
-        "cloud_hits_shelf": lambda shelf, T, cloud: jnp.ones(T.shape[:-2], bool),
-    }.get(what, fails)
-    monkeypatch.setattr(pick_and_place, "ways_in" if what == "turns" else what, replacement)
-    assert not transfer(space, tables, post, [place])(jnp.float32(SMALL), False).any()
+    able = functools.partial(transfers, in_the_way(place), [place], SMALL, False)
+    assert able().all()
+    assert not able(fault=FAULTS[what]).any()
 
 
 def test_a_retrieval_past_a_post_that_only_its_crossing_touches_hits_it(grasps):
@@ -318,14 +313,15 @@ def test_a_retrieval_past_a_post_that_only_its_crossing_touches_hits_it(grasps):
     turned = int(jnp.argmax(grasps.T_target_gripper[:, 1, 2]))
     grasp = make(grasps.T_target_gripper[turned, :3, :3], T[turned])
     feasible = jnp.arange(len(grasps.q7)) == turned
+    crossing_hits = jax.jit(found_target.crossing_hits, static_argnums=1)
     for top, hit in ((-0.005, True), (-0.045, True), (-0.15, False)):
         scene = in_the_way(grasp, top)
-        hits = found_target.crossing_hits(grasps, GRIPPER, scene, T_world_target, feasible)
+        hits = crossing_hits(grasps, GRIPPER, scene, T_world_target, feasible)
         assert bool(hits[turned, 0]) == hit
         assert not hits[~np.asarray(feasible)].any()
         assert not hits[:, 1].any()
         found = FoundGrasps(T_world_target, feasible, jnp.zeros((len(grasps.q7), 1, 7)))
-        z = grasp_hits(grasps, found, scene, jnp.ones(1, bool))
+        z = jax.jit(grasp_hits)(grasps, found, scene, jnp.ones(1, bool))
         assert not z.any()
 
 

@@ -25,6 +25,9 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import found_pixels
 
 UNSEEN, NOWHERE = jnp.array(False), jnp.zeros(3)
+# Compiled once for all that ask of as many objects; one by one, its operations take longer to compile.
+VIEWS = jax.jit(existence.object_views, static_argnums=4)
+EXISTENCE = jax.jit(existence.existence, static_argnums=5)
 
 
 def look(problem, objects, belief=None):
@@ -36,7 +39,7 @@ def coarsely(problem, views, exists, config=None):
     """f by the coarse image alone."""
     config = config or problem.config.existence
     allowed = jnp.full(problem.existence.corner.shape[:2], config.allowed(problem.camera))
-    return existence.existence(problem.existence, problem.camera, views, exists, allowed, config)
+    return EXISTENCE(problem.existence, problem.camera, views, exists, allowed, config)
 
 
 def every_scenario():
@@ -88,7 +91,7 @@ def test_f_is_that_of_a_brute_force_reference(problem):
     loaded = scenario.load_scenario(scenario.example_scenarios()["first-light"])
     objects = scenario.superquadrics(loaded.objects)
     config, everywhere = problem.config.existence, jnp.ones(problem.poses.shape[0], bool)
-    views = existence.object_views(problem.existence, problem.camera, objects, everywhere, config)
+    views = VIEWS(problem.existence, problem.camera, objects, everywhere, config)
     exists = np.asarray(coarsely(problem, views, everywhere))
     rng = np.random.default_rng(0)
     chosen = np.concatenate(
@@ -127,13 +130,13 @@ def test_a_closer_look_keeps_what_the_coarse_image_loses(problem, slivers):
     lost = 0
     for one in slivers:
         objects = scenario.superquadrics(one.objects)
-        views = existence.object_views(problem.existence, problem.camera, objects, everywhere, config)
+        views = VIEWS(problem.existence, problem.camera, objects, everywhere, config)
         coarse, fine = coarsely(problem, views, everywhere), look(problem, objects)
         assert not np.any(coarse & ~fine.exists)
         nearest = np.argmin(np.hypot(*(poses[:, :2] - np.array(one.target.position[:2])).T))
         lost += not coarse[nearest]
         # What is predicted for the state that is seen is what is believed of it.
-        same = existence.existence(problem.existence, problem.camera, views, everywhere, fine.allowed, config)
+        same = EXISTENCE(problem.existence, problem.camera, views, everywhere, fine.allowed, config)
         np.testing.assert_array_equal(same, fine.exists)
         # Only what was looked at again may show more.
         more = np.asarray(fine.allowed) > config.allowed(problem.camera)
@@ -146,7 +149,7 @@ def test_a_closer_look_keeps_what_the_coarse_image_loses(problem, slivers):
 def test_without_a_closer_look_every_place_may_show_the_same(problem):
     objects = scenario.superquadrics(scenario.load_scenario(scenario.example_scenarios()["first-light"]).objects)
     config = dataclasses.replace(problem.config.existence, closer_look=0)
-    views = existence.object_views(problem.existence, problem.camera, objects, None, config)
+    views = VIEWS(problem.existence, problem.camera, objects, None, config)
     closer = existence.closer_image(problem.camera, objects, views, config)
     told = existence.allowances(problem.existence, problem.camera, problem.target, views, closer, config)
     np.testing.assert_array_equal(told, np.full(told.shape, 2))
@@ -248,18 +251,24 @@ def test_empty_slots_hide_nothing_in_a_plan(problem, camera):
     tables = existence.existence_tables(camera, problem.shelf, problem.target, settings)
     here = problem.replace(camera=camera, existence=tables)
     loaded = scenario.superquadrics(scenario.load_scenario(scenario.example_scenarios()["first-light"]).objects)
-    for objects in (superquadric.empty(12), superquadric.pad(loaded, 12)):
-        belief = look(here, objects)
+
+    @jax.jit
+    def planned(here, belief, objects):
         root = Rollout(here, belief, policy.config, policy.propose, policy.predict, policy.objective).root(objects)
         bodies = root.scene.replace(valid=root.scene.valid & ~root.is_target)
-        views = existence.object_views(tables, camera, bodies, None, settings, root.views, root.moved)
-        f = existence.existence(tables, camera, views, root.exists, belief.allowed, settings)
+        views = existence.object_views(here.existence, camera, bodies, None, settings, root.views, root.moved)
+        f = existence.existence(here.existence, camera, views, root.exists, belief.allowed, settings)
+        return f, existence.occluders(here.existence, views), bodies.valid
+
+    for objects in (superquadric.empty(12), superquadric.pad(loaded, 12)):
+        belief = look(here, objects)
+        f, occludes, there = jax.device_get(planned(here, belief, objects))
         # Of an empty shelf nothing is believed, because nothing can be.
         np.testing.assert_array_equal(f, belief.exists & jnp.any(objects.valid))
-        assert not existence.occluders(tables, views)[:, ~np.asarray(bodies.valid)].any()
+        assert not occludes[:, ~there].any()
 
 
-@pytest.mark.parametrize("width", [640, 1280, 1920])
+@pytest.mark.parametrize("width", [640, 1280, pytest.param(1920, marks=pytest.mark.slow)])
 def test_f_rules_out_what_the_detector_sees_and_nothing_else(problem, width):
     """The same view in images of three sizes: the target stands at candidate poses beside a box and behind it."""
     camera, shelf, target = camera_of(width, width * 9 // 16, Camera().fx * width / 1280), problem.shelf, problem.target
@@ -303,11 +312,11 @@ def test_looking_again_at_moved_objects_alone_gives_the_same_views(problem):
     one = scenario.load_scenario(scenario.example_scenarios()["first-light"])
     objects = scenario.superquadrics(one.objects)
     config, tables, everywhere = problem.config.existence, problem.existence, jnp.ones(problem.poses.shape[0], bool)
-    before = existence.object_views(tables, problem.camera, objects, everywhere, config)
+    before = VIEWS(tables, problem.camera, objects, everywhere, config)
     moved = objects.replace(position=objects.position.at[1].add(jnp.float32([0.0, 0.04, 0.0])))
     which = jnp.arange(objects.capacity) == 1
-    update = existence.object_views(tables, problem.camera, moved, everywhere, config, before, which)
-    whole = existence.object_views(tables, problem.camera, moved, everywhere, config)
+    update = VIEWS(tables, problem.camera, moved, everywhere, config, before, which)
+    whole = VIEWS(tables, problem.camera, moved, everywhere, config)
     np.testing.assert_array_equal(update.collides, whole.collides)
     np.testing.assert_allclose(update.windows.depth, whole.windows.depth, rtol=1e-5)
 
@@ -316,7 +325,7 @@ def test_occluders_are_those_of_a_reference(problem):
     objects = scenario.superquadrics(scenario.load_scenario(scenario.example_scenarios()["crowded-shelf"]).objects)
     settings = problem.config.existence
     tables, coarse = problem.existence, problem.camera.scaled(settings.step(problem.camera))
-    views = existence.object_views(tables, problem.camera, objects, None, settings)
+    views = VIEWS(tables, problem.camera, objects, None, settings)
     told = np.asarray(existence.occluders(tables, views))
     middle = np.asarray(tables.corner[:, 0]) + np.array(tables.depth.shape[-2:]) // 2
     seen = (middle >= 0).all(axis=1) & (middle < (coarse.height, coarse.width)).all(axis=1)
@@ -335,10 +344,10 @@ def test_collisions_need_not_count(problem):
     objects = scenario.superquadrics(one.objects)
     config, tables, everywhere = problem.config.existence, problem.existence, jnp.ones(problem.poses.shape[0], bool)
     nowhere = jnp.zeros_like(everywhere)
-    without = existence.object_views(tables, problem.camera, objects, None, config)
+    without = VIEWS(tables, problem.camera, objects, None, config)
     assert without.collides is None
-    empty = existence.object_views(tables, problem.camera, objects, nowhere, config)
-    whole = existence.object_views(tables, problem.camera, objects, everywhere, config)
+    empty = VIEWS(tables, problem.camera, objects, nowhere, config)
+    whole = VIEWS(tables, problem.camera, objects, everywhere, config)
     hidden, same, free = (coarsely(problem, views, everywhere) for views in (without, empty, whole))
     np.testing.assert_array_equal(hidden, same)
     assert int(jnp.sum(free)) < int(jnp.sum(hidden))

@@ -146,10 +146,13 @@ def scheduled(q, least=1, pace=1.0):
     return motion._schedule(q, (there, close, motion._Stretch(400, 30, 0, (0.0, 0.0), least, pace)), PLAN.timestep)
 
 
+ALL_SCHEDULED = jax.jit(jax.vmap(lambda q, pace: scheduled(q, pace=pace)))
+
+
 @pytest.mark.parametrize("compiled", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_motion_is_the_same_alone_and_among_others(compiled):
     q = jnp.stack([line(), line()[::-1], 0.5 * line()])
-    batch, in_time = jax.jit(jax.vmap(scheduled))(q)
+    batch, in_time = ALL_SCHEDULED(q, jnp.ones(3))
     assert in_time.all()
     assert len(set(batch.length.tolist())) > 1
     alone, _ = (jax.jit(scheduled) if compiled else scheduled)(q[2])
@@ -158,7 +161,8 @@ def test_a_motion_is_the_same_alone_and_among_others(compiled):
 
 
 def test_a_stretch_takes_at_least_what_it_must_and_one_that_takes_too_long_is_out_of_reach():
-    reference, in_time = jax.jit(jax.vmap(lambda pace: scheduled(line(), 1, pace)))(jnp.array([1.0, 0.8, 0.5]))
+    q = jnp.stack([line()] * 3)
+    reference, in_time = ALL_SCHEDULED(q, jnp.array([1.0, 0.8, 0.5]))
     assert in_time.tolist() == [True, True, False]
     usual, gentle, too_gentle = (reference.length - reference.closed).tolist()
     assert abs(gentle - usual / 0.8) <= 2 * motion.GRAIN
