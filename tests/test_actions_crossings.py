@@ -264,12 +264,12 @@ def transfers(space, tables):
 
     compiled = jax.jit(able)
 
-    def told(post, places, half, post_there, wanted=(True, True, True), fault=ANYWHERE):
-        # One program for all: a single place is asked about twice.
+    def transferable(post, places, half, post_there, wanted=(True, True, True), fault=ANYWHERE):
+        # One program for all: a single place is looked at twice.
         T = jnp.stack([pose(DEEP), *places, *places][:3])
         return compiled(space, tables, jnp.float32(half), post, post_there, T, jnp.array(wanted), fault)
 
-    return told
+    return transferable
 
 
 @pytest.mark.parametrize("ends", ["grasp", "place"])
