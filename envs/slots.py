@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import flax.struct
 import jax
@@ -91,6 +91,15 @@ class Slots(Protocol):
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
         """Whether in some slots a collision-free grasp of the target exists, whatever anybody believes."""
+        ...
+
+
+@runtime_checkable
+class PreparesTrials(Protocol):
+    """`Trials` that know the programs which they will call."""
+
+    def programs(self, problem: Problem) -> Sequence[Program]:
+        """Those for the scenes of a problem."""
         ...
 
 
@@ -245,6 +254,7 @@ class ManySlots:
 
         return [
             *(program("plan", _propose, *question) for question in calls),
+            *(self._trials.programs(problem) if isinstance(self._trials, PreparesTrials) else ()),
             *(Program("small ones", lambda: False, functools.partial(choosing, question)) for question in calls),
             program("look", _look, problem, state, world, keys, rows, self._recogniser, self._sight),
             program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),

@@ -437,19 +437,22 @@ def test_of_many_scenes_it_says_the_same_and_nothing_where_it_is_not_wanted(prob
     assert said[2].tolist() == [UNKNOWN, UNKNOWN, UNKNOWN]
 
 
-def test_motions_that_are_computed_together_are_those_that_are_computed_alone(monkeypatch):
+def test_beside_a_gpu_the_host_computes_the_same_motions(problem, monkeypatch):
     over, away, aside = pushes()
-    monkeypatch.setattr(native, "AT_ONCE", 2)
-    actions = jax.device_get(stack(stack(over, no_action()), stack(away, aside), stack(aside, over)))
-    together, alone = (
-        native._Motions(actions, np.ones((3, 2), bool), MODEL.simulation.motion, t) for t in (True, False)
-    )
-    assert together(0, 1) is alone(0, 1) is None
-    for row, i in ((2, 0), (0, 0), (1, 0), (1, 1), (2, 1)):
-        (motion, able), (other, also) = together(row, i), alone(row, i)
-        assert bool(able) == bool(also)
-        if able:
-            jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-5), motion, other)
+    actions = jax.device_get([over, away, aside, no_action()])
+    config = MODEL.simulation.motion
+    alone = [native._motion(kind_of(int(action.kind)), action, config) for action in actions]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    begun = [program.begin() for program in MODEL.programs(problem)]
+    assert sum(compiling is not None for compiling in begun) == len(begun)
+    for compiling in begun:
+        compiling()
+    traced = native._motion_beside_gpu.jitted._cache_size()
+    for action, motion in zip(actions, alone, strict=True):
+        other = native._motion(kind_of(int(action.kind)), action, config)
+        jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-5), motion, other)
+    assert native._motion_beside_gpu.jitted._cache_size() == traced
+    assert alone[-1] is None
 
 
 def slots_of(problem, policy, trials, rows):

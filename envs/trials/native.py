@@ -11,10 +11,10 @@ An approximation: what is not recognised is not there, a hidden target least of 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import math
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -24,9 +24,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions import Action, Kind, kind_of
+from mechsearch_jax.actions import KINDS, Action, Kind, kind_of, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
-from mechsearch_jax.compiled import kept
+from mechsearch_jax.compiled import Kept, kept
 from mechsearch_jax.cores import cores
 from mechsearch_jax.envs.physics_push import bodies, sound
 from mechsearch_jax.envs.simulator import SimulatorConfig
@@ -38,6 +38,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.planner.trials import TrialResult, TrialScenes
+from mechsearch_jax.preparing import Program, motions
 from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
@@ -45,8 +46,6 @@ from mechsearch_jax.workspace.target import Target
 
 # What the arm is to do, and whether it can; None where nothing is to be done.
 Motion = tuple[Reference, Any] | None
-# So many motions are computed at once on a GPU, where there are several scenes.
-AT_ONCE = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,13 +86,10 @@ class NativeTrials:
         worlds: World = jax.device_get(
             _worlds(problem.target, problem.shelf, scenes.objects, jnp.asarray(scenes.pose), jnp.asarray(scenes.found))
         )
-        config = dataclasses.replace(self.simulation.motion, gripper=problem.gripper)
+        config = self._motion_config(problem)
         simulation = dataclasses.replace(self.simulation, motion=config)
         actions = jax.device_get(actions)
         chosen = np.asarray(wanted)
-        # A GPU computes many motions as fast as one.
-        together = len(chosen) > 1 and jax.default_backend() != "cpu"
-        motions = _Motions(actions, chosen, config, together)
 
         def one(row: int) -> World:
             return jax.tree.map(lambda a: a[row], worlds)
@@ -103,17 +99,33 @@ class NativeTrials:
             return _at_rest(problem.shelf, simulation, one(row), friction, mass)
 
         def attempt(scene: TrialScene | None, row: int, i: int, needed: Callable[[], bool]) -> TrialResult | None:
-            motion = motions(row, i)
+            kind = kind_of(int(actions.kind[row, i]))
+            motion = _motion(kind, jax.tree.map(lambda a: np.asarray(a[row, i]), actions), config)
             if motion is None or not motion[1]:
                 return TrialResult.FAILED
             if scene is None or not sound(*jax.tree.map(lambda a: np.asarray(a)[None], (one(row), motion[0]))):
                 return TrialResult.UNKNOWN
             try:
-                return scene.attempt(kind_of(int(actions.kind[row, i])), motion[0], int(actions.object[row, i]), needed)
+                return scene.attempt(kind, motion[0], int(actions.object[row, i]), needed)
             except mujoco.FatalError:
                 return TrialResult.UNKNOWN
 
         return in_order(chosen, self.threads or cores(), make, attempt)
+
+    def programs(self, problem: Problem) -> list[Program]:
+        """The motions of all kinds of action; see `slots.PreparesTrials`."""
+        config = self._motion_config(problem)
+        if jax.default_backend() == "cpu":
+            return motions(config)
+
+        def begin(kind: Kind) -> Callable[[], None] | None:
+            with _host():
+                return _motion_beside_gpu.begin(kind, jax.device_get(no_action()), config)
+
+        return [Program("motions of trials", lambda: False, functools.partial(begin, kind)) for kind in KINDS.values()]
+
+    def _motion_config(self, problem: Problem) -> MotionConfig:
+        return dataclasses.replace(self.simulation.motion, gripper=problem.gripper)
 
 
 @kept(static_argnames=("target",))
@@ -150,40 +162,28 @@ def _at_rest(
         return None
 
 
-class _Motions:
-    """The motions of actions, each computed when it is first needed; NumPy arrays."""
+def _motion(kind: Kind, action: Action, config: MotionConfig) -> Motion:
+    """What an action has the arm do, as NumPy arrays.
 
-    def __init__(self, actions: Action, wanted: Bool[np.ndarray, "r k"], config: MotionConfig, together: bool):
-        """Args:
-        actions, wanted: as of `Trials`, NumPy arrays.
-        config: of the motions.
-        together: whether those of several scenes are computed at once, `AT_ONCE` of them.
-        """
-        self._actions, self._wanted, self._config, self._together = actions, wanted, config, together
-        self._known: dict[tuple[int, int], Motion] = {}
-        self._lock = threading.Lock()
-
-    def __call__(self, row: int, i: int) -> Motion:
-        """The motion of an action, by row and column."""
-        kind = kind_of(int(self._actions.kind[row, i]))
-        if not self._together:
-            action: Action = jax.tree.map(lambda a: jnp.asarray(a[row, i]), self._actions)
-            return jax.device_get(reference_motion(kind, action, self._config))
-        with self._lock:
-            if (row, i) not in self._known:
-                alike = np.flatnonzero(self._wanted[:, i] & (self._actions.kind[:, i] == kind.code)).tolist()
-                # Always the same ones together, whichever is needed first: results must not depend on threads.
-                first = alike.index(row) // AT_ONCE * AT_ONCE
-                block = alike[first : first + AT_ONCE]
-                rows = np.resize(block, AT_ONCE)
-                several: Action = jax.tree.map(lambda a: jnp.asarray(a[rows, i]), self._actions)
-                found = jax.device_get(_motions(kind, several, self._config))
-                for place, r in enumerate(block):
-                    self._known[r, i] = jax.tree.map(lambda a, place=place: a[place], found)
-            return self._known[row, i]
+    The host computes it beside a GPU, too: in a thread of its own, and sooner than a GPU gets through the many small
+    steps of one motion.
+    """
+    compute = reference_motion if jax.default_backend() == "cpu" else _motion_beside_gpu
+    with _host():
+        return jax.device_get(compute(kind, action, config))
 
 
-@functools.partial(jax.jit, static_argnames=("kind", "config"))
-def _motions(kind: Kind, actions: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, " n"]] | None:
-    """`reference_motion` of several actions."""
-    return jax.vmap(lambda action: kind.reference(action, config))(actions)
+def _host() -> contextlib.AbstractContextManager[Any]:
+    """In which JAX computes on the host; on a GPU all the same where JAX was told to use nothing else."""
+    if jax.default_backend() != "cpu":
+        with contextlib.suppress(RuntimeError):
+            return jax.default_device(jax.local_devices(backend="cpu")[0])
+    return contextlib.nullcontext()
+
+
+def _reference(kind: Kind, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:
+    return kind.reference(action, config)
+
+
+# JAX's own cache keeps it: what else is kept on disk is for the first device.
+_motion_beside_gpu = Kept(_reference, static_argnames=("kind", "config"), on_disk=False)
