@@ -1,8 +1,12 @@
-"""How many cores this process may keep busy."""
+"""The host's processors: how many cores this process may keep busy, and computing on them beside a GPU."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+from typing import Any
+
+import jax
 
 # Set for processes that share the cores with others.
 VARIABLE = "MECHSEARCH_CORES"
@@ -20,3 +24,14 @@ def share_of_cores(processes: int) -> dict[str, str]:
     """What the environment of each of several processes must hold, so that together they keep no more cores busy than
     this one may."""
     return {VARIABLE: str(max(cores() // processes, 1))}
+
+
+def on_host() -> contextlib.AbstractContextManager[Any]:
+    """In this block JAX computes on the host, for what a GPU takes longer to compile or to get through.
+
+    Where JAX was told to know nothing but the GPU (`JAX_PLATFORMS`), it computes there all the same.
+    """
+    if jax.default_backend() != "cpu":
+        with contextlib.suppress(RuntimeError):
+            return jax.default_device(jax.local_devices(backend="cpu")[0])
+    return contextlib.nullcontext()

@@ -3,13 +3,14 @@
 import os
 import sys
 
+import jax
 import mujoco
 import numpy as np
 import pytest
 
 from mechsearch_jax.benchmarks.evaluate import make_jobs
 from mechsearch_jax.benchmarks.processes import Processes
-from mechsearch_jax.cores import VARIABLE, cores, share_of_cores
+from mechsearch_jax.cores import VARIABLE, cores, on_host, share_of_cores
 from mechsearch_jax.envs import model
 from mechsearch_jax.envs.method import Method
 from mechsearch_jax.workspace.camera import Camera
@@ -26,6 +27,22 @@ def test_the_cores_are_those_given_or_all(monkeypatch):
         assert cores() == everything
     monkeypatch.setenv(VARIABLE, "6")
     assert cores() == 6
+
+
+def test_beside_a_gpu_the_host_computes_and_alone_it_is_what_computes_anyway(monkeypatch):
+    with on_host():
+        assert jax.default_device.value is None
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with on_host():
+        assert jax.default_device.value.platform == "cpu"
+    assert jax.default_device.value is None
+
+    def not_there(backend):
+        raise RuntimeError(f"Unknown backend {backend}")
+
+    monkeypatch.setattr(jax, "local_devices", not_there)
+    with on_host():
+        assert jax.default_device.value is None
 
 
 @pytest.mark.parametrize(("processes", "each"), [(1, "6"), (2, "3"), (4, "1"), (7, "1")])

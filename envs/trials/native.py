@@ -11,7 +11,6 @@ An approximation: what is not recognised is not there, a hidden target least of 
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import math
@@ -27,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.actions import KINDS, Action, Kind, kind_of, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.compiled import Kept, kept
-from mechsearch_jax.cores import cores
+from mechsearch_jax.cores import cores, on_host
 from mechsearch_jax.envs.physics_push import bodies, sound
 from mechsearch_jax.envs.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.order import in_order
@@ -119,7 +118,7 @@ class NativeTrials:
             return motions(config)
 
         def begin(kind: Kind) -> Callable[[], None] | None:
-            with _host():
+            with on_host():
                 return _motion_beside_gpu.begin(kind, jax.device_get(no_action()), config)
 
         return [Program("motions of trials", lambda: False, functools.partial(begin, kind)) for kind in KINDS.values()]
@@ -169,16 +168,8 @@ def _motion(kind: Kind, action: Action, config: MotionConfig) -> Motion:
     steps of one motion.
     """
     compute = reference_motion if jax.default_backend() == "cpu" else _motion_beside_gpu
-    with _host():
+    with on_host():
         return jax.device_get(compute(kind, action, config))
-
-
-def _host() -> contextlib.AbstractContextManager[Any]:
-    """In which JAX computes on the host; on a GPU all the same where JAX was told to use nothing else."""
-    if jax.default_backend() != "cpu":
-        with contextlib.suppress(RuntimeError):
-            return jax.default_device(jax.local_devices(backend="cpu")[0])
-    return contextlib.nullcontext()
 
 
 def _reference(kind: Kind, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:

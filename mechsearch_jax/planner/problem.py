@@ -5,9 +5,11 @@ from __future__ import annotations
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tables
 from mechsearch_jax.actions.registry import check_kinds
+from mechsearch_jax.cores import on_host
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceTables, existence_tables
 from mechsearch_jax.graspability import GraspConfig, GraspTables, grasp_tables
@@ -114,19 +116,18 @@ def build_problem(
     check_camera(camera, shelf)
     check_outside(gripper, shelf)
     check_kinds(config.actions.actions)
-    grasps = grasp_tables(shelf, gripper, target, config.grasps)
-    if grasps.pair_pose.shape[0] == 0:
-        raise InputError(NOWHERE)
-    return Problem(
-        existence=existence_tables(camera, shelf, target, config.existence),
-        grasps=grasps,
-        actions=action_tables(gripper, config.grasps.wrists, config.actions),
-        retrieval=target_grasps(shelf, gripper, target, config.retrieval).tables,
-        poses=jnp.asarray(target.candidate_poses(shelf)),
-        cell=jnp.float32(target.cell(shelf)[:2]),
-        camera=camera,
-        shelf=shelf,
-        gripper=gripper,
-        target=target,
-        config=config,
-    )
+    # A GPU would compile a hundred small programs for it, each of them more slowly.
+    with on_host():
+        grasps = grasp_tables(shelf, gripper, target, config.grasps)
+        if grasps.pair_pose.shape[0] == 0:
+            raise InputError(NOWHERE)
+        tables = {
+            "existence": existence_tables(camera, shelf, target, config.existence),
+            "grasps": grasps,
+            "actions": action_tables(gripper, config.grasps.wrists, config.actions),
+            "retrieval": target_grasps(shelf, gripper, target, config.retrieval).tables,
+            "poses": target.candidate_poses(shelf),
+            "cell": np.float32(target.cell(shelf)[:2]),
+        }
+    tables = jax.tree.map(lambda table: jnp.asarray(np.asarray(table)), tables)
+    return Problem(**tables, camera=camera, shelf=shelf, gripper=gripper, target=target, config=config)
