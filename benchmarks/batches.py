@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from collections import deque
@@ -17,7 +18,9 @@ from mechsearch_jax.envs.method import EngineName, Method
 from mechsearch_jax.envs.recognisers import recogniser
 from mechsearch_jax.envs.records import Episode
 from mechsearch_jax.envs.simulator import Simulator
+from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.workspace.target import Target
 
@@ -79,6 +82,18 @@ class Batches:
             not suffice for a single world.
         """
         failures = _Failures(ended)
+        with contextlib.ExitStack() as stack:
+            trying = functools.cache(functools.partial(_trials, stack))
+            self._run_groups(jobs, begin, failures, trying)
+        failures.hand_on()
+
+    def _run_groups(
+        self,
+        jobs: Sequence[Job],
+        begin: Callable[[Job], bool],
+        failures: _Failures,
+        trying: Callable[[str], Trials | None],
+    ) -> None:
         # What is compiled for one group serves the next.
         simulators: dict[tuple[EngineName, Workcell], Simulator] = {}
         for target, group in groups(jobs):
@@ -93,7 +108,8 @@ class Batches:
             while batches:
                 batch = batches.pop()
                 try:
-                    self._run(batch, failures.ended, target, method, simulator, worlds)
+                    trials = trying(method.config.rehearsal)
+                    self._run(batch, failures.ended, target, method, simulator, worlds, trials)
                 except InputError:
                     raise
                 except Exception as error:
@@ -110,7 +126,6 @@ class Batches:
                         failures.add(batch.running[0], error)
                     else:
                         batches += batch.halves()
-        failures.hand_on()
 
     def _run(
         self,
@@ -120,6 +135,7 @@ class Batches:
         method: Method,
         simulator: Simulator,
         worlds: int,
+        trials: Trials | None,
     ) -> None:
         code = present_code()
         policy_of, options_of = functools.cache(Method.policy), functools.cache(Method.options)
@@ -145,8 +161,18 @@ class Batches:
             busy=self.busy,
             compiling=self.compiling,
             protocol=method.terms,
-            trials=method.trials(),
+            trials=trials,
         )
+
+
+def _trials(stack: contextlib.ExitStack, name: str) -> Trials | None:
+    """What tries actions out by name, in processes of its own beside a GPU; ended with the stack."""
+    trials = rehearsal(name)
+    if jax.default_backend() == "cpu" or not isinstance(trials, NativeTrials):
+        return trials
+    apart = ProcessTrials(trials)
+    stack.callback(apart.close)
+    return apart
 
 
 class _Batch:

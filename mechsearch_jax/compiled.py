@@ -25,6 +25,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import get_opaque_trace_state
 
+from mechsearch_jax.cores import on_host
 from mechsearch_jax.executables import Executables
 from mechsearch_jax.identity import Unidentified, identity
 
@@ -65,6 +66,11 @@ def keep_in(folder: Path | None) -> None:
     """Make this process keep what `kept` functions are compiled to in a folder; None to keep nothing from now on."""
     _KEEPING.executables = None if folder is None else Executables(folder)
     _KEEPING.untraced = get_opaque_trace_state()
+
+
+def kept_in() -> Path | None:
+    """Where this process keeps what `kept` functions are compiled to; None where it does not."""
+    return None if _KEEPING.executables is None else _KEEPING.executables.folder
 
 
 class Kept:
@@ -273,6 +279,32 @@ class Kept:
         return lowered
 
 
+class KeptOnHost(Kept):
+    """A `Kept` function that the host computes, beside a GPU too; inside of other transformations, as they have it.
+
+    Beside a GPU JAX's own cache keeps it on disk: executables are of the first device.
+    """
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        if jax.default_backend() == "cpu" or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+            return super().__call__(*args, **kwargs)
+        with on_host():
+            return super().__call__(*jax.device_get(args), **jax.device_get(kwargs))
+
+    def begin(self, *args: Any, **kwargs: Any) -> Callable[[], None] | None:
+        """See `Kept.begin`."""
+        with on_host():
+            return super().begin(*args, **kwargs)
+
+    def is_ready(self, *args: Any, **kwargs: Any) -> bool:
+        """See `Kept.is_ready`."""
+        with on_host():
+            return super().is_ready(*args, **kwargs)
+
+    def _said(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> str | None:
+        return super()._said(args, kwargs) if jax.default_backend() == "cpu" else None
+
+
 def _compile(lowered: Any) -> Any:
     """Compile, on a CPU with `CPU_OPTIONS`, where XLA knows them and nobody else has a say."""
     if jax.devices()[0].platform == "cpu" and not os.environ.get("XLA_FLAGS"):
@@ -285,9 +317,9 @@ def _compile(lowered: Any) -> Any:
     return lowered.compile()
 
 
-def kept(*, static_argnames: Sequence[str] = ()) -> Callable[[Callable[..., Any]], Kept]:
-    """A decorator in the place of `jax.jit` for what takes long to trace; see `Kept`."""
-    return lambda function: Kept(function, static_argnames)
+def kept(*, static_argnames: Sequence[str] = (), on_host: bool = False) -> Callable[[Callable[..., Any]], Kept]:
+    """A decorator in the place of `jax.jit` for what takes long to trace; see `Kept`, or on the host `KeptOnHost`."""
+    return lambda function: (KeptOnHost if on_host else Kept)(function, static_argnames)
 
 
 def _plain(leaf: Any) -> bool:

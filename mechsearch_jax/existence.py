@@ -182,7 +182,7 @@ class ObjectViews(flax.struct.PyTreeNode):
 def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: ExistenceConfig) -> ExistenceTables:
     """Precompute, for every candidate pose, the target's own depth image and collision cloud."""
     places = target.places(shelf, config.places)
-    T = jax.jit(upright_pose)(jnp.asarray(places), target.height(shelf))
+    T = jax.jit(upright_pose)(np.asarray(places, np.float32), target.height(shelf))
     coarse = camera.scaled(config.step(camera))
     half = np.array(target.half_size, np.float32)
     window, around = target_window(coarse, half, T)
@@ -199,13 +199,13 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
 
     each = jax.vmap(jax.vmap(view, in_axes=(None, 0)), in_axes=(None, 0))
     views, first = jax.jit(each)(coarse, T)
-    depth, corner = views.depth, views.corner
+    depth, corner, first = jax.device_get((views.depth, views.corner, first))
     middle = first[:, 0] + np.array(around, np.int32)[None] // 2
-    eroded = jnp.asarray(half - config.erosion)
     sample = jax.jit(superquadric.sample_surface, static_argnames="count")
-    cloud = sample(eroded, jnp.array(target.exponents), count=config.points)
-    nearest = jnp.min(depth[:, 0], axis=(-1, -2))
-    return ExistenceTables(T, depth, corner, middle, nearest, cloud.T, jnp.float32(np.linalg.norm(half)))
+    cloud = np.asarray(sample(half - np.float32(config.erosion), np.float32(target.exponents), count=config.points))
+    nearest = depth[:, 0].min(axis=(-1, -2))
+    radius = np.float32(np.linalg.norm(half))
+    return jax.device_put(ExistenceTables(T, depth, corner, middle, nearest, cloud.T, radius))
 
 
 def _window_side(extent: float) -> int:
@@ -244,12 +244,18 @@ def target_extent(
       T_world_target: the poses.
     """
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
-    pixels = np.asarray(project(coarse, transform(T_world_target[..., None, :, :], jnp.asarray(corners)))[0], float)
+    pixels = np.asarray(_seen_at(coarse, T_world_target, corners), float)
     # As far as `render.window_place` follows what is outside of the image.
     limit = np.array([coarse.height, coarse.width])
     low, high = (np.clip(bound, -1, limit) for bound in (pixels.min(axis=-2), pixels.max(axis=-2)))
     rows, columns = np.minimum((high - low).reshape(-1, 2).max(axis=0), limit)
     return float(rows), float(columns)
+
+
+@jax.jit
+def _seen_at(camera: Camera, T: Float[Array, "*batch 4 4"], points: Float[Array, "k 3"]) -> Float[Array, "*batch k 2"]:
+    """Where a camera sees points of bodies at some poses."""
+    return project(camera, transform(T[..., None, :, :], points))[0]
 
 
 def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | None = None) -> ObjectViews:

@@ -153,7 +153,7 @@ def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):
             f"Target: {min(widths):.3f} m wide, but the gripper takes {gripper.usable_opening} m; use a thinner target"
         )
     grasps = np.stack(np.meshgrid(yaws, config.tilts, np.arange(len(config.wrists)), indexing="ij"), -1).reshape(-1, 3)
-    yaw, tilt, wrist = jnp.float32(grasps[:, 0]), jnp.float32(grasps[:, 1]), grasps[:, 2].astype(int)
+    yaw, tilt, wrist = np.float32(grasps[:, 0]), np.float32(grasps[:, 1]), grasps[:, 2].astype(int)
     height = min(config.height, 0.6 * target.half_size[2])
     above = np.broadcast_to(np.array([0.0, 0.0, height], np.float32), (len(grasps), 3))
     T = jax.jit(lambda yaw, tilt, above: make(gripper_rotation(yaw, tilt), above))(yaw, tilt, above)
@@ -229,22 +229,22 @@ def grasp_tables(
     poses = jax.jit(upright_pose)(target.candidate_poses(shelf), target.height(shelf))
     tables = GraspTables(
         T_target_gripper=T_target_gripper,
-        q7=jnp.asarray(angles, jnp.float32)[wrist],
-        wrist=jnp.int32(wrist),
-        clouds=jnp.float32(np.stack(clouds)),
-        low=jnp.float32(np.stack(low)),
-        high=jnp.float32(np.stack(high)),
-        still_gripper=jnp.float32(np.stack([cloud.T for cloud in still])),
-        still_target=jnp.float32(
+        q7=np.asarray(angles, np.float32)[wrist],
+        wrist=np.int32(wrist),
+        clouds=np.float32(np.stack(clouds)),
+        low=np.float32(np.stack(low)),
+        high=np.float32(np.stack(high)),
+        still_gripper=np.float32(np.stack([cloud.T for cloud in still])),
+        still_target=np.float32(
             swept_target(target, np.array([1.0, 0.0, 0.0]), 0.0, config.still_points[1], config.erosion).T
         ),
         T_world_target=poses,
-        pair_pose=jnp.zeros(0, jnp.int32),
-        pair_grasp=jnp.zeros(0, jnp.int32),
-        pair_valid=jnp.zeros(0, bool),
-        pose_pairs=jnp.zeros((len(poses), 0), jnp.int32),
-        found_grasp=jnp.zeros(0, jnp.int32),
-        gap=jnp.float32(max(_gap(cloud.T, COARSE) for cloud in clouds)),
+        pair_pose=np.zeros(0, np.int32),
+        pair_grasp=np.zeros(0, np.int32),
+        pair_valid=np.zeros(0, bool),
+        pose_pairs=np.zeros((len(poses), 0), np.int32),
+        found_grasp=np.zeros(0, np.int32),
+        gap=np.float32(max(_gap(cloud.T, COARSE) for cloud in clouds)),
     )
     if candidates:
         judge = jax.jit(lambda tables, shelf: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))
@@ -252,16 +252,16 @@ def grasp_tables(
         tables = tables.replace(**_padded_pairs(pose, grasp, len(poses)))
     else:
         tables = tables.replace(
-            T_world_target=poses[:0],
+            T_world_target=np.asarray(poses)[:0],
             pose_pairs=tables.pose_pairs[:0],
-            found_grasp=jnp.arange(len(clouds), dtype=jnp.int32),
+            found_grasp=np.arange(len(clouds), dtype=np.int32),
         )
-    return tables
+    return jax.device_put(tables)
 
 
 def _padded_pairs(
     pose: Int[np.ndarray, " pairs"], grasp: Int[np.ndarray, " pairs"], poses: int
-) -> dict[str, jax.Array]:
+) -> dict[str, np.ndarray]:
     """The fields of `GraspTables` that say which grasps are feasible at which of the candidate poses."""
     rows = len(pose) + -len(pose) % PAIRS_STEP
     count = np.bincount(pose, minlength=poses)
@@ -270,10 +270,10 @@ def _padded_pairs(
     pose_pairs = np.full((poses, width + -width % POSE_STEP), rows, np.int32)
     pose_pairs[pose, place] = np.arange(len(pose))
     return {
-        "pair_pose": jnp.int32(np.pad(pose, (0, rows - len(pose)), mode="edge")) if rows else jnp.int32(pose),
-        "pair_grasp": jnp.int32(np.pad(grasp, (0, rows - len(pose)), mode="edge")) if rows else jnp.int32(grasp),
-        "pair_valid": jnp.asarray(np.arange(rows) < len(pose)),
-        "pose_pairs": jnp.asarray(pose_pairs),
+        "pair_pose": np.int32(np.pad(pose, (0, rows - len(pose)), mode="edge") if rows else pose),
+        "pair_grasp": np.int32(np.pad(grasp, (0, rows - len(pose)), mode="edge") if rows else grasp),
+        "pair_valid": np.arange(rows) < len(pose),
+        "pose_pairs": pose_pairs,
     }
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax import compiled, executables
-from mechsearch_jax.compiled import Kept, keep_in
+from mechsearch_jax.compiled import Kept, KeptOnHost, keep_in
 from mechsearch_jax.identity import Unidentified, identity
 from mechsearch_jax.planner.config import PlannerConfig
 from mechsearch_jax.workspace.camera import Camera
@@ -209,6 +209,28 @@ def test_inside_of_transformations_it_is_a_jitted_function(folder):
     assert float(jax.jit(lambda row: function(Camera(), row)["sum"])(rows[0])) == 3.0
     assert float(jax.jit(lambda: function(Camera(), VALUES)["sum"])()) == 6.0
     assert not folder.exists()
+
+
+def test_beside_a_gpu_the_host_computes_what_is_for_it(folder, monkeypatch):
+    devices = []
+
+    def doubled(values):
+        devices.append(getattr(jax.default_device.value, "platform", None))
+        return 2.0 * values
+
+    on_a_cpu = KeptOnHost(doubled, on_disk=False)
+    np.testing.assert_array_equal(on_a_cpu(VALUES), 2.0 * VALUES)
+    assert devices == [None]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    beside = KeptOnHost(doubled)
+    beside.begin(VALUES)()
+    assert beside.is_ready(VALUES)
+    np.testing.assert_array_equal(beside(jnp.asarray(VALUES)), 2.0 * VALUES)
+    assert devices == [None, "cpu"]
+    # Executables on disk are of the first device, and a function of functions decides for itself.
+    assert not folder.exists()
+    np.testing.assert_array_equal(jax.vmap(beside)(jnp.asarray(VALUES)), 2.0 * VALUES)
+    assert devices == [None, "cpu", None]
 
 
 def test_what_cannot_be_told_apart_is_not_kept(folder):

@@ -77,8 +77,7 @@ def told_of(model, problem, seen, at, found, actions, wanted=None):
 def world_of(problem, objects):
     """What is simulated of a scene whose target is not found."""
     seen, at = known(problem, objects)
-    several = jax.tree.map(lambda a: a[None], (seen, at, jnp.array(False)))
-    return jax.device_get(jax.tree.map(lambda a: a[0], native._worlds(problem.target, problem.shelf, *several)))
+    return jax.device_get(native._world(problem.target, problem.shelf, seen, at, jnp.array(False)))
 
 
 @functools.cache
@@ -435,24 +434,6 @@ def test_of_many_scenes_it_says_the_same_and_nothing_where_it_is_not_wanted(prob
     assert said[0].tolist() == [HARM, FAILED, DONE]
     assert int(np.argmax(said[1])) == int(np.argmax(told["loose"][1]))
     assert said[2].tolist() == [UNKNOWN, UNKNOWN, UNKNOWN]
-
-
-def test_beside_a_gpu_the_host_computes_the_same_motions(problem, monkeypatch):
-    over, away, aside = pushes()
-    actions = jax.device_get([over, away, aside, no_action()])
-    config = MODEL.simulation.motion
-    alone = [native._motion(kind_of(int(action.kind)), action, config) for action in actions]
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    begun = [program.begin() for program in MODEL.programs(problem)]
-    assert sum(compiling is not None for compiling in begun) == len(begun)
-    for compiling in begun:
-        compiling()
-    traced = native._motion_beside_gpu.jitted._cache_size()
-    for action, motion in zip(actions, alone, strict=True):
-        other = native._motion(kind_of(int(action.kind)), action, config)
-        jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-5), motion, other)
-    assert native._motion_beside_gpu.jitted._cache_size() == traced
-    assert alone[-1] is None
 
 
 def slots_of(problem, policy, trials, rows):

@@ -240,13 +240,12 @@ def test_images_are_recognised_by_one_program_for_both_shelves():
 
 
 def test_bodies_of_trials_are_compiled_once_for_both_shelves():
-    scenes = jax.tree.map(lambda a: a[None], OBJECTS)
-    pose, found = jnp.zeros((1, 3)), jnp.ones(1, bool)
-    worlds = [native._worlds(TARGET, shelf, scenes, pose, found) for shelf in (SHELF, SHELF)]
-    size = cache_size(native._worlds)
-    worlds.append(native._worlds(TARGET, MOVED, scenes, pose, found))
-    assert cache_size(native._worlds) == size
-    heights = [float(world.position[0, -1, 2]) for world in worlds]
+    pose, found = jnp.zeros(3), jnp.array(True)
+    worlds = [native._world(TARGET, shelf, OBJECTS, pose, found) for shelf in (SHELF, SHELF)]
+    size = cache_size(native._world)
+    worlds.append(native._world(TARGET, MOVED, OBJECTS, pose, found))
+    assert cache_size(native._world) == size
+    heights = [float(world.position[-1, 2]) for world in worlds]
     assert heights[0] == heights[1]
     assert heights[2] - heights[0] == pytest.approx(MOVED.board - SHELF.board, abs=1e-6)
 

@@ -36,9 +36,11 @@ class JointTrajectory(flax.struct.PyTreeNode):
     gripper: jax.Array
 
 
-@kept(static_argnames=("kind", "config"))
+@kept(static_argnames=("kind", "config"), on_host=True)
 def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:
     """`Kind.reference`, compiled: the motion of an action and whether the arm reaches all of it, or None.
+
+    The host computes it, beside a GPU too, which takes longer for the many small steps of a single motion.
 
     Args:
       kind: of the action; static.

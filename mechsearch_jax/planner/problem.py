@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import flax.struct
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tables
@@ -129,5 +128,5 @@ def build_problem(
             "poses": target.candidate_poses(shelf),
             "cell": np.float32(target.cell(shelf)[:2]),
         }
-    tables = jax.tree.map(lambda table: jnp.asarray(np.asarray(table)), tables)
+    tables = jax.tree.map(lambda table: jax.device_put(np.asarray(table)), tables)
     return Problem(**tables, camera=camera, shelf=shelf, gripper=gripper, target=target, config=config)
