@@ -63,7 +63,7 @@ class ProcessTrials:
 
         def begin(row: int) -> Pending:
             one = jax.tree.map(lambda a: a[row : row + 1], (scenes, actions, wanted))
-            return self._workers(cell).submit(_row, self.trials, cell, *one)
+            return self._workers().submit(_row, self.trials, cell, *one)
 
         rows = np.flatnonzero(wanted.any(axis=1)).tolist()
         try:
@@ -81,12 +81,14 @@ class ProcessTrials:
         cell = _cell(problem)
 
         def begin() -> Callable[[], None]:
-            workers = self._workers(cell)
-            answers = [workers.submit(_ready) for _ in range(self.processes)]
+            workers = self._workers()
+            first = workers.submit(_prepare, self.trials, cell)
 
             def finish() -> None:
-                for answer in answers:
-                    answer.result()
+                first.result()
+                # What the first has compiled, the others read from disk.
+                for other in [workers.submit(_prepare, self.trials, cell) for _ in range(self.processes)]:
+                    other.result()
 
             return finish
 
@@ -98,13 +100,13 @@ class ProcessTrials:
         if pool is not None:
             pool.shutdown(kill_workers=True)
 
-    def _workers(self, cell: Cell) -> loky.ProcessPoolExecutor:
+    def _workers(self) -> loky.ProcessPoolExecutor:
         if self._pool is None:
             alone = {"JAX_PLATFORMS": "cpu", "CUDA_VISIBLE_DEVICES": "", "OPENBLAS_NUM_THREADS": "1"}
             self._pool = loky.ProcessPoolExecutor(
                 self.processes,
-                initializer=_prepare,
-                initargs=(self.trials, cell, kept_in(), {name: getattr(jax.config, name) for name in CACHE}),
+                initializer=_keep,
+                initargs=(kept_in(), {name: getattr(jax.config, name) for name in CACHE}),
                 env=alone | share_of_cores(self.processes),
             )
         return self._pool
@@ -126,20 +128,20 @@ def _cell(problem: Problem) -> Cell:
     return Cell(problem.target, jax.device_get(problem.shelf), problem.gripper)
 
 
-def _prepare(trials: NativeTrials, cell: Cell, executables: Path | None, cache: Mapping[str, Any]) -> None:
-    """Make a process ready: compile, or read from disk, what its trials compute with JAX."""
+def _keep(executables: Path | None, cache: Mapping[str, Any]) -> None:
+    """Keep on disk in a new process what is compiled, where the first one does."""
     if executables is not None:
         keep_in(executables)
     for name, value in cache.items():
         jax.config.update(name, value)
+
+
+def _prepare(trials: NativeTrials, cell: Cell) -> None:
+    """Make a process ready: compile, or read from disk, what its trials compute with JAX."""
     for each in trials.cell_programs(cell):
         finish = each.begin()
         if finish is not None:
             finish()
-
-
-def _ready() -> None:
-    """Nothing: a process that answers has been prepared."""
 
 
 def _row(
