@@ -19,6 +19,8 @@ from mechsearch_jax.envs.recognisers import recogniser
 from mechsearch_jax.envs.records import Episode
 from mechsearch_jax.envs.simulator import Simulator
 from mechsearch_jax.envs.trials.named import rehearsal
+from mechsearch_jax.envs.trials.native import NativeTrials
+from mechsearch_jax.envs.trials.processes import ProcessTrials
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.planner.workcell import Workcell

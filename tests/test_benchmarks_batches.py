@@ -1,5 +1,6 @@
 """Batches of jobs: rows for all of them, whatever fails, and the same after a kill."""
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -18,6 +19,8 @@ from mechsearch_jax.envs.method import Method
 from mechsearch_jax.envs.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.native import NativeSimulator
 from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.envs.trials.native import NativeTrials
+from mechsearch_jax.envs.trials.processes import ProcessTrials
 from mechsearch_jax.planner import PRESETS, policies
 from mechsearch_jax.workspace.scenario import save_scenario
 
@@ -245,6 +248,20 @@ def test_96_settings_trace_the_plan_once(tmp_path, files, monkeypatch, how):
     assert len({identity(row) for row in rows}) == 96
     assert not any(row.is_error for row in rows)
     assert traced == [small["sequences"]]
+
+
+def test_beside_a_gpu_a_batch_tries_actions_out_in_processes_that_end_with_it(monkeypatch):
+    closed = []
+    monkeypatch.setattr(ProcessTrials, "close", closed.append)
+    with contextlib.ExitStack() as stack:
+        assert batches._trials(stack, "none") is None
+        assert isinstance(batches._trials(stack, "physics"), NativeTrials)
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        assert batches._trials(stack, "none") is None
+        trials = batches._trials(stack, "physics")
+        assert isinstance(trials, ProcessTrials)
+        assert closed == []
+    assert closed == [trials]
 
 
 def test_the_memory_of_the_device_bounds_the_worlds(monkeypatch):
