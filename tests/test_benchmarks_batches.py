@@ -252,7 +252,7 @@ def test_96_settings_trace_the_plan_once(tmp_path, files, monkeypatch, how):
 
 def test_beside_a_gpu_a_batch_tries_actions_out_in_processes_that_end_with_it(monkeypatch):
     closed = []
-    monkeypatch.setattr(ProcessTrials, "close", closed.append)
+    monkeypatch.setattr(ProcessTrials, "close", lambda trials: closed.append(trials))
     with contextlib.ExitStack() as stack:
         assert batches._trials(stack, "none") is None
         assert isinstance(batches._trials(stack, "physics"), NativeTrials)
