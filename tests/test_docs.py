@@ -10,7 +10,7 @@ import pytest
 
 import mechsearch_jax
 from mechsearch_jax.benchmarks.guard import read_reference
-from mechsearch_jax.benchmarks.intervals import share_interval, wilson
+from mechsearch_jax.benchmarks.intervals import mean_interval, share_interval, wilson
 from mechsearch_jax.benchmarks.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.envs.earlier import EARLIER, GONE, RENAMED
 from mechsearch_jax.envs.scene_sets import SETS, digest, is_chosen_on, recorded
@@ -277,11 +277,10 @@ def stored_median(name):
 
 def test_the_times_of_a_decision_are_the_stored_ones():
     readme = " ".join(read("README.md").split())
-    assert f"[{stored_median('plan-first-draws-cpu.json'):.1f} s on two CPU cores](" in readme
     runs = json.loads(read("benchmarks/results/plan-batch-h100.json"))["runs"]
     (alone,) = [1000 * run["median_seconds"] for run in runs if (run["code"], run["batch"]) == ("after", 1)]
     assert f"A decision takes [{alone:.0f} ms on one H100](benchmarks/results/plan-batch-h100.json)" in readme
-    # A GPU's time with what is tried out is told once it is stored.
+    # With what is tried out.
     for file in (ROOT / "benchmarks/results").glob("plan-rehearsal-*.json"):
         assert f"[{1000 * stored_median(file.name):.0f} ms on" in readme
         assert f"](benchmarks/results/{file.name})" in readme
@@ -337,6 +336,7 @@ def counts_retrievals(run):
     [
         ("rehearsal-h200.json", ["published", "`c2`", "`c2`, nothing rehearsed"]),
         ("standard-cpu.json", ["published, C MuJoCo"]),
+        ("standard-h100.json", ["`c2`, b62958a", "`c2`, f86e8f8", "`c2`, 8787b53", "published, 8787b53"]),
         (
             "standard-h200.json",
             [
@@ -360,6 +360,39 @@ def test_the_rates_of_the_results_by_number_of_objects_are_the_stored_ones(name,
             line = f"| {' | '.join(cells)} |"
             assert line in page
             assert ("| graspable or retrieved |" in header_above(page, line)) == counts_retrievals(run)
+
+
+def by_scene(*runs):
+    """The share of a scene's episodes in which the target was retrieved."""
+    scenes = {}
+    for episode in (episode for run in runs for episode in run["episodes"]):
+        scenes.setdefault(episode["scenario"], []).append(bool(episode["retrieved"]))
+    return {scene: statistics.fmean(values) for scene, values in scenes.items()}
+
+
+def test_what_the_rebuilt_engine_loses_is_what_is_stored():
+    *c2, published = stored_runs("standard-h100.json")
+    pairs = (c2, stored_runs("standard-h200.json")[1:2]), ([published], stored_runs("standard-cpu.json"))
+    told = []
+    for after, before in pairs:
+        now, then = by_scene(*after), by_scene(*before)
+        assert set(now) == set(then)
+        changes = [100 * (now[scene] - then[scene]) for scene in now]
+        low, high = mean_interval(changes, list(now))
+        assert low > -2.0
+        told.append([round(value, 1) + 0.0 for value in (statistics.fmean(changes), low, high)])
+    page = " ".join(read("docs/results.md").split())
+    (one, low, high), (other, least, most) = told
+    assert f"three runs against one, {one:.1f} ({low:+.1f} to {high:+.1f}) points" in page
+    assert f"the native simulator, {other:+.1f} ({least:+.1f} to {most:+.1f})." in page
+    clock = c2[0]["clock"]["nothing kept"]
+    ready, last = clock["all compiled [s]"], clock["last episode [s]"]
+    assert f"compiled after {ready:.0f} s, and the last of 720 episodes ended {last - ready:.0f} s after that" in page
+    seconds, actions = c2[0]["seconds"], sum(episode["steps"] for episode in c2[0]["episodes"])
+    assert (
+        f"{seconds['planning']:.0f} went into looking, planning and trying out, and {seconds['simulation']:.0f}" in page
+    )
+    assert f"{actions:,} actions: {1000 * seconds['planning'] / actions:.0f} ms each" in page
 
 
 def test_the_rates_of_the_experiments_are_the_stored_ones():
