@@ -15,20 +15,20 @@ from mechsearch_jax.envs.world import World
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import no_hits, pairs
 from mechsearch_jax.planner import Belief, Problem, Search, Sequences, initial_belief
-from mechsearch_jax.planner.config import Weights
+from mechsearch_jax.planner.config import PlannerConfig, Weights
 from mechsearch_jax.planner.found_target import found_grasps, found_hits
 from mechsearch_jax.planner.objective import Objective, SearchForGrasp
 from mechsearch_jax.planner.retrieval import GraspChoice, best_grasps
-from mechsearch_jax.planner.rollout import Rollout, plan
+from mechsearch_jax.planner.rollout import Rollout, plan, present_state
 
 
 @dataclasses.dataclass(frozen=True)
 class InFullView(SearchForGrasp):
     """How far the target is from graspable where it is known to be: it may stand hidden."""
 
-    def cost(self, problem, belief, exists, target_at, hits, weights) -> Float[Array, ""]:
-        nowhere_hidden = jnp.zeros_like(exists)
-        return super().cost(problem, belief, nowhere_hidden, target_at, hits, weights)
+    def cost(self, problem, belief, state, weights) -> Float[Array, ""]:
+        nowhere_hidden = jnp.zeros_like(state.exists)
+        return super().cost(problem, belief, state.replace(exists=nowhere_hidden), weights)
 
 
 class Judgement(flax.struct.PyTreeNode):
@@ -62,11 +62,12 @@ def judge(problem: Problem, objective: Objective, weights: Weights, world: World
       active: where false, little is computed, and what is told means nothing.
     """
     here = Snapshot(problem.camera, problem.shelf, world)
-    belief = _known(problem, world, active)
-    hits = found_hits(problem.target_grasps, belief.grasps, objects_on_the_board(here), active)
-    nowhere = jnp.zeros_like(belief.exists)
+    belief, objects = _known(problem, world, active), objects_on_the_board(here)
+    hits = found_hits(problem.target_grasps, belief.grasps, objects, active)
     rows = jnp.concatenate([no_hits(pairs(problem.grasps), hits.shape[1]), hits])
-    cost = objective.cost(problem, belief, nowhere, nowhere, rows, weights)
+    state = present_state(problem, belief, objects, PlannerConfig())
+    state = state.replace(exists=jnp.zeros_like(belief.exists), hits=rows)
+    cost = objective.cost(problem, belief, state, weights)
     return Judgement(cost, belief.grasps.feasible, hits & belief.grasps.feasible[:, None])
 
 
@@ -81,7 +82,8 @@ def _known(problem: Problem, world: World, active: Bool[Array, ""] | bool = True
 def sample(search: Search, key: Array, problem: Problem, world: World) -> Sequences:
     """Sequences of actions from a world, best first, as the planner samples them."""
     objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-    rollout = Rollout(problem, _known(problem, world), search.config, search.propose, search.predict, search.objective)
+    slots = search.propose, search.predict, search.objective, search.drawn_in
+    rollout = Rollout(problem, _known(problem, world), search.config, *slots)
     return plan(rollout, key, objects).sequences
 
 

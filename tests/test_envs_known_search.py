@@ -20,11 +20,11 @@ from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_ta
 from mechsearch_jax.envs.world import BODIES, TARGET, World, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
-from mechsearch_jax.graspability import no_hits, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import GraspChoice, Sequences, graspable_at
-from mechsearch_jax.planner.config import Weights
+from mechsearch_jax.planner.config import PlannerConfig, Weights
 from mechsearch_jax.planner.retrieval import best_grasps
+from mechsearch_jax.planner.rollout import present_state
 from mechsearch_jax.workspace.shelf import Shelf
 
 START = jax.device_get(from_scenario(TWO))
@@ -231,10 +231,10 @@ def test_settings_that_try_nothing_are_refused():
 def test_a_target_that_may_stand_hidden_costs_no_more_for_it(problem):
     belief = planner.initial_belief(problem).replace(found=jnp.array(True))
     at = jnp.arange(problem.poses.shape[0]) == 400
-    hits = no_hits(pairs(problem.grasps, belief.grasps), 8)
-    seen, hidden = (InFullView().cost(problem, belief, e, at, hits, Weights()) for e in (jnp.zeros_like(at), at))
-    assert seen == hidden == 1.0
-    assert planner.search_for_grasp().objective.cost(problem, belief, at, at, hits, Weights()) > 1.0
+    hidden = present_state(problem, belief, superquadric.empty(8), PlannerConfig()).replace(exists=at, target_at=at)
+    seen = hidden.replace(exists=jnp.zeros_like(at))
+    assert [float(InFullView().cost(problem, belief, state, Weights())) for state in (seen, hidden)] == [1.0, 1.0]
+    assert planner.search_for_grasp().objective.cost(problem, belief, hidden, Weights()) > 1.0
 
 
 @pytest.mark.slow

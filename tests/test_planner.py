@@ -23,11 +23,11 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner.belief import possible_space
 from mechsearch_jax.planner.config import Weights
-from mechsearch_jax.planner.imitation import LaterPlacementsStay
+from mechsearch_jax.planner.imitation import LaterPlacementsStay, in_the_present_scene
 from mechsearch_jax.planner.objective import SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import PredictByKind
-from mechsearch_jax.planner.proposal import ALONE, DEPTH, blame, passed_on, sampling_weights
-from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, sequence_values
+from mechsearch_jax.planner.proposal import ALONE, DEPTH, as_predicted, blame, passed_on, sampling_weights
+from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, present_state, sequence_values
 from mechsearch_jax.workspace import scenario
 
 CONFIG = PlannerConfig()
@@ -146,7 +146,7 @@ def test_the_preset_of_the_published_code_is_the_papers_but_for_two_settings():
 @pytest.mark.parametrize("factory", [planner.search_for_grasp, planner.search_and_grasp, planner.greedy])
 def test_the_slots_of_the_published_code_are_chosen_by_one_name(factory):
     own, published = factory(), factory(PlannerConfig(imitates="published-code"))
-    assert (own.config.later_draws, published.config.later_draws) == ("predicted", "present")
+    assert (own.drawn_in, published.drawn_in) == (as_predicted, in_the_present_scene)
     assert published.predict == LaterPlacementsStay(own.predict)
     assert isinstance(own.predict, PredictByKind)
     assert (own.objective.hindrance, published.objective.hindrance) == (1.0, 0.1)
@@ -159,10 +159,10 @@ def test_what_is_in_the_way_of_a_grasp_weighs_as_much_as_is_said(problem):
     rows = pairs(problem.grasps, belief.grasps)
     hits = jnp.zeros((rows.pose.shape[0], 9), bool).at[:, :2].set(True)
     exists = jnp.arange(problem.poses.shape[0]) % 7 == 0
-    nowhere = jnp.zeros_like(exists)
+    state = present_state(problem, belief, superquadric.empty(8), PlannerConfig()).replace(exists=exists, hits=hits)
 
     def cost(objective, known):
-        return float(objective.cost(problem, known, exists, nowhere, hits, Weights()))
+        return float(objective.cost(problem, known, state, Weights()))
 
     plain, light, none = (cost(SearchForGrasp(hindrance=h), belief) for h in (1.0, 0.1, 0.0))
     assert none == exists.sum()
@@ -222,15 +222,15 @@ def test_later_actions_are_drawn_in_the_present_scene_in_the_published_code(prob
         def cost(self, state):
             return jnp.sum(state.scene.position[0])
 
-    def starts(imitates):
-        config = dataclasses.replace(CONFIG, imitates=imitates, horizon=3, sequences=2)
-        rollout = Drawn(problem, belief, config, draws_where_it_stands, moves, POLICY.objective)
+    def starts(drawn_in):
+        config = dataclasses.replace(CONFIG, horizon=3, sequences=2)
+        rollout = Drawn(problem, belief, config, draws_where_it_stands, moves, POLICY.objective, drawn_in)
         told = jax.jit(lambda key, objects: plan(rollout, key, objects))(jax.random.key(0), objects)
         np.testing.assert_allclose(np.diff(told.sequences.cost[0]), 0.05, atol=1e-6)
         return np.asarray(told.sequences.actions.T_world_gripper)[0, :, 1, 3] - float(objects.position[0, 1])
 
-    np.testing.assert_allclose(starts("nothing"), [0.0, 0.05, 0.1], atol=1e-6)
-    np.testing.assert_allclose(starts("published-code"), 0.0, atol=1e-6)
+    np.testing.assert_allclose(starts(as_predicted), [0.0, 0.05, 0.1], atol=1e-6)
+    np.testing.assert_allclose(starts(in_the_present_scene), 0.0, atol=1e-6)
 
 
 def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(problem, root):

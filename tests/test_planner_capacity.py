@@ -8,10 +8,11 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions.sampler import BLOCK, _numbers
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
-from mechsearch_jax.geometry.superquadric import pad
+from mechsearch_jax.geometry.superquadric import empty, pad
 from mechsearch_jax.graspability import INFEASIBLE, graspability, pairs
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.config import Weights
+from mechsearch_jax.planner.config import PlannerConfig, Weights
+from mechsearch_jax.planner.rollout import present_state
 from mechsearch_jax.workspace import scenario
 
 CAPACITIES = (8, 12)
@@ -45,7 +46,9 @@ def test_g_and_j_are_the_same(problem):
     for objective in (planner.search_for_grasp().objective, planner.search_and_grasp().objective):
         # Where a found target is hidden, no grasp counts.
         for known, at in ((belief, jnp.zeros_like(somewhere)), (found, jnp.zeros_like(somewhere)), (found, somewhere)):
-            costs = [float(objective.cost(problem, known, exists | somewhere, at, h, Weights())) for h in (hits, wider)]
+            state = present_state(problem, known, empty(8), PlannerConfig())
+            state = state.replace(exists=exists | somewhere, target_at=at)
+            costs = [float(objective.cost(problem, known, state.replace(hits=h), Weights())) for h in (hits, wider)]
             assert costs[0] == costs[1]
 
 

@@ -124,7 +124,11 @@ def test_the_cost_of_a_pushed_target_is_that_of_its_candidate(problem, objects, 
 def test_where_a_pushed_target_could_be_hidden_no_grasp_counts(problem, belief, states, objective):
     _, after, _ = states
     at, hits = jnp.asarray(after.target_at), jnp.zeros(after.hits.shape, bool)
-    cost = lambda exists: float(objective.cost(problem, belief, exists, at, hits, Weights(crowding=0.02)))  # noqa: E731
+    after = jax.tree.map(jnp.asarray, after.replace(target_at=at, hits=hits))
+
+    def cost(exists):
+        return float(objective.cost(problem, belief, after.replace(exists=exists), Weights(crowding=0.02)))
+
     assert cost(jnp.zeros_like(at)) == objective.reached
     assert cost(at) == objective.reached + INFEASIBLE
 

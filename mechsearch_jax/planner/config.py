@@ -110,12 +110,6 @@ class PlannerConfig:
         """What an `Objective` weighs with."""
         return Weights(self.crowding_weight)
 
-    @property
-    def later_draws(self) -> Literal["predicted", "present"]:
-        """Where the later actions of a sequence are drawn: in the state that is predicted before them, as the paper
-        says, or in the present one, as in the published code, whatever has moved since."""
-        return "present" if self.imitates == "published-code" else "predicted"
-
     def __post_init__(self):
         # Rebuilt by JAX, the fields that are data hold whatever stands for their leaves, which is not checked.
         number = lambda name: isinstance(getattr(self, name), int | float)  # noqa: E731

@@ -13,11 +13,12 @@ from jaxtyping import Array, Bool
 
 from mechsearch_jax.actions.registry import KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner.config import Imitated
 from mechsearch_jax.planner.objective import Objective, SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import Predict
 from mechsearch_jax.planner.problem import Problem
-from mechsearch_jax.planner.proposal import Propose
+from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted
 from mechsearch_jax.planner.state import State
 
 # How much the published code's J minds what is in the way of a grasp; the paper's minds it as much as f.
@@ -30,6 +31,12 @@ class Slots(NamedTuple):
     propose: Propose
     predict: Predict
     objective: Objective
+    drawn_in: DrawnIn = as_predicted
+
+
+def in_the_present_scene(present: Superquadrics | None, state: State) -> State:
+    """A `DrawnIn` as in the published code: later actions are drawn in the present scene, too, whatever has moved."""
+    return state if present is None else state.replace(scene=present.replace(valid=present.valid & state.scene.valid))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,11 +64,12 @@ def _own(slots: Slots) -> Slots:
 
 
 def _published_code(slots: Slots) -> Slots:
-    """Later placements stay, and J minds hindrances less; an objective that is not the paper's stays as it is."""
+    """Later actions are drawn in the present scene, later placements stay, and J minds hindrances less; an objective
+    that is not the paper's stays as it is."""
     objective = slots.objective
     if isinstance(objective, SearchForGrasp | SearchAndGrasp):
         objective = dataclasses.replace(objective, hindrance=HINDRANCE)
-    return slots._replace(predict=LaterPlacementsStay(slots.predict), objective=objective)
+    return Slots(slots.propose, LaterPlacementsStay(slots.predict), objective, in_the_present_scene)
 
 
 # What makes a policy's slots those of `PlannerConfig.imitates`.

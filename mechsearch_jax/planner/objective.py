@@ -12,6 +12,7 @@ from mechsearch_jax.graspability import INFEASIBLE, crowding, graspability, pair
 from mechsearch_jax.planner.belief import Belief, possible_poses
 from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.state import State
 
 
 class Objective(Protocol):
@@ -24,46 +25,34 @@ class Objective(Protocol):
     @property
     def reached(self) -> float: ...
 
-    def cost(
-        self,
-        problem: Problem,
-        belief: Belief,
-        exists: Bool[Array, " x"],
-        target_at: Bool[Array, " x"],
-        hits: Bool[Array, "k n"],
-        weights: Weights,
-    ) -> Float[Array, ""]:
-        """J of a state.
+    def cost(self, problem: Problem, belief: Belief, state: State, weights: Weights) -> Float[Array, ""]:
+        """J of a state; a terminal value may be part of it.
 
         Args:
           problem: what does not change.
           belief: what was known at the start.
-          exists: f of the state; see `State`, as of the next.
-          target_at: the candidate pose that stands for where a found target was pushed to.
-          hits: H of the state, with the rows of `graspability.pairs`.
+          state: whose f and H are up to date.
           weights: of what is in the way of a grasp.
         """
         ...
 
-    def needs_graspability(
-        self, belief: Belief, exists: Bool[Array, " x"], target_at: Bool[Array, " x"]
-    ) -> Bool[Array, " y"]:
-        """At which poses, the candidates and then the found one, J depends on g."""
+    def needs_graspability(self, belief: Belief, state: State) -> Bool[Array, " y"]:
+        """At which poses, the candidates and then the found one, J depends on g; f of the state is up to date."""
         ...
 
 
-def _where_and_how_graspable(problem, belief, exists, target_at, hits):
+def _where_and_how_graspable(problem, belief, state):
     """f, how far each pose is from graspable with g extended below zero (B.4), and how crowded its grasps are.
 
     g only sees the best grasp of a pose; while nothing changes that one, clearing the way for others is progress too.
     A found target that is pushed to where it could be hidden counts as if no grasp were feasible: once it is not seen,
     nothing tells where it really went.
     """
-    f = possible_poses(belief, exists, target_at).astype(jnp.float32)
+    f = possible_poses(belief, state.exists, state.target_at).astype(jnp.float32)
     rows = pairs(problem.grasps, belief.grasps)
-    hidden = jnp.append(exists & belief.found, False)
-    g = jnp.minimum(graspability(rows, hits), jnp.where(hidden, 1 - INFEASIBLE, 1)).astype(jnp.float32)
-    return f, 1.0 - g, crowding(rows, hits)
+    hidden = jnp.append(state.exists & belief.found, False)
+    g = jnp.minimum(graspability(rows, state.hits), jnp.where(hidden, 1 - INFEASIBLE, 1)).astype(jnp.float32)
+    return f, 1.0 - g, crowding(rows, state.hits)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,12 +67,12 @@ class SearchForGrasp:
     hindrance: float = 1.0
     reached: float = 1.0
 
-    def cost(self, problem, belief, exists, target_at, hits, weights) -> Float[Array, ""]:
-        f, hindered, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits)
+    def cost(self, problem, belief, state, weights) -> Float[Array, ""]:
+        f, hindered, crowded = _where_and_how_graspable(problem, belief, state)
         return jnp.sum(f * (1.0 + self.hindrance * hindered + weights.crowding * crowded))
 
-    def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:
-        return possible_poses(belief, exists, target_at)
+    def needs_graspability(self, belief, state) -> Bool[Array, " y"]:
+        return possible_poses(belief, state.exists, state.target_at)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,13 +87,13 @@ class SearchAndGrasp:
     hindrance: float = 1.0
     reached: float = 0.0
 
-    def cost(self, problem, belief, exists, target_at, hits, weights) -> Float[Array, ""]:
-        f, hindered, crowded = _where_and_how_graspable(problem, belief, exists, target_at, hits)
+    def cost(self, problem, belief, state, weights) -> Float[Array, ""]:
+        f, hindered, crowded = _where_and_how_graspable(problem, belief, state)
         minded = self.hindrance * hindered + weights.crowding * crowded
         return jnp.where(belief.found, jnp.sum(f * minded), jnp.sum(f))
 
-    def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:
-        return possible_poses(belief, exists, target_at) & belief.found
+    def needs_graspability(self, belief, state) -> Bool[Array, " y"]:
+        return possible_poses(belief, state.exists, state.target_at) & belief.found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,8 +102,8 @@ class Indifferent:
 
     reached: float = 0.0
 
-    def cost(self, problem, belief, exists, target_at, hits, weights) -> Float[Array, ""]:
+    def cost(self, problem, belief, state, weights) -> Float[Array, ""]:
         return jnp.float32(0.0)
 
-    def needs_graspability(self, belief, exists, target_at) -> Bool[Array, " y"]:
-        return jnp.zeros_like(possible_poses(belief, exists, target_at))
+    def needs_graspability(self, belief, state) -> Bool[Array, " y"]:
+        return jnp.zeros_like(possible_poses(belief, state.exists, state.target_at))

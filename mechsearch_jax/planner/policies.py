@@ -32,7 +32,7 @@ from mechsearch_jax.planner.imitation import IMITATIONS, Slots
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import Predict, PredictByKind
 from mechsearch_jax.planner.problem import Problem
-from mechsearch_jax.planner.proposal import Propose, guided_draw
+from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted, guided_draw
 from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at, worth_trying
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
@@ -91,7 +91,7 @@ class Search(flax.struct.PyTreeNode):
 
     Attributes:
       config: how it decides.
-      propose, predict, objective: the slots; static.
+      propose, predict, objective, drawn_in: the slots; static.
       plan: how it plans with them; static.
       tries: whether its decisions hold what is worth trying out; static. What it decides does not depend on that: a
         grasp has to hit nothing, unless `trials.choose` finds one that succeeds.
@@ -101,6 +101,7 @@ class Search(flax.struct.PyTreeNode):
     propose: Propose = flax.struct.field(pytree_node=False)
     predict: Predict = flax.struct.field(pytree_node=False)
     objective: Objective = flax.struct.field(pytree_node=False)
+    drawn_in: DrawnIn = flax.struct.field(pytree_node=False, default=as_predicted)
     plan: Plan = flax.struct.field(pytree_node=False, default=plan)
     tries: bool = flax.struct.field(pytree_node=False, default=False)
 
@@ -187,7 +188,8 @@ def _grasps_first(grasp: Decision, planned: Decision) -> Decision:
 
 @kept()
 def _plan(search: Search, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
-    rollout = Rollout(problem, belief, search.config, search.propose, search.predict, search.objective)
+    slots = search.propose, search.predict, search.objective, search.drawn_in
+    rollout = Rollout(problem, belief, search.config, *slots)
     return search.plan(rollout, key, observation.objects)
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.actions.sampler import sample_action
 from mechsearch_jax.actions.types import Sample
 from mechsearch_jax.existence import occluders
+from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import pairs
 from mechsearch_jax.planner.belief import Belief, possible_space
 from mechsearch_jax.planner.objective import Objective
@@ -48,6 +49,24 @@ class Propose(Protocol):
           state: where it is sampled.
         """
         ...
+
+
+class DrawnIn(Protocol):
+    """As what a state is taken for where an action is drawn; static under jit."""
+
+    def __call__(self, present: Superquadrics | None, state: State) -> State:
+        """The state in which an action is drawn that is carried out in `state`.
+
+        Args:
+          present: the scene in which all sequences begin, fields (N, ...); None outside of sequences.
+          state: as it is predicted.
+        """
+        ...
+
+
+def as_predicted(present: Superquadrics | None, state: State) -> State:
+    """The default `DrawnIn`: an action is drawn in the state that is predicted before it, as the paper says."""
+    return state
 
 
 def blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[Array, " n"]:
@@ -88,7 +107,7 @@ def sampling_weights(
     feasible, it alone is in the way.
     """
     rows = pairs(problem.grasps, belief.grasps)
-    counts = rows.allowed & objective.needs_graspability(belief, state.exists, state.target_at)[rows.pose]
+    counts = rows.allowed & objective.needs_graspability(belief, state)[rows.pose]
     target = state.available & state.is_target
     blocked = jnp.any(state.hits, axis=1)
     blocks = blame(state.hits | (blocked[:, None] & target[None]), counts)

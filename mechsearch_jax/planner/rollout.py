@@ -31,14 +31,14 @@ from mechsearch_jax.planner.moved_target import candidate_of
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.prediction import Predict
 from mechsearch_jax.planner.problem import Problem
-from mechsearch_jax.planner.proposal import Propose
+from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted
 from mechsearch_jax.planner.state import Decision, Sequences, State
 
 # A sequence whose value is a smaller share of J gains nothing.
 GAIN = 0.02
-# What an action changes in a state, and what is then computed for the next one.
 # Draws an action in a state, and predicts it: one of several.
 Attempt = Callable[[State, Array], tuple[Sample, Prediction]]
+# What an action changes in a state, and what is then computed for the next one.
 CHANGING = ("scene", "target_at", "moved", "available", "alive", "options")
 
 
@@ -67,6 +67,30 @@ def sequence_values(
     return jax.tree.map(functools.partial(jnp.where, stuck), free, charged)
 
 
+def present_state(problem: Problem, belief: Belief, objects: Superquadrics, config: PlannerConfig) -> State:
+    """The state in which sequences begin, of which nothing is computed yet: as if every object had just moved.
+
+    Args:
+      problem, belief: what does not change, and what is known.
+      objects: as recognised, fields (N, ...).
+      config: how the planner decides.
+    """
+    scene, is_target = with_target(problem, belief, objects)
+    places = problem.existence.T_world_target.shape[:2] if config.predicted_collisions else None
+    return State(
+        scene=scene,
+        is_target=is_target,
+        exists=belief.exists,
+        target_at=jnp.zeros_like(belief.exists),
+        views=no_views(scene.capacity, problem.config.existence, places),
+        hits=no_hits(pairs(problem.grasps, belief.grasps), scene.capacity),
+        options=no_candidates(problem.space, scene.capacity),
+        moved=scene.valid,
+        available=scene.valid & (~is_target | config.move_target),
+        alive=jnp.array(True),
+    )
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rollout:
     """What all states of a decision share, and how one leads to the next.
@@ -74,8 +98,8 @@ class Rollout:
     Attributes:
       problem, belief: what does not change, and what is known.
       config: how the planner decides.
-      propose, predict, objective: the slots.
-      present: the scene in which later actions are drawn, too; None where each is drawn in the state before it.
+      propose, predict, objective, drawn_in: the slots.
+      present: the scene in which sequences begin; None outside of them.
     """
 
     problem: Problem
@@ -84,26 +108,12 @@ class Rollout:
     propose: Propose
     predict: Predict
     objective: Objective
+    drawn_in: DrawnIn = as_predicted
     present: Superquadrics | None = None
 
     def root(self, objects: Superquadrics) -> State:
-        """The present state, of which nothing is computed yet: as if every object had just moved."""
-        problem = self.problem
-        scene, is_target = with_target(problem, self.belief, objects)
-        candidates, spread = problem.existence.T_world_target.shape[:2]
-        places = (candidates, spread) if self.config.predicted_collisions else None
-        return State(
-            scene=scene,
-            is_target=is_target,
-            exists=self.belief.exists,
-            target_at=jnp.zeros_like(self.belief.exists),
-            views=no_views(scene.capacity, problem.config.existence, places),
-            hits=no_hits(pairs(problem.grasps, self.belief.grasps), scene.capacity),
-            options=no_candidates(problem.space, scene.capacity),
-            moved=scene.valid,
-            available=scene.valid & (~is_target | self.config.move_target),
-            alive=jnp.array(True),
-        )
+        """`present_state` with what the rollout knows."""
+        return present_state(self.problem, self.belief, objects, self.config)
 
     def update(self, state: State, moved: Bool[Array, " n"]) -> State:
         """Bring f and g of a state up to date after some objects moved."""
@@ -115,7 +125,7 @@ class Rollout:
         )
         here = jnp.where(self.belief.found, state.target_at, state.exists)
         exists = existence(problem.existence, problem.camera, views, here, self.belief.allowed, settings)
-        counts, found = split_found(self.objective.needs_graspability(self.belief, exists, state.target_at))
+        counts, found = split_found(self.objective.needs_graspability(self.belief, state.replace(exists=exists)))
         grasps, known = self.belief.grasps, problem.grasps.pair_pose.shape[0]
         # Where the target has moved, other rows of H count, of which nothing is known yet.
         unknown = moved | jnp.any(moved & state.is_target)
@@ -123,27 +133,19 @@ class Rollout:
         of_found = found_hits(problem.target_grasps, grasps, objects, found, state.hits[known:], moved)
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, of_found]))
 
-    def drawn_in(self, state: State) -> State:
-        """The state as it is taken for where an action is drawn."""
-        if self.present is None:
-            return state
-        return state.replace(scene=self.present.replace(valid=self.present.valid & state.scene.valid))
-
     def options(self, state: State, moved: Bool[Array, " n"]):
-        """What can be done in a state after some objects moved."""
+        """What can be done after some objects moved, where an action of a state is drawn."""
         possible = possible_space(self.problem, self.belief, state.exists)
-        space, tables = self.problem.space, self.problem.actions
-        return candidates(space, tables, state.scene, possible, state.options, moved, state.able)
+        space, tables, drawn_in = self.problem.space, self.problem.actions, self.drawn_in(self.present, state)
+        return candidates(space, tables, drawn_in.scene, possible, state.options, moved, state.able)
 
     def cost(self, state: State) -> Float[Array, ""]:
         """J of a state that is up to date."""
-        known = (state.exists, state.target_at, state.hits)
-        return self.objective.cost(self.problem, self.belief, *known, self.config.weights)
+        return self.objective.cost(self.problem, self.belief, state, self.config.weights)
 
     def _attempt(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
-        sample = self.propose(
-            key, self.problem, self.belief, self.objective, self.config.guided_fraction, self.drawn_in(state)
-        )
+        drawn_in = self.drawn_in(self.present, state)
+        sample = self.propose(key, self.problem, self.belief, self.objective, self.config.guided_fraction, drawn_in)
         return sample, self.predict(self.problem, state, sample, first)
 
     def _draw(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
@@ -178,7 +180,8 @@ class Rollout:
     def risk(self, state: State, sample: Sample) -> Float[Array, ""]:
         """Share of the possible poses at which an action would touch the target, where it was drawn."""
         possible = possible_space(self.problem, self.belief, state.exists)
-        return contact_risk(self.problem.space, self.problem.actions, self.drawn_in(state).scene, possible, sample)
+        scene = self.drawn_in(self.present, state).scene
+        return contact_risk(self.problem.space, self.problem.actions, scene, possible, sample)
 
     def step(self, states: State, keys: Array, time: Int[Array, ""]):
         """All sequences by one action: the states after it, and what is to be kept of the ones before it."""
@@ -191,9 +194,7 @@ class Rollout:
         states = shared(jax.vmap(self.update)(states.replace(exists=states.exists & computes), moved))
 
         def go_on():
-            # What can be done in the present scene is known from the first action on.
-            changed = moved if self.present is None else moved & first
-            options = shared(jax.vmap(self.options)(jax.vmap(self.drawn_in)(states), changed))
+            options = shared(jax.vmap(self.options)(states, moved))
             act = jax.vmap(functools.partial(self.act, first))
             changes, actions, price = act(states.replace(options=options), keys)
             return changes | {"options": options}, actions, price
@@ -263,8 +264,7 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     config = rollout.config
     count, horizon = config.sequences, config.horizon
     root = rollout.root(objects)
-    if config.later_draws == "present":
-        rollout = dataclasses.replace(rollout, present=root.scene)
+    rollout = dataclasses.replace(rollout, present=root.scene)
     states = repeated(root, count)
     keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
     _, (actions, cost, price, scenes) = jax.lax.scan(
