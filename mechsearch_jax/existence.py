@@ -202,10 +202,12 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
     depth, corner, first = jax.device_get((views.depth, views.corner, first))
     middle = first[:, 0] + np.array(around, np.int32)[None] // 2
     sample = jax.jit(superquadric.sample_surface, static_argnames="count")
-    cloud = np.asarray(sample(half - np.float32(config.erosion), np.float32(target.exponents), count=config.points))
+    cloud = np.asarray(
+        sample(half - np.float32(config.erosion), np.array(target.exponents, np.float32), count=config.points)
+    )
     nearest = depth[:, 0].min(axis=(-1, -2))
     radius = np.float32(np.linalg.norm(half))
-    return jax.device_put(ExistenceTables(T, depth, corner, middle, nearest, cloud.T, radius))
+    return ExistenceTables(*jax.device_put((T, depth, corner, middle, nearest, cloud.T, radius)))
 
 
 def _window_side(extent: float) -> int:
@@ -513,7 +515,7 @@ def _pixels(
     window = math.ceil(h * grown), math.ceil(w * grown)
     one = Superquadrics(
         size=jnp.float32(target.half_size),
-        exponents=jnp.float32(target.exponents),
+        exponents=jnp.array(target.exponents, np.float32),
         position=T_world_target[:3, 3],
         rotation=T_world_target[:3, :3],
         valid=jnp.array(True),

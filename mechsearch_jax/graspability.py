@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -227,41 +227,35 @@ def grasp_tables(
         low.append(both.min(axis=0))
         high.append(both.max(axis=0))
     poses = jax.jit(upright_pose)(target.candidate_poses(shelf), target.height(shelf))
-    tables = GraspTables(
-        T_target_gripper=T_target_gripper,
-        q7=np.asarray(angles, np.float32)[wrist],
-        wrist=np.int32(wrist),
-        clouds=np.float32(np.stack(clouds)),
-        low=np.float32(np.stack(low)),
-        high=np.float32(np.stack(high)),
-        still_gripper=np.float32(np.stack([cloud.T for cloud in still])),
-        still_target=np.float32(
-            swept_target(target, np.array([1.0, 0.0, 0.0]), 0.0, config.still_points[1], config.erosion).T
-        ),
-        T_world_target=poses,
-        pair_pose=np.zeros(0, np.int32),
-        pair_grasp=np.zeros(0, np.int32),
-        pair_valid=np.zeros(0, bool),
-        pose_pairs=np.zeros((len(poses), 0), np.int32),
-        found_grasp=np.zeros(0, np.int32),
-        gap=np.float32(max(_gap(cloud.T, COARSE) for cloud in clouds)),
-    )
+    still_target = swept_target(target, np.array([1.0, 0.0, 0.0]), 0.0, config.still_points[1], config.erosion)
+    fields = {
+        "T_target_gripper": T_target_gripper,
+        "q7": np.asarray(angles, np.float32)[wrist],
+        "wrist": np.int32(wrist),
+        "clouds": np.float32(np.stack(clouds)),
+        "low": np.float32(np.stack(low)),
+        "high": np.float32(np.stack(high)),
+        "still_gripper": np.float32(np.stack([cloud.T for cloud in still])),
+        "still_target": np.float32(still_target.T),
+        "T_world_target": np.asarray(poses),
+        "pair_pose": np.zeros(0, np.int32),
+        "pair_grasp": np.zeros(0, np.int32),
+        "pair_valid": np.zeros(0, bool),
+        "pose_pairs": np.zeros((len(poses), 0), np.int32),
+        "found_grasp": np.zeros(0, np.int32),
+        "gap": np.float32(max(_gap(cloud.T, COARSE) for cloud in clouds)),
+    }
     if candidates:
         judge = jax.jit(lambda tables, shelf: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))
-        pose, grasp = np.nonzero(np.asarray(judge(tables, shelf)))
-        tables = tables.replace(**_padded_pairs(pose, grasp, len(poses)))
+        pose, grasp = np.nonzero(np.asarray(judge(GraspTables(**jax.device_put(fields)), shelf)))
+        fields |= _padded_pairs(pose, grasp, len(poses))
     else:
-        tables = tables.replace(
-            T_world_target=np.asarray(poses)[:0],
-            pose_pairs=tables.pose_pairs[:0],
-            found_grasp=np.arange(len(clouds), dtype=np.int32),
-        )
-    return jax.device_put(tables)
+        fields |= {name: fields[name][:0] for name in ("T_world_target", "pose_pairs")}
+        fields["found_grasp"] = np.arange(len(clouds), dtype=np.int32)
+    return GraspTables(**jax.device_put(fields))
 
 
-def _padded_pairs(
-    pose: Int[np.ndarray, " pairs"], grasp: Int[np.ndarray, " pairs"], poses: int
-) -> dict[str, np.ndarray]:
+def _padded_pairs(pose: Int[np.ndarray, " pairs"], grasp: Int[np.ndarray, " pairs"], poses: int) -> dict[str, Any]:
     """The fields of `GraspTables` that say which grasps are feasible at which of the candidate poses."""
     rows = len(pose) + -len(pose) % PAIRS_STEP
     count = np.bincount(pose, minlength=poses)

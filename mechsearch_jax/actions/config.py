@@ -184,12 +184,12 @@ def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: Act
     # Only the hand and the fingers push; the links behind them would thin out the points that matter.
     surface = gripper_cloud(gripper, 0.0, float(q7[CLOSED][0]), 2048)
     pusher = surface[surface[:, 2] > -HAND_LENGTH][: config.pusher_points]
-    tables = ActionTables(
-        q7=np.float32(q7),
-        clouds=np.float32(np.swapaxes(clouds, -1, -2)),
-        low=np.float32(clouds.min(axis=-2)),
-        high=np.float32(clouds.max(axis=-2)),
-        still=np.float32(np.swapaxes(still, -1, -2)),
-        pusher=np.float32(pusher),
-    )
-    return jax.device_put(tables)
+    tables = {
+        "q7": np.float32(q7),
+        "clouds": np.float32(np.swapaxes(clouds, -1, -2)),
+        "low": np.float32(clouds.min(axis=-2)),
+        "high": np.float32(clouds.max(axis=-2)),
+        "still": np.float32(np.swapaxes(still, -1, -2)),
+        "pusher": np.float32(pusher),
+    }
+    return ActionTables(**jax.device_put(tables))

@@ -126,7 +126,7 @@ def build_problem(
             "actions": action_tables(gripper, config.grasps.wrists, config.actions),
             "retrieval": target_grasps(shelf, gripper, target, config.retrieval).tables,
             "poses": target.candidate_poses(shelf),
-            "cell": np.float32(target.cell(shelf)[:2]),
+            "cell": np.array(target.cell(shelf)[:2], np.float32),
         }
     tables = jax.tree.map(lambda table: jax.device_put(np.asarray(table)), tables)
     return Problem(**tables, camera=camera, shelf=shelf, gripper=gripper, target=target, config=config)

@@ -76,7 +76,8 @@ def present_state(problem: Problem, belief: Belief, objects: Superquadrics, conf
       config: how the planner decides.
     """
     scene, is_target = with_target(problem, belief, objects)
-    places = problem.existence.T_world_target.shape[:2] if config.predicted_collisions else None
+    count, spread = problem.existence.T_world_target.shape[:2]
+    places = (count, spread) if config.predicted_collisions else None
     return State(
         scene=scene,
         is_target=is_target,
