@@ -160,8 +160,11 @@ def _outcome(shelf: Shelf, scene: Superquadrics, world: World, simulated: Simula
 class NativePhysics:
     """The `PushModel` that runs pushes in C MuJoCo, all that are mapped over at once, on several threads.
 
-    `jax.pure_callback` takes them to the host; one call of a plan is one call there. The same pushes always give the
-    same results. One that diverges, that the arm cannot follow, or whose scene is no scene, has an infinite residual.
+    `jax.pure_callback` takes them to the host; one call of a plan is one call there. A plan calls for the first draw
+    of all sequences, and once more for each further one, of those that have no possible action yet: at most as often
+    as a first action is drawn (`PlannerConfig.first_draws`, or `draws` where that is more). The same pushes always give
+    the same results. One that diverges, that the arm cannot follow, or whose scene is no scene, has an infinite
+    residual.
 
     Attributes:
       simulation: how it is simulated.

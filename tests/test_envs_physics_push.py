@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from test_envs_simulator import pose, push, scene, standing
 
+from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.dynamics import named as push_models
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs import physics_push
@@ -278,30 +279,57 @@ def seen(problem):
     return update_belief(problem, initial_belief(problem), observation), observation
 
 
+def pushing(problem):
+    """The problem where nothing but pushes can be done."""
+    actions = dataclasses.replace(problem.config.actions, actions=("push",))
+    return problem.replace(config=dataclasses.replace(problem.config, actions=actions))
+
+
 @pytest.mark.slow
-def test_a_decision_simulates_once(problem, monkeypatch):
-    simulate, calls = physics_push._simulate, []
+def test_each_draw_of_a_first_action_is_simulated_once_and_nothing_else(problem, monkeypatch):
+    problem, simulate, calls, redraws_fail = pushing(problem), physics_push._simulate, [], False
 
     def counted(*arguments):
-        calls.append(np.shape(arguments[-1]))
-        return simulate(*arguments)
+        simulated = simulate(*arguments)
+        calls.append(np.asarray(arguments[-1]))
+        # Sequence 0 never gets an action, and no other one in a second draw.
+        fails = (np.arange(6) == 0) | (len(calls) > 1)
+        return simulated.replace(failed=simulated.failed | fails) if redraws_fail else simulated
 
     monkeypatch.setattr(physics_push, "_simulate", counted)
     config, later = PlannerConfig(sequences=6, horizon=2), all_push_models.push_models("physics").later
     policy = search_for_grasp(config, push_model=NativePhysics(threads=5), later_push_model=later)
-    plans = [policy(jax.random.key(i), problem, *seen(problem)) for i in (0, 0, 1)]
-    jax.block_until_ready(plans)
-    assert calls == [(6,)] * 3
-    jax.tree.map(np.testing.assert_array_equal, plans[0], plans[1])
-    assert np.isfinite(plans[0].value)
+
+    def decided(seed):
+        calls.clear()
+        plan = jax.block_until_ready(policy(jax.random.key(seed), problem, *seen(problem)))
+        return plan, np.stack(calls)
+
+    (plan, simulated), again, other = decided(0), decided(0), decided(1)
+    jax.tree.map(np.testing.assert_array_equal, (plan, simulated), again)
+    assert np.isfinite(plan.value)
+    for _, rows in ((plan, simulated), other):
+        # All sequences at once, and as many calls as the one takes that draws most.
+        assert rows[0].all()
+        assert 1 <= len(rows) <= config.first_draws
+        assert rows.shape[1:] == (6,)
+        assert (rows[1:] <= rows[:-1]).all()
+
+    redraws_fail = True
+    plan, simulated = decided(0)
+    assert len(simulated) == config.first_draws
+    assert simulated[0].all()
+    # Those that have an action are not simulated again.
+    has_none = int((plan.sequences.actions.kind[:, 0] == ActionKind.NONE).sum())
+    assert 0 < has_none < 6
+    assert simulated[1:].sum(axis=1).tolist() == [has_none] * (config.first_draws - 1)
 
 
 @pytest.mark.slow
 def test_a_decision_simulates_all_its_pushes_in_the_batch_simulator(problem):
-    actions = dataclasses.replace(problem.config.actions, actions=("push",))
-    pushing = problem.replace(config=dataclasses.replace(problem.config, actions=actions))
+    problem = pushing(problem)
     plan, native = (
-        search_for_grasp(push_model=model, sequences=2, horizon=2)(jax.random.key(0), pushing, *seen(pushing))
+        search_for_grasp(push_model=model, sequences=2, horizon=2)(jax.random.key(0), problem, *seen(problem))
         for model in (MjxPhysics(), NativePhysics())
     )
     assert (plan.sequences.actions.kind[:, 0] == native.sequences.actions.kind[:, 0]).all()

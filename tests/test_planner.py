@@ -21,13 +21,14 @@ from mechsearch_jax.geometry import masked, superquadric
 from mechsearch_jax.graspability import GraspConfig, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
+from mechsearch_jax.planner import rollout as rollouts
 from mechsearch_jax.planner.belief import possible_space
 from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.imitation import LaterPlacementsStay, in_the_present_scene
 from mechsearch_jax.planner.objective import SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import PredictByKind
 from mechsearch_jax.planner.proposal import ALONE, DEPTH, as_predicted, blame, passed_on, sampling_weights
-from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, present_state, sequence_values
+from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, present_state, repeated, sequence_values
 from mechsearch_jax.workspace import scenario
 
 CONFIG = PlannerConfig()
@@ -253,6 +254,48 @@ def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(
         changes = {"draws": draws, "first_draws": first_draws}
         assert share(True, **changes) == pytest.approx(1 - 0.7**first, abs=0.03)
         assert share(False, **changes) == pytest.approx(1 - 0.7**later, abs=0.03)
+
+
+@pytest.mark.parametrize("on_cpu", [True, False])
+def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem, root, monkeypatch, on_cpu):
+    monkeypatch.setattr(rollouts, "on_cpu", lambda: on_cpu)
+    rows, draws, rounds = 200, 4, []
+
+    def counts(key, problem, belief, objective, guided_fraction, state):
+        return Sample(no_action().replace(q7=jax.random.uniform(key)), jnp.int32(0))
+
+    def note(q7, movable, objects):
+        rounds.append((q7 < 0.3, movable, objects))
+        return q7 < 0.3
+
+    def seldom(problem, state, sample, first):
+        told = (sample.action.q7, jnp.any(state.available), jnp.any(state.scene.valid))
+        possible = jax.pure_callback(note, jax.ShapeDtypeStruct((), bool), *told, vmap_method="broadcast_all")
+        return Prediction(state.scene, state.scene.valid, possible)
+
+    config = dataclasses.replace(CONFIG, draws=1, first_draws=draws)
+    rollout = Rollout(problem, planner.initial_belief(problem), config, counts, seldom, POLICY.objective)
+    keys = jax.random.split(jax.random.key(0), rows)
+    # The last is a sequence that has ended.
+    states = repeated(root, rows).replace(alive=jnp.arange(rows) < rows - 1)
+    act = jax.jit(jax.vmap(lambda state, key: rollout.act(jnp.array(True), state, key)[0]["alive"]))
+    acted = np.asarray(act(states, keys))
+    works, busy, objects = (np.stack(part) for part in zip(*rounds, strict=True))
+    np.testing.assert_array_equal(busy, objects)
+    alive = np.asarray(states.alive)
+    if on_cpu:
+        # One after the other: only those go on that have no action yet.
+        found = np.cumsum(works, axis=0) > 0
+        assert busy.shape == (draws, rows)
+        np.testing.assert_array_equal(busy[0], alive)
+        np.testing.assert_array_equal(busy[1:], alive & ~found[:-1])
+        assert 0 < busy[-1].sum() < busy[0].sum() / 2
+    else:
+        # All at once, in a single call.
+        works, busy = works[0], busy[0]
+        np.testing.assert_array_equal(busy, np.repeat(alive[:, None], draws, axis=1))
+        found = np.cumsum(works, axis=1).T > 0
+    np.testing.assert_array_equal(acted, found[-1] & alive)
 
 
 def test_options_are_changed_by_name_and_survive_json():

@@ -210,6 +210,15 @@ class Rollout:
         return states.replace(**changes), kept
 
 
+def _to_do_in(state: State, counts: Bool[Array, ""]) -> State:
+    """The state for an attempt, which finds no object and nothing that can be moved if it does not count.
+
+    So it has little to do, and nothing to simulate.
+    """
+    scene = state.scene.replace(valid=state.scene.valid & counts)
+    return state.replace(scene=scene, available=state.available & counts)
+
+
 def _one_after_the_other(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
     """The first attempt that is possible, and no more of them than it takes: for a CPU, which has enough to do."""
     shapes, _ = jax.eval_shape(attempt, state, jnp.int32(0))
@@ -218,10 +227,8 @@ def _one_after_the_other(attempt: Attempt, state: State, draws: Int[Array, ""], 
 
     def again(carry):
         i, (_, found) = carry
-        # In a batch, those that have an action go round with the others. Without objects they have little to do.
-        needed = state.alive & ~found.possible
-        here = state.replace(scene=state.scene.replace(valid=state.scene.valid & needed))
-        return i + 1, attempt(here, i)
+        # In a batch, those that have an action go round with the others.
+        return i + 1, attempt(_to_do_in(state, state.alive & ~found.possible), i)
 
     def wanted(carry):
         i, (_, found) = carry
@@ -234,13 +241,7 @@ def _at_once(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -
     """The first attempt that is possible, of all of them: for a GPU, on which waiting for the first takes longer."""
     number = jnp.arange(most, dtype=jnp.int32)
 
-    def one(i):
-        # Attempts that do not count find no object and nothing that can be moved, and so have little to do.
-        counts = state.alive & (i < draws)
-        scene = state.scene.replace(valid=state.scene.valid & counts)
-        return attempt(state.replace(scene=scene, available=state.available & counts), i)
-
-    sample, found = jax.vmap(one)(number)
+    sample, found = jax.vmap(lambda i: attempt(_to_do_in(state, state.alive & (i < draws)), i))(number)
     works = found.possible & (number < draws)
     sample, found = jax.tree.map(lambda a: a[jnp.argmax(works)], (sample, found))
     return sample, found.replace(possible=jnp.any(works))
