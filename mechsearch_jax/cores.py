@@ -6,8 +6,6 @@ import contextlib
 import os
 from typing import Any
 
-import jax
-
 # Set for processes that share the cores with others.
 VARIABLE = "MECHSEARCH_CORES"
 
@@ -31,6 +29,9 @@ def on_host() -> contextlib.AbstractContextManager[Any]:
 
     Where JAX was told to know nothing but the GPU (`JAX_PLATFORMS`), it computes there all the same.
     """
+    # Who asks for help alone does not wait for it.
+    import jax
+
     if jax.default_backend() != "cpu":
         with contextlib.suppress(RuntimeError):
             return jax.default_device(jax.local_devices(backend="cpu")[0])
