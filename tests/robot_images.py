@@ -4,9 +4,9 @@ for the robot's shape."""
 import mujoco
 import numpy as np
 
-from mechsearch_jax.envs.model import compile_model, initial_state, with_bodies
-from mechsearch_jax.envs.simulated_camera import AMBIENT, BACKGROUND_COLOUR, LIGHT, PALETTE, SHELF
-from mechsearch_jax.envs.world import slots
+from mechsearch_jax.envs.camera.simulated_camera import AMBIENT, BACKGROUND_COLOUR, LIGHT, PALETTE, SHELF
+from mechsearch_jax.envs.world.model import compile_model, initial_state, with_bodies
+from mechsearch_jax.envs.world.world import slots
 from mechsearch_jax.workspace.camera import rays
 
 ROBOT = SHELF + 1

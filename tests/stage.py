@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action
-from mechsearch_jax.envs.native import NativeWorld
-from mechsearch_jax.envs.outcome import Failure, Outcome, Overflow
-from mechsearch_jax.envs.world import BODIES, TARGET, from_scenario
+from mechsearch_jax.envs.simulators.native import NativeWorld
+from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
+from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
 from mechsearch_jax.planner import Decision, Sequences, graspable_at
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.benchmarks import bench
-from mechsearch_jax.benchmarks.agreement import (
+from mechsearch_jax.benchmarks.parts import bench
+from mechsearch_jax.benchmarks.parts.agreement import (
     Agreement,
     Case,
     agreement,
@@ -18,8 +18,8 @@ from mechsearch_jax.benchmarks.agreement import (
     pose_differences,
     save_agreement,
 )
-from mechsearch_jax.benchmarks.tables import agreement_table
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.benchmarks.report.tables import agreement_table
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, example_scenarios, load_scenario
 

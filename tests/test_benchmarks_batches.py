@@ -9,16 +9,16 @@ import jax
 import pytest
 from stage import HIDDEN, OPEN, Stage
 
-from mechsearch_jax.benchmarks import batches
-from mechsearch_jax.benchmarks.batches import Batches, fitting_worlds
-from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
-from mechsearch_jax.benchmarks.rows import identity
-from mechsearch_jax.benchmarks.shards import Results
-from mechsearch_jax.benchmarks.worker import Worker
-from mechsearch_jax.envs.method import Method
-from mechsearch_jax.envs.mjx_simulator import MjxSimulator
-from mechsearch_jax.envs.native import NativeSimulator
-from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.benchmarks.running import batches
+from mechsearch_jax.benchmarks.running.batches import Batches, fitting_worlds
+from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs
+from mechsearch_jax.benchmarks.running.worker import Worker
+from mechsearch_jax.benchmarks.store.rows import identity
+from mechsearch_jax.benchmarks.store.shards import Results
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.records import Episode
+from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
+from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.processes import ProcessTrials
 from mechsearch_jax.planner import PRESETS, policies

@@ -13,18 +13,18 @@ from pathlib import Path
 import pytest
 from stage import HIDDEN, OPEN
 
-from mechsearch_jax.benchmarks import batches, cluster
-from mechsearch_jax.benchmarks.batches import Batches
-from mechsearch_jax.benchmarks.cluster import MOST_DEATHS, RayCluster, join
-from mechsearch_jax.benchmarks.cluster_workers import InTurn, OnCpus, OnGpus
-from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs, present_code
-from mechsearch_jax.benchmarks.processes import ENVIRONMENT, Processes
-from mechsearch_jax.benchmarks.rows import episode_key
+from mechsearch_jax.benchmarks.running import batches, cluster
+from mechsearch_jax.benchmarks.running.batches import Batches
+from mechsearch_jax.benchmarks.running.cluster import MOST_DEATHS, RayCluster, join
+from mechsearch_jax.benchmarks.running.cluster_workers import InTurn, OnCpus, OnGpus
+from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs, present_code
+from mechsearch_jax.benchmarks.running.processes import ENVIRONMENT, Processes
+from mechsearch_jax.benchmarks.store.rows import episode_key
 from mechsearch_jax.commands.options import EpisodeOptions
 from mechsearch_jax.commands.runs import Here, OnRay, RunOptions
 from mechsearch_jax.cores import VARIABLE
-from mechsearch_jax.envs.method import Method
-from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax.benchmarks import dense
-from mechsearch_jax.benchmarks.dense import Tiling
+from mechsearch_jax.benchmarks.parts import dense
+from mechsearch_jax.benchmarks.parts.dense import Tiling
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
 

@@ -10,15 +10,15 @@ import pytest
 from rich.console import Console
 
 from mechsearch_jax import versions
-from mechsearch_jax.benchmarks import evaluate as benchmark
-from mechsearch_jax.benchmarks import tables
-from mechsearch_jax.benchmarks.episode_tables import rates_table
-from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs, present_code, shard_of
-from mechsearch_jax.benchmarks.processes import Processes
-from mechsearch_jax.benchmarks.rates import summarise
-from mechsearch_jax.benchmarks.rows import episode_key, identity
-from mechsearch_jax.benchmarks.shards import OPEN, Results, ShardWriter
-from mechsearch_jax.envs.method import Method
+from mechsearch_jax.benchmarks.report import tables
+from mechsearch_jax.benchmarks.report.episode_tables import rates_table
+from mechsearch_jax.benchmarks.running import evaluate as benchmark
+from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs, present_code, shard_of
+from mechsearch_jax.benchmarks.running.processes import Processes
+from mechsearch_jax.benchmarks.statistics.rates import summarise
+from mechsearch_jax.benchmarks.store.rows import episode_key, identity
+from mechsearch_jax.benchmarks.store.shards import OPEN, Results, ShardWriter
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
@@ -366,7 +366,7 @@ def test_a_policy_of_another_module_reaches_the_worker(tmp_path, files, monkeypa
 
 def test_a_worker_ends_with_its_input_whatever_it_is_doing():
     program = (
-        "import sys, time; from mechsearch_jax.benchmarks.worker import until_closed; "
+        "import sys, time; from mechsearch_jax.benchmarks.running.worker import until_closed; "
         "next(until_closed(sys.stdin)); print('busy', flush=True); time.sleep(100)"
     )
     pipe, command = subprocess.PIPE, [sys.executable, "-c", program]

@@ -7,13 +7,13 @@ import math
 
 import pytest
 
-from mechsearch_jax.benchmarks import evaluate as evaluation
-from mechsearch_jax.benchmarks import guard
-from mechsearch_jax.benchmarks.guard import Outcome, compare, detectable, power, sign_test, suite
-from mechsearch_jax.benchmarks.rows import Row
+from mechsearch_jax.benchmarks.guard import guard
+from mechsearch_jax.benchmarks.guard.guard import Outcome, compare, detectable, power, sign_test, suite
+from mechsearch_jax.benchmarks.running import evaluate as evaluation
+from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.commands import bench_episodes
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.scene_sets import recorded
+from mechsearch_jax.envs.scenes.scene_sets import recorded
 from mechsearch_jax.errors import InputError
 
 ROW = Row(

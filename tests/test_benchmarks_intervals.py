@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from mechsearch_jax.benchmarks.intervals import mean_interval, share_interval, wilson
+from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
 
 DRAWS = 2000
 

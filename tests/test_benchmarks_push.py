@@ -12,12 +12,13 @@ import pytest
 from rich.console import Console
 
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.benchmarks import bench, push, tables
-from mechsearch_jax.benchmarks.push import Bench, Measured, held_out_generation, nudged, repeated
+from mechsearch_jax.benchmarks.parts import bench, push
+from mechsearch_jax.benchmarks.parts.push import Bench, Measured, held_out_generation, nudged, repeated
+from mechsearch_jax.benchmarks.report import tables
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.native import NativeSimulator
-from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.envs.pushing import pushes as generator
+from mechsearch_jax.envs.simulators.native import NativeSimulator
+from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.push import PushConfig, PushNetwork
 from mechsearch_jax.networks.weights import ARCHITECTURES, save_weights

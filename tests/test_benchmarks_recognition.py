@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks import images, recognition, recognition_figure, tables
-from mechsearch_jax.benchmarks.recognition import Bench, Method, Row
+from mechsearch_jax.benchmarks.parts import images, recognition, recognition_figure
+from mechsearch_jax.benchmarks.parts.recognition import Bench, Method, Row
+from mechsearch_jax.benchmarks.report import tables
 from mechsearch_jax.commands import bench_quality
-from mechsearch_jax.envs.world import true_superquadrics
+from mechsearch_jax.envs.world.world import true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.perception.scores import sharpened

@@ -9,12 +9,12 @@ import pytest
 from matplotlib import image
 from rich.console import Console
 
-from mechsearch_jax.benchmarks import report
-from mechsearch_jax.benchmarks.episode_tables import events_table, rates_table
-from mechsearch_jax.benchmarks.intervals import wilson
-from mechsearch_jax.benchmarks.rates import summarise
-from mechsearch_jax.benchmarks.report_figures import reached, success_figure
-from mechsearch_jax.benchmarks.rows import EVENTS, Row, write_rows
+from mechsearch_jax.benchmarks.report import report
+from mechsearch_jax.benchmarks.report.episode_tables import events_table, rates_table
+from mechsearch_jax.benchmarks.report.report_figures import reached, success_figure
+from mechsearch_jax.benchmarks.statistics.intervals import wilson
+from mechsearch_jax.benchmarks.statistics.rates import summarise
+from mechsearch_jax.benchmarks.store.rows import EVENTS, Row, write_rows
 from mechsearch_jax.errors import InputError
 
 WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)

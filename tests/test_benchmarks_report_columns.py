@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from mechsearch_jax.benchmarks import films
-from mechsearch_jax.benchmarks.pages import Heading, Paragraph, Table, as_html, as_latex, as_markdown
-from mechsearch_jax.benchmarks.paired import paired
-from mechsearch_jax.benchmarks.rates import summarise
-from mechsearch_jax.benchmarks.report import ASKED_FILES, FILES, Asked, Report, write_report
-from mechsearch_jax.benchmarks.report_figures import COLOURS, curve_figure, rates_figure, success_figure
-from mechsearch_jax.benchmarks.report_page import blocks
-from mechsearch_jax.benchmarks.rows import Row, configuration, episode_key, options_of, write_rows
-from mechsearch_jax.benchmarks.variants import Key, column, label_variants, natural
-from mechsearch_jax.benchmarks.worker import Worker
+from mechsearch_jax.benchmarks.report import films
+from mechsearch_jax.benchmarks.report.pages import Heading, Paragraph, Table, as_html, as_latex, as_markdown
+from mechsearch_jax.benchmarks.report.report import ASKED_FILES, FILES, Asked, Report, write_report
+from mechsearch_jax.benchmarks.report.report_figures import COLOURS, curve_figure, rates_figure, success_figure
+from mechsearch_jax.benchmarks.report.report_page import blocks
+from mechsearch_jax.benchmarks.running.worker import Worker
+from mechsearch_jax.benchmarks.statistics.paired import paired
+from mechsearch_jax.benchmarks.statistics.rates import summarise
+from mechsearch_jax.benchmarks.statistics.variants import Key, column, label_variants, natural
+from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, options_of, write_rows
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.planner.workcell import Workcell

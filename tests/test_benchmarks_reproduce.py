@@ -9,16 +9,24 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mechsearch_jax.benchmarks import evaluate as evaluation
-from mechsearch_jax.benchmarks.evaluate import present_code
-from mechsearch_jax.benchmarks.intervals import wilson
-from mechsearch_jax.benchmarks.paper_tables import BOTH, METHODS, PUSH, TABLES, Figures, paper_figures, table_scenes
-from mechsearch_jax.benchmarks.reproduce import Mean, Results, Setting, bootstrap, markdown, screen
-from mechsearch_jax.benchmarks.rows import Row
-from mechsearch_jax.benchmarks.shards import ShardWriter
+from mechsearch_jax.benchmarks.paper.paper_tables import (
+    BOTH,
+    METHODS,
+    PUSH,
+    TABLES,
+    Figures,
+    paper_figures,
+    table_scenes,
+)
+from mechsearch_jax.benchmarks.paper.reproduce import Mean, Results, Setting, bootstrap, markdown, screen
+from mechsearch_jax.benchmarks.running import evaluate as evaluation
+from mechsearch_jax.benchmarks.running.evaluate import present_code
+from mechsearch_jax.benchmarks.statistics.intervals import wilson
+from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands import reproduce as command
-from mechsearch_jax.envs.scene_sets import SETS
+from mechsearch_jax.envs.scenes.scene_sets import SETS
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 

@@ -12,9 +12,10 @@ import pyarrow.parquet
 import pytest
 
 from mechsearch_jax.actions import ActionKind, no_action
-from mechsearch_jax.benchmarks.intervals import wilson
-from mechsearch_jax.benchmarks.rates import summarise
-from mechsearch_jax.benchmarks.rows import (
+from mechsearch_jax.benchmarks.statistics.intervals import wilson
+from mechsearch_jax.benchmarks.statistics.rates import summarise
+from mechsearch_jax.benchmarks.statistics.variants import label_variants
+from mechsearch_jax.benchmarks.store.rows import (
     EVENTS,
     SCHEMA,
     Row,
@@ -26,11 +27,10 @@ from mechsearch_jax.benchmarks.rows import (
     read_rows,
     write_rows,
 )
-from mechsearch_jax.benchmarks.variants import label_variants
-from mechsearch_jax.envs.earlier import EARLIER, GONE, RENAMED
-from mechsearch_jax.envs.method import Method
-from mechsearch_jax.envs.narration import verdict
-from mechsearch_jax.envs.records import Episode, Step, load_episode, record_action, save_episode
+from mechsearch_jax.envs.episode.earlier import EARLIER, GONE, RENAMED
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.records import Episode, Step, load_episode, record_action, save_episode
+from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.files import check_writable, replacing
 from mechsearch_jax.geometry import superquadric

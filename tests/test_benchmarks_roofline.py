@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks import bench, ceilings, dense, roofline
-from mechsearch_jax.benchmarks.bench import Timing
-from mechsearch_jax.benchmarks.ceilings import Ceiling
-from mechsearch_jax.benchmarks.tables import timings_table
+from mechsearch_jax.benchmarks.parts import bench, ceilings, dense, roofline
+from mechsearch_jax.benchmarks.parts.bench import Timing
+from mechsearch_jax.benchmarks.parts.ceilings import Ceiling
+from mechsearch_jax.benchmarks.report.tables import timings_table
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
@@ -134,7 +134,7 @@ def test_what_is_no_result_is_named(tmp_path, text):
 
 def test_the_bytes_of_a_world_are_the_simulators():
     pytest.importorskip("warp")
-    from mechsearch_jax.envs.mjx_model import MjxConfig, MjxModel
+    from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel
 
     data = MjxModel(Shelf(), Camera(), MjxConfig()).make_data(8)
     total = sum(leaf.nbytes for leaf in jax.tree.leaves(data))

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO
 
-from mechsearch_jax.benchmarks import scenes
-from mechsearch_jax.benchmarks.evaluate import present_code
-from mechsearch_jax.benchmarks.exact_existence import exact_existence
-from mechsearch_jax.benchmarks.scenes import Row, look_at_all, nearest_pose, save_scenes, summary
-from mechsearch_jax.benchmarks.tables import scenes_table
-from mechsearch_jax.envs.simulated_camera import observe, target_pixels
-from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
+from mechsearch_jax.benchmarks.parts import scenes
+from mechsearch_jax.benchmarks.parts.exact_existence import exact_existence
+from mechsearch_jax.benchmarks.parts.scenes import Row, look_at_all, nearest_pose, save_scenes, summary
+from mechsearch_jax.benchmarks.report.tables import scenes_table
+from mechsearch_jax.benchmarks.running.evaluate import present_code
+from mechsearch_jax.envs.camera.simulated_camera import observe, target_pixels
+from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import FOUND_PIXELS

@@ -10,12 +10,12 @@ import time
 import pyarrow.dataset
 import pytest
 
-from mechsearch_jax.benchmarks import claims as claiming
-from mechsearch_jax.benchmarks.claims import CLAIMS, Claims
-from mechsearch_jax.benchmarks.report import read_tables
-from mechsearch_jax.benchmarks.rows import Row, configuration, episode_key, write_rows
-from mechsearch_jax.benchmarks.shards import OPEN, Results, ShardWriter, close_shards_of
-from mechsearch_jax.envs.earlier import EARLIER
+from mechsearch_jax.benchmarks.report.report import read_tables
+from mechsearch_jax.benchmarks.store import claims as claiming
+from mechsearch_jax.benchmarks.store.claims import CLAIMS, Claims
+from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, write_rows
+from mechsearch_jax.benchmarks.store.shards import OPEN, Results, ShardWriter, close_shards_of
+from mechsearch_jax.envs.episode.earlier import EARLIER
 from mechsearch_jax.errors import InputError
 
 ROW = Row(
@@ -191,10 +191,10 @@ def test_a_claim_that_names_nobody_is_free_in_the_end(tmp_path):
 KILLED = """
 import functools, os, random, signal, sys, time
 from pathlib import Path
-from mechsearch_jax.benchmarks import evaluate as benchmark
-from mechsearch_jax.benchmarks.evaluate import Job, evaluate
-from mechsearch_jax.benchmarks.shards import ShardWriter
-from mechsearch_jax.envs.method import Method
+from mechsearch_jax.benchmarks.running import evaluate as benchmark
+from mechsearch_jax.benchmarks.running.evaluate import Job, evaluate
+from mechsearch_jax.benchmarks.store.shards import ShardWriter
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.workspace.scenario import Body, Scenario
 
 out, log, kills = Path(sys.argv[1]), sys.argv[2], int(sys.argv[3])

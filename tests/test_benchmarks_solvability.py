@@ -13,19 +13,19 @@ from published import published_scenarios
 from stage import HIDDEN, OPEN, TWO
 
 from mechsearch_jax.actions import KINDS, Action
-from mechsearch_jax.benchmarks import solvability, unsolved
-from mechsearch_jax.benchmarks.episode_tables import ceiling_table
-from mechsearch_jax.benchmarks.intervals import wilson
-from mechsearch_jax.benchmarks.rows import Row as EpisodeRow
-from mechsearch_jax.benchmarks.rows import write_rows
-from mechsearch_jax.benchmarks.shards import ShardWriter
-from mechsearch_jax.benchmarks.solvability import Ceiling, Outcomes, Row, read_outcomes, summary
-from mechsearch_jax.benchmarks.unsolved import blockers, in_the_way, reason
-from mechsearch_jax.envs.known_search import Found, KnownSearchConfig, Node
-from mechsearch_jax.envs.known_target import Judgement
-from mechsearch_jax.envs.native import NativeWorld
-from mechsearch_jax.envs.records import ActionRecord
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.benchmarks.ceiling import solvability, unsolved
+from mechsearch_jax.benchmarks.ceiling.solvability import Ceiling, Outcomes, Row, read_outcomes, summary
+from mechsearch_jax.benchmarks.ceiling.unsolved import blockers, in_the_way, reason
+from mechsearch_jax.benchmarks.report.episode_tables import ceiling_table
+from mechsearch_jax.benchmarks.statistics.intervals import wilson
+from mechsearch_jax.benchmarks.store.rows import Row as EpisodeRow
+from mechsearch_jax.benchmarks.store.rows import write_rows
+from mechsearch_jax.benchmarks.store.shards import ShardWriter
+from mechsearch_jax.envs.episode.records import ActionRecord
+from mechsearch_jax.envs.known_target.judgement import Judgement
+from mechsearch_jax.envs.known_target.search import Found, KnownSearchConfig, Node
+from mechsearch_jax.envs.simulators.native import NativeWorld
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.scenario import load_scenario
 

@@ -11,12 +11,12 @@ import sys
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks import evaluate as evaluation
-from mechsearch_jax.benchmarks.report import FILES
-from mechsearch_jax.benchmarks.rows import Row, write_rows
+from mechsearch_jax.benchmarks.report.report import FILES
+from mechsearch_jax.benchmarks.running import evaluate as evaluation
+from mechsearch_jax.benchmarks.store.rows import Row, write_rows
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands import options
-from mechsearch_jax.envs.records import Episode, save_episode
+from mechsearch_jax.envs.episode.records import Episode, save_episode
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.planner.settings import Settings, load_settings

@@ -12,7 +12,7 @@ from test_mutated_files import program
 from test_search import IMAGES, TRUSTING, seen
 
 from mechsearch_jax.commands import plan
-from mechsearch_jax.envs import cell
+from mechsearch_jax.envs.cell import loading as cell
 from mechsearch_jax.perception.image_files import (
     load_camera,
     load_colour,

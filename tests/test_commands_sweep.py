@@ -6,12 +6,12 @@ import itertools
 
 import pytest
 
-from mechsearch_jax.benchmarks import evaluate as evaluation
-from mechsearch_jax.benchmarks.estimate import CONTINUOUS, estimate
-from mechsearch_jax.benchmarks.evaluate import make_jobs, present_code
-from mechsearch_jax.benchmarks.shards import ShardWriter
+from mechsearch_jax.benchmarks.running import evaluate as evaluation
+from mechsearch_jax.benchmarks.running.estimate import CONTINUOUS, estimate
+from mechsearch_jax.benchmarks.running.evaluate import make_jobs, present_code
+from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.versions import versions

@@ -312,8 +312,8 @@ def test_what_another_process_may_know_otherwise_has_no_identity(value):
 SEARCH = """
     import re
     import jax
-    from mechsearch_jax.envs.episodes import run_episode, target_of
-    from mechsearch_jax.envs.native import NativeSimulator
+    from mechsearch_jax.envs.episode.episodes import run_episode, target_of
+    from mechsearch_jax.envs.simulators.native import NativeSimulator
     from mechsearch_jax.preparing import first_decision, prepared
     from mechsearch_jax.planner import search_for_grasp
     from mechsearch_jax.planner.cache import cached_problem, keep_compilations

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 import mechsearch_jax
-from mechsearch_jax.benchmarks.guard import read_reference
-from mechsearch_jax.benchmarks.intervals import mean_interval, share_interval, wilson
-from mechsearch_jax.benchmarks.paper_tables import BOTH, METHODS, TABLES, paper_figures
-from mechsearch_jax.envs.earlier import EARLIER, GONE, RENAMED
-from mechsearch_jax.envs.scene_sets import SETS, digest, is_chosen_on, recorded
+from mechsearch_jax.benchmarks.guard.guard import read_reference
+from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
+from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
+from mechsearch_jax.envs.episode.earlier import EARLIER, GONE, RENAMED
+from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, is_chosen_on, recorded
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.workspace.detector import FOUND_PIXELS
 
@@ -300,7 +300,7 @@ def test_what_came_of_searches_in_a_cell_is_what_is_stored():
     )
     assert "| " + " | ".join(map(str, counts)) + " |" in read("docs/results.md")
     assert f"took [{counts[2]} of {len(rows)} hidden targets out](" in " ".join(read("README.md").split())
-    assert stored["config"] == read("benchmarks/cells/other-cell.toml")
+    assert stored["config"] == read("benchmarks/parts/cells/other-cell.toml")
 
 
 def test_the_guard_is_paired_with_what_it_replaced_as_the_page_says():

@@ -10,15 +10,15 @@ import pytest
 from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, idle, push_off, reveal, topple
 
 from mechsearch_jax.actions import no_action
-from mechsearch_jax.envs.episode_log import Choice, EpisodeLog, Result, distrust, record
-from mechsearch_jax.envs.episodes import Start, run_episode, run_episodes
-from mechsearch_jax.envs.mjx_simulator import MjxSimulator
-from mechsearch_jax.envs.native import NativeSimulator
-from mechsearch_jax.envs.outcome import Failure, Overflow
-from mechsearch_jax.envs.policy_numbers import mould
-from mechsearch_jax.envs.simulator import Simulator
-from mechsearch_jax.envs.verdicts import Verdict
-from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.envs.episode.episode_log import Choice, EpisodeLog, Result, distrust, record
+from mechsearch_jax.envs.episode.episodes import Start, run_episode, run_episodes
+from mechsearch_jax.envs.episode.policy_numbers import mould
+from mechsearch_jax.envs.episode.verdicts import Verdict
+from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
+from mechsearch_jax.envs.simulators.native import NativeSimulator
+from mechsearch_jax.envs.simulators.simulator import Simulator
+from mechsearch_jax.envs.world.outcome import Failure, Overflow
+from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import search_for_grasp
 

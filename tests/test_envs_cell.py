@@ -6,8 +6,8 @@ import jax
 import pytest
 
 from mechsearch_jax.compiled import _KEEPING
-from mechsearch_jax.envs import cell
-from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.cell import loading as cell
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.examples import example_images

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from mechsearch_jax.envs import episodes
-from mechsearch_jax.envs.compile_clock import EVENTS, CompileClock
+from mechsearch_jax.envs.episode import episodes
+from mechsearch_jax.envs.episode.compile_clock import EVENTS, CompileClock
 
 
 def tell(seconds, event=f"{EVENTS}backend_compile_duration"):

@@ -11,15 +11,15 @@ from rich.console import Console
 from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO, UPRIGHT, Stage, grab, idle, push_off, reveal, topple
 
 from mechsearch_jax.actions import kind_of
-from mechsearch_jax.benchmarks.rows import Row
-from mechsearch_jax.envs.episodes import run_episode, target_of
-from mechsearch_jax.envs.method import Method
-from mechsearch_jax.envs.narration import Narrator, events, verdict
-from mechsearch_jax.envs.native import NativeSimulator
-from mechsearch_jax.envs.outcome import Failure
-from mechsearch_jax.envs.records import load_episode, save_episode
-from mechsearch_jax.envs.snapshot import Snapshot, oracle
-from mechsearch_jax.envs.world import TARGET, from_scenario
+from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
+from mechsearch_jax.envs.episode.episodes import run_episode, target_of
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.records import load_episode, save_episode
+from mechsearch_jax.envs.recording.narration import Narrator, events, verdict
+from mechsearch_jax.envs.simulators.native import NativeSimulator
+from mechsearch_jax.envs.world.outcome import Failure
+from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import search_for_grasp

@@ -12,17 +12,17 @@ from PIL import Image
 from recordings import MOVES, RECORDING, RESTS, SAMPLED, SEQUENCES, WORLD
 
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.film import Film
-from mechsearch_jax.envs.native import Trace
-from mechsearch_jax.envs.pictures import recorded_frame
-from mechsearch_jax.envs.playback import ENDS, LOOKS, WAY_TIME, playback
-from mechsearch_jax.envs.recording import (
+from mechsearch_jax.envs.recording.film import Film
+from mechsearch_jax.envs.recording.pictures import recorded_frame
+from mechsearch_jax.envs.recording.playback import ENDS, LOOKS, WAY_TIME, playback
+from mechsearch_jax.envs.recording.recording import (
     NAME,
     Recorder,
     load_recording,
     save_recording,
 )
-from mechsearch_jax.envs.world import BODIES, TARGET
+from mechsearch_jax.envs.simulators.native import Trace
+from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME, VELOCITY_LIMIT
 from mechsearch_jax.viz.movie import save_movie
@@ -181,7 +181,7 @@ def test_where_no_way_is_found_a_straight_one_is_shown(monkeypatch):
     def lost(*arguments, **options):
         raise InputError("no way")
 
-    monkeypatch.setattr("mechsearch_jax.envs.playback.free_motion", lost)
+    monkeypatch.setattr("mechsearch_jax.envs.recording.playback.free_motion", lost)
     shown = playback(dataclasses.replace(RECORDING, steps=RECORDING.steps[:1]), 25)
     lasts = LOOKS + 2 * WAY_TIME + MOVES + RESTS + ENDS
     assert shown.time[-1] == pytest.approx(lasts, abs=0.2)

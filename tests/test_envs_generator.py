@@ -8,8 +8,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stage import stays_put
 
-from mechsearch_jax.envs import generator, simulated_camera, world
-from mechsearch_jax.envs.generator import GeneratorConfig, ScenarioGenerator, outline, separation
+from mechsearch_jax.envs.camera import simulated_camera
+from mechsearch_jax.envs.scenes import generator
+from mechsearch_jax.envs.scenes.generator import GeneratorConfig, ScenarioGenerator, outline, separation
+from mechsearch_jax.envs.world import world
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.object_sizes import ObjectSizes

@@ -7,9 +7,9 @@ import subprocess
 import pytest
 
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs import health
-from mechsearch_jax.envs.episodes import target_of
-from mechsearch_jax.envs.finding import State
+from mechsearch_jax.envs.episode.episodes import target_of
+from mechsearch_jax.envs.health import checks as health
+from mechsearch_jax.envs.health.finding import State
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks import weights
 from mechsearch_jax.planner import cache

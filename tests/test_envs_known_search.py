@@ -11,13 +11,13 @@ from stage import BOX, HIDDEN, TWO
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
-from mechsearch_jax.envs import known_search
-from mechsearch_jax.envs.known_search import Frontier, KnownSearchConfig, Node, in_turn
-from mechsearch_jax.envs.known_target import InFullView, Judgement, judge
-from mechsearch_jax.envs.native import NativeSimulator
-from mechsearch_jax.envs.outcome import Failure, Outcome
-from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, true_target_pose
-from mechsearch_jax.envs.world import BODIES, TARGET, World, from_scenario
+from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
+from mechsearch_jax.envs.known_target import search as known_search
+from mechsearch_jax.envs.known_target.judgement import InFullView, Judgement, judge
+from mechsearch_jax.envs.known_target.search import Frontier, KnownSearchConfig, Node, in_turn
+from mechsearch_jax.envs.simulators.native import NativeSimulator
+from mechsearch_jax.envs.world.outcome import Failure, Outcome
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.observation import Observation

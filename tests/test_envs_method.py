@@ -6,11 +6,11 @@ import math
 
 import pytest
 
-from mechsearch_jax.benchmarks.evaluate import Job, present_code
-from mechsearch_jax.benchmarks.rows import Row
-from mechsearch_jax.envs.earlier import present_options
-from mechsearch_jax.envs.method import Method
-from mechsearch_jax.envs.records import Episode
+from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
+from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.envs.episode.earlier import present_options
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.graspability import GraspConfig
 from mechsearch_jax.planner import OPTIONS, PRESETS

@@ -16,13 +16,14 @@ import pytest
 from test_envs_simulator import BOARD, pick_and_place, pose, push, scene, standing, take_out
 
 from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
-from mechsearch_jax.envs import mjx_step, model, simulator, warp_kernels
-from mechsearch_jax.envs.batch_model import BodyFields, body_fields
-from mechsearch_jax.envs.mjx_simulator import MjxConfig, MjxSimulator
-from mechsearch_jax.envs.native import NativeWorld
-from mechsearch_jax.envs.outcome import Failure, Overflow
-from mechsearch_jax.envs.simulator import Simulator, SimulatorConfig
-from mechsearch_jax.envs.world import TARGET, from_scenario, slots
+from mechsearch_jax.envs.simulators import mjx_step, simulator, warp_kernels
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields
+from mechsearch_jax.envs.simulators.mjx_simulator import MjxConfig, MjxSimulator
+from mechsearch_jax.envs.simulators.native import NativeWorld
+from mechsearch_jax.envs.simulators.simulator import Simulator, SimulatorConfig
+from mechsearch_jax.envs.world import model
+from mechsearch_jax.envs.world.outcome import Failure, Overflow
+from mechsearch_jax.envs.world.world import TARGET, from_scenario, slots
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.preparing import prepare
 from mechsearch_jax.robot.motion import MotionConfig, Reference

@@ -13,12 +13,12 @@ from test_envs_simulator import pose, push, scene, standing
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.dynamics import named as push_models
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
-from mechsearch_jax.envs import physics_push
-from mechsearch_jax.envs import push_models as all_push_models
-from mechsearch_jax.envs.native import NativeWorld
-from mechsearch_jax.envs.physics_push import STILL, MjxPhysics, NativePhysics
-from mechsearch_jax.envs.pushes import push_simulation
-from mechsearch_jax.envs.world import bodies_of, from_scenario, superquadrics
+from mechsearch_jax.envs.pushing import physics_push
+from mechsearch_jax.envs.pushing import push_models as all_push_models
+from mechsearch_jax.envs.pushing.physics_push import STILL, MjxPhysics, NativePhysics
+from mechsearch_jax.envs.pushing.pushes import push_simulation
+from mechsearch_jax.envs.simulators.native import NativeWorld
+from mechsearch_jax.envs.world.world import bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.observation import Observation

@@ -9,13 +9,13 @@ import pytest
 from stage import BOX, CYLINDER, HIDDEN, OPEN, Grab, Stage, push_off, reveal
 
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.envs.episodes import Start, run_episode, run_episodes
-from mechsearch_jax.envs.method import Method
-from mechsearch_jax.envs.outcome import Failure
-from mechsearch_jax.envs.protocols import ALL_FAILED, HIDDEN_AGAIN, OUTSIDE, PROTOCOLS, REACHED
-from mechsearch_jax.envs.snapshot import oracle, true_target_pose
-from mechsearch_jax.envs.verdicts import swept_free
-from mechsearch_jax.envs.world import from_scenario, true_superquadrics
+from mechsearch_jax.envs.camera.snapshot import oracle, true_target_pose
+from mechsearch_jax.envs.episode.episodes import Start, run_episode, run_episodes
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.protocols import ALL_FAILED, HIDDEN_AGAIN, OUTSIDE, PROTOCOLS, REACHED
+from mechsearch_jax.envs.episode.verdicts import swept_free
+from mechsearch_jax.envs.world.outcome import Failure
+from mechsearch_jax.envs.world.world import from_scenario, true_superquadrics
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.workspace.scenario import Scenario

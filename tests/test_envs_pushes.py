@@ -12,13 +12,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.benchmarks.push import repeated
+from mechsearch_jax.benchmarks.parts.push import repeated
 from mechsearch_jax.dynamics import push_model
-from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.native import NativeSimulator
-from mechsearch_jax.envs.push_portions import portions
-from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
-from mechsearch_jax.envs.world import TARGET, World, bodies_of, from_scenario, superquadrics
+from mechsearch_jax.envs.pushing import pushes as generator
+from mechsearch_jax.envs.pushing.push_portions import portions
+from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, draw_push, generate_pushes, push_tables
+from mechsearch_jax.envs.simulators.native import NativeSimulator
+from mechsearch_jax.envs.world.world import TARGET, World, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.graspability import gripper_rotation

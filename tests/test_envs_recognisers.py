@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.envs.episodes import target_of
-from mechsearch_jax.envs.recognisers import labelled, large_segments, numbered, recogniser, true_labels
-from mechsearch_jax.envs.simulated_camera import observe
-from mechsearch_jax.envs.snapshot import Snapshot, oracle
-from mechsearch_jax.envs.world import TARGET, from_scenario, true_superquadrics
+from mechsearch_jax.envs.camera.recognisers import labelled, large_segments, numbered, recogniser, true_labels
+from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
+from mechsearch_jax.envs.episode.episodes import target_of
+from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from stage import stays_put
 
-from mechsearch_jax.envs import scene_sets, simulated_camera, world
-from mechsearch_jax.envs.generator import GeneratorConfig, outline, separation
-from mechsearch_jax.envs.scene_sets import SETS, Block, find_scene, find_set, make_scene, recorded, scene_files
-from mechsearch_jax.envs.three_objects import LineConfig, LineGenerator
+from mechsearch_jax.envs.camera import simulated_camera
+from mechsearch_jax.envs.scenes import scene_sets
+from mechsearch_jax.envs.scenes.generator import GeneratorConfig, outline, separation
+from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, find_scene, find_set, make_scene, recorded, scene_files
+from mechsearch_jax.envs.scenes.three_objects import LineConfig, LineGenerator
+from mechsearch_jax.envs.world import world
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import cache
 from mechsearch_jax.robot.gripper import Gripper

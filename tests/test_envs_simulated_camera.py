@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs import simulated_camera, world
-from mechsearch_jax.envs.model import shelf_boxes
-from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.envs.camera import simulated_camera
+from mechsearch_jax.envs.world import world
+from mechsearch_jax.envs.world.model import shelf_boxes
+from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
@@ -94,7 +95,8 @@ try:
     import mujoco
 except Exception:
     sys.exit(3)
-from mechsearch_jax.envs import model, world
+from mechsearch_jax.envs.world import model
+from mechsearch_jax.envs.world import world
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import load_scenario
 from mechsearch_jax.workspace.shelf import Shelf

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from stage import HIDDEN, OPEN
 
-from mechsearch_jax.envs.simulated_camera import observe
-from mechsearch_jax.envs.simulated_cell import SHELF, SensorNoise, SimulatedCell, _owner
-from mechsearch_jax.envs.world import TARGET, from_scenario
+from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.cell.simulated_cell import SHELF, SensorNoise, SimulatedCell, _owner
+from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner.workcell import Workcell
 from mechsearch_jax.robot.robot_trajectory import Bounds, RobotTrajectory

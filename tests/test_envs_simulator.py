@@ -14,9 +14,10 @@ from published import published_scenarios
 
 from mechsearch_jax.actions import KINDS, Action, ActionKind, kind_of, no_action, retrieve_action
 from mechsearch_jax.actions.trajectory import reference_motion
-from mechsearch_jax.envs import model, simulator, world
-from mechsearch_jax.envs.native import NativeSimulator, NativeWorld
-from mechsearch_jax.envs.world import BODIES, TARGET
+from mechsearch_jax.envs.simulators import simulator
+from mechsearch_jax.envs.simulators.native import NativeSimulator, NativeWorld
+from mechsearch_jax.envs.world import model, world
+from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import gripper_rotation
@@ -158,8 +159,8 @@ def test_reset_keeps_the_scenario_exactly_and_rest_does_not_move_it(sim):
 def test_nothing_native_imports_the_batch_simulator():
     code = """
 import sys
-import mechsearch_jax.envs.native, mechsearch_jax.envs.episodes, mechsearch_jax.envs.generator
-sys.exit(any(name.startswith(("mujoco.mjx", "warp", "mechsearch_jax.envs.mjx")) for name in sys.modules))
+import mechsearch_jax.envs.simulators.native, mechsearch_jax.envs.episode.episodes, mechsearch_jax.envs.scenes.generator
+sys.exit(any(name.startswith(("mujoco.mjx", "warp", "mechsearch_jax.envs.simulators.mjx")) for name in sys.modules))
 """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 

@@ -16,16 +16,16 @@ from test_envs_simulator import take_out as retrieval
 
 from mechsearch_jax.actions import ActionKind, kind_of, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
-from mechsearch_jax.envs.native import NativeWorld
-from mechsearch_jax.envs.outcome import Failure
-from mechsearch_jax.envs.slots import ManySlots
-from mechsearch_jax.envs.snapshot import Snapshot, objects_on_the_board, oracle, true_target_pose
+from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, oracle, true_target_pose
+from mechsearch_jax.envs.episode.slots import ManySlots
+from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.trials.scene import TrialScene
-from mechsearch_jax.envs.world import bodies_of, from_scenario
+from mechsearch_jax.envs.world.outcome import Failure
+from mechsearch_jax.envs.world.world import bodies_of, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from stage import HIDDEN, OPEN, SILL, Stage, grab, reveal
 
-from mechsearch_jax.envs import verdicts
-from mechsearch_jax.envs.episodes import Start, run_episode, run_episodes
-from mechsearch_jax.envs.narration import verdict
-from mechsearch_jax.envs.snapshot import Snapshot
-from mechsearch_jax.envs.verdicts import Verdict, judge, paper_grasps
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.envs.camera.snapshot import Snapshot
+from mechsearch_jax.envs.episode import verdicts
+from mechsearch_jax.envs.episode.episodes import Start, run_episode, run_episodes
+from mechsearch_jax.envs.episode.verdicts import Verdict, judge, paper_grasps
+from mechsearch_jax.envs.recording.narration import verdict
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.graspability import GraspConfig
 from mechsearch_jax.planner.problem import target_grasps
 from mechsearch_jax.workspace.target import Target

@@ -12,8 +12,8 @@ from recordings import MOVES, OBJECTS, RECORDING, SAMPLED, WORLD
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.recording import NAME, save_recording
-from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.envs.recording.recording import NAME, save_recording
+from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.viz import web
@@ -40,7 +40,7 @@ def server():
 
 @pytest.fixture(scope="module")
 def viewer(server):
-    from mechsearch_jax.envs.viewer import Viewer
+    from mechsearch_jax.envs.recording.viewer import Viewer
 
     return Viewer(RECORDING, server, FPS)
 

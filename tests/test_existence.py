@@ -11,10 +11,10 @@ from published import published_scenarios
 from test_workspace_camera_render import reference_superquadric_depth
 
 from mechsearch_jax import existence, planner
-from mechsearch_jax.envs.generator import ScenarioGenerator
-from mechsearch_jax.envs.scene_sets import find_scene, make_scene
-from mechsearch_jax.envs.simulated_camera import target_pixels
-from mechsearch_jax.envs.world import TARGET, from_scenario
+from mechsearch_jax.envs.camera.simulated_camera import target_pixels
+from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
+from mechsearch_jax.envs.scenes.scene_sets import find_scene, make_scene
+from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import superquadric

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
 
 

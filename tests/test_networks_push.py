@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from mechsearch_jax.actions import ActionConfig, action_tables
 from mechsearch_jax.dynamics import learned
 from mechsearch_jax.dynamics.learned import LearnedPush, predicted
-from mechsearch_jax.envs.generator import separation
+from mechsearch_jax.envs.scenes.generator import separation
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.geometry.superquadric import Superquadrics

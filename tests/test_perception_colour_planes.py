@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs import simulated_camera, world
-from mechsearch_jax.envs.simulated_camera import PALETTE
+from mechsearch_jax.envs.camera import simulated_camera
+from mechsearch_jax.envs.camera.simulated_camera import PALETTE
+from mechsearch_jax.envs.world import world
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception import colour, planes
 from mechsearch_jax.perception.colour import TargetColour

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from published import published_scenarios
 
-from mechsearch_jax.envs.simulated_camera import observe
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation

@@ -10,8 +10,8 @@ import pytest
 from robot_images import ROBOT, robot_image
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs.simulated_camera import SHELF
-from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.envs.camera.simulated_camera import SHELF
+from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception import camera_pose, real_camera
 from mechsearch_jax.perception.camera_pose import PoseConfig, with_pose

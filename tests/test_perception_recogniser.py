@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.envs.example_images import SCENARIO, sensed_images
-from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.envs.camera.example_images import SCENARIO, sensed_images
+from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.colour import TargetColour
 from mechsearch_jax.perception.examples import STEP, example_images, save_images

@@ -9,7 +9,8 @@ import pytest
 from published import published_scenarios
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs import simulated_camera, world
+from mechsearch_jax.envs.camera import simulated_camera
+from mechsearch_jax.envs.world import world
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import sample_surface
 from mechsearch_jax.geometry.transforms import matmul, yaw_rotation

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.envs.example_images import SCENARIO, sensed_images
-from mechsearch_jax.envs.simulated_camera import PALETTE, observe
-from mechsearch_jax.envs.world import TARGET, from_scenario
+from mechsearch_jax.envs.camera.example_images import SCENARIO, sensed_images
+from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe
+from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.cloud import above_board
 from mechsearch_jax.perception.colour import RED, TargetColour

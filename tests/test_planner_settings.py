@@ -10,8 +10,8 @@ import pytest
 
 from mechsearch_jax import errors, tables
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.envs.episodes import target_of
-from mechsearch_jax.envs.method import Method
+from mechsearch_jax.envs.episode.episodes import target_of
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.colour import TargetColour
 from mechsearch_jax.planner import OPTIONS, PRESETS, settings

@@ -10,9 +10,9 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.actions.registry import ActionKind
-from mechsearch_jax.envs import slots
-from mechsearch_jax.envs.episode_log import Choice
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.envs.episode import slots
+from mechsearch_jax.envs.episode.episode_log import Choice
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.transforms import make, translate

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mechsearch_jax.envs import model as models
-from mechsearch_jax.envs.world import BODIES
+from mechsearch_jax.envs.world import model as models
+from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make

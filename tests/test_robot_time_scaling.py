@@ -12,7 +12,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from mechsearch_jax.actions import ActionConfig
-from mechsearch_jax.envs.mjx_model import MjxConfig, MjxModel
+from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot import motion

@@ -14,12 +14,12 @@ from stage import HIDDEN, OPEN, grab, idle
 from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
-from mechsearch_jax.envs.cell import load_searcher
-from mechsearch_jax.envs.compile_clock import CompileClock
-from mechsearch_jax.envs.simulated_camera import observe
-from mechsearch_jax.envs.snapshot import Snapshot, oracle
+from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
+from mechsearch_jax.envs.cell.loading import load_searcher
+from mechsearch_jax.envs.episode.compile_clock import CompileClock
 from mechsearch_jax.envs.trials.native import NativeTrials
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import compose

@@ -12,8 +12,8 @@ import pytest
 
 from mechsearch_jax.actions import Action
 from mechsearch_jax.actions.retrieve import retrieve_action
-from mechsearch_jax.envs.simulated_camera import observe
-from mechsearch_jax.envs.world import from_scenario, true_superquadrics
+from mechsearch_jax.envs.camera.simulated_camera import observe
+from mechsearch_jax.envs.world.world import from_scenario, true_superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import make
@@ -300,7 +300,7 @@ def test_files_are_not_overwritten_silently(tmp_path, save):
 @pytest.mark.slow
 def test_a_simulated_arm_follows_random_actions():
     """Pushes and retrievals all over the shelf; the benchmark `trajectories` does so for those that a planner draws."""
-    from mechsearch_jax.benchmarks.trajectories import Follower
+    from mechsearch_jax.benchmarks.parts.trajectories import Follower
 
     follower, rng = Follower(SETTING, 0.004), np.random.default_rng(0)
     config = dataclasses.replace(CONFIG, free=FreeMotionConfig(attempts=200))

@@ -15,9 +15,11 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax import graspability
-from mechsearch_jax.envs import model, physics_push, simulated_camera, world
-from mechsearch_jax.envs.batch_model import BodyFields, body_fields
-from mechsearch_jax.envs.native import NativeWorld
+from mechsearch_jax.envs.camera import simulated_camera
+from mechsearch_jax.envs.pushing import physics_push
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields
+from mechsearch_jax.envs.simulators.native import NativeWorld
+from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception import scores
 from mechsearch_jax.perception.target_pose import target_pose

@@ -14,11 +14,12 @@ from mechsearch_jax.actions.candidates import candidates
 from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.compiled import Kept
-from mechsearch_jax.envs import recognisers, simulated_camera, slots
-from mechsearch_jax.envs.recognisers import recogniser
-from mechsearch_jax.envs.snapshot import Snapshot, oracle, sight_of
+from mechsearch_jax.envs.camera import recognisers, simulated_camera
+from mechsearch_jax.envs.camera.recognisers import recogniser
+from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle, sight_of
+from mechsearch_jax.envs.episode import slots
 from mechsearch_jax.envs.trials import native
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import recogniser as recognising

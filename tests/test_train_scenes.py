@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.envs.generator import outline, separation
-from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.envs.scenes.generator import outline, separation
+from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.cloud import above_board, cloud_of, draw, resample, shelf_view, view
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs import simulated_camera as seen_by
-from mechsearch_jax.envs.model import shelf_boxes
-from mechsearch_jax.envs.world import from_scenario
+from mechsearch_jax.envs.camera import simulated_camera as seen_by
+from mechsearch_jax.envs.world.model import shelf_boxes
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.robot.arm_clearance import link_poses
 from mechsearch_jax.robot.kinematics import FINGER_TIPS, HOME
 from mechsearch_jax.shapes import in_order, shape_of

@@ -18,11 +18,11 @@ from jaxtyping import Array, Bool, Float, Key
 from mechsearch_jax.dynamics.learned import LIKELY, MAX_PENETRATION, NAME, predicted
 from mechsearch_jax.dynamics.push_model import PushModel, PushOutcome
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
-from mechsearch_jax.envs import pushes as generator
-from mechsearch_jax.envs.push_portions import portions
-from mechsearch_jax.envs.pushes import Generation, Pushes, PushesConfig, joined, push_tables
-from mechsearch_jax.envs.simulator import Simulator
-from mechsearch_jax.envs.world import superquadrics
+from mechsearch_jax.envs.pushing import pushes as generator
+from mechsearch_jax.envs.pushing.push_portions import portions
+from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, joined, push_tables
+from mechsearch_jax.envs.simulators.simulator import Simulator
+from mechsearch_jax.envs.world.world import superquadrics
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import matmul
@@ -285,7 +285,7 @@ def random_pushes(
     told: Callable[[int], None] = lambda pushes: None,
     make_simulator: Callable[[], Simulator] | None = None,
 ) -> Pushes:
-    """Pushes in such scenes, simulated on a GPU or not; see `envs.push_portions.portions` for the rest."""
+    """Pushes in such scenes, simulated on a GPU or not; see `envs.pushing.push_portions.portions` for the rest."""
     draw_world = functools.partial(random_world, config=scenes)
     simulate = make_simulator or functools.partial(generator.engine, gpu)
     source = repr((generator.engine_name(gpu), generator.push_simulation(), origin(scenes)))

@@ -15,7 +15,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.envs.world import TARGET, World, true_superquadrics
+from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.transforms import matmul, rotate
 from mechsearch_jax.networks.recognition import (

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.envs.generator import CATALOGUE
-from mechsearch_jax.envs.recognisers import true_labels
-from mechsearch_jax.envs.simulated_camera import cast_body, cast_shelf
-from mechsearch_jax.envs.world import BODIES, TARGET, World
+from mechsearch_jax.envs.camera.recognisers import true_labels
+from mechsearch_jax.envs.camera.simulated_camera import cast_body, cast_shelf
+from mechsearch_jax.envs.scenes.generator import CATALOGUE
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
 from mechsearch_jax.perception.cloud import View, shelf_view

@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.envs.world import TARGET
+from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.networks.segmentation import SegmentationConfig, SegmentationNetwork, apply_network
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.perception.assignment import assign

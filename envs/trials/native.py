@@ -26,11 +26,11 @@ from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.compiled import kept
 from mechsearch_jax.cores import cores
-from mechsearch_jax.envs.physics_push import bodies, sound
-from mechsearch_jax.envs.simulator import SimulatorConfig
+from mechsearch_jax.envs.pushing.physics_push import bodies, sound
+from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.trials.scene import TrialScene
-from mechsearch_jax.envs.world import TARGET, World, bodies_of
+from mechsearch_jax.envs.world.world import TARGET, World, bodies_of
 from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.geometry.transforms import upright_pose

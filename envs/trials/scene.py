@@ -19,11 +19,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mechsearch_jax.actions import Kind
-from mechsearch_jax.envs import model as models
-from mechsearch_jax.envs.native import NativeWorld
-from mechsearch_jax.envs.outcome import Failure
-from mechsearch_jax.envs.simulator import ARM, ROBOT, SimulatorConfig, controls
-from mechsearch_jax.envs.world import BODIES, TARGET
+from mechsearch_jax.envs.simulators.native import NativeWorld
+from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig, controls
+from mechsearch_jax.envs.world import model as models
+from mechsearch_jax.envs.world.outcome import Failure
+from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.planner.trials import TrialResult
 from mechsearch_jax.robot.motion import Reference
 from mechsearch_jax.shapes import in_order

@@ -24,7 +24,7 @@ from mechsearch_jax.commands.options import (
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
-    from mechsearch_jax.benchmarks.bench import Timing
+    from mechsearch_jax.benchmarks.parts.bench import Timing
 
 
 def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing]) -> None:
@@ -35,8 +35,8 @@ def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing])
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.bench import save_timing
-    from mechsearch_jax.benchmarks.tables import timing_table
+    from mechsearch_jax.benchmarks.parts.bench import save_timing
+    from mechsearch_jax.benchmarks.report.tables import timing_table
 
     check_files(out)
     forget_kept_compilations()
@@ -59,7 +59,7 @@ def _timing_of(subject: Literal["existence", "graspability"], what: str) -> Call
         out: JsonFile = None,
         options: EpisodeOptions = DEFAULTS,
     ) -> None:
-        from mechsearch_jax.benchmarks import bench as benches
+        from mechsearch_jax.benchmarks.parts import bench as benches
 
         at_least_one(f"bench {subject}", repeats=repeats, batch=batch)
         settings = options.settings()
@@ -99,7 +99,7 @@ def bench_plan(
       out: JSON file for the result.
       options: how the planner decides.
     """
-    from mechsearch_jax.benchmarks import bench as benches
+    from mechsearch_jax.benchmarks.parts import bench as benches
 
     at_least_one("bench plan", repeats=repeats, batch=batch)
     (chosen,) = options.methods(chosen_policies("bench plan", method and (method,), policy and (policy,)))
@@ -124,7 +124,7 @@ def bench_perceive(
       recognition: "masks" is told which pixels are whose, "full" finds out.
       out: JSON file for the result.
     """
-    from mechsearch_jax.benchmarks import bench as benches
+    from mechsearch_jax.benchmarks.parts import bench as benches
 
     at_least_one("bench perceive", repeats=repeats, batch=batch)
     _print_timing("perceive", out, lambda: benches.bench_perceive(recognition, objects, batch, repeats=repeats))
@@ -149,7 +149,7 @@ def bench_predict(
       repeats: number of timed calls.
       out: JSON file for the result.
     """
-    from mechsearch_jax.benchmarks import bench as benches
+    from mechsearch_jax.benchmarks.parts import bench as benches
 
     at_least_one("bench predict", repeats=repeats, batch=batch)
     if weights is not None and push_model != "learned":
@@ -166,7 +166,7 @@ def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, ou
       repeats: number of timed calls.
       out: JSON file for the result.
     """
-    from mechsearch_jax.benchmarks import bench as benches
+    from mechsearch_jax.benchmarks.parts import bench as benches
 
     _print_timing("simulate", out, lambda: benches.bench_simulate(worlds, steps, repeats))
 
@@ -185,9 +185,9 @@ def bench_inside(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import roofline
-    from mechsearch_jax.benchmarks.bench import save_timings
-    from mechsearch_jax.benchmarks.tables import timings_table
+    from mechsearch_jax.benchmarks.parts import roofline
+    from mechsearch_jax.benchmarks.parts.bench import save_timings
+    from mechsearch_jax.benchmarks.report.tables import timings_table
 
     check_files(out)
     forget_kept_compilations()
@@ -208,7 +208,7 @@ def bench_roofline(
       results: folder with their JSON files; others are left out.
       out: Markdown file.
     """
-    from mechsearch_jax.benchmarks.roofline import write_page
+    from mechsearch_jax.benchmarks.parts.roofline import write_page
 
     write_page(results, out)
     print(out)

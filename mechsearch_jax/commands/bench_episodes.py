@@ -15,7 +15,7 @@ from mechsearch_jax.cores import cores
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
-    from mechsearch_jax.envs.known_search import Node
+    from mechsearch_jax.envs.known_target.search import Node
     from mechsearch_jax.workspace.scenario import Scenario
 
 Results = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FOLDER|FILE ...")]
@@ -79,9 +79,9 @@ def bench_ceiling(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import solvability
-    from mechsearch_jax.benchmarks.episode_tables import ceiling_table
-    from mechsearch_jax.envs.known_search import KnownSearchConfig
+    from mechsearch_jax.benchmarks.ceiling import solvability
+    from mechsearch_jax.benchmarks.report.episode_tables import ceiling_table
+    from mechsearch_jax.envs.known_target.search import KnownSearchConfig
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
 
@@ -130,12 +130,12 @@ def bench_guard(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import guard
-    from mechsearch_jax.benchmarks.episode_tables import guard_table
-    from mechsearch_jax.benchmarks.evaluate import evaluate, make_jobs
-    from mechsearch_jax.benchmarks.processes import Processes
-    from mechsearch_jax.benchmarks.tables import EpisodeProgress
-    from mechsearch_jax.envs.method import Method
+    from mechsearch_jax.benchmarks.guard import guard
+    from mechsearch_jax.benchmarks.report.episode_tables import guard_table
+    from mechsearch_jax.benchmarks.report.tables import EpisodeProgress
+    from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs
+    from mechsearch_jax.benchmarks.running.processes import Processes
+    from mechsearch_jax.envs.episode.method import Method
 
     at_least_one("bench guard", workers=workers)
     stored = reference or guard.REFERENCE
@@ -181,8 +181,8 @@ def bench_cell(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import cell
-    from mechsearch_jax.envs.simulated_cell import SensorNoise
+    from mechsearch_jax.benchmarks.parts import cell_searches as cell
+    from mechsearch_jax.envs.cell.simulated_cell import SensorNoise
     from mechsearch_jax.files import check_writable
 
     at_least_one("bench cell", searches=searches, **{f"objects {n}": n for n in objects})

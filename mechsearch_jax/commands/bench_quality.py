@@ -61,9 +61,9 @@ def bench_agreement(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.agreement import agreement, draw_actions, generated_scenes, save_agreement
-    from mechsearch_jax.benchmarks.tables import agreement_table
-    from mechsearch_jax.envs.mjx_model import import_mjx
+    from mechsearch_jax.benchmarks.parts.agreement import agreement, draw_actions, generated_scenes, save_agreement
+    from mechsearch_jax.benchmarks.report.tables import agreement_table
+    from mechsearch_jax.envs.simulators.mjx_model import import_mjx
     from mechsearch_jax.planner.cache import keep_compilations
 
     at_least_one("bench agreement", actions=actions, scenes=scenes)
@@ -116,8 +116,8 @@ def bench_recognition(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import images, recognition, recognition_figure
-    from mechsearch_jax.benchmarks.tables import recognition_tables, recognition_times_table
+    from mechsearch_jax.benchmarks.parts import images, recognition, recognition_figure
+    from mechsearch_jax.benchmarks.report.tables import recognition_tables, recognition_times_table
     from mechsearch_jax.viz.drawing import save_figure
 
     at_least_one("bench recognition", worst=worst)
@@ -200,8 +200,8 @@ def bench_segmentation(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import images, segmentation
-    from mechsearch_jax.benchmarks.tables import segmentation_tables
+    from mechsearch_jax.benchmarks.parts import images, segmentation
+    from mechsearch_jax.benchmarks.report.tables import segmentation_tables
     from mechsearch_jax.viz.drawing import save_figure
 
     at_least_one("bench segmentation", worst=worst)
@@ -251,8 +251,8 @@ def bench_push(
     import jax
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import push
-    from mechsearch_jax.benchmarks.tables import push_scores_tables
+    from mechsearch_jax.benchmarks.parts import push
+    from mechsearch_jax.benchmarks.report.tables import push_scores_tables
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.train.run import counting
@@ -286,8 +286,8 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import scenes
-    from mechsearch_jax.benchmarks.tables import scenes_table
+    from mechsearch_jax.benchmarks.parts import scenes
+    from mechsearch_jax.benchmarks.report.tables import scenes_table
     from mechsearch_jax.planner.cache import keep_compilations
 
     names = [Path(name).resolve().name for name in scenarios]

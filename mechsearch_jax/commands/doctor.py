@@ -23,8 +23,8 @@ def doctor(
     """
     from rich.console import Console
 
-    from mechsearch_jax.envs.finding import State
-    from mechsearch_jax.envs.health import checks, examine
+    from mechsearch_jax.envs.health.checks import checks, examine
+    from mechsearch_jax.envs.health.finding import State
     from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import load_scenario
 

@@ -26,9 +26,9 @@ def inspect(
     """
     from rich.progress import track
 
-    from mechsearch_jax.envs.episodes import target_of
-    from mechsearch_jax.envs.pictures import inspect_scenario
-    from mechsearch_jax.envs.recognisers import recogniser
+    from mechsearch_jax.envs.camera.recognisers import recogniser
+    from mechsearch_jax.envs.episode.episodes import target_of
+    from mechsearch_jax.envs.recording.pictures import inspect_scenario
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.viz.drawing import save_figure

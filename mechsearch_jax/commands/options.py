@@ -17,8 +17,8 @@ from mechsearch_jax.files import check_writable, is_file, is_folder
 from mechsearch_jax.shapes import SHAPES
 
 if TYPE_CHECKING:
-    from mechsearch_jax.envs.method import EngineName, Method
-    from mechsearch_jax.envs.scene_sets import Block
+    from mechsearch_jax.envs.episode.method import EngineName, Method
+    from mechsearch_jax.envs.scenes.scene_sets import Block
     from mechsearch_jax.planner import Option
     from mechsearch_jax.planner.settings import Settings
 
@@ -68,7 +68,7 @@ class EpisodeOptions:
           InputError: a policy, an option, the push model or the recognition cannot be used; told of now, not by every
             episode.
         """
-        from mechsearch_jax.envs.method import Method
+        from mechsearch_jax.envs.episode.method import Method
 
         if any(":" in policy for policy in policies) and "" not in sys.path:
             # As Python itself does for a program that is not installed.
@@ -93,7 +93,7 @@ class EpisodeOptions:
         """
         if self.simulator == "native" or (self.simulator == "auto" and not (gpu or has_gpu)()):
             return "NativeSimulator"
-        from mechsearch_jax.envs.mjx_model import import_mjx
+        from mechsearch_jax.envs.simulators.mjx_model import import_mjx
 
         if self.simulator == "mjx":
             import_mjx()
@@ -253,7 +253,7 @@ def find_scenario(name: str) -> Path:
     Raises:
       InputError: there is none.
     """
-    from mechsearch_jax.envs.scene_sets import SETS, find_scene
+    from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene
     from mechsearch_jax.workspace.scenario import example_scenarios
 
     shipped = example_scenarios()
@@ -283,7 +283,7 @@ def find_scenarios(names: Sequence[str]) -> list[Path]:
     Raises:
       InputError: there is nothing for one of them.
     """
-    from mechsearch_jax.envs.scene_sets import SETS, set_scenes
+    from mechsearch_jax.envs.scenes.scene_sets import SETS, set_scenes
 
     files: list[Path] = []
     for name in names:
@@ -301,7 +301,7 @@ def find_scenarios(names: Sequence[str]) -> list[Path]:
 
 def _tell_what_is_taken(name: str) -> None:
     """Say so where what a path leads to goes before a scene set, or a scene of one, of the same name."""
-    from mechsearch_jax.envs.scene_sets import SETS, find_scene
+    from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene
 
     if name in SETS or find_scene(name):
         what = "folder" if is_folder(name) else "file"
@@ -328,7 +328,7 @@ def _files_in(folder: Path) -> list[Path]:
 
 def files_of(scenes: Sequence[tuple[Block, int]]) -> list[Path]:
     """Files of scenes of sets; making them shows its progress on standard error."""
-    from mechsearch_jax.envs.scene_sets import scene_files
+    from mechsearch_jax.envs.scenes.scene_sets import scene_files
     from mechsearch_jax.planner.cache import keep_compilations
 
     def progress(missing: Sequence[Any]) -> Iterable[Any]:

@@ -56,7 +56,7 @@ def plan(
     from rich.console import Console
 
     from mechsearch_jax.commands.options import settings_of
-    from mechsearch_jax.envs.cell import searcher_of
+    from mechsearch_jax.envs.cell.loading import searcher_of
     from mechsearch_jax.files import check_writable, is_file
     from mechsearch_jax.perception.image_files import load_camera
     from mechsearch_jax.planner.cache import keep_compilations

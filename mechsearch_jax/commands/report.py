@@ -14,8 +14,8 @@ from mechsearch_jax.commands.options import find_scenario, find_scenarios
 from mechsearch_jax.errors import InputError
 
 if TYPE_CHECKING:
-    from mechsearch_jax.benchmarks.films import Draw
-    from mechsearch_jax.benchmarks.rows import Row
+    from mechsearch_jax.benchmarks.report.films import Draw
+    from mechsearch_jax.benchmarks.store.rows import Row
 
 
 def _columns(texts: Sequence[str]) -> tuple[str, ...]:
@@ -53,10 +53,10 @@ def report(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks import films as single
-    from mechsearch_jax.benchmarks.episode_tables import differences_table, events_summary_table, print_summary
-    from mechsearch_jax.benchmarks.paired import PAIRED
-    from mechsearch_jax.benchmarks.report import Asked, Report, read_tables, told_of_changes, write_report
+    from mechsearch_jax.benchmarks.report import films as single
+    from mechsearch_jax.benchmarks.report.episode_tables import differences_table, events_summary_table, print_summary
+    from mechsearch_jax.benchmarks.report.report import Asked, Report, read_tables, told_of_changes, write_report
+    from mechsearch_jax.benchmarks.statistics.paired import PAIRED
 
     if films and out is None:
         raise InputError("report: --films are drawn into a folder; give --out")
@@ -88,7 +88,7 @@ def report(
 
 def _drawer(scenes: Sequence[str], status) -> Draw:
     """What draws an episode's filmstrip, its scenario found among these, the shipped ones or those of scene sets."""
-    from mechsearch_jax.benchmarks.films import replay
+    from mechsearch_jax.benchmarks.report.films import replay
     from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 

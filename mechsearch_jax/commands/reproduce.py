@@ -18,11 +18,11 @@ from mechsearch_jax.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.evaluate import Job
-    from mechsearch_jax.benchmarks.paper_tables import PaperTable
-    from mechsearch_jax.benchmarks.reproduce import Setting
-    from mechsearch_jax.benchmarks.rows import Row
-    from mechsearch_jax.envs.method import EngineName
+    from mechsearch_jax.benchmarks.paper.paper_tables import PaperTable
+    from mechsearch_jax.benchmarks.paper.reproduce import Setting
+    from mechsearch_jax.benchmarks.running.evaluate import Job
+    from mechsearch_jax.benchmarks.store.rows import Row
+    from mechsearch_jax.envs.episode.method import EngineName
 
 TableName = Literal["table1", "table3", "table4", "table5"]
 Recognition = Literal["oracle", "masks", "full"]
@@ -37,7 +37,7 @@ def _settings(
     protocol: Sequence[str],
 ) -> list[Setting]:
     """What the cells of a table run with."""
-    from mechsearch_jax.benchmarks.reproduce import Setting
+    from mechsearch_jax.benchmarks.paper.reproduce import Setting
     from mechsearch_jax.planner import PRESETS
 
     unknown = [name for name in preset if name not in PRESETS]
@@ -55,7 +55,7 @@ def _jobs(
     Raises:
       InputError: a setting cannot be used.
     """
-    from mechsearch_jax.benchmarks.evaluate import make_jobs
+    from mechsearch_jax.benchmarks.running.evaluate import make_jobs
 
     options: Any = with_planner_options()
 
@@ -112,7 +112,7 @@ def reproduce(
       simulator: as evaluate has it.
       run: how the episodes are run.
     """
-    from mechsearch_jax.benchmarks.paper_tables import METHODS, TABLES, table_scenes
+    from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, table_scenes
 
     at_least_one("reproduce", scenes=scenes)
     chosen = TABLES[table]
@@ -140,8 +140,8 @@ def reproduce(
 
 def _draw(console: Console, table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], out: Path) -> None:
     """Print and write the table from what is in the folder."""
-    from mechsearch_jax.benchmarks.reproduce import results_of, screen, write_table
-    from mechsearch_jax.benchmarks.shards import Results
+    from mechsearch_jax.benchmarks.paper.reproduce import results_of, screen, write_table
+    from mechsearch_jax.benchmarks.store.shards import Results
 
     known = Results(out)
     known.refresh()

@@ -18,10 +18,10 @@ from mechsearch_jax.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.evaluate import Job, Runner
-    from mechsearch_jax.benchmarks.rows import Row
-    from mechsearch_jax.benchmarks.tables import EpisodeProgress
-    from mechsearch_jax.envs.method import EngineName
+    from mechsearch_jax.benchmarks.report.tables import EpisodeProgress
+    from mechsearch_jax.benchmarks.running.evaluate import Job, Runner
+    from mechsearch_jax.benchmarks.store.rows import Row
+    from mechsearch_jax.envs.episode.method import EngineName
 
 
 def _count(metavar: str) -> Any:
@@ -153,8 +153,8 @@ class Here:
 
     def runner(self, run: RunOptions, in_processes: bool, progress: EpisodeProgress) -> Runner:
         """See `Site`."""
-        from mechsearch_jax.benchmarks.batches import Batches
-        from mechsearch_jax.benchmarks.processes import TIME_LIMIT, Processes
+        from mechsearch_jax.benchmarks.running.batches import Batches
+        from mechsearch_jax.benchmarks.running.processes import TIME_LIMIT, Processes
         from mechsearch_jax.planner.cache import keep_compilations
 
         if in_processes:
@@ -168,7 +168,7 @@ class OnRay:
     """A Ray cluster.
 
     Attributes:
-      address: as `benchmarks.cluster.join` has it.
+      address: as `benchmarks.running.cluster.join` has it.
     """
 
     address: str
@@ -177,7 +177,7 @@ class OnRay:
         """Join it, and leave its GPUs to its workers."""
         import jax
 
-        from mechsearch_jax.benchmarks.cluster import join
+        from mechsearch_jax.benchmarks.running.cluster import join
 
         join(self.address)
         # Were it to use a GPU of this machine, this process would take most of its memory.
@@ -185,15 +185,15 @@ class OnRay:
 
     def has_gpu(self) -> bool:
         """See `Site`."""
-        from mechsearch_jax.benchmarks.cluster import join
+        from mechsearch_jax.benchmarks.running.cluster import join
 
         return any(machine.get("GPU", 0) >= 1 for machine in join(self.address))
 
     def runner(self, run: RunOptions, in_processes: bool, progress: EpisodeProgress) -> Runner:
         """See `Site`."""
-        from mechsearch_jax.benchmarks.cluster import RayCluster
-        from mechsearch_jax.benchmarks.cluster_workers import OnCpus, OnGpus
-        from mechsearch_jax.benchmarks.processes import TIME_LIMIT
+        from mechsearch_jax.benchmarks.running.cluster import RayCluster
+        from mechsearch_jax.benchmarks.running.cluster_workers import OnCpus, OnGpus
+        from mechsearch_jax.benchmarks.running.processes import TIME_LIMIT
 
         kind = OnCpus(run.workers, run.time_limit or TIME_LIMIT) if in_processes else OnGpus(run.batch)
         return RayCluster(kind, self.address)
@@ -238,8 +238,8 @@ def run_episodes_of(
     Raises:
       InputError: something that is given cannot be used.
     """
-    from mechsearch_jax.benchmarks.episode_tables import print_rates
-    from mechsearch_jax.benchmarks.evaluate import make_jobs
+    from mechsearch_jax.benchmarks.report.episode_tables import print_rates
+    from mechsearch_jax.benchmarks.running.evaluate import make_jobs
 
     engine = run.engine(command, points[0])
     # The same settings may come from several points.
@@ -269,12 +269,12 @@ def run_jobs(
     Raises:
       InputError: something that is given cannot be used.
     """
-    from mechsearch_jax.benchmarks.evaluate import shard_of
+    from mechsearch_jax.benchmarks.running.evaluate import shard_of
 
     jobs = shard_of(jobs, *parsed_shard(command, run.shard))
     in_processes = run.in_processes(command, simulator)
     if run.dry_run:
-        from mechsearch_jax.benchmarks.estimate import estimate
+        from mechsearch_jax.benchmarks.running.estimate import estimate
 
         workers = run.workers or cores()
         print(estimate(jobs, out, workers if in_processes else None, run.retry_errors))
@@ -293,8 +293,8 @@ def _run(
     """Run jobs in worker processes, or else in batches."""
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.evaluate import evaluate
-    from mechsearch_jax.benchmarks.tables import EpisodeProgress
+    from mechsearch_jax.benchmarks.report.tables import EpisodeProgress
+    from mechsearch_jax.benchmarks.running.evaluate import evaluate
 
     console = Console(highlight=False)
     with EpisodeProgress(console, len(jobs)) as progress:

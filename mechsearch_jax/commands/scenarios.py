@@ -28,7 +28,7 @@ def list_sets() -> None:
     """List the named sets of scenes: how many scenes, with how many objects, and what they hold."""
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.tables import scene_sets_table
+    from mechsearch_jax.benchmarks.report.tables import scene_sets_table
 
     Console(highlight=False).print(scene_sets_table())
 
@@ -78,7 +78,7 @@ def generate(
 def _generate_more(seeds: range, objects: int, settings: Settings, target: TargetShape | None, out: Path) -> None:
     from rich.progress import track
 
-    from mechsearch_jax.envs.generator import ScenarioGenerator
+    from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
     from mechsearch_jax.workspace.scenario import save_scenario
 
     generator = ScenarioGenerator.of(settings, target)
@@ -91,7 +91,7 @@ def _generate_set(name: str, out: Path) -> int:
     """Write a set's scenes into a folder; how many they are."""
     from rich.progress import track
 
-    from mechsearch_jax.envs.scene_sets import find_set, holds, scene_files, set_scenes
+    from mechsearch_jax.envs.scenes.scene_sets import find_set, holds, scene_files, set_scenes
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
 

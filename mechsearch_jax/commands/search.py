@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
 
-    from mechsearch_jax.envs.method import Method
-    from mechsearch_jax.envs.narration import Narrator
-    from mechsearch_jax.envs.recording import Recorder
-    from mechsearch_jax.envs.records import Episode
+    from mechsearch_jax.envs.episode.method import Method
+    from mechsearch_jax.envs.episode.records import Episode
+    from mechsearch_jax.envs.recording.narration import Narrator
+    from mechsearch_jax.envs.recording.recording import Recorder
     from mechsearch_jax.planner import Problem
     from mechsearch_jax.workspace.scenario import Scenario
 
@@ -42,7 +42,7 @@ def _check_scene(scenario: str | None, objects: int | None, target: str | None) 
 
 def _save(out: Path, scene: Scenario, episode: Episode, strip: Figure) -> None:
     """Write what there is of every episode."""
-    from mechsearch_jax.envs.records import save_episode
+    from mechsearch_jax.envs.episode.records import save_episode
     from mechsearch_jax.viz.drawing import save_figure
     from mechsearch_jax.workspace.scenario import save_scenario
 
@@ -55,18 +55,18 @@ def _run(
     console: Console, status: Status, chosen: Method, scene: Scenario, problem: Problem, seed: int
 ) -> tuple[Episode, Narrator, Recorder]:
     """Run the episode; what was told of it, and what was recorded."""
-    from mechsearch_jax.envs.episodes import run_episode
-    from mechsearch_jax.envs.simulator import SimulatorConfig
+    from mechsearch_jax.envs.episode.episodes import run_episode
+    from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
     from mechsearch_jax.preparing import first_decision, prepared
 
     policy, workcell = chosen.policy(), chosen.workcell
     first = first_decision(problem, policy, SimulatorConfig().motion)
     with prepared(first, lambda text: console.print(text, style="dim")):
         # These take long to import, and meanwhile what the first decision needs is read or compiled.
-        from mechsearch_jax.envs.narration import Narrator
-        from mechsearch_jax.envs.native import NativeSimulator
-        from mechsearch_jax.envs.recognisers import recogniser
-        from mechsearch_jax.envs.recording import TRACE_EVERY, Recorder
+        from mechsearch_jax.envs.camera.recognisers import recogniser
+        from mechsearch_jax.envs.recording.narration import Narrator
+        from mechsearch_jax.envs.recording.recording import TRACE_EVERY, Recorder
+        from mechsearch_jax.envs.simulators.native import NativeSimulator
 
         simulator = NativeSimulator(
             config=SimulatorConfig(trace_every=TRACE_EVERY), shelf=workcell.shelf, camera=workcell.camera
@@ -119,8 +119,8 @@ def search(
     """
     from rich.console import Console
 
-    from mechsearch_jax.envs.episodes import target_of
-    from mechsearch_jax.envs.generator import ScenarioGenerator
+    from mechsearch_jax.envs.episode.episodes import target_of
+    from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.planner.cache import keep_compilations
     from mechsearch_jax.viz.movie import check_movie_path
@@ -145,8 +145,8 @@ def search(
         problem = workcell.problem(target_of(scene, workcell.target), chosen.problem_config)
         episode, narrator, recorder = _run(console, status, chosen, scene, problem, seed)
         # Not before: these take long to import.
-        from mechsearch_jax.envs.narration import verdict
-        from mechsearch_jax.envs.recording import NAME, save_recording
+        from mechsearch_jax.envs.recording.narration import verdict
+        from mechsearch_jax.envs.recording.recording import NAME, save_recording
         from mechsearch_jax.viz.filmstrip import filmstrip
 
         status.update("writing")

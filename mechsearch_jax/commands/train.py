@@ -99,7 +99,7 @@ def train_push(
     """
     import jax
 
-    from mechsearch_jax.envs.pushes import Generation
+    from mechsearch_jax.envs.pushing.pushes import Generation
     from mechsearch_jax.files import check_writable
     from mechsearch_jax.networks.push import PushConfig
     from mechsearch_jax.train.loop import TrainConfig

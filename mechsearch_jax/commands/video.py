@@ -12,7 +12,7 @@ from mechsearch_jax.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from mechsearch_jax.envs.recording import Recording
+    from mechsearch_jax.envs.recording.recording import Recording
 
 WIDTH, FPS = 960, 15
 # A wider or faster film nobody watches.
@@ -78,7 +78,7 @@ def recording_of(episode: Path) -> Recording:
     Raises:
       InputError: there is none, or it cannot be read.
     """
-    from mechsearch_jax.envs.recording import NAME, load_recording
+    from mechsearch_jax.envs.recording.recording import NAME, load_recording
     from mechsearch_jax.files import is_file
 
     if not is_file(episode / NAME):
@@ -96,7 +96,7 @@ def make_film(
     """
     from rich.progress import track
 
-    from mechsearch_jax.envs.film import Film
+    from mechsearch_jax.envs.recording.film import Film
     from mechsearch_jax.viz.movie import save_movie
 
     film = Film(recording, width, fps, speed)

@@ -38,7 +38,7 @@ def view(
     check_pace("view", fps, speed)
     viser = import_viser()
     recording = recording_of(episode)
-    from mechsearch_jax.envs.viewer import Viewer
+    from mechsearch_jax.envs.recording.viewer import Viewer
     from mechsearch_jax.planner.cache import keep_compilations
 
     keep_compilations()

@@ -1,4 +1,4 @@
-"""The push models that need no simulator, by name; `envs.push_models` knows them all."""
+"""The push models that need no simulator, by name; `envs.pushing.push_models` knows them all."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def own_push_model(name: str) -> PushModel:
     check_name(name)
     if name == "physics":
         raise InputError(
-            'push model "physics" needs a simulator; give the policy those of mechsearch_jax.envs.push_models'
+            'push model "physics" needs a simulator; give the policy those of mechsearch_jax.envs.pushing.push_models'
         )
     if name == "quasi-static":
         return QuasiStatic()

@@ -50,7 +50,7 @@ def example_images() -> Images:
     """Images of the shipped scenario `first-light`, whose target is hidden, by the simulated camera.
 
     1280 x 720 pixels; depths in whole millimetres with Gaussian noise of 1 mm, one in two hundred missing. They are
-    made by `python -m mechsearch_jax.envs.example_images`.
+    made by `python -m mechsearch_jax.envs.camera.example_images`.
     """
     return load_images(Path(str(importlib.resources.files("mechsearch_jax") / "data" / FILE)))
 

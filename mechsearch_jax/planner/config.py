@@ -153,7 +153,7 @@ class Config:
     Attributes:
       problem: how the problem is built.
       planner: how the planner decides.
-      push_model: name of what predicts pushes; see `dynamics.named`, and `envs.push_models` for "physics".
+      push_model: name of what predicts pushes; see `dynamics.named`, and `envs.pushing.push_models` for "physics".
       rehearsal: name of what tries actions out before one is made; see `envs.trials`. The paper tries nothing.
       max_steps: T, actions in an episode.
     """

@@ -1,6 +1,6 @@
 """The search as a robot programmer runs it: images in, the next motion out, told again when it is over.
 
-    searcher = ms.Searcher(ms.Workcell(camera=..., shelf=..., target=...))  # or envs.cell.load_searcher("mine.toml")
+    searcher = ms.Searcher(ms.Workcell(camera=..., shelf=..., target=...))  # or envs.cell.loading.load_searcher(FILE)
     while True:
         step = searcher.next(depth, colour)         # kind, reason, warnings, trajectory
         ...                                         # move along step.trajectory
@@ -111,7 +111,7 @@ class Searcher:
           workcell: camera, shelf, gripper and target; the defaults if left out.
           config: how the problem is built and how the planner decides, and how many actions it may take; preset
             `standard` without a rehearsal if left out. What it names and needs a simulator has to be given beside it:
-            `envs.cell.load_searcher` makes all of that from a file.
+            `envs.cell.loading.load_searcher` makes all of that from a file.
           seed: of all random numbers.
           policy: what decides; by default search-for-grasp with the planner's part of `config`. One that is given has
             that part and its models itself.

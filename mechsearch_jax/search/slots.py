@@ -13,7 +13,7 @@ from mechsearch_jax.planner.trials import Trials
 # What is said where no action is tried out.
 UNTRIED = (
     "rehearsal: no action is tried out before it is made, so that less is found and retrieved than the results say; "
-    "envs.cell.load_searcher, or rehearsal=NativeTrials(), tries them in simulation"
+    "envs.cell.loading.load_searcher, or rehearsal=NativeTrials(), tries them in simulation"
 )
 
 
@@ -45,14 +45,14 @@ def filled(policy: Policy | None, config: Config, trials: Trials | None, slots: 
     if config.rehearsal != "none" and trials is None:
         raise InputError(
             f'Searcher: config names the rehearsal "{config.rehearsal}", and none is given; use '
-            "mechsearch_jax.envs.cell.load_searcher, give rehearsal=NativeTrials() (envs.trials.native), or a "
+            "mechsearch_jax.envs.cell.loading.load_searcher, give rehearsal=NativeTrials() (envs.trials.native), or a "
             'config with rehearsal="none"'
         )
     if slots["push_model"] is None:
         if config.push_model == "physics":
             raise InputError(
                 'Searcher: config names the push model "physics", and none is given; use '
-                'mechsearch_jax.envs.cell.load_searcher, give push_model, or a config with push_model="learned"'
+                'mechsearch_jax.envs.cell.loading.load_searcher, give push_model, or a config with push_model="learned"'
             )
         slots = {**slots, "push_model": own_push_model(config.push_model)}
     elif config.push_model == "quasi-static":

@@ -61,10 +61,10 @@ def scenario_files():
 
 
 def run_episode(path, method, recognition, rehearsal="physics", seed=0):
-    from mechsearch_jax.envs import episodes
-    from mechsearch_jax.envs.method import Method
-    from mechsearch_jax.envs.native import NativeSimulator
-    from mechsearch_jax.envs.recognisers import recogniser
+    from mechsearch_jax.envs.camera.recognisers import recogniser
+    from mechsearch_jax.envs.episode import episodes
+    from mechsearch_jax.envs.episode.method import Method
+    from mechsearch_jax.envs.simulators.native import NativeSimulator
     from mechsearch_jax.planner import PRESETS
     from mechsearch_jax.planner.cache import cached_problem
     from mechsearch_jax.workspace.scenario import load_scenario
@@ -155,7 +155,7 @@ def chosen_actions():
 def simulator(kept):
     """The actions of `chosen_actions`."""
     from mechsearch_jax.actions import KINDS, Action
-    from mechsearch_jax.envs.mjx_simulator import MjxSimulator
+    from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
     actions = {k: v for k, v in kept.items() if k.startswith("action ")} or {
@@ -178,8 +178,8 @@ def simulator(kept):
 
 
 def maps(kept):
-    from mechsearch_jax.envs.episodes import target_of
-    from mechsearch_jax.envs.pictures import inspect_scenario
+    from mechsearch_jax.envs.episode.episodes import target_of
+    from mechsearch_jax.envs.recording.pictures import inspect_scenario
     from mechsearch_jax.planner.cache import cached_problem
     from mechsearch_jax.workspace.scenario import load_scenario
 
@@ -193,10 +193,10 @@ def maps(kept):
 
 
 def shapes(kept):
-    from mechsearch_jax.envs.episodes import target_of
-    from mechsearch_jax.envs.recognisers import recogniser
-    from mechsearch_jax.envs.snapshot import Snapshot
-    from mechsearch_jax.envs.world import from_scenario
+    from mechsearch_jax.envs.camera.recognisers import recogniser
+    from mechsearch_jax.envs.camera.snapshot import Snapshot
+    from mechsearch_jax.envs.episode.episodes import target_of
+    from mechsearch_jax.envs.world.world import from_scenario
     from mechsearch_jax.planner.cache import cached_problem
     from mechsearch_jax.workspace.scenario import load_scenario
 
@@ -216,8 +216,8 @@ def shapes(kept):
 
 def made_up_pushes():
     """Pushes of the first object of each shipped scenario, after which it is where the gripper has gone."""
-    from mechsearch_jax.envs.pushes import Pushes
-    from mechsearch_jax.envs.world import BODIES, from_scenario
+    from mechsearch_jax.envs.pushing.pushes import Pushes
+    from mechsearch_jax.envs.world.world import BODIES, from_scenario
     from mechsearch_jax.geometry.transforms import make
     from mechsearch_jax.graspability import gripper_rotation
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
@@ -275,8 +275,8 @@ def weights(kept):
 
 def report(kept):
     """What is written of a few episodes whose wall times are made up."""
-    from mechsearch_jax.benchmarks.report import write_report
-    from mechsearch_jax.benchmarks.rows import Row
+    from mechsearch_jax.benchmarks.report.report import write_report
+    from mechsearch_jax.benchmarks.store.rows import Row
     from mechsearch_jax.workspace.scenario import example_scenarios
 
     rows = []

@@ -1,0 +1,252 @@
+"""A guard against losses: a fixed suite of episodes, compared one by one with what they came to before.
+
+The suite is run natively with preset `standard`. Every pair of an episode then and now can be the same, a gain or a
+loss; if gains and losses were equally likely, losses would outnumber gains as rarely as the sign test says (exact
+McNemar, one-sided).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import scipy.stats
+
+from mechsearch_jax.benchmarks.parts.images import save_rows
+from mechsearch_jax.benchmarks.running.evaluate import present_code
+from mechsearch_jax.benchmarks.store.rows import Row, set_by_retrievals
+from mechsearch_jax.envs.scenes.scene_sets import SETS, Block
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike
+from mechsearch_jax.versions import versions
+
+REFERENCE = Path(__file__).parents[1] / "results" / "guard-cpu.json"
+# Of each number of objects in the set `development`, in a suite of that many scenes.
+SUITES: Mapping[int, int] = {40: 10, 80: 20, 160: 40}
+SEED = 0
+# What is compared, and how likely a false alarm is in all: each is tested at its part of it.
+MEASURES = ("graspable", "retrieved")
+ALPHA = 0.05
+# Share of episodes that end otherwise with another seed: published scenes, `standard`, retrieved
+# (benchmarks/results/motion-h200.json, P: 0.10 to 0.13). A change of random numbers alone does the same.
+FLIPS = 0.12
+POWER = 0.8
+# What a reference says since graspable is told apart from retrieved.
+_APART = "graspable_apart_from_retrieved"
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What an episode of the suite came to.
+
+    Attributes:
+      scenario, content_hash, objects, seed: which episode it is.
+      found, graspable, retrieved, steps, failure: as in `Row`, the first two whether there was such a step; None for
+        `graspable` where that is not known (see `Row.graspable_known`).
+    """
+
+    scenario: str
+    content_hash: str | None
+    objects: int
+    seed: int
+    found: bool
+    graspable: bool | None
+    retrieved: bool
+    steps: int
+    failure: str | None
+
+    @classmethod
+    def of_row(cls, row: Row) -> Outcome:
+        """What the row of an episode says."""
+        return cls(
+            scenario=row.scenario,
+            content_hash=row.content_hash,
+            objects=row.objects,
+            seed=row.seed,
+            found=row.found_step is not None,
+            graspable=row.graspable_step is not None if row.graspable_known else None,
+            retrieved=row.retrieved,
+            steps=row.steps,
+            failure=row.failure,
+        )
+
+    @property
+    def episode(self) -> tuple[str | None, int]:
+        """What a pair has in common."""
+        return self.content_hash, self.seed
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """How a measure of the suite changed.
+
+    Attributes:
+      measure: one of `MEASURES`.
+      pairs: how many episodes.
+      before, now: in how many it held.
+      gains, losses: in how many it holds only now, and held only before.
+      p_value: how likely so large a share of losses is if gains and losses are equally likely.
+      alpha: at which that is significant.
+    """
+
+    measure: str
+    pairs: int
+    before: int
+    now: int
+    gains: int
+    losses: int
+    p_value: float
+    alpha: float
+
+    @property
+    def lost(self) -> bool:
+        """Whether the loss is significant."""
+        return self.p_value <= self.alpha
+
+
+def suite(scenes: int) -> list[tuple[Block, int]]:
+    """The scenes of a suite, for `scene_sets.scene_files`: the first of each number of objects in `development`.
+
+    Raises:
+      InputError: there is no suite of that size.
+    """
+    if scenes not in SUITES:
+        raise InputError(f"bench guard: there is no suite of {scenes} scenes; there are {', '.join(map(str, SUITES))}")
+    return [(block, index) for block in SETS["development"].blocks for index in range(SUITES[scenes])]
+
+
+def sign_test(gains: int, losses: int) -> float:
+    """How likely at least so many losses are among so many changes, if each is a gain or a loss with equal chance."""
+    changes = gains + losses
+    return 1.0 if changes == 0 else float(scipy.stats.binomtest(losses, changes, 0.5, alternative="greater").pvalue)
+
+
+def compare(before: Sequence[Outcome], now: Sequence[Outcome]) -> list[Comparison]:
+    """How each measure changed from a reference, episode by episode; the reference may hold more episodes.
+
+    A measure that some of the episodes do not say is left out.
+
+    Raises:
+      InputError: there is nothing to compare, or the reference lacks an episode.
+    """
+    known = {outcome.episode: outcome for outcome in before}
+    missing = [outcome.scenario for outcome in now if outcome.episode not in known]
+    if missing or not now:
+        what = f"{missing[0]} as it is here" if missing else "anything"
+        raise InputError(f"bench guard: the reference does not hold {what}; write a new one with --write")
+    changes = []
+    for measure in MEASURES:
+        pairs = [(getattr(known[one.episode], measure), getattr(one, measure)) for one in now]
+        if any(None in pair for pair in pairs):
+            continue
+        gains, losses = (sum(pair == change for pair in pairs) for change in ((False, True), (True, False)))
+        before_held, now_held = (sum(column) for column in zip(*pairs, strict=True))
+        changes.append(
+            Comparison(
+                measure=measure,
+                pairs=len(pairs),
+                before=before_held,
+                now=now_held,
+                gains=gains,
+                losses=losses,
+                p_value=sign_test(gains, losses),
+                alpha=ALPHA / len(MEASURES),
+            )
+        )
+    return changes
+
+
+def power(pairs: int, loss: float, flips: float = FLIPS, alpha: float = ALPHA / len(MEASURES)) -> float:
+    """How likely a true loss is noticed.
+
+    Args:
+      pairs: how many episodes are compared.
+      loss: by how much the share falls.
+      flips: share of the pairs that differ without it, half of them gains and half losses.
+      alpha: significance level of the test.
+    """
+    gain, lose = flips / 2, flips / 2 + loss
+    changes = np.arange(pairs + 1)
+    chance = scipy.stats.binom.pmf(changes, pairs, gain + lose)
+    # The least number of losses among so many changes that is significant.
+    needed = scipy.stats.binom.isf(alpha, changes, 0.5) + 1
+    noticed = scipy.stats.binom.sf(needed - 1, changes, lose / (gain + lose))
+    return float(np.sum(chance * np.where(changes > 0, noticed, 0.0)))
+
+
+def detectable(pairs: int, flips: float = FLIPS) -> float:
+    """The smallest loss, in steps of half a point, that is noticed with a probability of `POWER`."""
+    losses = np.arange(1, int(200 * (1 - flips))) / 200
+    return float(next(loss for loss in losses if power(pairs, loss, flips) >= POWER))
+
+
+def save_reference(rows: Sequence[Row], command: str, path: PathLike) -> None:
+    """Store what the suite came to, for later comparisons.
+
+    Args:
+      rows: of all episodes.
+      command: that ran them.
+      path: of the JSON file.
+
+    Raises:
+      InputError: an episode could not be run to its end, there are none, or the file cannot be written.
+    """
+    errors = [row for row in rows if row.is_error]
+    if errors or not rows:
+        told = f"{errors[0].scenario} ended with {errors[0].failure!r}" if errors else "there are no episodes"
+        raise InputError(f"bench guard: {told}; nothing is stored")
+    if not all(row.graspable_known for row in rows):
+        raise InputError("bench guard: an earlier version wrote these rows; nothing is stored; use another folder")
+    head = {
+        "command": command,
+        "code": present_code(),
+        "versions": versions(),
+        "configuration": json.loads(rows[0].configuration or "{}"),
+        _APART: True,
+        "retrieved": {str(n): share for n, share in _shares(rows, "retrieved").items()},
+        "graspable": {str(n): share for n, share in _shares(rows, "graspable").items()},
+    }
+    save_rows(head, [Outcome.of_row(row) for row in rows], path)
+
+
+def _shares(rows: Sequence[Row], measure: str) -> dict[int, float]:
+    """A measure's share of the episodes with each number of objects."""
+    outcomes = [Outcome.of_row(row) for row in rows]
+    groups = {n: [one for one in outcomes if one.objects == n] for n in sorted({one.objects for one in outcomes})}
+    return {n: sum(getattr(one, measure) for one in group) / len(group) for n, group in groups.items()}
+
+
+class Reference(NamedTuple):
+    """What `save_reference` stored: the code that ran, and what its episodes came to."""
+
+    code: str
+    outcomes: list[Outcome]
+
+
+def read_reference(path: PathLike) -> Reference:
+    """What `save_reference` stored.
+
+    In files of earlier versions a retrieval counted as graspable: whether a retrieved target was is not known.
+
+    Raises:
+      InputError: the file cannot be read, or is something else.
+    """
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror or error}); write a reference with --write"
+        ) from error
+    except ValueError as error:
+        raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
+    try:
+        outcomes = [Outcome(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
+        if not value.get(_APART) and set_by_retrievals(json.dumps(value.get("configuration"))):
+            outcomes = [dataclasses.replace(one, graspable=None) if one.retrieved else one for one in outcomes]
+        return Reference(value["code"], outcomes)
+    except (TypeError, KeyError, ValueError, AttributeError) as error:
+        raise InputError(f"{path}: is no reference of bench guard ({error})") from error

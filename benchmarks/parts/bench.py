@@ -1,0 +1,481 @@
+"""How long perception, f, g, predicted pushes, a decision and simulation take, on scenes that the generator made.
+
+Compilation is timed apart from the steady state.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax import planner
+from mechsearch_jax.actions import Action
+from mechsearch_jax.benchmarks.parts.push import named_model, weights_of
+from mechsearch_jax.dynamics.named import PushModelName
+from mechsearch_jax.dynamics.push_model import PushOutcome
+from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
+from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.pushing.pushes import PushesConfig, draw_push, push_tables
+from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
+from mechsearch_jax.envs.simulators.mjx_model import MjxConfig
+from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
+from mechsearch_jax.envs.simulators.mjx_step import commands
+from mechsearch_jax.envs.world.world import TARGET, World, from_scenario, true_superquadrics
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.existence import existence, object_views
+from mechsearch_jax.files import PathLike, save_json
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import make
+from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation, pairs
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import Belief, Config, Decision, Problem
+from mechsearch_jax.planner import trials as trying
+from mechsearch_jax.planner.settings import Settings
+from mechsearch_jax.planner.trials import Trials
+from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.robot import motion
+from mechsearch_jax.train.push import push_scenes
+from mechsearch_jax.train.scenes import random_world
+from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.object_sizes import ObjectSizes
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS
+from mechsearch_jax.workspace.shelf import Shelf
+
+# What a call does many of; how many is in `Timing.shapes`.
+COUNTED = ("evaluations", "operations", "bytes", "recognitions", "predictions")
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """How long one function takes.
+
+    Attributes:
+      subject: "existence", "graspability", "plan", "perceive: ..." and "predict: ..." with what does it, "simulate", or
+        a part of `roofline.bench_inside`.
+      objects: number of objects in the scenes.
+      shapes: sizes that the time depends on; for "simulate" also what was seen of overflows and divergence.
+      compile_seconds: of tracing and compiling [s]; honest only if compilations are not kept on disk.
+      seconds: of every call afterwards, results awaited [s].
+      versions: as `versions` returns them; for "plan" also the "push model", for "predict: learned" also
+        "weights", their SHA-256.
+    """
+
+    subject: str
+    objects: int
+    shapes: dict[str, int]
+    compile_seconds: float
+    seconds: tuple[float, ...]
+    versions: dict[str, str]
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.seconds)
+
+    @property
+    def spread(self) -> tuple[float, float]:
+        """The fastest and the slowest call [s]."""
+        return min(self.seconds), max(self.seconds)
+
+    @property
+    def unit(self) -> str | None:
+        """What a call does many of: "steps" (of all worlds together), or one of `COUNTED`; None where nothing is."""
+        return "steps" if self.subject == "simulate" else next((unit for unit in COUNTED if unit in self.shapes), None)
+
+    @property
+    def rate(self) -> float | None:
+        """How many of its unit are done per second; None where nothing is counted."""
+        if self.unit is None:
+            return None
+        return self.shapes[self.unit] * self.shapes.get("worlds", 1) / self.median
+
+    def value(self) -> dict[str, Any]:
+        """What is written to a file: the fields, the median and the rate."""
+        value = {**dataclasses.asdict(self), "median_seconds": self.median}
+        return value if self.rate is None else {**value, f"{self.unit}_per_second": self.rate}
+
+
+def save_timing(timing: Timing, path: PathLike) -> None:
+    """Write a timing as JSON, with its median.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    save_json(timing.value(), path)
+
+
+def save_timings(timings: Sequence[Timing], path: PathLike) -> None:
+    """Write several timings as one JSON file, `{"timings": [...]}`.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    save_json({"timings": [timing.value() for timing in timings]}, path)
+
+
+def measure(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repeats: int) -> tuple[float, list[float]]:
+    """Seconds to compile a function for its arguments, and of every call after that.
+
+    Args:
+      function: to be compiled.
+      calls: arguments of the same shapes, taken in turn.
+      repeats: number of timed calls.
+    """
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*calls[0]).compile()
+    compile_seconds = time.perf_counter() - start
+    jax.block_until_ready(compiled(*calls[0]))
+    return compile_seconds, _timed(compiled, calls, repeats)
+
+
+def measure_first(
+    function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repeats: int
+) -> tuple[float, list[float]]:
+    """The same of a function that compiles what it needs by itself: how much longer its first call takes."""
+    first = _timed(function, calls, 1)[0]
+    seconds = _timed(function, calls, repeats)
+    return max(first - statistics.median(seconds), 0.0), seconds
+
+
+def _timed(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repeats: int) -> list[float]:
+    seconds = []
+    for i in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(function(*calls[i % len(calls)]))
+        seconds.append(time.perf_counter() - start)
+    return seconds
+
+
+def f_of(problem: Problem, scene: Superquadrics) -> Bool[Array, " x"]:
+    """f of a single state, for all poses."""
+    everywhere = jnp.ones(problem.poses.shape[0], bool)
+    views = object_views(problem.existence, problem.camera, scene, everywhere, problem.config.existence)
+    config = problem.config.existence
+    allowed = jnp.full(problem.existence.corner.shape[:2], config.allowed(problem.camera), jnp.int32)
+    return existence(problem.existence, problem.camera, views, everywhere, allowed, config)
+
+
+def g_of(problem: Problem, belief: Belief, scene: Superquadrics) -> Int[Array, " x"]:
+    """g of a single state, where f = 1."""
+    return graspability(pairs(problem.grasps), grasp_hits(problem.grasps, None, scene, belief.exists))
+
+
+def bench_part(
+    subject: Literal["existence", "graspability"],
+    objects: int,
+    settings: Settings,
+    batch: int = 1,
+    scenes: int = 5,
+    repeats: int = 20,
+) -> Timing:
+    """Time f or g on generated scenes.
+
+    Args:
+      subject: what is timed.
+      objects: number of objects in a scene.
+      settings: of the workcell, of the objects in it, and how the problem is built.
+      batch: number of scenes in one call; 1 times the function itself, without a batch axis.
+      scenes: number of different scenes, taken in turn.
+      repeats: number of timed calls.
+
+    Raises:
+      InputError: the number of objects does not fit.
+    """
+    problem, states, shapes = _states(objects, settings.config, settings.workcell, settings.objects, batch, scenes)
+    functions: dict[str, Callable[..., Any]] = {
+        "existence": lambda problem, key, belief, seen: f_of(problem, seen.objects),
+        "graspability": lambda problem, key, belief, seen: g_of(problem, belief, seen.objects),
+    }
+    if subject == "graspability":
+        shapes["median_possible_poses"] = int(statistics.median(int(belief.exists.sum()) for _, belief, _ in states))
+    function, calls = functions[subject], [(problem, *state) for state in states]
+    if batch > 1:
+        function, calls = jax.vmap(function, in_axes=(None, 0, 0, 0)), [(problem, *_batch_of(states, batch))]
+    compile_seconds, seconds = measure(function, calls, repeats)
+    return Timing(subject, objects, shapes, compile_seconds, tuple(seconds), versions())
+
+
+def bench_plan(
+    objects: int,
+    method: Method,
+    batch: int = 1,
+    scenes: int = 5,
+    repeats: int = 20,
+    sizes: ObjectSizes | None = None,
+) -> Timing:
+    """Time a decision on generated scenes, whose targets are not found yet.
+
+    Args:
+      objects: number of objects in a scene.
+      method: what decides, and with which settings.
+      batch, scenes, repeats: as in `bench_part`.
+      sizes: of the objects; the paper's if None.
+
+    Raises:
+      InputError: the number of objects does not fit, or the method cannot be used.
+    """
+    policy, trials = method.policy(), method.trials()
+    problem, states, shapes = _states(objects, method.config, method.workcell, sizes, batch, scenes)
+    shapes |= {"sequences": method.config.planner.sequences, "horizon": method.config.planner.horizon}
+
+    def propose(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
+        return policy(key, problem, belief, seen)
+
+    def decide(problem: Problem, key: Array, belief: Belief, seen: Observation) -> Decision:
+        return trying.decide(policy, trials, key, problem, belief, seen)
+
+    if batch > 1:
+        several = [(problem, *_batch_of(states, batch))]
+        proposed = jax.vmap(propose, in_axes=(None, 0, 0, 0))
+        if trials is None:
+            compile_seconds, seconds = measure(proposed, several, repeats)
+        else:
+            compile_seconds, seconds = measure_first(_after_trials(jax.jit(proposed), trials), several, repeats)
+    else:
+        # As in an episode alone: a policy compiles what it needs, and computes only what the belief asks for.
+        compile_seconds, seconds = measure_first(decide, [(problem, *state) for state in states], repeats)
+    told = versions() | {"push model": method.config.push_model}
+    return Timing("plan", objects, shapes, compile_seconds, tuple(seconds), told)
+
+
+def _after_trials(proposed: Callable[..., Decision], trials: Trials) -> Callable[..., Decision]:
+    """What decides on many scenes after trials."""
+    choose = jax.jit(jax.vmap(trying.choose))
+
+    def decide(problem: Problem, keys: Array, beliefs: Belief, seen: Observation) -> Decision:
+        decisions = proposed(problem, keys, beliefs, seen)
+        alternatives = decisions.alternatives
+        if alternatives is None:
+            return decisions
+        scenes = trying.scenes_of(beliefs, seen)
+        results = trials(problem, scenes, *jax.device_get((alternatives.actions, alternatives.worth)))
+        return choose(decisions, jnp.asarray(results))
+
+    return decide
+
+
+def _states(
+    objects: int, config: Config, workcell: Workcell, sizes: ObjectSizes | None, batch: int, scenes: int
+) -> tuple[Problem, list[tuple[Array, Belief, Observation]], dict[str, int]]:
+    """The problem, what is known and seen at the start of generated scenes with a key each, and the sizes."""
+    around = {"shelf": workcell.shelf, "camera": workcell.camera, "gripper": workcell.gripper}
+    generator = ScenarioGenerator(workcell.target, **around, sizes=sizes)
+    problem = planner.build_problem(target=generator.target, **around, config=config.problem)
+    states = []
+    for seed in range(scenes):
+        world = from_scenario(generator.generate(seed, objects))
+        scene = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
+        observation = Observation(scene, jnp.array(False), jnp.zeros(3))
+        belief = planner.update_belief(problem, planner.initial_belief(problem), observation)
+        states.append((jax.random.key(seed), belief, observation))
+    capacity = states[0][2].objects.capacity
+    return problem, states, {"poses": len(problem.poses), "capacity": capacity, "scenes": scenes, "batch": batch}
+
+
+def _batch_of(states: Sequence[Any], batch: int) -> Any:
+    """So many of the states, in turn, with a leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack([leaves[i % len(states)] for i in range(batch)]), *states)
+
+
+def bench_perceive(
+    recognition: RecognitionName, objects: int, batch: int = 1, scenes: int = 5, repeats: int = 20
+) -> Timing:
+    """Time what makes superquadrics of noisy depth images: cloud, segments, network and refinement.
+
+    The images are ray-cast in the same computation, because that is how the planner's simulated camera comes to them.
+
+    Args:
+      recognition: "masks" or "full".
+      objects: number of objects in a scene, all of which are recognised at once.
+      batch, scenes, repeats: as in `bench_part`.
+
+    Raises:
+      InputError: the oracle recognises nothing, the number of objects does not fit, or the weights are damaged.
+    """
+    if recognition == "oracle":
+        raise InputError("bench perceive: the oracle recognises nothing; give --recognition masks or full")
+    generator = ScenarioGenerator()
+    see = recogniser(recognition, generator.target)
+    camera, shelf = Camera(), Shelf()
+    worlds = [from_scenario(generator.generate(seed, objects)) for seed in range(scenes)]
+    states = [(jax.random.key(seed), world) for seed, world in enumerate(worlds)]
+
+    def perceive(key: Array, world: World) -> Superquadrics:
+        return see(key, Snapshot(camera, shelf, world)).objects
+
+    function, calls = perceive, states
+    if batch > 1:
+        function = jax.vmap(perceive)
+        calls = [_batch_of(states, batch)]
+    compile_seconds, seconds = measure(function, calls, repeats)
+    shapes = {"scenes": scenes, "batch": batch, "recognitions": batch * objects}
+    return Timing(f"perceive: {recognition}", objects, shapes, compile_seconds, tuple(seconds), versions())
+
+
+def drawn_pushes(count: int, objects: int, seed: int = 0, tries: int = 100) -> tuple[World, Action]:
+    """Random pushes that the arm can make, as the push model is trained on, each in a random scene of its own.
+
+    Args:
+      count: how many.
+      objects: in each scene. One with room for fewer, or in which no push is possible, is drawn anew.
+      seed: of the scenes and the pushes.
+      tries: after so many times `count` scenes it is given up.
+
+    Returns:
+      The scenes and the pushes, with a leading axis.
+
+    Raises:
+      InputError: the number of objects does not fit, or too few pushes are found.
+    """
+    if not 1 <= objects <= MAX_OBJECTS:
+        raise InputError(f"bench predict: --objects {objects} is not between 1 and {MAX_OBJECTS}")
+    scenes, config, shelf = dataclasses.replace(push_scenes(), objects=(objects, objects)), PushesConfig(), Shelf()
+    tables = push_tables(config)
+
+    def draw(key: Array) -> tuple[World, Action, Array]:
+        scene_key, push_key = jax.random.split(key)
+        world = random_world(scene_key, scenes, shelf)
+        action, found = draw_push(push_key, world, tables, config, shelf)
+        return world, action, found & (jnp.sum(world.valid[:TARGET]) == objects)
+
+    several = jax.jit(lambda keys: jax.lax.map(draw, keys, batch_size=min(count, 64)))
+    parts, have = [], 0
+    for i in range(tries):
+        world, action, real = jax.device_get(
+            several(jax.random.split(jax.random.fold_in(jax.random.key(seed), i), count))
+        )
+        parts.append(jax.tree.map(lambda a, real=real: a[real], (world, action)))
+        have += int(real.sum())
+        if have >= count:
+            return jax.tree.map(lambda *a: jnp.asarray(np.concatenate(a)[:count]), *parts)
+    raise InputError(f"bench predict: only {have} of {count} pushes were possible with {objects} objects; take fewer")
+
+
+def bench_predict(
+    push_model: PushModelName, objects: int, batch: int = 30, repeats: int = 20, weights: Path | None = None
+) -> Timing:
+    """Time a push model on random pushes, each in a scene of its own, all in one call.
+
+    Args:
+      push_model: its name.
+      objects: number of objects in a scene.
+      batch: pushes in a call; a step of a decision predicts one for each sampled sequence.
+      repeats: number of timed calls.
+      weights: of the learned model; the shipped ones if None.
+
+    Raises:
+      InputError: the number of objects does not fit, or the model cannot be used.
+    """
+    model = named_model(push_model, weights)
+    world, action = drawn_pushes(batch, objects)
+    shelf, pusher = Shelf(), push_tables(PushesConfig()).pusher
+
+    def predict(pusher: Array, scene: Superquadrics, action: Action) -> PushOutcome:
+        return model(shelf, scene, pusher, action.T_world_gripper, action.displacement, action.q7)
+
+    # As in a decision, the target is none of the objects.
+    scene = true_superquadrics(world)
+    compile_seconds, seconds = measure(jax.vmap(predict, in_axes=(None, 0, 0)), [(pusher, scene, action)], repeats)
+    about = weights_of(model)
+    shapes = {"predictions": batch, "capacity": TARGET}
+    if about is not None:
+        shapes["parameters"] = about["parameters"]
+    told = versions() if about is None else {**versions(), "weights": about["sha256"]}
+    return Timing(f"predict: {push_model}", objects, shapes, compile_seconds, tuple(seconds), told)
+
+
+def crowded_worlds(worlds: int, scenes: int = 8, seed: int = 0) -> World:
+    """Many worlds with 8 objects each: generated scenes in turn, in every world with other sizes.
+
+    Args:
+      worlds: how many.
+      scenes: number of generated scenes.
+      seed: of the scenes and of the sizes.
+    """
+    generator = ScenarioGenerator()
+    made = [from_scenario(generator.generate(seed + i, MAX_OBJECTS)) for i in range(min(scenes, worlds))]
+    several: World = jax.tree.map(lambda *leaves: np.stack(leaves)[np.arange(worlds) % len(leaves)], *made)
+    scale = np.random.default_rng(seed).uniform(0.96, 1.0, (worlds, several.kind.shape[1], 1)).astype(np.float32)
+    half = np.asarray(several.half_size)
+    # A smaller body stands lower, if it stands.
+    lower = (1 - scale[..., 0]) * half[..., 2]
+    position = np.asarray(several.position) - lower[..., None] * np.array([0.0, 0.0, 1.0], np.float32)
+    return several.replace(half_size=half * scale, position=position)
+
+
+def plough(worlds: int, steps: int) -> tuple[Float[Array, "steps worlds 9"], Float[Array, "worlds 9"]]:
+    """Controls with which the arm reaches in, sweeps 0.15 m through the objects, and goes out again, to and fro.
+
+    Args:
+      worlds: each sweeps at a depth and a side of its own.
+      steps: number of time steps.
+
+    Returns:
+      The controls, and where the robot begins.
+    """
+    u = jnp.asarray((np.arange(worlds) % 16) / 16.0 + 1 / 32, jnp.float32)
+    position = jnp.stack([0.53 + 0.07 * u, -0.08 + 0.3 * ((5 * u) % 1), jnp.full(worlds, 0.48)], axis=-1)
+    tilt = jnp.full(worlds, np.radians(30), jnp.float32)
+    T = make(gripper_rotation(jnp.zeros(worlds), tilt), position.astype(jnp.float32))
+    shift = jnp.tile(jnp.float32([[0.0, 0.15, 0.0]]), (worlds, 1))
+    build = jax.vmap(lambda T, shift, q7: motion.push_reference(T, shift, q7, motion.MotionConfig()))
+    reference, reachable = build(T, shift, jnp.full(worlds, WRIST_ORIGIN + np.radians(30), jnp.float32))
+    if not reachable.all():
+        raise InputError("bench simulate: the arm cannot make its sweep")
+    told = jnp.swapaxes(commands(reference), 0, 1)[: int(reference.length.max())]
+    # Back along the same way at its end, where the next sweep would begin elsewhere.
+    last = len(told) - 1
+    index = np.arange(steps) % (2 * last)
+    row = np.minimum(index, 2 * last - index)
+    start = jnp.concatenate([reference.start, reference.start[:, -1:]], axis=1)
+    return told[row], start
+
+
+def bench_simulate(
+    worlds: int, steps: int, repeats: int = 5, scenes: int = 8, config: MjxConfig | None = None
+) -> Timing:
+    """Time the batch simulator: 8 objects of other sizes in every world, the arm sweeping through them.
+
+    Args:
+      worlds: how many at once.
+      steps: time steps of a timed call; `Timing.rate` is worlds times steps by the median of the calls.
+      repeats: number of timed calls; each begins with the scenes as generated.
+      scenes: number of generated scenes, which the worlds take in turn.
+      config: of the simulator.
+
+    Raises:
+      InputError: a number is not positive, or Warp is missing.
+    """
+    for name, value in {"worlds": worlds, "steps": steps, "repeats": repeats, "scenes": scenes}.items():
+        if value < 1:
+            raise InputError(f"bench simulate: {name} {value} must be at least 1")
+    simulator = MjxSimulator(config=config)
+    start = crowded_worlds(worlds, scenes)
+    controls, begin = plough(worlds, steps)
+    seconds = []
+    for _ in range(repeats + 1):
+        jax.block_until_ready((simulator.load(start), controls))
+        before = time.perf_counter()
+        outcomes = jax.block_until_ready(simulator.follow(controls, begin))
+        seconds.append(time.perf_counter() - before)
+    first, *rest = seconds
+    shapes = {
+        "worlds": worlds,
+        "steps": steps,
+        "scenes": scenes,
+        "overflowed_worlds": int((outcomes.overflow != 0).sum()),
+        "diverged_worlds": int((outcomes.failure != 0).sum()),
+    }
+    # Warp compiles when its kernels are first launched, so that only the first call's excess tells how long that takes.
+    compile_seconds = max(first - statistics.median(rest), 0.0)
+    return Timing("simulate", MAX_OBJECTS, shapes, compile_seconds, tuple(rest), versions())

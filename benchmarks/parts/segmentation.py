@@ -1,0 +1,265 @@
+"""How well the objects of depth images are told apart, on scenes that no training has seen.
+
+What is judged is the image as the planner's `full` mode labels it: the cloud is drawn, segmented, cleaned up and spread
+over the pixels. A segment is compared with the object that it overlaps most, one each; an object that none is left
+for counts as 0.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from mechsearch_jax.benchmarks.parts.images import NOISES, Look, Scene, image_of, named, save_rows
+from mechsearch_jax.envs.camera.recognisers import Labeller, Segmenter
+from mechsearch_jax.envs.camera.simulated_camera import is_found
+from mechsearch_jax.envs.world.world import TARGET
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike
+from mechsearch_jax.networks.weights import shipped_weights
+from mechsearch_jax.perception.cloud import shelf_view
+from mechsearch_jax.train.scenes import PIXELS
+from mechsearch_jax.versions import versions
+from mechsearch_jax.viz import drawing
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+# Colours of up to eight objects, told apart with red-green blindness too.
+_COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#ee8866", "#8c8c8c")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """How well one object was told apart.
+
+    Attributes:
+      source, scene, object: which object of which scene.
+      objects: in the scene, seen or not.
+      noise: name of the sensor.
+      pixels: of the full image that show it.
+      visible: that number over the one that there would be if it stood alone.
+      iou: of its pixels with those of its segment.
+    """
+
+    source: str
+    scene: str
+    object: int
+    objects: int
+    noise: str
+    pixels: int
+    visible: float
+    iou: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """What came of it.
+
+    Attributes:
+      rows: one for every visible object of every image.
+      seconds: for each image, the time to label it [s].
+      compile_seconds: of the first call, less the median of the others [s].
+      settings: what scenes, noises and seed they come from.
+      versions: as `versions` returns them.
+    """
+
+    rows: tuple[Row, ...]
+    seconds: tuple[float, ...]
+    compile_seconds: float
+    settings: dict[str, Any]
+    versions: dict[str, str]
+
+    def summary(self) -> list[dict[str, Any]]:
+        """Mean intersection over union by source, noise and number of objects in the scene (None: of all)."""
+        lines = []
+        for source, noise in dict.fromkeys((row.source, row.noise) for row in self.rows):
+            own = [row for row in self.rows if (row.source, row.noise) == (source, noise)]
+            for count in (*sorted({row.objects for row in own}), None):
+                chosen = [row for row in own if count in (None, row.objects)]
+                enough = [row.iou for row in chosen if row.pixels >= PIXELS]
+                lines.append(
+                    {
+                        "source": source,
+                        "noise": noise,
+                        "objects": count,
+                        "scenes": len({row.scene for row in chosen}),
+                        "counted": len(enough),
+                        "iou_mean": float(np.mean(enough)) if enough else None,
+                        "missed": sum(iou < 0.5 for iou in enough),
+                        "visible": len(chosen),
+                        "iou_mean_visible": float(np.mean([row.iou for row in chosen])),
+                    }
+                )
+        return lines
+
+    def value(self) -> dict[str, Any]:
+        """What is written to a file, without the rows."""
+        return {
+            "settings": self.settings,
+            "versions": self.versions,
+            "median_seconds": statistics.median(self.seconds),
+            "compile_seconds": self.compile_seconds,
+            "summary": self.summary(),
+        }
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Bench:
+    """Scenes to segment; everything that is needed to repeat any part of it.
+
+    Attributes:
+      scenes: what is segmented.
+      noises: names of `images.NOISES`.
+      seed: of the noise and of the points that are drawn.
+      labeller: what segments; the shipped network if None.
+      shelf: what the scenes stand on.
+    """
+
+    scenes: Sequence[Scene]
+    noises: Sequence[str] = ("clean", "gaussian")
+    seed: int = 0
+    labeller: Labeller | None = None
+    shelf: Shelf = dataclasses.field(default_factory=Shelf)
+
+    def __post_init__(self):
+        if not self.scenes:
+            raise InputError("bench segmentation: there are no scenes; give --scenes, or scenario files")
+        unknown = next((name for name in self.noises if name not in NOISES), None)
+        if unknown is not None or not self.noises:
+            raise InputError(f'bench segmentation: noise "{unknown}" is unknown; use {", ".join(NOISES)}')
+
+    def run(self, watcher: Callable[[int], None] = lambda done: None) -> Measured:
+        """Segment everything.
+
+        Args:
+          watcher: told after every image how many are done.
+
+        Raises:
+          InputError: the shipped weights are missing or damaged.
+        """
+        label = self._compiled()
+        first = self._label(label, 0, self.noises[0])[2]
+        rows: list[Row] = []
+        seconds: list[float] = []
+        for noise in self.noises:
+            for index, scene in enumerate(self.scenes):
+                image, found, spent = self._label(label, index, noise)
+                rows += _rows(scene, noise, image, found)
+                seconds.append(spent)
+                watcher(len(seconds))
+        sources = [scene.source for scene in self.scenes]
+        settings = {
+            "held_out_scenes": sources.count("held-out"),
+            "scenario_files": sources.count("files"),
+            "noises": {name: named(NOISES[name]) for name in self.noises},
+            "seed": self.seed,
+            "least_pixels": PIXELS,
+        }
+        compiling = max(first - statistics.median(seconds), 0.0)
+        return Measured(tuple(rows), tuple(seconds), compiling, settings, versions())
+
+    def images(self, choice: Sequence[tuple[int, str]]) -> list[tuple[Look, np.ndarray]]:
+        """Some images, by scene's place and noise, with the labels that were found."""
+        label = self._compiled()
+        return [self._label(label, index, noise)[:2] for index, noise in choice]
+
+    def _compiled(self) -> Callable[..., Any]:
+        labeller = self.labeller or Segmenter(shipped_weights("segmentation"))
+
+        def label(key, image, target_seen):
+            labels = image.shown.labels
+            of_target = (labels == TARGET) & target_seen
+            # Small segments are judged, too.
+            return labeller(key, self.shelf, image.shown.points, of_target, labels, 0.0)
+
+        return jax.jit(label)
+
+    def _label(self, label: Callable[..., Any], index: int, noise: str) -> tuple[Look, np.ndarray, float]:
+        key, image = image_of(self.scenes, index, noise, self.seed, shelf_view(shelf=self.shelf), self.shelf)
+        seen = jax.block_until_ready((image, is_found(Camera(), self.scenes[index].world)))[1]
+        start = time.perf_counter()
+        found = jax.block_until_ready(label(key, image, seen))
+        return image, np.asarray(found), time.perf_counter() - start
+
+
+def overlaps(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Intersection over union of each object's pixels with those of the segment of its number; NaN where unseen."""
+    objects = np.arange(TARGET)[:, None]
+    one, other = found.reshape(1, -1) == objects, truth.reshape(1, -1) == objects
+    union = (one | other).sum(axis=1)
+    return np.where(other.any(axis=1), (one & other).sum(axis=1) / np.maximum(union, 1), np.nan)
+
+
+def _rows(scene: Scene, noise: str, image: Look, found: np.ndarray) -> list[Row]:
+    iou = overlaps(found, np.asarray(image.shown.labels))
+    pixels, visible, valid = jax.device_get((image.pixels, image.visible, scene.world.valid[:TARGET]))
+    return [
+        Row(
+            source=scene.source,
+            scene=scene.name,
+            object=int(i),
+            objects=int(valid.sum()),
+            noise=noise,
+            pixels=int(pixels[i]),
+            visible=round(float(visible[i]), 4),
+            iou=round(float(iou[i]), 4),
+        )
+        for i in np.flatnonzero(valid & np.isfinite(iou))
+    ]
+
+
+def save_segmentation(measured: Measured, path: PathLike) -> None:
+    """Write the figures and all rows as JSON.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    save_rows(measured.value(), measured.rows, path)
+
+
+def worst_figure(bench: Bench, rows: Sequence[Row], count: int) -> Figure:
+    """The images whose objects of at least 100 pixels are told apart worst: true masks beside those found.
+
+    Raises:
+      InputError: there are none.
+    """
+    shares: dict[tuple[str, str, str], list[float]] = {}
+    for row in rows:
+        if row.pixels >= PIXELS:
+            shares.setdefault((row.source, row.scene, row.noise), []).append(row.iou)
+    order = sorted(shares, key=lambda key: statistics.mean(shares[key]))[:count]
+    if not order or count < 1:
+        raise InputError("bench segmentation: there are no images to draw; count from 1")
+    place = {(scene.source, scene.name): i for i, scene in enumerate(bench.scenes)}
+    images = bench.images([(place[source, scene], noise) for source, scene, noise in order])
+    columns = min(3, len(order))
+    lines = -(-len(order) // columns)
+    figure = Figure(figsize=(4.2 * columns, 4.1 * lines), layout="constrained")
+    panels = figure.subfigures(lines, columns, squeeze=False).reshape(-1)
+    for key, (image, found), panel in zip(order, images, panels, strict=False):
+        truth = np.asarray(image.shown.labels)
+        panel.suptitle(
+            f"{key[1]}, {key[2]}: mean IoU {statistics.mean(shares[key]):.2f}", fontsize=9, color=drawing.INK
+        )
+        for axes, labels, name in zip(panel.subplots(2, 1), (truth, found), ("true", "found"), strict=True):
+            _draw(axes, np.asarray(image.shown.depth), labels)
+            axes.set_ylabel(name, fontsize=8, color=drawing.MUTED)
+    return figure
+
+
+def _draw(axes: Any, depth: np.ndarray, labels: np.ndarray) -> None:
+    near = np.where(np.isfinite(depth), depth, np.nan)
+    axes.imshow(near, cmap="gray", interpolation="nearest")
+    tint = np.zeros((*labels.shape, 4))
+    for i, colour in enumerate(_COLOURS):
+        tint[labels == i] = (*drawing.rgb(colour), 0.75)
+    axes.imshow(tint, interpolation="nearest")
+    axes.set_xticks([])
+    axes.set_yticks([])

@@ -1,0 +1,176 @@
+"""Results of whole episodes on the screen: rates by variant, what share of scenes can be solved, what a suite lost."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+from rich.console import Console, Group
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from mechsearch_jax.benchmarks.ceiling import solvability
+from mechsearch_jax.benchmarks.guard import guard
+from mechsearch_jax.benchmarks.report.tables import plain_table
+from mechsearch_jax.benchmarks.statistics.paired import Difference, by_variant
+from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise, summarise_events
+from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
+from mechsearch_jax.benchmarks.store.rows import Row
+
+
+def print_rates(console: Console, rows: Sequence[Row]) -> None:
+    """Print the rates of rows by variant and number of objects, with what the labels stand for."""
+    print_summary(console, summarise(rows), Key.of(rows))
+
+
+def print_summary(console: Console, summary: Sequence[Rates], key: Key) -> None:
+    """Print rates, and what the labels of variants stand for."""
+    console.print(summary_table(summary, key))
+    console.print("plan, act: seconds per action", style="dim")
+    if any(rates.graspable is None for rates in summary):
+        said = "graspable -: not known; in an earlier version a retrieval counted as graspable, too"
+        console.print(said, style="dim", soft_wrap=True)
+    if key.numbered:
+        console.print()
+        for label, short in key.short.items():
+            console.print(f"{short}  {label}", soft_wrap=True)
+    elif key.common:
+        console.print(f"all {key.common}", style="dim", soft_wrap=True)
+
+
+def rates_table(rows: Sequence[Row]) -> Table:
+    """Rates of success by variant and number of objects; see `summary_table`."""
+    return summary_table(summarise(rows), Key.of(rows))
+
+
+def summary_table(summary: Sequence[Rates], key: Key) -> Table:
+    """Rates of success by group, and mean times per action.
+
+    "paper's" is the share that is graspable with the paper's grasps alone, of the episodes that say so.
+    """
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    columns = list(summary[0].group)
+    for name in columns:
+        _add_group_column(table, name)
+    for name in ("runs", "found", "graspable", "paper's", "retrieved", "actions", "plan", "act"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for rates in _told(summary, key):
+        shares = rates.found, rates.graspable, rates.paper_graspable, rates.retrieved
+        table.add_row(
+            *_group(rates.group, key),
+            str(rates.episodes),
+            *("-" if share is None else f"{share:.2f}" for share in shares),
+            f"{rates.steps:.1f}",
+            f"{rates.planning_seconds:.2f}",
+            f"{rates.simulation_seconds:.2f}",
+            style="bold" if None in rates.group.values() else None,
+        )
+    return table
+
+
+def _add_group_column(table: Table, name: str) -> None:
+    """A column that says what a group has in common; others give way before labels do."""
+    text = name in (VARIANT, "scenario", "policy")
+    header = {"objects": "objs"}.get(name, name.replace("_", " "))
+    table.add_column(header, justify="left" if text else "right", no_wrap=name == VARIANT, overflow="fold")
+
+
+def _group(group: Mapping[str, Hashable], key: Key) -> list[str]:
+    """What a group has in common, as cells; what a cell says is no markup."""
+    found = []
+    for value in group.values():
+        told = f"{value:g}" if isinstance(value, float) else key.short.get(str(value), str(value))
+        found.append("all" if value is None else escape(told))
+    return found
+
+
+def _told(summary: Sequence[Any], key: Key) -> Sequence[Any]:
+    """What is printed: all, or where there are many variants, what is over all numbers of objects."""
+    if len(key.short) <= MOST_IN_FULL or list(summary[0].group) != [VARIANT, "objects"]:
+        return summary
+    return [each for each in summary if each.objects is None]
+
+
+def differences_table(differences: Sequence[Difference], key: Key, baseline: str) -> Table:
+    """How variants differ from one of them over pairs of episodes, in percentage points, each ± a standard error."""
+    table = plain_table(f"points more than {key.short[baseline]}, same episodes")
+    table.add_column("variant", overflow="fold")
+    for name in ("pairs", *GOALS):
+        table.add_column(name, justify="right", no_wrap=True)
+    for label, goals in by_variant(differences).items():
+        cells = []
+        for goal in GOALS:
+            one = goals[goal]
+            error = "" if one.standard_error is None else f" ± {100 * one.standard_error:.1f}"
+            cells.append("-" if one.difference is None else f"{100 * one.difference:+.1f}{error}")
+        table.add_row(escape(key.short[label]), str(goals["found"].pairs), *cells)
+    return table
+
+
+def events_table(rows: Sequence[Row]) -> Table | None:
+    """What happened on the way, by variant and number of objects; None where no row says it."""
+    summary = summarise_events(rows)
+    return events_summary_table(summary, Key.of(rows)) if summary else None
+
+
+def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
+    """What happened on the way, of at least one group."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    for name in summary[0].group:
+        _add_group_column(table, name)
+    for name in ("runs", *EVENTS.values()):
+        table.add_column(name, justify="right")
+    for events in _told(summary, key):
+        table.add_row(
+            *_group(events.group, key),
+            str(events.episodes),
+            *(f"{getattr(events, name):.3f}" for name in EVENTS),
+            style="bold" if events.objects is None else None,
+        )
+    return table
+
+
+def ceiling_table(rows: Sequence[solvability.Row]) -> Group:
+    """What share of scenes can be solved: a row for each number of objects; and below it why the others were not."""
+    table = plain_table("scenes that can be solved at all")
+    for name in ("objects", "scenes", "in an episode", "by the search", "solvable", "95% interval"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for line in solvability.summary(rows):
+        low, high = line["solvable_interval"]
+        table.add_row(
+            "all" if line["objects"] is None else str(line["objects"]),
+            str(line["scenes"]),
+            str(line["solved_in_an_episode"]),
+            str(line["solved_by_the_search"]),
+            f"{line['solvable']:.2f}",
+            f"{low:.2f} to {high:.2f}",
+            style="bold" if line["objects"] is None else None,
+        )
+    reasons = [Text(f"{row.scenario}: {row.reason}") for row in rows if not row.solvable]
+    return Group(table, *reasons)
+
+
+def guard_table(comparisons: Sequence[guard.Comparison], code: str) -> Group:
+    """How a suite did against its reference: a row for each measure."""
+    pairs = comparisons[0].pairs
+    table = plain_table(f"{pairs} episodes against {code}")
+    for name in ("", "before", "now", "gains", "losses", "p", "verdict"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for one in comparisons:
+        verdict = "lost" if one.lost else "no significant loss"
+        counts = (one.before, one.now, one.gains, one.losses)
+        table.add_row(one.measure, *map(str, counts), f"{one.p_value:.3f}", verdict, style="bold" if one.lost else None)
+    alone, beside = (100 * guard.detectable(pairs, flips) for flips in (0.0, guard.FLIPS))
+    explanation = (
+        f"p: one-sided sign test, significant up to {comparisons[0].alpha:g}, so that a false alarm has a chance of "
+        f"{guard.ALPHA:g} at most. Noticed with a chance of {guard.POWER:g}: a loss of {alone:.1f} points where "
+        f"nothing else changes, of {beside:.1f} where {100 * guard.FLIPS:.0f}% of the episodes end otherwise by "
+        "chance, as with another seed."
+    )
+    left_out = [name for name in guard.MEASURES if name not in {one.measure for one in comparisons}]
+    why = (
+        f"{' and '.join(left_out)}: not compared, since in the reference a retrieval counts as graspable, too; write a "
+        "new one with --write"
+    )
+    return Group(table, *([Text(why)] if left_out else []), Text(explanation, style="dim"))

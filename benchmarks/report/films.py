@@ -1,0 +1,194 @@
+"""Single episodes of a report: which ones to show, and their filmstrips, drawn by running them again."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from mechsearch_jax.benchmarks.running.evaluate import present_code
+from mechsearch_jax.benchmarks.statistics.rates import says
+from mechsearch_jax.benchmarks.statistics.variants import label_variants
+from mechsearch_jax.benchmarks.store.rows import Row, episode_key, options_of
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike
+from mechsearch_jax.workspace.scenario import Scenario
+
+# Of each kind.
+EACH = 3
+TYPICAL, LOST, SLOWEST = "Typical: retrieved in the usual number of actions", "Lost", "Slowest"
+# The folder of the pictures in that of a report.
+FOLDER = "films"
+# What has to be the same for an episode to have ended the same.
+_END = ("found_step", "graspable_step", "retrieved", "steps", "failure")
+
+
+@dataclasses.dataclass(frozen=True)
+class Film:
+    """An episode that a report shows.
+
+    Attributes:
+      row: of the episode.
+      method: the label of its variant.
+      why: it is shown.
+      caption: what is to be known of it.
+      drawn: whether there is a picture of it.
+    """
+
+    row: Row
+    method: str
+    why: str
+    caption: str
+    drawn: bool
+
+    @property
+    def seed(self) -> int:
+        """Of the episode."""
+        return self.row.seed
+
+    @property
+    def file(self) -> str:
+        """The picture, in the folder of the report."""
+        return f"{FOLDER}/{episode_key(self.row)}.png"
+
+
+def chosen(rows: Sequence[Row]) -> list[tuple[str, Row]]:
+    """Episodes worth a look, and why: typical ones, lost ones for different reasons, and the slowest.
+
+    The same ones for the same rows, in whatever order.
+    """
+    ended = [row for row in rows if not row.is_error]
+    won = [row for row in ended if row.retrieved]
+    found: list[tuple[str, Row]] = []
+    if won:
+        usual = statistics.median_low(row.steps for row in won)
+        found += [(TYPICAL, row) for row in sorted((r for r in won if r.steps == usual), key=episode_key)[:EACH]]
+    reasons: dict[str, list[Row]] = {}
+    for row in ended:
+        if not row.retrieved:
+            reasons.setdefault(_reason(row), []).append(row)
+    ranked = sorted(reasons.values(), key=lambda group: (-len(group), _reason(group[0])))
+    # One of each reason, then a second one of each, and so on.
+    turns = collections.deque(sorted(group, key=episode_key)[:EACH] for group in ranked)
+    lost: list[Row] = []
+    while turns and len(lost) < EACH:
+        group = turns.popleft()
+        lost.append(group[0])
+        if group[1:]:
+            turns.append(group[1:])
+    found += [(LOST, row) for row in lost]
+    slow = sorted(ended, key=lambda row: (-_seconds(row), episode_key(row)))
+    return [*found, *((SLOWEST, row) for row in slow[:EACH])]
+
+
+def _reason(row: Row) -> str:
+    return (row.failure or "unknown").partition(" at action ")[0]
+
+
+def _seconds(row: Row) -> float:
+    return row.planning_seconds + row.simulation_seconds
+
+
+def _caption(row: Row) -> str:
+    ended = "retrieved" if row.retrieved else row.failure or "not retrieved"
+    return f"{row.scenario}: {ended}, {row.steps} actions, {_seconds(row):.1f} s"
+
+
+Draw = Callable[[Row, Path], str]
+
+
+def films(rows: Sequence[Row], out: PathLike, draw: Draw | None = None) -> list[Film]:
+    """The episodes that a report shows, with the pictures that are there or can be drawn.
+
+    Args:
+      rows: of the report.
+      out: its folder; pictures are in the folder `FOLDER` in it.
+      draw: draws the picture of an episode that is not there into a file, and says what is to be known of it; an
+        `InputError` says why it cannot. If None, nothing is drawn.
+    """
+    labels = dict(zip(map(id, rows), label_variants(rows), strict=True))
+    told: dict[str, str] = {}
+    found: list[Film] = []
+    for why, row in chosen(rows):
+        key, file = episode_key(row), Path(out) / FOLDER / f"{episode_key(row)}.png"
+        if draw is not None and key not in told and not file.is_file():
+            try:
+                told[key] = draw(row, file)
+            except InputError as error:
+                told[key] = f"no picture: {error}"
+        drawn = file.is_file()
+        note = told.get(key, "" if drawn else "no picture; report --films draws it")
+        found.append(Film(row, labels[id(row)], why, f"{_caption(row)}{note and f' ({note})'}", drawn))
+    return found
+
+
+class Frames:
+    """A `Watcher` that keeps a frame of every step."""
+
+    def __init__(self, problem: Any) -> None:
+        self.frames: list[Any] = []
+        self._problem = problem
+
+    def busy(self, stage: str) -> None:
+        """Nothing is said."""
+
+    def decided(self, moment: Any) -> None:
+        """Nothing has come of it yet."""
+
+    def acted(self, moment: Any) -> None:
+        """Keep the step."""
+        from mechsearch_jax.envs.recording import pictures
+
+        self.frames.append(pictures.frame(moment, self._problem))
+
+
+def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
+    """Run an episode again in the native simulator, and draw its filmstrip.
+
+    Returns:
+      What is to be known of the picture: empty where the episode ended as its row says.
+
+    Raises:
+      InputError: its options cannot be used today, the scenario holds something else, or the file cannot be written.
+    """
+    from mechsearch_jax.envs.camera.recognisers import recogniser
+    from mechsearch_jax.envs.episode.episodes import run_episode, target_of
+    from mechsearch_jax.envs.episode.method import Method
+    from mechsearch_jax.envs.recording.narration import verdict
+    from mechsearch_jax.envs.simulators.native import NativeSimulator
+    from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.viz.filmstrip import filmstrip
+
+    if row.content_hash not in (None, scenario.content_hash):
+        raise InputError(f"{row.scenario}: its scenario holds something else today; name the file it was run from")
+    method = Method.of_options(options_of(row))
+    method.check()
+    workcell = method.workcell
+    target = target_of(scenario, workcell.target)
+    problem = workcell.problem(target, method.problem_config)
+    watcher = Frames(problem)
+    episode = run_episode(
+        row.seed,
+        scenario,
+        problem,
+        method.policy(),
+        NativeSimulator(shelf=workcell.shelf, camera=workcell.camera),
+        recogniser(method.recognition, target),
+        method.config.max_steps,
+        method.options(),
+        watcher,
+        method.terms,
+        method.trials(),
+    )
+    save_figure(filmstrip(watcher.frames, problem.camera, problem.shelf, problem.target, verdict(episode)), file)
+    again = Row.of_episode(episode)
+    # What an earlier version's row does not say cannot differ.
+    if all(getattr(row, name) == getattr(again, name) for name in _END if says(row, name.removesuffix("_step"))):
+        return ""
+    simulator = options_of(row).get("simulator")
+    why = "in another simulator" if simulator != "NativeSimulator" else ""
+    why = why or ("by other code" if row.code != present_code() else "on another machine, perhaps")
+    return f"run again {why}, it ended otherwise: {_caption(again).partition(': ')[2]}"

@@ -1,0 +1,214 @@
+"""Rates of success of episodes with confidence intervals, and how many actions it took."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from typing import Any
+
+from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_interval, share_interval
+from mechsearch_jax.benchmarks.statistics.variants import VARIANT, canonical, grouped
+from mechsearch_jax.benchmarks.store.rows import Row
+
+# The shares in `Events`, in the words of tables.
+EVENTS = {
+    "truth_lost": "truth ruled out",
+    "looks_truth_lost": "of all looks",
+    "restarted": "f started anew",
+    "fallen": "objects fallen",
+    "held_up": "arm held up",
+    "unsettled": "never at rest",
+}
+# What an episode may reach, in the words of pictures.
+GOALS = {"found": "found", "graspable": "found and graspable", "retrieved": "retrieved"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Rates:
+    """Shares of episodes, among those of a group.
+
+    Attributes:
+      group: what the group has in common, by column; None stands for all values of it. Usually `VARIANT`, the policy
+        with the options that tell it from the others (see `label_variants`), and "objects", their number.
+      episodes: how many episodes.
+      errors: how many of them could not be run to their end; they count as failures.
+      found, graspable, retrieved: shares of them; None for `graspable` where some of them do not say it (see
+        `Row.graspable_known`), since those that do are not like the others.
+      found_interval, graspable_interval, retrieved_interval: what the true shares may be: see `share_interval`.
+      paper_episodes: how many of the episodes say whether the target could be grasped with the paper's grasps alone.
+      paper_graspable, paper_graspable_interval: share of those in which it could, None where there are none, and what
+        the true share may be.
+      found_steps, graspable_steps, retrieved_steps: mean number of actions until then, of the episodes that got there;
+        None where none did, or that is not known.
+      found_steps_interval, graspable_steps_interval, retrieved_steps_interval: what the true means may be: see
+        `mean_interval`.
+      steps: mean number of actions, attempts to take the target out among them.
+      planning_seconds, simulation_seconds: mean wall time per action [s].
+    """
+
+    group: Mapping[str, Hashable]
+    episodes: int
+    errors: int
+    found: float
+    graspable: float | None
+    retrieved: float
+    found_interval: Interval
+    graspable_interval: Interval
+    retrieved_interval: Interval
+    paper_episodes: int
+    paper_graspable: float | None
+    paper_graspable_interval: Interval
+    found_steps: float | None
+    graspable_steps: float | None
+    retrieved_steps: float | None
+    found_steps_interval: Interval | None
+    graspable_steps_interval: Interval | None
+    retrieved_steps_interval: Interval | None
+    steps: float
+    planning_seconds: float
+    simulation_seconds: float
+
+    @property
+    def method(self) -> Hashable:
+        """The variant's label."""
+        return self.group.get(VARIANT)
+
+    @property
+    def objects(self) -> Hashable:
+        """The number of surrounding objects; None for all."""
+        return self.group.get("objects")
+
+
+@dataclasses.dataclass(frozen=True)
+class Events:
+    """What happened on the way, in the episodes of a group that say so.
+
+    Attributes:
+      group: as in `Rates`.
+      episodes: how many episodes say so.
+      truth_lost: share of them in which f ruled out the target's true pose at some step.
+      looks_truth_lost: share of all steps before the target was found at which it did.
+      restarted: share of the episodes in which f became empty and was started anew.
+      fallen: in which an object left the board.
+      held_up: in which the arm was held up.
+      unsettled: in which something never came to rest after an action.
+    """
+
+    group: Mapping[str, Hashable]
+    episodes: int
+    truth_lost: float
+    looks_truth_lost: float
+    restarted: float
+    fallen: float
+    held_up: float
+    unsettled: float
+
+    @property
+    def objects(self) -> Hashable:
+        """The number of surrounding objects; None for all."""
+        return self.group.get("objects")
+
+
+def step_of(row: Row, goal: str) -> int | None:
+    """Number of actions after which an episode reached one of `GOALS`; None if it never did."""
+    if goal == "retrieved":
+        return row.steps if row.retrieved else None
+    return row.found_step if goal == "found" else row.graspable_step
+
+
+def scene_of(row: Row) -> tuple[str, str | None]:
+    """What an episode was run on: the scenario, by its name and content."""
+    return row.scenario, row.content_hash
+
+
+def says(row: Row, goal: str) -> bool:
+    """Whether a row tells if its episode reached one of `GOALS`: those of earlier versions need not for "graspable"."""
+    return goal != "graspable" or row.graspable_known
+
+
+def summarise(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")) -> list[Rates]:
+    """Rates for every combination of what columns say, and for each of all but the last column over all values of it.
+
+    Usually by variant and number of objects, and for each variant over all of them.
+
+    Raises:
+      InputError: there is no such column.
+    """
+    return [_rates(group, members) for group, members in _groups(rows, columns)]
+
+
+def _rates(group: Mapping[str, Hashable], rows: Sequence[Row]) -> Rates:
+    count, actions = len(rows), max(sum(row.steps for row in rows), 1)
+    by_paper = [row for row in rows if row.paper_graspable is not None]
+    said = [bool(row.paper_graspable) for row in by_paper]
+    told: dict[str, Any] = {}
+    for goal in GOALS:
+        told |= _goal(rows, goal)
+    return Rates(
+        group=group,
+        episodes=count,
+        errors=sum(row.is_error for row in rows),
+        **told,
+        paper_episodes=len(said),
+        paper_graspable=sum(said) / len(said) if said else None,
+        paper_graspable_interval=share_interval(said, list(map(scene_of, by_paper))),
+        steps=sum(row.steps for row in rows) / count,
+        planning_seconds=sum(row.planning_seconds for row in rows) / actions,
+        simulation_seconds=sum(row.simulation_seconds for row in rows) / actions,
+    )
+
+
+def _goal(rows: Sequence[Row], goal: str) -> dict[str, Any]:
+    """The fields of `Rates` that tell of a goal."""
+    names = goal, f"{goal}_interval", f"{goal}_steps", f"{goal}_steps_interval"
+    if not all(says(row, goal) for row in rows):
+        return dict(zip(names, (None, (0.0, 1.0), None, None), strict=True))
+    scenes, after = list(map(scene_of, rows)), [step_of(row, goal) for row in rows]
+    got = [(float(step), scene) for step, scene in zip(after, scenes, strict=True) if step is not None]
+    steps, own = [step for step, _ in got], [scene for _, scene in got]
+    values = (
+        len(steps) / len(rows),
+        share_interval([step is not None for step in after], scenes),
+        sum(steps) / len(steps) if steps else None,
+        mean_interval(steps, own),
+    )
+    return dict(zip(names, values, strict=True))
+
+
+def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")) -> list[Events]:
+    """What happened on the way, grouped as `summarise` does; groups of which nothing is known are left out."""
+    summary = []
+    for group, members in _groups(rows, columns):
+        known = [row for row in members if row.looks is not None]
+        if not known:
+            continue
+
+        def share(name: str, known: Sequence[Row] = known) -> float:
+            return sum(getattr(row, name) > 0 for row in known) / len(known)
+
+        looks, lost = (sum(getattr(row, name) for row in known) for name in ("looks", "truth_lost"))
+        summary.append(
+            Events(
+                group=group,
+                episodes=len(known),
+                truth_lost=share("truth_lost"),
+                looks_truth_lost=lost / max(looks, 1),
+                restarted=share("restarts"),
+                fallen=share("objects_fallen"),
+                held_up=share("held_up"),
+                unsettled=share("unsettled"),
+            )
+        )
+    return summary
+
+
+def _groups(rows: Sequence[Row], columns: Sequence[str]) -> Iterator[tuple[Mapping[str, Hashable], list[Row]]]:
+    """The rows by columns, and after those that differ in the last one alone, with None for it, all of them."""
+    names = [canonical(name) for name in columns]
+    found = grouped(rows, names)
+    for outer, inner in itertools.groupby(found, key=lambda values: values[:-1]):
+        values = list(inner)
+        for value in values:
+            yield dict(zip(names, value, strict=True)), found[value]
+        yield dict(zip(names, (*outer, None), strict=True)), [row for value in values for row in found[value]]

@@ -1,0 +1,171 @@
+"""What tells rows of results apart: their options as labels, long and short, and any column of them by its name."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import operator
+import re
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from typing import Any
+
+from mechsearch_jax.benchmarks.store.rows import OPTIONS, Row, options_of
+from mechsearch_jax.envs.episode.earlier import GONE
+from mechsearch_jax.errors import InputError, nearest
+
+# A label that is longer does not fit into a table or a picture; variants are numbered then.
+LONGEST = 16
+# More variants than these have one line each in tables, over all numbers of objects.
+MOST_IN_FULL = 12
+# The column of a row's variant, and another name of it.
+VARIANT = "method"
+_ALIASES = {"variant": VARIANT}
+
+_variant = operator.attrgetter("configuration", *OPTIONS)
+_NUMBER = re.compile(r"(-?\d+(?:\.\d+)?(?:e-?\d+)?)")
+
+
+def _said(value: Any) -> str:
+    values = value if isinstance(value, list) else [value]
+    return "/".join(f"{v:g}" if isinstance(v, float) else str(v) for v in values)
+
+
+def _label(policy: str, differing: Mapping[str, str]) -> str:
+    return ", ".join([policy, *(f"{name} {value}" for name, value in differing.items())])
+
+
+def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dict[str, str]]]]:
+    """For each row what is known of its options, and for each of those the policy and the options that differ."""
+    variants = list(map(_variant, rows))
+    # Thousands of rows have the same few options.
+    each = {variant: {**GONE, **options_of(row)} for variant, row in dict(zip(variants, rows, strict=True)).items()}
+    names = sorted({name for options in each.values() for name in options} - {"policy"})
+    differing = [name for name in names if len({json.dumps(options.get(name)) for options in each.values()}) > 1]
+    parts = {
+        variant: (
+            str(options["policy"]),
+            {name.replace("_", " "): _said(options.get(name, "unknown")) for name in differing},
+        )
+        for variant, options in each.items()
+    }
+    return variants, parts
+
+
+def label_variants(rows: Sequence[Row]) -> list[str]:
+    """For each row the policy and those options that are not the same in all rows: "search-for-grasp, gamma 0.5".
+
+    Rows that ran under different options never share a label.
+    """
+    variants, parts = _differing(rows)
+    labels = {variant: _label(*said) for variant, said in parts.items()}
+    return [labels[variant] for variant in variants]
+
+
+def natural(text: Any) -> Any:
+    """A key to sort by, in which numbers inside of texts count as numbers, and None comes last."""
+    if text is None:
+        return 2, ()
+    if isinstance(text, bool | int | float):
+        return 0, (float(text),)
+    parts = _NUMBER.split(str(text))
+    return 1, tuple((0, float(part), "") if i % 2 else (1, 0.0, part) for i, part in enumerate(parts) if part)
+
+
+@dataclasses.dataclass(frozen=True)
+class Key:
+    """Short labels of variants, and what they stand for.
+
+    Attributes:
+      short: by the labels of `label_variants`, in an order in which numbers count as such.
+      common: the policy, where it is the same in all of several variants and left out of the short labels; else empty.
+      options: what each variant's options are that differ, by its label, and then by the option's name in words.
+    """
+
+    short: Mapping[str, str]
+    common: str = ""
+    options: Mapping[str, Mapping[str, str]] = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(cls, rows: Sequence[Row]) -> Key:
+        """The key of rows: labels without a policy that all have, or numbers where these are too long."""
+        known = {_label(*said): said for said in _differing(rows)[1].values()}
+        labels = sorted(known, key=natural)
+        policies = {policy for policy, _ in known.values()}
+        common = policies.pop() if len(policies) == 1 and len(labels) > 1 else ""
+        options = {label: {**({} if common else {"policy": known[label][0]}), **known[label][1]} for label in labels}
+        plain = {label: label.removeprefix(f"{common}, ") if common else label for label in labels}
+        if max(map(len, plain.values()), default=0) <= LONGEST:
+            return cls(plain, common, options)
+        digits = len(str(len(labels)))
+        return cls({label: f"V{i:0{digits}d}" for i, label in enumerate(labels, start=1)}, common, options)
+
+    @property
+    def numbered(self) -> bool:
+        """Whether the short labels say nothing by themselves."""
+        return any(short not in label for label, short in self.short.items())
+
+    def named(self, text: str) -> str:
+        """The label that a text stands for: itself, its short one, or some of its parts, as "gamma 0.5" or "gamma=0.5".
+
+        Raises:
+          InputError: there is none, or there are several.
+        """
+        if text in self.short:
+            return text
+        parts = {part.strip().replace("=", " ").replace("_", " ") for part in text.split(",")}
+        found = [
+            label for label, short in self.short.items() if text == short or parts <= set(label.split(", ")) | {short}
+        ]
+        if len(found) == 1:
+            return found[0]
+        among = found or list(self.short)
+        told = "; ".join(f"{self.short[label]} ({label})" for label in among[:4]) + ("; ..." if len(among) > 4 else "")
+        raise InputError(f'report: variant "{text}" is {"one of several" if found else "unknown"}: {told}')
+
+
+def column(rows: Sequence[Row], name: str) -> list[Hashable]:
+    """What a column says of each row: a field of `Row`, an option, or "method" for the label of its variant.
+
+    Lists are joined by "/".
+
+    Raises:
+      InputError: there is no such column.
+    """
+    name = canonical(name)
+    if name == VARIANT:
+        return list(label_variants(rows))
+    fields = [field.name for field in dataclasses.fields(Row)]
+    if name in fields:
+        return [getattr(row, name) for row in rows]
+    variants = list(map(_variant, rows))
+    each = {variant: options_of(row) for variant, row in dict(zip(variants, rows, strict=True)).items()}
+    if not any(name in options for options in each.values()):
+        options = {option for known in each.values() for option in known}
+        raise InputError(f"report: column {name} is unknown; {nearest(name, [VARIANT, *fields, *sorted(options)])}")
+    values: dict[Any, Hashable] = {
+        variant: _plain(options.get(name, GONE.get(name))) for variant, options in each.items()
+    }
+    return [values[variant] for variant in variants]
+
+
+def canonical(name: str) -> str:
+    """A column's name as `Row` has it, of one that may be written as an option."""
+    plain = name.strip().removeprefix("--").replace("-", "_")
+    return _ALIASES.get(plain, plain)
+
+
+def _plain(value: Any) -> Hashable:
+    return "/".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value) if isinstance(value, list) else value
+
+
+def grouped(rows: Sequence[Row], columns: Sequence[str]) -> dict[tuple[Hashable, ...], list[Row]]:
+    """The rows by what several columns say of them, in their order, where numbers count as such.
+
+    Raises:
+      InputError: there is no such column.
+    """
+    groups: dict[tuple[Hashable, ...], list[Row]] = {}
+    for values, row in zip(zip(*(column(rows, name) for name in columns), strict=True), rows, strict=True):
+        groups.setdefault(values, []).append(row)
+    order: Callable[[tuple[Hashable, ...]], Any] = lambda values: tuple(map(natural, values))  # noqa: E731
+    return {values: groups[values] for values in sorted(groups, key=order)}

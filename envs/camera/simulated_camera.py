@@ -1,0 +1,211 @@
+"""What the camera sees: an exact ray-cast of the bodies and the shelf.
+
+Every ray is cut with every body in closed form: neither a display nor OpenGL is needed, and depth is exact to float32.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from operator import add, sub
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.compiled import kept
+from mechsearch_jax.envs.world.model import shelf_corners
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World
+from mechsearch_jax.geometry.transforms import rotate
+from mechsearch_jax.shapes import by_shape, in_order, shape_of
+from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
+from mechsearch_jax.workspace.detector import found_pixels
+from mechsearch_jax.workspace.shelf import Shelf
+
+BACKGROUND, SHELF = -1, BODIES
+
+# Colour of each slot, the target (red, as in the paper) and the shelf.
+PALETTE = np.array(
+    [
+        (0.35, 0.55, 0.80),
+        (0.95, 0.75, 0.35),
+        (0.45, 0.72, 0.45),
+        (0.62, 0.47, 0.75),
+        (0.40, 0.75, 0.75),
+        (0.85, 0.60, 0.70),
+        (0.65, 0.52, 0.42),
+        (0.60, 0.65, 0.35),
+        (0.7282, 0.1558, 0.2099),
+        (0.82, 0.79, 0.74),
+    ],
+    np.float32,
+)
+BACKGROUND_COLOUR = (1.0, 1.0, 1.0)
+LIGHT = (-0.62, 0.25, 0.74)
+AMBIENT = 0.55
+# Windows around the target have a multiple of so many rows and columns.
+WINDOW_BLOCK = 16
+# What the shelf is made of.
+_BOARD = shape_of("box")
+
+
+class Image(flax.struct.PyTreeNode):
+    """An image of the shelf.
+
+    Attributes:
+      depth: along the camera's axis [m], shape (h, w); infinite where nothing is.
+      segmentation: what is seen, int8, shape (h, w): -1 nothing, 0 to 7 an object's slot, 8 the target, 9 the shelf.
+      colour: red, green and blue in 0 to 1, shape (h, w, 3).
+    """
+
+    depth: jax.Array
+    segmentation: jax.Array
+    colour: jax.Array
+
+
+def _local(rotation: Array, vector: Array) -> list[Array]:
+    """The components of world vectors (..., 3) in a body's frame."""
+    x, y, z = (vector[..., k] for k in range(3))
+    return [rotation[0, i] * x + rotation[1, i] * y + rotation[2, i] * z for i in range(3)]
+
+
+def cast_body(
+    camera: Camera, world: World, slot: Array | int, directions: Float[Array, "*pixels 3"]
+) -> Float[Array, "*pixels"]:
+    """Depth of one body along rays from the camera [m]; infinite where it is not.
+
+    Args:
+      camera: where the rays start.
+      world: the bodies.
+      slot: which of them.
+      directions: as `pixel_rays` gives them, so that they are of unit depth.
+    """
+    origin = _local(world.rotation[slot], jnp.array(camera.position) - world.position[slot])
+    direction = _local(world.rotation[slot], directions)
+    cuts = [partial(shape.cut, origin, direction, world.half_size[slot], jnp) for shape in in_order()]
+    shown = jax.lax.switch(world.kind[slot], cuts)
+    return jnp.where(world.valid[slot], shown, jnp.inf)
+
+
+def _cast_bodies(
+    camera: Camera, world: World, directions: Float[Array, "*pixels 3"]
+) -> tuple[Float[Array, "*pixels"], Int[Array, "*pixels"]]:
+    """Depth along each ray and the slot of the first body that it meets; infinity and -1 where there is none."""
+
+    def nearer(i, best):
+        depth, owner = best
+        candidate = jax.lax.cond(
+            world.valid[i],
+            lambda i: cast_body(camera, world, i, directions),
+            lambda _: jnp.full(directions.shape[:-1], jnp.inf, directions.dtype),
+            i,
+        )
+        return jnp.minimum(depth, candidate), jnp.where(candidate < depth, jnp.int8(i), owner)
+
+    nothing = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
+    none = jnp.full(directions.shape[:-1], BACKGROUND, jnp.int8)
+    return jax.lax.fori_loop(0, BODIES, nearer, (nothing, none))
+
+
+def cast_shelf(camera: Camera, shelf: Shelf, directions: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels"]:
+    """Depth of the empty shelf along rays from the camera [m]; infinite where it is not."""
+    depth = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
+    for low, high in shelf_corners(shelf).values():
+        centre, half = ([sign(a, b) / 2 for a, b in zip(high, low, strict=True)] for sign in (add, sub))
+        origin = [jnp.float32(camera.position[i] - centre[i]) for i in range(3)]
+        towards = [directions[..., i] for i in range(3)]
+        depth = jnp.minimum(depth, _BOARD.cut(origin, towards, jnp.array(half, jnp.float32), jnp))
+    return depth
+
+
+def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, depth: Array, owner: Array) -> Array:
+    """Outward normals in the world, found from where on its body, or in the shelf, each point lies."""
+    flat = depth.shape
+    directions, depth, owner = directions.reshape(-1, 3), depth.reshape(-1), owner.reshape(-1)
+    point = jnp.array([camera.position]) + directions * jnp.where(jnp.isfinite(depth), depth, 0.0)[:, None]
+    slot = jnp.clip(owner, 0, TARGET)
+    rotation = world.rotation[slot]
+    offset = point - world.position[slot]
+    local = rotate(jnp.swapaxes(rotation, -1, -2), offset)
+    half = world.half_size[slot]
+    chosen = by_shape(world.kind[slot][..., None], lambda shape: shape.normal(local, half, jnp), jnp)
+    chosen = chosen / jnp.maximum(jnp.linalg.norm(chosen, axis=-1, keepdims=True), 1e-9)
+    body = rotate(rotation, chosen)
+
+    x, y, z = (point[..., k] for k in range(3))
+    gaps = jnp.stack(
+        [jnp.abs(x - shelf.back), jnp.abs(y - shelf.right), jnp.abs(y - shelf.left), jnp.abs(z - shelf.board)], axis=-1
+    )
+    walls = jnp.array([(-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 0.0)])
+    wall = jnp.where(jnp.min(gaps, axis=-1) < 1e-4, jnp.argmin(gaps, axis=-1), 4)
+    return jnp.where((owner == SHELF)[:, None], walls[wall], body).reshape(*flat, 3)
+
+
+@kept()
+def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Image:
+    """The camera's image of the shelf and everything on it; the robot is out of the way.
+
+    Args:
+      camera: the camera.
+      world: the bodies.
+      shelf: the shelf; the default shelf if None.
+    """
+    shelf = shelf or Shelf()
+    directions = rays(camera)
+    depth, owner = _cast_bodies(camera, world, directions)
+    behind = cast_shelf(camera, shelf, directions)
+    owner = jnp.where(behind < depth, jnp.int8(SHELF), owner)
+    depth = jnp.minimum(depth, behind)
+
+    light = np.array(LIGHT) / np.linalg.norm(LIGHT)
+    normals = _normals(camera, shelf, world, directions, depth, owner)
+    shade = AMBIENT + (1.0 - AMBIENT) * jnp.maximum(sum(normals[..., k] * light[k] for k in range(3)), 0.0)
+    colour = jnp.asarray(PALETTE)[jnp.clip(owner, 0, SHELF)] * shade[..., None]
+    colour = jnp.where((owner == BACKGROUND)[..., None], jnp.array([[BACKGROUND_COLOUR]]), colour)
+    return Image(depth, owner, colour)
+
+
+def target_window(camera: Camera) -> int:
+    """Side of a window of a camera's image that holds a 0.1 m tall target anywhere on the shelf, in pixels.
+
+    Not for a traced camera. A camera that was calibrated again nearly always has the same.
+    """
+    side = math.ceil(0.36 * max(camera.fx, camera.fy) / WINDOW_BLOCK) * WINDOW_BLOCK
+    return min(side, max(camera.width, camera.height))
+
+
+def target_pixels(camera: Camera, world: World, window: int | None = None) -> Int[Array, ""]:
+    """How many pixels of the target the camera sees: those of `observe`, counted in a window around the target only.
+
+    The shelf hides nothing of what stands on it from this camera and is left out.
+
+    Args:
+      camera: the camera.
+      world: the bodies.
+      window: side of the window; `target_window` if left out, which for a traced camera it must not be.
+    """
+    return pixels_in_window(camera, world, window or target_window(camera))
+
+
+@kept(static_argnames=("window",))
+def pixels_in_window(camera: Camera, world: World, window: int) -> Int[Array, ""]:
+    """`target_pixels` in a window of a given side in pixels, which is static."""
+    centre, _ = project(camera, world.position[TARGET])
+    corner = jnp.floor(centre - (window - 1) / 2)
+    rows = corner[0] + jnp.arange(window)[:, None] + jnp.zeros((1, window))
+    columns = corner[1] + jnp.arange(window)[None, :] + jnp.zeros((window, 1))
+    inside = (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width)
+    _, owner = _cast_bodies(camera, world, pixel_rays(camera, rows, columns))
+    return jnp.sum(inside & (owner == TARGET))
+
+
+def is_found(camera: Camera, world: World, window: int | None = None) -> Bool[Array, ""]:
+    """Whether the detector sees the target: more of its pixels than `found_pixels`, 100 at 1280 x 720.
+
+    Args:
+      camera, world, window: as of `target_pixels`.
+    """
+    # Of no weak type, so that what takes it is compiled once.
+    return jnp.asarray(target_pixels(camera, world, window) > found_pixels(camera), bool)

@@ -1,0 +1,113 @@
+"""What may be known of the shelf at one moment, and the recogniser that knows it all."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Protocol, runtime_checkable
+
+import flax.struct
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.compiled import kept
+from mechsearch_jax.envs.camera.simulated_camera import Image, is_found, observe, target_window
+from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.perception.cloud import View, thinned_view
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+
+class Sight(flax.struct.PyTreeNode):
+    """What of a camera's sight of a shelf decides about shapes, found on the host, where both are known.
+
+    Attributes:
+      view: see `thinned_view`; None of a camera that does not look into all of the shelf.
+      window: see `target_window`; static.
+    """
+
+    view: View | None
+    window: int = flax.struct.field(pytree_node=False)
+
+
+def sight_of(camera: Camera, shelf: Shelf) -> Sight:
+    """What recognisers have to know beforehand where camera and shelf are traced. Not to be called with such."""
+    try:
+        view = thinned_view(camera, shelf)
+    except InputError:
+        # Who only asks what is true needs none.
+        view = None
+    return Sight(view, target_window(camera))
+
+
+@dataclasses.dataclass(frozen=True)
+class Snapshot:
+    """The shelf at one moment, as the camera can see it; images are ray-cast only when they are asked for.
+
+    Attributes:
+      camera, shelf: of the problem.
+      world: the true state, for a recogniser that may know it.
+      sight: of camera and shelf; to be given where they are traced.
+    """
+
+    camera: Camera
+    shelf: Shelf
+    world: World
+    sight: Sight | None = None
+
+    @property
+    def view(self) -> View:
+        """The part of the image that networks are shown; see `thinned_view`.
+
+        Raises:
+          InputError: the camera does not see the shelf.
+        """
+        if self.sight is None:
+            return thinned_view(self.camera, self.shelf)
+        if self.sight.view is None:
+            raise InputError("snapshot: the camera does not look into the shelf; check its pose")
+        return self.sight.view
+
+    @functools.cached_property
+    def image(self) -> Image:
+        """Depth, segmentation and colour at full resolution."""
+        return observe(self.camera, self.world, self.shelf)
+
+    @functools.cached_property
+    def target_seen(self) -> Bool[Array, ""]:
+        """Whether the detector finds the target in the image; much cheaper than the image."""
+        return is_found(self.camera, self.world, None if self.sight is None else self.sight.window)
+
+
+@runtime_checkable
+class Recogniser(Protocol):
+    """Turns what the camera sees into what the planner plans with. For batches it has to be traceable by JAX."""
+
+    def __call__(self, key: Array, snapshot: Snapshot) -> Observation: ...
+
+
+def oracle(key: Array, snapshot: Snapshot) -> Observation:
+    """The `Recogniser` that knows the true shapes and poses, of the target once the detector sees it. Needs no key."""
+    return Observation(objects_on_the_board(snapshot), snapshot.target_seen, true_target_pose(snapshot.world))
+
+
+def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:
+    """The true objects, without those that have fallen off the board."""
+    return _on_the_board(snapshot.world, snapshot.shelf)
+
+
+@kept()
+def _on_the_board(world: World, shelf: Shelf) -> Superquadrics:
+    scene = true_superquadrics(world)
+    fallen = (scene.position[:, 0] < shelf.front) | (scene.position[:, 2] < shelf.board)
+    return scene.replace(valid=scene.valid & ~fallen)
+
+
+@kept()
+def true_target_pose(world: World) -> Float[Array, " 3"]:
+    """x, y [m] and yaw [rad] of the target."""
+    R, t = world.rotation[TARGET], world.position[TARGET]
+    return jnp.stack([t[0], t[1], jnp.arctan2(R[1, 0], R[0, 0])])

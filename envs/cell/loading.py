@@ -1,0 +1,88 @@
+"""A searcher for a real cell from its configuration file, planning as `mechsearch search` does.
+
+    from mechsearch_jax.envs.cell.loading import load_searcher
+
+    searcher = load_searcher("mine.toml")
+
+What a configuration names (rehearsal, push model) is made here: it may need the simulator, which the planner's own part
+of the package does not know.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.files import PathLike
+from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.planner.cache import keep_compilations
+from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.planner.settings import Settings, load_settings
+from mechsearch_jax.search.searcher import Searcher
+from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
+from mechsearch_jax.workspace.camera import Camera
+
+
+def load_searcher(
+    path: PathLike | None = None,
+    *,
+    camera: Camera | None = None,
+    policy: str = "search-for-grasp",
+    preset: str | None = None,
+    seed: int = 0,
+    recogniser: Callable[[Problem], Any] = Recogniser,
+    trajectories: TrajectoryConfig | None = None,
+    keep: bool = True,
+    **options: Any,
+) -> Searcher:
+    """A `Searcher` with the workcell and all planner's options of a configuration file.
+
+    It plans as `mechsearch search` does with that file: with the push model that it names, with its rehearsal, and with
+    its `max_steps`. Compiled functions and the problem are kept on disk, so that the next process starts in seconds.
+
+    Args:
+      path: of the file; all defaults if left out.
+      camera: in the place of the file's, such as one of `perception.image_files.load_camera`.
+      policy: what decides, by its name or import path, as `--policy` of the command line.
+      preset: in the place of the file's.
+      seed: of all random numbers.
+      recogniser, trajectories: as for a `Searcher`.
+      keep: whether this process keeps what it compiles from now on; see `keep_compilations`.
+      **options: of the planner by name, which go before the file's, such as `rehearsal="none"`.
+
+    Raises:
+      InputError: the file cannot be used, an option is impossible, or the camera does not see the shelf.
+    """
+    settings = Settings() if path is None else load_settings(path)
+    if keep:
+        keep_compilations()
+    return searcher_of(
+        settings.with_options(preset, **options),
+        camera=camera,
+        policy=policy,
+        seed=seed,
+        recogniser=recogniser,
+        trajectories=trajectories,
+    )
+
+
+def searcher_of(
+    settings: Settings, *, camera: Camera | None = None, policy: str = "search-for-grasp", **arguments: Any
+) -> Searcher:
+    """A `Searcher` with all that settings say.
+
+    Args:
+      settings: what a configuration file says.
+      camera, policy: as of `load_searcher`.
+      **arguments: of a `Searcher`: seed, recogniser, trajectories.
+
+    Raises:
+      InputError: as `load_searcher`.
+    """
+    workcell = settings.workcell
+    if camera is not None:
+        workcell = dataclasses.replace(workcell, camera=camera)
+    method = Method(policy, settings.config, workcell=workcell)
+    return Searcher(workcell, settings.config, policy=method.policy(), rehearsal=method.trials(), **arguments)

@@ -1,0 +1,296 @@
+"""What is written down of an episode while it runs, and the verdicts on it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.actions import Action, ActionKind, kind_of
+from mechsearch_jax.compiled import kept
+from mechsearch_jax.envs.episode.records import Episode, Step, record_action
+from mechsearch_jax.envs.episode.verdicts import Verdict
+from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
+from mechsearch_jax.envs.world.world import TARGET, fallen_over
+from mechsearch_jax.planner import Decision
+from mechsearch_jax.versions import versions
+from mechsearch_jax.workspace.scenario import Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+
+
+class Choice(flax.struct.PyTreeNode):
+    """What a policy decided, without the sequences that it did not choose.
+
+    Attributes:
+      action, cost, predicted_cost: of the `Decision`.
+      sequences: how many sequences it was chosen from.
+      refused: how many more began with what did harm in a rehearsal.
+      others: the first actions of all of these, the best first, of kind NONE after the last; None where not known.
+    """
+
+    action: Action
+    cost: jax.Array
+    predicted_cost: jax.Array
+    sequences: jax.Array
+    refused: jax.Array | int = 0
+    others: Action | None = None
+
+
+@kept()
+def chosen(decision: Decision) -> Choice:
+    """What a decision comes down to."""
+    count = jnp.sum(jnp.isfinite(decision.sequences.value))
+    others = jax.tree.map(lambda a: a[:, 0], decision.sequences.actions)
+    return Choice(decision.action, decision.cost, decision.predicted_cost, count, decision.refused, others)
+
+
+def takes_target(choice: Choice) -> bool:
+    """Whether the chosen action is to take the target out."""
+    return kind_of(int(choice.action.kind)).takes_target
+
+
+def distrust(choice: Choice) -> str | None:
+    """Why a choice must not be acted upon; None if it may."""
+    numbers = [choice.cost, *jax.tree.leaves(choice.action)]
+    return None if all(np.all(np.isfinite(n)) for n in numbers) else "error: the decision is not finite"
+
+
+def target_trouble(shelf: Shelf, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"]) -> str | None:
+    """Why a target at this pose can no longer be taken out as the planner knows it; None if it can."""
+    if position[0] < shelf.front or position[2] < shelf.board:
+        return "the target fell off the board"
+    return "the target fell over" if fallen_over(rotation) else None
+
+
+def overflow_trouble(outcome: Outcome, i: int) -> str | None:
+    """What was too small for the contacts of world `i`; None if nothing was."""
+    flags = Overflow(int(outcome.overflow[i]))
+    if flags is Overflow.NONE:
+        return None
+    names = ", ".join(str(flag.name).lower() for flag in Overflow if flag and flag in flags)
+    return f"error: the simulator's buffers were too small ({names})"
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What the simulator said of what was decided, in the words of a record.
+
+    Attributes:
+      failure: why it was not carried out as chosen; None if it was.
+      takes_target: whether it was an attempt to take the target out.
+      retrieved: whether that succeeded and nothing fell meanwhile.
+      final: whether trying once more would not mend it.
+      off_board: bodies that are off the board now, since then or before.
+      held_up, at_rest, tracking_error: as in `Step`.
+    """
+
+    failure: str | None
+    takes_target: bool
+    retrieved: bool
+    final: bool
+    off_board: frozenset[int]
+    held_up: bool
+    at_rest: bool
+    tracking_error: float
+
+
+def result_of(choice: Choice, outcome: Outcome, i: int) -> Result:
+    """What came of the action in world `i`."""
+    code, takes = Failure(int(outcome.failure[i])), takes_target(choice)
+    # The same grasp stays out of reach, what fell stays off the board, and a target that is out cannot be taken out.
+    final = code in (Failure.UNREACHABLE, Failure.FALLEN) or bool(outcome.held[i] & outcome.outside[i])
+    return Result(
+        failure=failure_of(choice, outcome, i),
+        takes_target=takes,
+        retrieved=bool(outcome.retrieved[i]),
+        final=takes and final,
+        off_board=frozenset(np.flatnonzero(outcome.fallen[i]).tolist()),
+        held_up=code is Failure.HELD_UP,
+        at_rest=bool(outcome.settled[i]),
+        tracking_error=float(outcome.tracking_error[i]),
+    )
+
+
+def failure_of(choice: Choice, outcome: Outcome, i: int) -> str | None:
+    """Why the action in world `i` was not carried out as chosen, in the words of a record; None if it was."""
+    kind, reason = kind_of(int(choice.action.kind)), outcome.reason(i)
+    if kind.code == ActionKind.NONE:
+        return "all that was tried out did harm" if int(choice.refused) else "no action is possible"
+    return f"retrieval: {reason}" if reason and kind.takes_target else reason
+
+
+def record(
+    found: bool,
+    belief_size: int,
+    verdict: Verdict,
+    choice: Choice | None,
+    truth_possible: bool | None = None,
+    restarts: int | None = None,
+) -> Step:
+    """A step as it is decided: what comes of it is filled in later.
+
+    Args:
+      found: whether the target has been found.
+      belief_size: number of poses where it can be.
+      verdict: on the true state.
+      choice: None where nothing is done.
+      truth_possible, restarts: as in `Step`.
+    """
+    cost = predicted = action = None
+    sequences = 0
+    if choice is not None:
+        action, cost = record_action(choice.action), float(choice.cost)
+        if not takes_target(choice):
+            predicted = _expected(choice)
+            sequences = int(choice.sequences)
+    return Step(
+        belief_size=belief_size,
+        found=found,
+        graspable=verdict.graspable,
+        cost=cost,
+        action=action,
+        predicted_cost=predicted,
+        observed_cost=None,
+        sequences=sequences,
+        failure=None,
+        timings={},
+        truth_possible=truth_possible,
+        restarts=restarts,
+        paper_graspable=verdict.paper_graspable,
+    )
+
+
+def _expected(choice: Choice) -> float | None:
+    """The cost that is expected after a choice, if any is: a policy need not say."""
+    return float(choice.predicted_cost) if np.isfinite(choice.predicted_cost) else None
+
+
+class EpisodeLog:
+    """The steps of an episode that is running, and the verdicts on them.
+
+    At every step `decide` notes what was known and decided, and then `act` what came of it.
+
+    Attributes:
+      steps: those that are over, and the one that was decided.
+      spoilt: why the target cannot be retrieved any more, whatever is done: an object has left the board; None before.
+    """
+
+    def __init__(self, max_steps: int) -> None:
+        self.steps: list[Step] = []
+        self.spoilt: str | None = None
+        self._off_board: frozenset[int] = frozenset()
+        self._max_steps = max_steps
+        self._index = 0
+        self._found_step: int | None = None
+        self._graspable_step: int | None = None
+        self._paper_graspable_step: int | None = None
+        self._retrieved = False
+        self._failure: str | None = None
+
+    @property
+    def index(self) -> int:
+        """Number of the present step: how many steps came before it."""
+        return self._index
+
+    @property
+    def last(self) -> bool:
+        """Whether at the present step only a retrieval is allowed any more."""
+        return self._index == self._max_steps
+
+    @property
+    def acts(self) -> bool:
+        """Whether an action was decided upon."""
+        return self.steps[-1].action is not None
+
+    def decide(self, step: Step) -> Step:
+        """Note what is known and decided at the present step."""
+        if self.steps:
+            self.steps[-1] = dataclasses.replace(self.steps[-1], observed_cost=step.cost)
+        if step.found and self._found_step is None:
+            self._found_step = self._index
+        if step.graspable and self._graspable_step is None:
+            self._graspable_step = self._index
+        if step.paper_graspable and self._paper_graspable_step is None:
+            self._paper_graspable_step = self._index
+        self.steps.append(step)
+        return step
+
+    def took(self, choice: Choice) -> None:
+        """Note that another action was executed than the one that was decided upon."""
+        self.steps[-1] = dataclasses.replace(
+            self.steps[-1], action=record_action(choice.action), predicted_cost=_expected(choice)
+        )
+
+    def act(self, result: Result | None, trouble: str | None, timings: dict[str, float]) -> bool:
+        """Note what came of the decision; whether the episode ends with it.
+
+        Args:
+          result: of what was executed; None where nothing was.
+          trouble: why the episode cannot go on, unless it was a success; None if it can.
+          timings: of the step's stages [s].
+        """
+        self.steps[-1] = dataclasses.replace(self.steps[-1], timings=timings)
+        if result is not None:
+            self._note(result)
+        error = trouble is not None and trouble.startswith("error")
+        self._retrieved = result is not None and result.retrieved and not error and self.spoilt is None
+        self._failure = None if self._retrieved else trouble or self._end(result is not None and result.final)
+        if self._failure and self.spoilt and not error:
+            self._failure = self.spoilt
+        self._index += 1
+        return self._retrieved or self._failure is not None
+
+    def _note(self, result: Result) -> None:
+        """Write down what came of what was executed."""
+        left = result.off_board - self._off_board
+        self._off_board |= result.off_board
+        objects = tuple(sorted(left - {TARGET}))
+        self.steps[-1] = dataclasses.replace(
+            self.steps[-1],
+            failure=result.failure,
+            fallen=objects,
+            target_fallen=TARGET in left,
+            held_up=result.held_up,
+            at_rest=result.at_rest,
+            tracking_error=result.tracking_error,
+        )
+        if objects and self.spoilt is None:
+            blamed = "retrieval: " if result.takes_target else ""
+            self.spoilt = f"{blamed}an object fell off the board at action {self._index + 1}"
+
+    def _end(self, final: bool) -> str | None:
+        """Why an episode without a retrieval ends here; None if it goes on.
+
+        Args:
+          final: whether the present failure ends it.
+        """
+        step = self.steps[-1]
+        if final:
+            return step.failure or self.spoilt
+        # Nothing is left to be learned: it is known whether the target could be grasped, and it will not be retrieved.
+        if self.spoilt and self._graspable_step is not None:
+            return self.spoilt
+        if not self.last:
+            return None
+        return step.failure or ("found, but not graspable" if step.found else "not found")
+
+    def episode(self, scenario: Scenario, options: dict[str, Any]) -> Episode:
+        """The record of the episode, which has ended."""
+        return Episode(
+            scenario=scenario.name,
+            objects=len(scenario.objects),
+            config=options,
+            versions=versions(),
+            steps=tuple(self.steps),
+            found_step=self._found_step,
+            graspable_step=self._graspable_step,
+            retrieved=self._retrieved,
+            failure=self._failure,
+            content_hash=scenario.content_hash,
+            paper_graspable_step=self._paper_graspable_step,
+        )

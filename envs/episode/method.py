@@ -1,0 +1,182 @@
+"""What decides about an episode beside its scenario and its seed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from typing import Any, Literal
+
+from mechsearch_jax.actions.registry import check_kinds
+from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
+from mechsearch_jax.envs.episode.earlier import GONE
+from mechsearch_jax.envs.episode.policy_numbers import mould
+from mechsearch_jax.envs.episode.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
+from mechsearch_jax.envs.pushing.push_models import push_models
+from mechsearch_jax.envs.trials.named import rehearsal
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
+from mechsearch_jax.planner.trials import Trials
+from mechsearch_jax.planner.workcell import Workcell
+
+EngineName = Literal["NativeSimulator", "MjxSimulator"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """A policy with all of its settings, what it sees the world through, and what steps the world; hashable.
+
+    Attributes:
+      name: of the policy, as `planner.policy_factory` takes it: one of `planner.POLICIES`, or the import path of
+        another, as "my_lab.policies:Mine".
+      config: every setting of the problem and of the policy, one preset's worth.
+      recognition: name of the recogniser.
+      engine: name of the simulator.
+      workcell: what stands around the objects, and how finely a target is searched.
+      protocol: name of how its episodes are run and judged, one of `protocols.PROTOCOLS`.
+    """
+
+    name: str = "search-for-grasp"
+    config: Config = dataclasses.field(default_factory=PRESETS["standard"])
+    recognition: RecognitionName = "oracle"
+    engine: EngineName = "NativeSimulator"
+    workcell: Workcell = dataclasses.field(default_factory=Workcell)
+    protocol: ProtocolName = "strict"
+
+    def policy(self) -> Policy:
+        """The policy, with the models that the configuration names.
+
+        What it proposes is tried out by `trials`, between its decision and what is done.
+
+        Raises:
+          InputError: there is no such policy, or its push model cannot be used.
+        """
+        first, later = push_models(self.config.push_model, self.workcell.shelf)
+        return policy_factory(self.name)(
+            self.config.planner,
+            push_model=first,
+            later_push_model=later,
+            tries=self.config.rehearsal != "none",
+        )
+
+    def trials(self) -> Trials | None:
+        """What tries the policy's best actions out before one is made; None where nothing does."""
+        return rehearsal(self.config.rehearsal)
+
+    @property
+    def terms(self) -> EpisodeProtocol:
+        """How its episodes are run and judged."""
+        return PROTOCOLS[self.protocol]
+
+    @property
+    def problem_config(self) -> ProblemConfig:
+        """How the problem is built that its episodes are run with."""
+        return self.terms.problem(self.config.problem)
+
+    def mould(self) -> Hashable:
+        """What is compiled for episodes of one target: the same for methods that differ in numbers of their policies,
+        such as gamma, or in the number of steps alone.
+
+        Raises:
+          InputError: as `policy`.
+        """
+        shared = self.workcell, self.config.problem, self.recognition, self.engine, self.protocol
+        return *shared, self.config.rehearsal, mould(self.policy())
+
+    def check(self) -> None:
+        """Fail before the first episode rather than in every one.
+
+        Raises:
+          InputError: as `policy`, or there is no such kind of action, or the weights that the recogniser needs are
+            missing or damaged.
+        """
+        check_kinds(self.config.problem.actions.actions)
+        self.policy()
+        recogniser(self.recognition, self.workcell.target)
+
+    def options(self) -> dict[str, Any]:
+        """What tells this method from others, flat and as JSON values: policy, recognition, protocol, every option of
+        the configuration by its name, and other settings that are not the preset `standard`'s, or not the usual
+        workcell's, by their path."""
+        named = {".".join(option.path) for option in OPTIONS}
+        pairs = ((self.config, PRESETS["standard"](), ""), (self.workcell, Workcell(), "workcell."))
+        unusual: dict[str, Any] = {}
+        for config, standard, prefix in pairs:
+            usual = dict(_settings(standard, prefix))
+            settings = _settings(config, prefix)
+            unusual |= {path: value for path, value in settings if value != usual[path] and path not in named}
+        told = {"policy": self.name, "recognition": self.recognition, "protocol": self.protocol}
+        return {**told, **self.config.options(), **unusual}
+
+    @classmethod
+    def of_options(cls, options: Mapping[str, Any]) -> Method:
+        """The method whose `options` these are; what they do not hold is as in the preset `standard`. It runs natively.
+
+        Raises:
+          InputError: a setting is impossible, there is none of a path, or an option is gone.
+        """
+        for name, usual in GONE.items():
+            if options.get(name, usual) != usual:
+                raise InputError(f"option {name} is gone: what ran with {options[name]!r} cannot be run again")
+        known = {option.name for option in OPTIONS}
+        config = PRESETS["standard"](**{name: value for name, value in options.items() if name in known})
+        parts: dict[str, Any] = {"config": config, "workcell": Workcell()}
+        for path, value in options.items():
+            first, *rest = path.split(".")
+            if rest and first == "workcell":
+                parts["workcell"] = _with_setting(parts["workcell"], rest, value)
+            elif rest:
+                parts["config"] = _with_setting(parts["config"], path.split("."), value)
+        protocol = options.get("protocol", "strict")
+        return cls(options["policy"], recognition=options["recognition"], protocol=protocol, **parts)
+
+    def to_json(self) -> dict[str, Any]:
+        """All of it as JSON values, for another process."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> Method:
+        """What `to_json` returned, possibly in another process.
+
+        Raises:
+          InputError: a setting is impossible.
+        """
+        return _restored(cls(), value)
+
+
+def _settings(config: Config | Workcell, prefix: str) -> Iterator[tuple[str, Any]]:
+    """Every setting, as JSON has it, by its path: "problem.grasps.wrists", after a prefix."""
+
+    def inside(value: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
+        for name, part in value.items():
+            if isinstance(part, dict):
+                yield from inside(part, f"{path}{name}.")
+            else:
+                yield f"{path}{name}", part
+
+    return inside(json.loads(json.dumps(dataclasses.asdict(config))), prefix)
+
+
+def _with_setting(settings: Any, path: Sequence[str], value: Any) -> Any:
+    """Settings with another value, as JSON has it, at a path.
+
+    Raises:
+      InputError: it is impossible, or there is no such path.
+    """
+    first, *rest = path
+    if not hasattr(settings, first):
+        raise InputError(f"setting {'.'.join(path)} is unknown to this version")
+    here = getattr(settings, first)
+    new = _with_setting(here, rest, value) if rest else _restored(here, value)
+    return dataclasses.replace(settings, **{first: new})
+
+
+def _restored(like: Any, value: Any) -> Any:
+    """What `dataclasses.asdict` and JSON made of something like `like`: dataclasses from dictionaries, tuples from
+    lists."""
+    if dataclasses.is_dataclass(like):
+        return type(like)(**{name: _restored(getattr(like, name), part) for name, part in value.items()})
+    if isinstance(value, list | tuple):
+        first = like[0] if isinstance(like, tuple) and like else None
+        return tuple(_restored(first, part) for part in value)
+    return value

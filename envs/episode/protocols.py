@@ -1,0 +1,222 @@
+"""How episodes are run and judged: strictly, or as the authors' published code does (docs/method.md, "Protocols")."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple, Protocol
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from mechsearch_jax.actions import Action, ActionKind, no_action
+from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, true_target_pose
+from mechsearch_jax.envs.episode.episode_log import Choice, takes_target
+from mechsearch_jax.envs.episode.slots import Slots
+from mechsearch_jax.envs.episode.verdicts import Verdict
+from mechsearch_jax.envs.simulators.simulator import Simulator
+from mechsearch_jax.envs.world.outcome import Failure, Outcome
+from mechsearch_jax.envs.world.world import World
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import ProblemConfig
+from mechsearch_jax.workspace.shelf import Shelf
+
+ProtocolName = Literal["strict", "published-code"]
+
+# Why an episode under `PublishedCode` ends, beside those of `EpisodeLog`.
+REACHED = "graspable: nothing is taken out by this protocol"
+HIDDEN_AGAIN = "the target is hidden again"
+OUTSIDE = "something is outside the shelf"
+ALL_FAILED = "every action that was tried failed"
+
+
+class Execution(NamedTuple):
+    """What became of the decisions of a round.
+
+    Attributes:
+      outcome: in all worlds, on the host; of the last action that was tried.
+      choices: what was executed in each slot.
+      stuck: the slots in which nothing could be; their worlds are as before.
+    """
+
+    outcome: Outcome
+    choices: dict[int, Choice]
+    stuck: frozenset[int] = frozenset()
+
+
+class EpisodeProtocol(Protocol):
+    """How episodes are run and judged; hashable."""
+
+    @property
+    def name(self) -> ProtocolName: ...
+
+    def problem(self, config: ProblemConfig) -> ProblemConfig:
+        """How the problem is built that episodes are run with, from how the method builds it."""
+        ...
+
+    def recogniser(self, inner: Recogniser) -> Recogniser:
+        """What the policy sees the world through, from the method's own."""
+        ...
+
+    def judge(self, known: Slots, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
+        """The verdicts in slots where the target has been found."""
+        ...
+
+    def ends(
+        self,
+        shelf: Shelf,
+        world: World,
+        rows: Sequence[int],
+        verdicts: Mapping[int, Verdict],
+        choices: Mapping[int, Choice],
+    ) -> dict[int, str]:
+        """In which slots the episode ends before anything is executed, and why."""
+        ...
+
+    @property
+    def once(self) -> bool:
+        """Whether what was decided is executed once, whatever becomes of it."""
+        ...
+
+    def execute(self, simulator: Simulator, choices: Mapping[int, Choice]) -> Execution:
+        """Execute what was decided, in one slot at least."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Strict:
+    """Every action counts, whatever becomes of it, and the target has to be taken out."""
+
+    name: ProtocolName = "strict"
+    once: bool = True
+
+    def problem(self, config: ProblemConfig) -> ProblemConfig:
+        return config
+
+    def recogniser(self, inner: Recogniser) -> Recogniser:
+        return inner
+
+    def judge(self, known: Slots, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
+        """On the true state."""
+        return known.judge(world, rows)
+
+    def ends(self, shelf, world, rows, verdicts, choices) -> dict[int, str]:
+        return {}
+
+    def execute(self, simulator: Simulator, choices: Mapping[int, Choice]) -> Execution:
+        return Execution(_executed(simulator, choices), dict(choices))
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishedCode:
+    """What the authors' code does.
+
+    The sampled first actions are tried best first; where one fails, or something leaves the board, the world is set
+    back and the next is tried, all within one step. An episode fails where all have failed, and where something is
+    outside the shelf as a step begins. It succeeds where the target is in sight, and at some candidate grasp what
+    gripper and target sweep meets neither the recognised objects nor the shelf; nothing is taken out. The target's true
+    pose is known once it is found.
+    """
+
+    name: ProtocolName = "published-code"
+    once: bool = False
+
+    def problem(self, config: ProblemConfig) -> ProblemConfig:
+        """A found target has the candidates' grasps, and no others."""
+        return dataclasses.replace(config, retrieval=config.grasps)
+
+    def recogniser(self, inner: Recogniser) -> Recogniser:
+        return WithTruePose(inner)
+
+    def judge(self, known: Slots, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
+        """`graspable` as said above; `paper_graspable` on the true state, as always."""
+        free, strict = known.swept_free(rows), known.judge(world, rows)
+        return {r: Verdict(free[r], strict[r].paper_graspable) for r in rows}
+
+    def ends(
+        self,
+        shelf: Shelf,
+        world: World,
+        rows: Sequence[int],
+        verdicts: Mapping[int, Verdict],
+        choices: Mapping[int, Choice],
+    ) -> dict[int, str]:
+        position, valid = jax.device_get((world.position, world.valid))
+        outside = np.any(valid & ((position[..., 0] < shelf.front) | (position[..., 2] < shelf.board)), axis=1)
+        taking = {r: HIDDEN_AGAIN for r in rows if r in choices and takes_target(choices[r])}
+        reached = {r: REACHED for r in rows if r in verdicts and verdicts[r].graspable}
+        return taking | reached | {r: OUTSIDE for r in rows if outside[r]}
+
+    def execute(self, simulator: Simulator, choices: Mapping[int, Choice]) -> Execution:
+        before, left, taken = simulator.world, dict(choices), dict(choices)
+        assert before is not None
+        count, rank = len(before.kind), 0
+        outcome = _executed(simulator, left)
+        while left:
+            bad = {r for r in left if _is_bad(left[r], outcome, r)}
+            if bad:
+                simulator.load(before, np.isin(np.arange(count), list(bad)))
+            rank += 1
+            left = {r: _next(choices[r], rank) for r in bad if _has(choices[r], rank)}
+            stuck = {r for r in bad if r not in left}
+            taken = {r: choice for r, choice in (taken | left).items() if r not in stuck}
+            if left:
+                now = _executed(simulator, left)
+                outcome = _where(np.isin(np.arange(count), list(left)), now, outcome)
+        return Execution(outcome, taken, frozenset(choices.keys() - taken.keys()))
+
+
+PROTOCOLS: Mapping[str, EpisodeProtocol] = {"strict": Strict(), "published-code": PublishedCode()}
+
+
+@dataclasses.dataclass(frozen=True)
+class WithTruePose:
+    """A `Recogniser` that says where the target truly is, whenever it is seen."""
+
+    inner: Recogniser
+
+    def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
+        return self.inner(key, snapshot).replace(target_pose=true_target_pose(snapshot.world))
+
+
+def _executed(simulator: Simulator, choices: Mapping[int, Choice]) -> Outcome:
+    """What the simulator says of actions in some worlds."""
+    assert simulator.world is not None
+    return jax.device_get(simulator.execute(*chosen_actions(choices, len(simulator.world.kind))))
+
+
+def chosen_actions(choices: Mapping[int, Choice], count: int) -> tuple[Action, Array]:
+    """The actions of all of so many worlds, and which of them were chosen."""
+    actions: Action = jax.tree.map(
+        lambda a: np.broadcast_to(a, (count, *np.shape(a))).copy(), jax.device_get(no_action())
+    )
+    for row, choice in choices.items():
+        for name in Action.__dataclass_fields__:
+            getattr(actions, name)[row] = getattr(choice.action, name)
+    return jax.device_put((actions, np.isin(np.arange(count), list(choices))))
+
+
+def _is_bad(choice: Choice, outcome: Outcome, row: int) -> bool:
+    """Whether an action is taken back; where the simulator's buffers were too small, nothing is."""
+    failed = int(outcome.failure[row]) != Failure.NONE or int(choice.action.kind) == ActionKind.NONE
+    return (failed or bool(np.any(outcome.fallen[row]))) and not int(outcome.overflow[row])
+
+
+def _has(choice: Choice, rank: int) -> bool:
+    """Whether there is a next best action of so high a rank, counted from 0; none comes after doing nothing."""
+    kinds = np.zeros(0) if choice.others is None else np.asarray(choice.others.kind)
+    nothing = int(choice.action.kind) == ActionKind.NONE
+    return not nothing and rank < len(kinds) and int(kinds[rank]) != ActionKind.NONE
+
+
+def _next(choice: Choice, rank: int) -> Choice:
+    """The action of a rank in place of the best one; what it is expected to cost was not kept."""
+    return choice.replace(
+        action=jax.tree.map(lambda a: a[rank], choice.others), predicted_cost=np.float32(np.nan), others=None
+    )
+
+
+def _where(rows: np.ndarray, new: Outcome, old: Outcome) -> Outcome:
+    """One outcome in some worlds, another in the others."""
+    return jax.tree.map(lambda a, b: np.where(rows.reshape(-1, *[1] * (np.ndim(a) - 1)), a, b), new, old)

@@ -1,0 +1,183 @@
+"""The record of an episode, `episode.json`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mechsearch_jax.actions import Action, kind_of
+from mechsearch_jax.envs.episode.earlier import present_options
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike, replacing
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionRecord:
+    """An action as a file keeps it; fields as in `mechsearch_jax.actions.Action`.
+
+    Attributes:
+      kind: name of a registered kind: "push", "pick-and-place", "retrieve", "none", ...
+      object: index of the object in the scenario; None where the action moves none, for example for a retrieval.
+      T_world_gripper, T_world_place: rows of the 4 x 4 poses [m].
+      displacement: [m].
+      q7: [rad].
+      opening: [m].
+    """
+
+    kind: str
+    object: int | None
+    T_world_gripper: list[list[float]]
+    displacement: list[float]
+    T_world_place: list[list[float]]
+    q7: float
+    opening: float
+
+
+def record_action(action: Action) -> ActionRecord:
+    """A single action, as a file keeps it.
+
+    Raises:
+      InputError: its kind is unknown.
+    """
+    kind = kind_of(int(action.kind))
+    return ActionRecord(
+        kind=kind.name,
+        object=int(action.object) if kind.moves_object else None,
+        T_world_gripper=np.asarray(action.T_world_gripper).tolist(),
+        displacement=np.asarray(action.displacement).tolist(),
+        T_world_place=np.asarray(action.T_world_place).tolist(),
+        q7=float(action.q7),
+        opening=float(action.opening),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """What was known at one step of an episode, what was done, and what came of it.
+
+    Attributes:
+      belief_size: number of candidate poses where the target can still be.
+      found: whether the target has been found, and may still be where it was seen last.
+      graspable: whether it has been found and a collision-free grasp of it exists in the true state.
+      cost: J of the observed state; None where nothing was planned.
+      action: what the robot did; None if the episode ended here.
+      predicted_cost: J that the plan expects right after the action; None where nothing was planned or expected.
+      observed_cost: J at the next observation; None if there was none.
+      sequences: number of valid action sequences that the plan was chosen from.
+      failure: why the action could not be carried out as planned; None if it was.
+      timings: wall time of each stage [s]; "compile", where anything was compiled, is in no other.
+      truth_possible: whether f holds the candidate pose that is nearest to the target's true pose; None once the target
+        is found, and where it has fallen, so that no candidate is near its pose.
+      restarts: how often f had become empty and was started anew.
+      fallen: indices in the scenario of the objects that left the board in this step; () where none did.
+      target_fallen: whether the target did; never one that is in the hand.
+      held_up: whether the arm was held up: see `SimulatorConfig.tracking_bound`.
+      at_rest: whether everything came to rest after the action; False also where the simulation diverged.
+      tracking_error: how far the joint that was farthest from its reference was from it [rad].
+      paper_graspable: whether `graspable` holds with the paper's grasps alone: see `verdicts.paper_grasps`.
+
+    From `fallen` to `tracking_error` they are None where nothing was executed, from `truth_possible` on in files of
+    earlier versions.
+    """
+
+    belief_size: int
+    found: bool
+    graspable: bool
+    cost: float | None
+    action: ActionRecord | None
+    predicted_cost: float | None
+    observed_cost: float | None
+    sequences: int
+    failure: str | None
+    timings: dict[str, float]
+    truth_possible: bool | None = None
+    restarts: int | None = None
+    fallen: tuple[int, ...] | None = None
+    target_fallen: bool | None = None
+    held_up: bool | None = None
+    at_rest: bool | None = None
+    tracking_error: float | None = None
+    paper_graspable: bool | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Episode:
+    """A whole episode, from the first look to the retrieval or to giving up.
+
+    Attributes:
+      scenario: name of the scenario.
+      objects: number of surrounding objects.
+      config: the planner's and the episode's options.
+      versions: as `versions` returns them.
+      steps: one for each observation.
+      found_step: number of actions before the target was found; None where it never was.
+      graspable_step: number of actions before a step said `graspable`, whatever was retrieved; None where none did.
+      retrieved: whether the hand took the target out of the shelf and no object fell, neither then nor before.
+      failure: why the episode ended without a retrieval; None after one. Where an object left the board, this is the
+        reason, with the number of the action.
+      content_hash: of the scenario, see `Scenario.content_hash`; None in files of earlier versions.
+      paper_graspable_step: number of actions before it could be grasped with the paper's grasps alone; None where it
+        could not before the episode ended, and in files of earlier versions, whose steps do not say.
+    """
+
+    scenario: str
+    objects: int
+    config: dict[str, Any]
+    versions: dict[str, str]
+    steps: tuple[Step, ...]
+    found_step: int | None
+    graspable_step: int | None
+    retrieved: bool
+    failure: str | None
+    content_hash: str | None = None
+    paper_graspable_step: int | None = None
+
+
+def save_episode(episode: Episode, path: PathLike) -> None:
+    """Write `episode.json`.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    text = json.dumps(dataclasses.asdict(episode), indent=1, allow_nan=False) + "\n"
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def load_episode(path: PathLike) -> Episode:
+    """Read `episode.json`; options of earlier versions are as `earlier.present_options` has them.
+
+    In files of earlier versions a retrieval may have set `graspable_step`: it is read from the steps instead.
+
+    Raises:
+      InputError: the file cannot be read or is not the record of an episode.
+    """
+    try:
+        value = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
+    try:
+        steps = tuple(_step(step) for step in value["steps"])
+        graspable = next((i for i, step in enumerate(steps) if step.graspable), None)
+        config = present_options(value["config"])
+        return Episode(**{**value, "steps": steps, "config": config, "graspable_step": graspable})
+    except (TypeError, KeyError) as error:
+        raise InputError(f"{path}: is not the record of an episode ({error})") from error
+
+
+def _step(value: dict[str, Any]) -> Step:
+    """A step from what a file keeps of it."""
+    action, fallen = value["action"], value.get("fallen")
+    return Step(
+        **{
+            **value,
+            "action": None if action is None else ActionRecord(**action),
+            "fallen": None if fallen is None else tuple(fallen),
+        }
+    )

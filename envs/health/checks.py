@@ -1,0 +1,227 @@
+"""What is usable on this machine, and what to do about what is not."""
+
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.metadata
+import importlib.util
+import io
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mechsearch_jax.envs.health.finding import Finding, State
+from mechsearch_jax.errors import InputError
+
+if TYPE_CHECKING:
+    from mechsearch_jax.planner.settings import Settings
+    from mechsearch_jax.workspace.scenario import Scenario
+
+PACKAGES = ("mechsearch-jax", "jax", "jaxlib", "flax", "numpy", "mujoco", "mujoco-mjx")
+EXTRAS = ("warp-lang", "example-robot-data")
+# Draws an empty picture through OpenGL.
+_RENDER = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco/>")
+with mujoco.Renderer(model, 8, 8) as renderer:
+    renderer.update_scene(mujoco.MjData(model))
+    renderer.render()
+"""
+
+
+Check = Callable[[], Iterator[Finding]]
+
+
+def checks(scenario: Scenario | None, settings: Settings, cell: bool = False) -> Mapping[str, Check]:
+    """All that can be looked at, by subject.
+
+    Args:
+      scenario: whose problem is looked for in the cache; None for none.
+      settings: that it would be built with.
+      cell: whether the cell of the settings is looked at, for which its problem is built.
+    """
+    found = dict(CHECKS)
+    if cell:
+        # What recognises takes long to import.
+        from mechsearch_jax.envs.health import cell_health
+
+        parts = {part: getattr(cell_health, part) for part in CELL}
+        found |= {part: functools.partial(check, settings) for part, check in parts.items()}
+    if scenario is not None:
+        found["problem"] = lambda: _problem(scenario, settings)
+    return found
+
+
+def examine(subject: str, check: Check) -> Iterator[Finding]:
+    """What a check finds; that it failed, where it does."""
+    try:
+        yield from check()
+    # Whatever is broken, the other checks still tell something.
+    except Exception as error:
+        state = State.BROKEN if subject in NEEDED else State.MISSING
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"[:300]
+        yield Finding(subject, state, reason, "install again: pip install --force-reinstall mechsearch-jax")
+
+
+def _versions() -> Iterator[Finding]:
+    known = {name: _version(name) for name in (*PACKAGES, *EXTRAS)}
+    told = ", ".join(f"{name} {version}" for name, version in known.items() if version)
+    yield Finding("versions", State.FINE, f"Python {platform.python_version()}, {told}")
+    for name in PACKAGES:
+        if not known[name]:
+            yield Finding("versions", State.BROKEN, f"{name} is not installed", f"pip install {name}")
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def _devices() -> Iterator[Finding]:
+    import jax
+
+    from mechsearch_jax.cores import cores
+
+    devices = jax.devices()
+    told = ", ".join(f"{device.platform}: {device.device_kind}" for device in devices)
+    yield Finding("devices", State.FINE, f"JAX computes on {told}; {cores()} cores")
+    if jax.default_backend() == "cpu" and (shutil.which("nvidia-smi") or Path("/proc/driver/nvidia/version").exists()):
+        yield Finding(
+            "devices",
+            State.MISSING,
+            "there is an NVIDIA GPU that JAX does not see",
+            "pip install 'mechsearch-jax[gpu]', and leave JAX_PLATFORMS unset",
+        )
+
+
+def _simulator() -> Iterator[Finding]:
+    import mujoco
+
+    from mechsearch_jax.envs.world import model
+    from mechsearch_jax.workspace.camera import Camera
+    from mechsearch_jax.workspace.shelf import Shelf
+
+    compiled = model.compile_model(Shelf(), Camera())
+    mujoco.mj_step(compiled, mujoco.MjData(compiled))
+    yield Finding("simulator", State.FINE, "the native simulator, MuJoCo in C, steps the scene")
+
+
+def _batches() -> Iterator[Finding]:
+    from mechsearch_jax.envs.simulators.mjx_model import import_mjx
+
+    try:
+        import_mjx()
+    except InputError as error:
+        says, _, remedy = str(error).partition("; ")
+        yield Finding("batches", State.MISSING, says, remedy)
+        return
+    import warp  # pyright: ignore[reportMissingImports]
+
+    # It tells on standard output that there is no GPU, which is told below.
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        gpus = [device.name for device in warp.get_cuda_devices()]
+    told = ", ".join(gpus) if gpus else "the CPU alone, slowly: no GPU is seen"
+    yield Finding("batches", State.FINE, f"MJX and Warp {warp.config.version} work, on {told}")
+
+
+def _rendering() -> Iterator[Finding]:
+    for backend in ("egl", "osmesa"):
+        asked = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+        try:
+            done = subprocess.run([sys.executable, "-c", _RENDER], env=asked, capture_output=True, timeout=60)
+            works = done.returncode == 0
+        except subprocess.TimeoutExpired:
+            works = False
+        if works:
+            yield Finding("rendering", State.FINE, f"OpenGL through {backend}, for MuJoCo's own pictures alone")
+            return
+    yield Finding(
+        "rendering",
+        State.MISSING,
+        "neither EGL nor OSMesa works; nothing here needs them, pictures are ray-cast",
+        "for MuJoCo's own pictures install libegl1 or libosmesa6",
+    )
+
+
+def _weights() -> Iterator[Finding]:
+    import importlib.resources
+
+    from mechsearch_jax.networks.weights import ARCHITECTURES, load_weights
+
+    folder = Path(str(importlib.resources.files("mechsearch_jax") / "networks"))
+    for name in ARCHITECTURES:
+        try:
+            card = load_weights(folder / f"{name}.npz", name).card
+        except InputError as error:
+            yield Finding("weights", State.BROKEN, str(error), "pip install --force-reinstall mechsearch-jax")
+        else:
+            told = f"{name}: {card['parameters']} parameters, SHA-256 {card['sha256'][:12]}"
+            yield Finding("weights", State.FINE, told)
+
+
+def _cache() -> Iterator[Finding]:
+    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.planner.cache import VARIABLE, cache_folder
+
+    kept = {"problems, compilations": cache_folder()}
+    if given := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        kept = {"problems": cache_folder(), "compilations": Path(given)}
+    for what, folder in kept.items():
+        if folder is None:
+            says = f"{what} are not kept: {VARIABLE} is empty, so that every start takes minutes"
+            yield Finding("cache", State.MISSING, says, f"unset {VARIABLE}, or set it to a folder")
+            continue
+        try:
+            check_writable(folder)
+        except InputError as error:
+            says = f"{what} are not kept: {error}"
+            yield Finding("cache", State.MISSING, says, f"set {VARIABLE} to a folder that can be written to")
+            continue
+        sizes = [file.stat().st_size for file in folder.rglob("*") if file.is_file()]
+        told = f"{what}: {folder}, {len(sizes)} files, {sum(sizes) / 1e6:.0f} MB, writable"
+        yield Finding("cache", State.FINE, told)
+
+
+def _meshes() -> Iterator[Finding]:
+    if importlib.util.find_spec("example_robot_data") is not None:
+        yield Finding("meshes", State.FINE, "the robot's meshes are installed")
+    else:
+        says = "the robot's meshes are not installed; only the test of the collision primitives needs them"
+        yield Finding("meshes", State.MISSING, says, "pip install 'mechsearch-jax[meshes]'")
+
+
+def _problem(scenario: Scenario, settings: Settings) -> Iterator[Finding]:
+    from mechsearch_jax.envs.episode.episodes import target_of
+
+    cell = settings.workcell
+    if cell.is_cached(target_of(scenario, cell.target), settings.config.problem):
+        yield Finding("problem", State.FINE, f"that of {scenario.name} is in the cache")
+    else:
+        says = f"that of {scenario.name} is not in the cache; to build it takes some 15 s, once"
+        yield Finding("problem", State.MISSING, says, "run a search or inspect")
+
+
+CHECKS: Mapping[str, Check] = {
+    "versions": _versions,
+    "devices": _devices,
+    "simulator": _simulator,
+    "batches": _batches,
+    "rendering": _rendering,
+    "weights": _weights,
+    "cache": _cache,
+    "meshes": _meshes,
+}
+# What is looked at of a cell, and without what nothing can be searched.
+CELL = ("camera", "target", "shelf", "networks", "planner")
+NEEDED = ("versions", "devices", "simulator", "weights", *CELL)

@@ -1,0 +1,117 @@
+"""Pushes in files: made in portions, of which those that lie there already are not made again."""
+
+from __future__ import annotations
+
+import dataclasses
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from flax import serialization
+from flax.traverse_util import flatten_dict, unflatten_dict
+from jaxtyping import Array
+
+from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, generate_pushes
+from mechsearch_jax.envs.simulators.simulator import Simulator
+from mechsearch_jax.envs.world.world import World
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import replacing
+
+
+def save_pushes(path: Path, pushes: Pushes, identity: str) -> None:
+    """Write pushes and how they were made.
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    arrays = flatten_dict(serialization.to_state_dict(pushes), sep="/")
+    with replacing(path) as file:
+        np.savez(file, identity=np.array(identity), **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def load_pushes(path: Path, identity: str) -> Pushes:
+    """Read pushes that were made in a certain way.
+
+    Raises:
+      InputError: the file is damaged, or its pushes were made otherwise.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        found = str(arrays.pop("identity"))
+        tree: dict[str, Any] = unflatten_dict(arrays, sep="/")
+        worlds = {name: World(**tree.pop(name)) for name in ("before", "after")}
+        pushes = Pushes(**worlds, **tree)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); choose another --data") from None
+    except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile):
+        complaint = "is damaged, or was written by another version; remove it or choose another --data"
+        raise InputError(f"{path}: {complaint}") from None
+    if found != identity:
+        raise InputError(f"{path}: was made otherwise ({found}); repeat that or choose another --data")
+    return pushes
+
+
+def _drawn_from(config: PushesConfig) -> dict[str, Any]:
+    """The settings on which pushes depend; of those of a planner's actions, most concern others."""
+    pushing = ("push_wrists", "push_tilt", "push_depths", "push_height", "push_leverage")
+    pushing += ("cloud_points", "pusher_points")
+    settings = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    return settings | {"actions": {name: getattr(config.actions, name) for name in pushing}}
+
+
+def portions(
+    generation: Generation,
+    folder: Path,
+    make_simulator: Callable[[], Simulator],
+    draw_world: Callable[[Array], World],
+    source: str = "",
+    config: PushesConfig | None = None,
+    told: Callable[[int], None] = lambda pushes: None,
+) -> Iterator[Pushes]:
+    """Portions of pushes until there are enough; those that lie in the folder already are read instead of made.
+
+    Args:
+      generation: how many.
+      folder: for one file for each portion.
+      make_simulator: called if anything has to be simulated.
+      draw_world: see `generate_pushes`.
+      source: names the simulator and the scenes; what lies in the folder must have been made with the same.
+      config: which pushes.
+      told: is told how many pushes there are.
+
+    Raises:
+      InputError: what lies in the folder is damaged or was made otherwise, or the folder cannot be written.
+    """
+    config = config or PushesConfig()
+    simulator: Simulator | None = None
+    count = number = 0
+    while count < generation.pushes:
+        path = folder / f"pushes-{number:03d}.npz"
+        identity = repr((generation.seed, generation.worlds, generation.rounds, number, _drawn_from(config), source))
+        if path.exists():
+            part = load_pushes(path, identity)
+        else:
+            simulator = simulator or make_simulator()
+            key = jax.random.fold_in(jax.random.key(generation.seed), number)
+            base = count
+            part = generate_pushes(
+                key,
+                generation.worlds,
+                generation.rounds,
+                simulator,
+                draw_world,
+                config,
+                told=lambda _, pushes, base=base: told(base + pushes),
+            )
+            part = part.replace(lane=part.lane + number * generation.worlds)
+            save_pushes(path, part, identity)
+        count += len(part.object)
+        if not len(part.object):
+            raise InputError(f"no push was possible in {generation.worlds} worlds; give more --worlds")
+        told(count)
+        number += 1
+        yield part

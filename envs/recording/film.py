@@ -1,0 +1,138 @@
+"""The film of a recorded episode: a bystander sees the robot act, beside what the planner knows."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mechsearch_jax.cores import cores
+from mechsearch_jax.envs.camera.simulated_camera import AMBIENT, BACKGROUND_COLOUR, LIGHT, PALETTE, SHELF
+from mechsearch_jax.envs.recording.pictures import recorded_frame
+from mechsearch_jax.envs.recording.playback import Playback, playback
+from mechsearch_jax.envs.recording.recording import Recording
+from mechsearch_jax.envs.world.model import shelf_boxes
+from mechsearch_jax.envs.world.world import World
+from mechsearch_jax.robot.arm_clearance import link_poses
+from mechsearch_jax.shapes import in_order, shape_of
+from mechsearch_jax.viz import drawing, sketches
+from mechsearch_jax.viz.film import Layout, Moving, Page
+from mechsearch_jax.viz.panda import panda_solids
+from mechsearch_jax.viz.raycast import Colour, Eye, Solid
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+# From the middle of the opening's lower edge, where the bystander is, and where he looks [m]: he stands at the left,
+# and the boards between him and the objects are left out.
+STANDS, LOOKS_AT = np.array([-0.56, 1.25, 0.85]), np.array([-0.09, -0.04, 0.03])
+LEFT_OUT = ("ceiling", "left")
+# Width of his view, in units of its distance.
+VIEW_ANGLE = 1.02
+
+
+class Film:
+    """The pictures of an episode, one after the other.
+
+    Attributes:
+      count: how many there are.
+      size: their width and height.
+    """
+
+    def __init__(self, recording: Recording, width: int, fps: int, speed: float = 1.0):
+        """Args:
+        recording: of the episode.
+        width: of the pictures, in pixels.
+        fps: pictures in a second.
+        speed: how many times as fast as it was everything goes.
+        """
+        self._recording = recording
+        self._played = playback(recording, fps, speed)
+        self._room = drawing.height_of(
+            [s for step in recording.steps for s in (step.scene, step.after)], recording.shelf
+        )
+        self._layout = Layout.of(width, recording.camera, recording.shelf, self._room)
+        self.size, self.count = self._layout.size, len(self._played.time)
+
+    def __iter__(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        recording, played = self._recording, self._played
+        *_, width, height = self._layout.beside
+        eye = Eye(bystander(recording.shelf, width, height), LIGHT, AMBIENT, BACKGROUND_COLOUR)
+        empty = eye.picture(_shelf_solids(recording.shelf))
+        poses = link_poses(played.q)
+
+        def beside(row: int) -> UInt8[np.ndarray, "h w 3"]:
+            world = recording.steps[int(played.step[row])].world
+            solids = [*_body_solids(world, played, row), *panda_solids(poses[row], float(played.opening[row]))]
+            return eye.picture(solids, empty).pixels
+
+        with ThreadPoolExecutor(cores()) as pool:
+            for index, rows in itertools.groupby(range(self.count), lambda row: int(played.step[row])):
+                step = recording.steps[index]
+                frame = recorded_frame(step, recording.camera, recording.shelf)
+                page = Page(frame, recording.camera, recording.shelf, recording.target, self._room, self._layout)
+                # So few at once that they do not pile up where drawing is slower.
+                for some in _in_lots(rows, 2 * cores()):
+                    for row, picture in zip(some, pool.map(beside, some), strict=True):
+                        yield page.image(picture, _moving(step.world, played, row, poses[row]))
+
+
+def bystander(shelf: Shelf, width: int, height: int) -> Camera:
+    """Where the film is taken from: at the robot's left, above the shelf."""
+    edge = np.array([shelf.front, (shelf.left + shelf.right) / 2, shelf.board])
+    position, forward = edge + STANDS, LOOKS_AT - STANDS
+    distance = float(np.linalg.norm(forward))
+    forward = forward / distance
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward], axis=1)
+    focal = width / VIEW_ANGLE
+    rows = tuple((float(a), float(b), float(c)) for a, b, c in rotation)
+    x, y, z = (float(p) for p in position)
+    return Camera(width, height, focal, focal, width / 2, height / 2, rows, (x, y, z))
+
+
+def _in_lots(rows: Iterator[int], size: int) -> Iterator[list[int]]:
+    while lot := list(itertools.islice(rows, size)):
+        yield lot
+
+
+def _colour(index: int) -> Colour:
+    red, green, blue = (float(c) for c in PALETTE[index])
+    return red, green, blue
+
+
+def _shelf_solids(shelf: Shelf) -> list[Solid]:
+    boxes = [box for name, box in shelf_boxes(shelf).items() if name not in LEFT_OUT]
+    board = shape_of("box")
+    return [Solid(board, (high - low) / 2, np.eye(3), (low + high) / 2, _colour(SHELF)) for low, high in boxes]
+
+
+def _body_solids(world: World, played: Playback, row: int) -> list[Solid]:
+    return [
+        Solid(
+            in_order()[int(world.kind[i])],
+            np.asarray(world.half_size[i]),
+            played.rotation[row, i],
+            played.position[row, i],
+            _colour(i),
+        )
+        for i in np.flatnonzero(world.valid).tolist()
+    ]
+
+
+def _moving(world: World, played: Playback, row: int, poses: Float[np.ndarray, "8 4 4"]) -> Moving:
+    bodies = [
+        _body_points(world, i) @ played.rotation[row, i].T + played.position[row, i] if valid else None
+        for i, valid in enumerate(world.valid)
+    ]
+    return Moving(bodies, sketches.points_of_hand(poses[7], float(played.opening[row])), float(played.time[row]))
+
+
+def _body_points(world: World, i: int) -> Float[np.ndarray, "points 3"]:
+    """Points whose hull is a body, in its own frame [m]."""
+    half = [float(h) for h in world.half_size[i]]
+    level = in_order()[int(world.kind[i])].rim(half)
+    return np.concatenate([np.column_stack([level, np.full(len(level), z)]) for z in (-half[2], half[2])])

@@ -1,0 +1,153 @@
+"""Tells on the screen how an episode goes: what the robot sees, what it chose and why, and how long each stage took."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.status import Status
+
+from mechsearch_jax.actions import ActionKind, kind_of
+from mechsearch_jax.envs.episode.episodes import Moment
+from mechsearch_jax.envs.episode.records import Episode, Step
+from mechsearch_jax.envs.recording import pictures
+from mechsearch_jax.planner import Problem
+from mechsearch_jax.viz.filmstrip import Frame
+
+STAGES = {
+    "recognise": "looking, and working out where the target can be",
+    "plan": "planning",
+    "judge": "judging whether the target can be grasped",
+    "simulate": "acting",
+}
+NOTHING = "no action is possible"
+
+
+class Narrator:
+    """A `Watcher` that prints a few lines for every step and keeps a frame of it for the filmstrip.
+
+    Attributes:
+      frames: of the steps so far.
+    """
+
+    def __init__(
+        self,
+        console: Console,
+        status: Status,
+        problem: Problem,
+        drawn: Callable[[Moment, Frame], None] = lambda moment, frame: None,
+    ):
+        """Args:
+        console, status: where it is told.
+        problem: of the episode.
+        drawn: told of every step that is over, with its frame.
+        """
+        self._drawn = drawn
+        self.frames: list[Frame] = []
+        self._restarts = 0
+        self._console = console
+        self._status = status
+        self._problem = problem
+
+    def busy(self, stage: str) -> None:
+        patience = " (compiling first, once)" if stage == "plan" and not self.frames else ""
+        self._status.update(f"{STAGES[stage]}{patience}")
+
+    def decided(self, moment: Moment) -> None:
+        record = moment.record
+        self._sees(moment)
+        if moment.decision is None:
+            return
+        kind, refused = kind_of(int(moment.decision.action.kind)), int(moment.decision.refused)
+        self._line("does", kind.describe(moment.decision.action, moment.observation.objects.capacity))
+        if kind.takes_target:
+            self._line("why", "a grasp that takes it out is known")
+        elif kind.code == ActionKind.NONE:
+            self._line("why", f"each of the {refused} best does harm as it is tried out" if refused else NOTHING)
+        elif record.sequences and record.predicted_cost is not None:
+            length = int(moment.decision.sequences.length[0])
+            self._line(
+                "why",
+                f"cost {record.cost:.0f} now, {record.predicted_cost:.0f} expected after it; the best of "
+                f"{record.sequences} sequences, {length} action{'s' if length > 1 else ''} long"
+                + (f", after {refused} that do harm as they are tried out" if refused else ""),
+            )
+
+    def acted(self, moment: Moment) -> None:
+        record = moment.record
+        if record.action is None:
+            self._sees(moment)
+        if record.failure:
+            self._line("failed", record.failure, "red")
+        for event in events(record):
+            self._line("but", event, "red")
+        stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in record.timings.items())
+        self._line("time", stages, "dim")
+        self._status.update("drawing")
+        self.frames.append(pictures.frame(moment, self._problem))
+        self._drawn(moment, self.frames[-1])
+
+    def ended(self, episode: Episode) -> None:
+        """Say how it ended."""
+        self._console.print(f"\n[bold]{escape(verdict(episode))}[/bold]", soft_wrap=True)
+
+    def _sees(self, moment: Moment) -> None:
+        shown = np.unique(np.asarray(moment.snapshot.image.segmentation))
+        objects = np.flatnonzero(np.asarray(moment.observation.objects.valid))
+        seen = int(np.isin(objects, shown).sum())
+        if moment.record.found:
+            x, y, _ = np.asarray(moment.belief.found_pose)
+            known = f"the target at x {x:.3f}, y {y:.3f} m"
+        else:
+            known = f"no target; it can be at {moment.record.belief_size} of {len(moment.belief.exists)} poses"
+            if (moment.record.restarts or 0) > self._restarts:
+                known += ", after there were none left"
+            if moment.record.truth_possible is False:
+                known += ", and none of them is where it is"
+        self._restarts = moment.record.restarts or 0
+        self._console.print(f"\n[bold]step {moment.index + 1}[/bold]")
+        self._line("sees", f"{seen} of {len(objects)} objects, {known}")
+
+    def _line(self, label: str, text: str, style: str = "") -> None:
+        self._console.print(f"  [cyan]{label:>6}[/cyan]  [{style or 'default'}]{escape(text)}[/]", soft_wrap=True)
+
+
+def events(record: Step) -> list[str]:
+    """What happened in a step that was not intended, beside what its `failure` says."""
+    told = []
+    if record.fallen:
+        several = len(record.fallen) > 1
+        which = " and ".join(map(str, record.fallen))
+        told.append(f"object{'s' if several else ''} {which} fell off the board: nothing can be retrieved any more")
+    if record.target_fallen:
+        told.append("the target fell off the board")
+    if record.at_rest is False:
+        told.append("something never came to rest, and was stopped as it moved")
+    return told
+
+
+def verdict(episode: Episode) -> str:
+    """How an episode ended, in one sentence."""
+
+    def after(step: int) -> str:
+        return f"after {step} action{'' if step == 1 else 's'}"
+
+    parts = []
+    if episode.found_step is None:
+        parts.append(f"not found ({episode.failure})")
+    else:
+        graspable, by_paper = episode.graspable_step, episode.paper_graspable_step
+        parts.append(f"found {after(episode.found_step)}")
+        never = "never graspable without touching something"
+        parts.append(never if graspable is None else f"graspable {after(graspable)}")
+        if graspable != by_paper:
+            when = "never" if by_paper is None else after(by_paper)
+            known = by_paper is not None or all(step.paper_graspable is not None for step in episode.steps)
+            parts[-1] += f" ({when} with the paper's grasps)" if known else ""
+        parts.append("retrieved" if episode.retrieved else f"not retrieved ({episode.failure})")
+    restless = [str(i + 1) for i, step in enumerate(episode.steps) if step.at_rest is False]
+    if restless:
+        parts.append(f"something never came to rest after action {', '.join(restless)}")
+    return f"{episode.scenario}: {', '.join(parts)}"

@@ -1,0 +1,256 @@
+"""The recording of an episode, `recording.npz`: what moved, and what was believed and decided at every step.
+
+Enough to show the episode again without simulating, recognising or planning anything. Images are not kept: they are
+ray-cast from the true poses.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mechsearch_jax.actions import Action, no_action
+from mechsearch_jax.arrays import read_arrays
+from mechsearch_jax.envs.episode.episodes import Moment
+from mechsearch_jax.envs.recording.sampled import Sampled, nothing_sampled, packed, sampled, unpacked
+from mechsearch_jax.envs.simulators.native import Trace
+from mechsearch_jax.envs.simulators.simulator import ARM
+from mechsearch_jax.envs.world.world import BODIES, World
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.files import PathLike, read_bytes, replacing
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.planner import Problem
+from mechsearch_jax.shapes import in_order
+from mechsearch_jax.viz.filmstrip import Frame
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import MAX_OBJECTS
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+NAME = "recording.npz"
+FORMAT, VERSION = "mechsearch recording", 1
+# A file that is larger is none of ours [bytes]; ten actions make about half a megabyte.
+LIMIT = 64 * 2**20
+# A simulator keeps the state of every so many time steps: 25 rows a second.
+TRACE_EVERY = 10
+
+# What a file keeps: of the problem and of each step as text, of each step as arrays, and as groups of arrays.
+_SETTINGS: dict[str, type] = {"camera": Camera, "shelf": Shelf, "target": Target}
+_TOLD = ("title", "caption", "found")
+_ARRAYS = ("existence", "graspability", "target_pose")
+_TREES: dict[str, type] = {"world": World, "scene": Superquadrics, "after": Superquadrics, "action": Action}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RecordedStep:
+    """One step; arrays are NumPy's, single steps' fields without leading axes.
+
+    Attributes:
+      title, caption, found: as in `Frame`.
+      world: the true state when the robot looked.
+      scene, after: the objects as they were recognised, and as they were expected after the action.
+      existence, graspability: f and g at the candidate poses.
+      target_pose: x, y [m] and yaw [rad] of the true target.
+      action: what was decided; None where nothing was.
+      trace: what moved; without rows where nothing did.
+      sampled: what the decision chose from; nothing where that is not known.
+    """
+
+    title: str
+    caption: str
+    found: bool
+    world: World
+    scene: Superquadrics
+    after: Superquadrics
+    existence: Bool[np.ndarray, " x"]
+    graspability: Int[np.ndarray, " x"]
+    target_pose: Float[np.ndarray, " 3"]
+    action: Action | None
+    trace: Trace
+    sampled: Sampled = dataclasses.field(default_factory=nothing_sampled)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Recording:
+    """A whole episode.
+
+    Attributes:
+      heading: how it ended, in one sentence.
+      camera, shelf, target: of the problem.
+      steps: in their order, at least one.
+    """
+
+    heading: str
+    camera: Camera
+    shelf: Shelf
+    target: Target
+    steps: tuple[RecordedStep, ...]
+
+
+class Traced(Protocol):
+    """A simulator that tells how everything moved in each world during the last action, as `NativeSimulator` does."""
+
+    @property
+    def traces(self) -> Sequence[Trace]: ...
+
+
+class Recorder:
+    """Collects the steps of an episode that runs alone."""
+
+    def __init__(self, simulator: Traced):
+        """Args:
+        simulator: of the episode.
+        """
+        self._simulator = simulator
+        self._steps: list[RecordedStep] = []
+
+    def note(self, moment: Moment, frame: Frame) -> None:
+        """Keep a step that is over.
+
+        Args:
+          moment: all that is known of it.
+          frame: its picture.
+        """
+        acted = moment.outcome is not None
+        chosen_from = nothing_sampled()
+        if acted and moment.decision is not None:
+            chosen_from = sampled(moment.decision.sequences)
+        assert frame.target_pose is not None
+        self._steps.append(
+            RecordedStep(
+                title=frame.title,
+                caption=frame.caption,
+                found=frame.found,
+                world=jax.tree.map(np.asarray, moment.snapshot.world),
+                scene=frame.scene,
+                after=frame.after,
+                existence=frame.existence,
+                graspability=frame.graspability,
+                target_pose=frame.target_pose,
+                action=jax.tree.map(np.asarray, moment.decision.action) if acted and moment.decision else None,
+                trace=self._simulator.traces[0] if acted else empty_trace(),
+                sampled=chosen_from,
+            )
+        )
+
+    def recording(self, problem: Problem, heading: str) -> Recording:
+        """All that was noted."""
+        return Recording(heading, problem.camera, problem.shelf, problem.target, tuple(self._steps))
+
+
+def empty_trace() -> Trace:
+    """A trace of nothing."""
+    rows = (np.zeros((0, *shape)) for shape in ((), (ARM,), (2,), (BODIES, 3), (BODIES, 4)))
+    return Trace(*rows)
+
+
+def save_recording(recording: Recording, path: PathLike) -> None:
+    """Write a recording as a compressed npz file (docs/method.md, "Files").
+
+    Raises:
+      InputError: the file cannot be written.
+    """
+    steps = recording.steps
+    head = {
+        "format": FORMAT,
+        "version": VERSION,
+        "heading": recording.heading,
+        **{name: dataclasses.asdict(getattr(recording, name)) for name in _SETTINGS},
+        "steps": [{name: getattr(step, name) for name in _TOLD} for step in steps],
+    }
+    arrays: dict[str, np.ndarray] = {"rows": np.array([len(step.trace.time) for step in steps])}
+    arrays["acts"] = np.array([step.action is not None for step in steps])
+    for name in _fields(Trace):
+        parts = [np.asarray(getattr(step.trace, name), np.float32) for step in steps]
+        arrays[f"trace.{name}"] = np.concatenate(parts)
+    for name, kind in _TREES.items():
+        trees = [getattr(step, name) or jax.device_get(no_action()) for step in steps]
+        for field in _fields(kind):
+            arrays[f"{name}.{field}"] = np.stack([np.asarray(getattr(tree, field)) for tree in trees])
+    arrays |= {name: np.stack([np.asarray(getattr(step, name)) for step in steps]) for name in _ARRAYS}
+    arrays |= packed([step.sampled for step in steps])
+    with replacing(path) as file:
+        np.savez_compressed(file, allow_pickle=False, head=np.array(json.dumps(head)), **arrays)
+
+
+def load_recording(path: PathLike) -> Recording:
+    """Read what `save_recording` wrote.
+
+    Raises:
+      InputError: the file cannot be read or holds something else.
+    """
+    arrays = read_arrays(read_bytes(path, LIMIT), path)
+    try:
+        head = json.loads(str(arrays["head"]))
+        if (head["format"], head["version"]) != (FORMAT, VERSION):
+            raise ValueError("of another kind or version")
+        told, count = head["steps"], len(head["steps"])
+        settings = {name: kind(**_tuples(head[name])) for name, kind in _SETTINGS.items()}
+        _check(arrays, count, len(settings["target"].candidate_poses(settings["shelf"])))
+        ends = np.cumsum(arrays["rows"])
+        chosen_from = unpacked(arrays, count)
+        steps = [
+            dataclasses.replace(
+                _step(arrays, told[i], i, slice(ends[i] - arrays["rows"][i], ends[i])), sampled=chosen_from[i]
+            )
+            for i in range(count)
+        ]
+        return Recording(str(head["heading"]), **settings, steps=tuple(steps))
+    except (KeyError, ValueError, TypeError, AttributeError, IndexError) as error:
+        raise InputError(f"{path}: is no recording of an episode ({' '.join(str(error).split())})") from error
+
+
+def _check(arrays: dict[str, np.ndarray], count: int, poses: int) -> None:
+    """Refuse arrays that are not those of so many steps and candidate poses."""
+    nothing = superquadric.empty(MAX_OBJECTS)
+    likes = {"world": _no_world(), "scene": nothing, "after": nothing, "action": no_action()}
+    like = {f"{name}.{f}": np.asarray(getattr(tree, f)) for name, tree in likes.items() for f in _fields(type(tree))}
+    like |= {"rows": np.array(0), "acts": np.array(True), "target_pose": np.zeros(3)}
+    like |= {"existence": np.zeros(poses, bool), "graspability": np.zeros(poses, int)}
+    if not count or any(arrays[name].shape != (count, *one.shape) for name, one in like.items()):
+        raise ValueError("steps are missing, or their arrays are of other shapes")
+    still = empty_trace()
+    like |= {f"trace.{name}": getattr(still, name) for name in _fields(Trace)}
+    if any(arrays[name].dtype.kind != one.dtype.kind for name, one in like.items()):
+        raise ValueError("an array is of another type")
+    rows = int(arrays["rows"].sum())
+    if arrays["rows"].min() < 0 or any(
+        arrays[name].shape != (rows, *one.shape[1:]) for name, one in like.items() if name.startswith("trace.")
+    ):
+        raise ValueError("rows are missing")
+    if not all(np.isfinite(arrays[name]).all() for name in like):
+        raise ValueError("there are numbers that are not finite")
+    kinds = arrays["world.kind"]
+    if kinds.min() < 0 or kinds.max() >= len(in_order()) or not (arrays["world.half_size"] > 0).all():
+        raise ValueError("a body is of no shape")
+
+
+def _no_world() -> World:
+    vectors = np.zeros((BODIES, 3), np.float32)
+    rotations, present = np.zeros((BODIES, 3, 3), np.float32), np.zeros(BODIES, bool)
+    return World(np.zeros(BODIES, np.int32), vectors, vectors, rotations, present)  # pyright: ignore[reportArgumentType]
+
+
+def _step(arrays: dict[str, np.ndarray], told: dict[str, Any], i: int, rows: slice) -> RecordedStep:
+    trees = {name: kind(*(arrays[f"{name}.{f}"][i] for f in _fields(kind))) for name, kind in _TREES.items()}
+    trees["action"] = trees["action"] if arrays["acts"][i] else None
+    trace = Trace(*(arrays[f"trace.{name}"][rows] for name in _fields(Trace)))
+    return RecordedStep(**{n: told[n] for n in _TOLD}, **{n: arrays[n][i] for n in _ARRAYS}, **trees, trace=trace)
+
+
+def _fields(kind: type) -> tuple[str, ...]:
+    return tuple(field.name for field in dataclasses.fields(kind))
+
+
+def _tuples(value: Any) -> Any:
+    """Lists of JSON as the tuples that they were, within a dictionary."""
+    if isinstance(value, dict):
+        return {name: _tuples(each) for name, each in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value

@@ -1,0 +1,117 @@
+"""What a page shows of each decision of a recording: pictures, meshes and words, before anything is sent anywhere."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from mechsearch_jax.actions import kind_of
+from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.envs.recording.pictures import recorded_frame
+from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.viz import drawing, sketches, web
+
+# Colours of the best and of the worst sampled action.
+BEST, WORST = drawing.GRASPABLE, drawing.BLOCKED[-1]
+
+# Name, mesh, colour and opacity.
+Ghost = tuple[str, web.Mesh, str, float]
+
+
+class ShownSample(NamedTuple):
+    """A sampled action.
+
+    Attributes:
+      text: it in words, with its value and cost.
+      arrow: from where what moves begins to where it ends; None where nothing does.
+      colour: red, green and blue, 0 to 1, which tell its value.
+    """
+
+    text: str
+    arrow: web.Mesh | None
+    colour: tuple[float, ...]
+
+
+class ShownDecision(NamedTuple):
+    """What is shown of a step.
+
+    Attributes:
+      text: what was done and why.
+      view: what the camera saw.
+      cells: f and g.
+      recognised: the shapes.
+      ghosts: what the action is predicted to do, and the hand.
+      path: of the action [m]; None where nothing moves.
+      samples: what it was chosen from, best first.
+    """
+
+    text: str
+    view: UInt8[np.ndarray, "h w 3"]
+    cells: web.Cells
+    recognised: list[Ghost]
+    ghosts: list[Ghost]
+    path: Float[np.ndarray, "points 3"] | None
+    samples: list[ShownSample]
+
+
+def shown_decisions(recording: Recording) -> list[ShownDecision]:
+    """What is shown of each step; what the camera saw is cast once more."""
+    scenes = [scene for step in recording.steps for scene in (step.scene, step.after)]
+    room = drawing.height_of(scenes, recording.shelf)
+    return [_decision(step, recording, room) for step in recording.steps]
+
+
+def _decision(step: RecordedStep, recording: Recording, room: float) -> ShownDecision:
+    camera, shelf, target = recording.camera, recording.shelf, recording.target
+    frame = recorded_frame(step, camera, shelf)
+    return ShownDecision(
+        text=f"**{step.title}**\n\n{step.caption}",
+        view=web.seen_picture(frame, camera, shelf, target, room),
+        cells=web.map_cells(frame, shelf, target),
+        recognised=[(str(i), m, drawing.OBJECT, 0.45) for i, m in _present(web.meshes_of(step.scene))],
+        ghosts=predicted(step.scene, step.after, frame.sketch),
+        path=sketches.shown_path(frame.sketch, shelf),
+        samples=_samples(step),
+    )
+
+
+def predicted(scene: Superquadrics, after: Superquadrics, sketch: Sketch) -> list[Ghost]:
+    """What an action moves where it is to end, and the hand where it begins and ends."""
+    ghosts = _present(web.meshes_of(sketches.moved(scene, after)))
+    hands = sketch.hands if sketch.hands is not None else ()
+    return [
+        *((f"ghost{i}", mesh, drawing.ACTION, 0.4) for i, mesh in ghosts),
+        *(
+            (f"hand{i}", web.hand_mesh(T, sketch.opening), drawing.HAND, 0.15 if i else 0.35)
+            for i, T in enumerate(hands)
+        ),
+    ]
+
+
+def _samples(step: RecordedStep) -> list[ShownSample]:
+    """What the decision chose from, coloured by value: the best as `BEST`, the worst as `WORST`."""
+    sampled = step.sampled
+    worst = float(np.ptp(sampled.value)) if len(sampled) else 0.0
+    best, last = drawing.rgb(BEST), drawing.rgb(WORST)
+    result = []
+    for k in range(len(sampled)):
+        path = sampled_sketch(step, k).path
+        share = float(sampled.value[k] - sampled.value.min()) / max(worst, 1e-9)
+        words = kind_of(int(sampled.action.kind[k])).describe(sampled.single(k), step.scene.capacity)
+        text = f"{k + 1}. {words}: value {sampled.value[k]:.1f}, cost {sampled.cost[k]:.0f}"
+        colour = tuple(((1 - share) * best + share * last).tolist())
+        result.append(ShownSample(text, None if path is None else web.arrow_mesh(path[0], path[-1]), colour))
+    return result
+
+
+def sampled_sketch(step: RecordedStep, k: int) -> Sketch:
+    """What there is to show of a sampled action."""
+    action = step.sampled.single(k)
+    return kind_of(int(action.kind)).sketch(step.scene, step.sampled.after(k, step.scene), action)
+
+
+def _present(meshes: list[web.Mesh | None]) -> list[tuple[int, web.Mesh]]:
+    return [(i, mesh) for i, mesh in enumerate(meshes) if mesh is not None]

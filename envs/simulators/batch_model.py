@@ -1,0 +1,88 @@
+"""The model of many worlds at once: one compiled MJCF, and the few of its fields that differ from world to world.
+
+`body_fields` gives for thousands of worlds, in closed form, what `model.with_bodies` has MuJoCo compute for one.
+"""
+
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.envs.world import model as models
+from mechsearch_jax.envs.world.world import BODIES
+from mechsearch_jax.shapes import in_order
+
+
+class BodyFields(flax.struct.PyTreeNode):
+    """Fields of the model that depend on the bodies' shapes; every one has a leading axis for the worlds.
+
+    Names, units and the axes that follow (bodies, geoms, degrees of freedom) are those of MJX's model.
+    """
+
+    geom_size: jax.Array
+    geom_rbound: jax.Array
+    geom_aabb: jax.Array
+    body_mass: jax.Array
+    body_inertia: jax.Array
+    body_subtreemass: jax.Array
+    body_invweight0: jax.Array
+    dof_invweight0: jax.Array
+    body_gravcomp: jax.Array
+
+
+def body_fields(
+    blank: mujoco.MjModel,
+    kind: Int[Array, "worlds 9"],
+    half_size: Float[Array, "worlds 9 3"],
+    valid: Bool[Array, "worlds 9"],
+) -> BodyFields:
+    """The fields of a model whose slots hold the bodies of each world, float32; traceable.
+
+    Args:
+      blank: the compiled model with empty slots.
+      kind, half_size, valid: of the bodies, as in a `World`.
+    """
+    worlds = len(kind)
+    mass, inertia = models.masses_and_inertias(kind, half_size, jnp)
+    mass = jnp.where(valid, mass, models.EMPTY_MASS)
+    inertia = jnp.where(valid[..., None], inertia, models.EMPTY_INERTIA)
+
+    fields = {}
+    for name in BodyFields.__dataclass_fields__:
+        value = jnp.asarray(getattr(blank, name), jnp.float32)
+        fields[name] = jnp.broadcast_to(value, (worlds, *value.shape))
+
+    def put(name: str, where: np.ndarray | int, value: Array) -> None:
+        fields[name] = fields[name].at[:, where].set(value.astype(jnp.float32))
+
+    body = np.array([blank.body(f"body{i}").id for i in range(BODIES)])
+    put("body_mass", body, mass)
+    put("body_inertia", body, inertia)
+    put("body_gravcomp", body, ~valid)
+    # A free body is all of its subtree; the world's subtree is everything.
+    put("body_subtreemass", body, mass)
+    robot = blank.body_mass.sum() - blank.body_mass[body].sum()
+    put("body_subtreemass", 0, robot + mass.sum(axis=1))
+
+    # The inverse of a free body's mass matrix is diagonal; its turns share the mean, as in mj_setConst.
+    inverse = jnp.stack([1 / mass, (1 / inertia).mean(axis=-1)], axis=-1)
+    put("body_invweight0", body, inverse)
+    dof = np.concatenate([np.arange(6) + blank.joint(f"body{i}").dofadr[0] for i in range(BODIES)])
+    put("dof_invweight0", dof, jnp.repeat(inverse, 3, axis=-1).reshape(worlds, -1))
+
+    for shape in in_order():
+        geom = np.array([blank.geom(models.geometry_name(shape, i)).id for i in range(BODIES)])
+        used = valid & (kind == shape.code)
+        half = jnp.where(used[..., None], half_size - models.MARGIN, models.TINY)
+        put("geom_size", geom, shape.geometry_size(half, jnp))
+        put("geom_rbound", geom, shape.bounding_radius(half, jnp))
+        put("geom_aabb", geom, jnp.concatenate([jnp.zeros_like(half), half], axis=-1))
+    fields["geom_aabb"] = fields["geom_aabb"].reshape(worlds, -1, 2, 3)
+    return BodyFields(**fields)

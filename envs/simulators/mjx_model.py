@@ -1,0 +1,211 @@
+"""The scene in MuJoCo's Warp implementation: one model and state for many worlds, and a step of all of them."""
+
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import functools
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.scipy.spatial.transform import Rotation
+from jaxtyping import Array, Bool
+
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields
+from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig
+from mechsearch_jax.envs.simulators.warp_kernels import compile_kernels
+from mechsearch_jax.envs.world import model as models
+from mechsearch_jax.envs.world.outcome import Overflow
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+# The constraint solver's tolerance: the least that MuJoCo Warp takes where it makes its model itself.
+SOLVER_TOLERANCE = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class MjxConfig:
+    """How the batch simulator runs.
+
+    Attributes:
+      simulator: as for the native simulator; `trace_every` has no meaning here, there are no traces.
+      contacts: capacity for contacts, per world on average; the buffer is shared.
+      rows: capacity for constraint rows in every world.
+      chunk: time steps between looks at whether all worlds are done.
+    """
+
+    simulator: SimulatorConfig = dataclasses.field(default_factory=SimulatorConfig)
+    contacts: int = 64
+    rows: int = 320
+    chunk: int = 25
+
+    def __post_init__(self):
+        for name in ("contacts", "rows", "chunk"):
+            if getattr(self, name) < 1:
+                raise InputError(f"MjxConfig: {name} {getattr(self, name)} must be at least 1")
+
+
+def import_mjx() -> Any:
+    """The module `mujoco.mjx`, once Warp is known to be there.
+
+    Raises:
+      InputError: Warp cannot be imported.
+    """
+    try:
+        import warp  # pyright: ignore[reportMissingImports]
+
+        # By default it announces itself, and every kernel that it loads, on standard output.
+        if warp.config.log_level == warp.LOG_INFO:
+            warp.config.log_level = warp.LOG_WARNING
+        from mujoco import mjx
+    except (ImportError, RuntimeError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"the batch simulator needs Warp ({reason}); install it with: pip install 'mechsearch-jax[gpu]'"
+        ) from error
+    return mjx
+
+
+def where(condition: Bool[Array, " worlds"], a: Array, b: Array) -> Array:
+    """`jnp.where` of a condition per world."""
+    return jnp.where(condition.reshape(-1, *[1] * (b.ndim - 1)), a, b)
+
+
+class MjxModel:
+    """The model that all worlds share, and what follows from it.
+
+    Attributes:
+      blank: with empty slots, of C MuJoCo.
+      robot: the robot's configuration at home, shape (9,).
+    """
+
+    def __init__(self, shelf: Shelf, camera: Camera, config: MjxConfig):
+        """Raises:
+        InputError: Warp cannot be imported.
+        """
+        self._mjx = import_mjx()
+        self._config = config
+        blank = copy.copy(models.compile_model(shelf, camera, config.simulator.motion.timestep))
+        # Warp has no midphase that could be disabled.
+        blank.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+        # To Warp this flag says what collides two boxes: the algorithm of C MuJoCo, rather than that for any two convex
+        # shapes, which in float32 misses or misjudges every tenth contact of a finger with a box.
+        blank.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+        self.blank = blank
+        with warnings.catch_warnings():
+            # The planes have no friction of their own: that of a contact is the larger of the two.
+            warnings.filterwarnings("ignore", message=r".*friction\[")
+            model = self._mjx.put_model(blank, impl="warp")
+        # What overflows is in the outcomes; printed from the device, it would be a line for every world and step.
+        option = model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=0))
+        # MJX takes over the tolerance of C MuJoCo, which is too small for float32: the solver would only hop about the
+        # solution, and all worlds wait for the one that hops longest.
+        option = option.replace(tolerance=jnp.maximum(option.tolerance, SOLVER_TOLERANCE))
+        self._model = model.replace(opt=option)
+        self._axes = jax.tree.map(lambda _: None, self._model).replace(
+            **dict.fromkeys(BodyFields.__dataclass_fields__, 0)
+        )
+        parked = [np.array([*models.parking_place(i), 1.0, 0.0, 0.0, 0.0]) for i in range(BODIES)]
+        self._parked = jnp.asarray(np.stack(parked), jnp.float32)
+        self.robot = jnp.asarray(np.concatenate([HOME, np.zeros(ROBOT - ARM)]), jnp.float32)
+
+    def start(self, world: World) -> tuple[BodyFields, Array, Array]:
+        """The fields of the model, the configuration and the commands of worlds at rest with the robot at home."""
+        count = len(world.kind)
+        fields = body_fields(self.blank, world.kind, world.half_size, world.valid)
+        upright = jnp.where(world.valid[..., None, None], world.rotation, jnp.eye(3)[None, None])
+        quaternion = Rotation.from_matrix(upright.reshape(-1, 3, 3)).as_quat()[:, np.array([3, 0, 1, 2])]
+        poses = jnp.concatenate([world.position, quaternion.reshape(count, BODIES, 4)], axis=-1)
+        poses = jnp.where(world.valid[..., None], poses, self._parked[None]).reshape(count, -1)
+        robot = jnp.broadcast_to(self.robot, (count, ROBOT))
+        return fields, jnp.concatenate([robot, poses], axis=1), robot
+
+    def make_data(self, worlds: int) -> Any:
+        """The state of so many worlds, as yet with nothing in it."""
+        # Within a plan that is traced, it still has to give numbers.
+        with jax.ensure_compile_time_eval():
+            one = self._one(self._config.contacts * worlds)
+            # MJX ties it to a device, and with it all results; what was compiled for free arrays would not serve for
+            # those.
+            one = jax.device_get(one)
+        return jax.jit(_repeated)(jnp.arange(worlds), one)
+
+    def data_shapes(self, worlds: int) -> Any:
+        """The shapes of `make_data`."""
+        return jax.eval_shape(_repeated, jnp.arange(worlds), jax.device_get(self._one(self._config.contacts * worlds)))
+
+    def kernels(self, worlds: int) -> Callable[[], None] | None:
+        """Begin to compile Warp's kernels for so many worlds in another process; returns what waits for it, if it is
+        not known to have been done."""
+        device = "cpu" if jax.default_backend() == "cpu" else "cuda:0"
+        batched = tuple(BodyFields.__dataclass_fields__)
+        return compile_kernels(self.blank, batched, worlds, self._config.contacts * worlds, self._config.rows, device)
+
+    def step(self, fields: BodyFields, data: Any) -> Any:
+        """The state of all worlds one time step later."""
+        model = self._model.replace(**{name: getattr(fields, name) for name in BodyFields.__dataclass_fields__})
+        return jax.vmap(self._mjx.step, in_axes=(self._axes, 0))(model, data)
+
+    def holds_target(self, contacts: Any) -> Bool[Array, " worlds"]:
+        """In which worlds both fingers press on the target.
+
+        Args:
+          contacts: what Warp keeps of a state beside MJX's fields.
+        """
+        return self._touches(contacts, "left") & self._touches(contacts, "right")
+
+    def bytes_per_world(self) -> int:
+        """About how much of the device's memory a world takes [bytes]: its state, and the commands of an action.
+
+        Each is counted as often as it lies in memory when one becomes the next.
+        """
+        plan = self._config.simulator.motion
+        stretches = 2 * (plan.approach_longest + plan.carry_longest) + 4 * plan.leave_longest + plan.transfer_longest
+        longest = stretches + plan.close_steps + plan.open_steps
+        # One row of commands for each kind of motion, the chosen one, and the joint angles that they came from.
+        commands = 8 * longest * ROBOT * np.dtype(np.float32).itemsize
+        return 3 * sum(leaf.nbytes for leaf in jax.tree.leaves(self._one(self._config.contacts))) + commands
+
+    def _one(self, contacts: int) -> Any:
+        return self._mjx.make_data(self.blank, impl="warp", naconmax=contacts, njmax=self._config.rows)
+
+    def _touches(self, contacts: Any, side: str) -> Array:
+        """In which worlds a finger presses on the target."""
+        worlds = contacts.nefc.shape[0]
+        owner = jnp.asarray(self.blank.geom_bodyid)
+        finger = self.blank.body(f"{side}_finger").id
+        target = self.blank.body(f"body{TARGET}").id
+        found = jnp.arange(len(contacts.contact__worldid)) < contacts.nacon[0]
+        found &= contacts.contact__efc_address[:, 0] >= 0
+        a, b = owner[contacts.contact__geom[:, 0]], owner[contacts.contact__geom[:, 1]]
+        found &= ((a == finger) & (b == target)) | ((a == target) & (b == finger))
+        return jnp.zeros(worlds, bool).at[jnp.where(found, contacts.contact__worldid, worlds)].set(True, mode="drop")
+
+
+def _repeated(places: Array, one: Any) -> Any:
+    """A state for each place."""
+    return jax.vmap(lambda _, data: data, in_axes=(0, None))(places, one)
+
+
+def overflow_of(flags: Array) -> Array:
+    """Warp's flags as flags of `Overflow`; those that only say that a solver stopped early are none."""
+    from mujoco.mjx.third_party.mujoco_warp import OverflowType
+
+    groups = {
+        Overflow.ROWS: OverflowType.NEFC | OverflowType.NJMAX_NNZ,
+        Overflow.CONTACTS: OverflowType.BROADPHASE | OverflowType.NARROWPHASE,
+        Overflow.SHAPES: OverflowType.CCD | OverflowType.EPA_HORIZON,
+    }
+    terms = [jnp.where((flags & int(mask)) != 0, int(flag), 0) for flag, mask in groups.items()]
+    return functools.reduce(jnp.bitwise_or, terms).astype(jnp.int32)

@@ -1,0 +1,382 @@
+"""The batch simulator: MuJoCo's Warp implementation in MJX steps thousands of worlds in one compiled function.
+
+It has the scene, the motion primitives and the verdicts of the native simulator, for W worlds at once:
+
+    simulator = MjxSimulator()
+    world = simulator.reset(scenarios)            # W scenarios; a `World` whose fields have a leading axis W
+    outcome = simulator.execute(actions)          # an `Action` whose fields have a leading axis W
+    outcome = simulator.execute(actions, active)  # worlds whose `active` (W,) is False stay exactly as they are
+    simulator.world                               # where everything is now
+    outcome.failure                               # (W,) codes of `Failure`; `outcome.reason(i)` is the text
+    outcome.overflow                              # (W,) flags of `Overflow`; not 0: do not trust this world
+
+In one call some worlds may push, others pick and place, others take the target out and others do nothing. All step
+together until the last of them is at rest; a world that is done before that is frozen. A world whose state is no longer
+finite is put back to where it was and frozen at once, so that it touches no other. The first call for a number of
+worlds compiles; later ones do not, whatever the actions are.
+
+A step of few worlds takes as long as one of some hundreds. Who has many does not wait for the last of them:
+
+    simulator.begin(actions, active)               # the others go on with what they are at
+    done, outcome = simulator.advance(64)          # until so many more are done; which, and what came of it
+
+Everything stays on the device: the host waits for the kinds of the actions, and where a field of an outcome or of
+`world` is read.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.actions import Action, ActionKind, no_action
+from mechsearch_jax.compiled import Kept
+from mechsearch_jax.envs.simulators.batch_model import BodyFields
+from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel, where
+from mechsearch_jax.envs.simulators.mjx_step import (
+    Progress,
+    Task,
+    acting,
+    advance,
+    begin,
+    merged,
+    taken_over,
+    verdicts,
+    waiting,
+)
+from mechsearch_jax.envs.simulators.simulator import ROBOT, check_actions
+from mechsearch_jax.envs.world.outcome import Failure, Outcome
+from mechsearch_jax.envs.world.world import World, from_scenario
+from mechsearch_jax.errors import InputError
+from mechsearch_jax.preparing import Program
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+
+
+class MjxSimulator:
+    """Many worlds in MuJoCo's Warp implementation, a `Simulator`; see the module's description.
+
+    On a CPU the same scenarios and actions always give the same results, on a GPU they do not.
+
+    Attributes:
+      engine: what records call it.
+      shelf, camera, config: as given.
+      world: the present state of all worlds; None before the first `reset`.
+    """
+
+    engine = "MjxSimulator"
+
+    def __init__(self, shelf: Shelf | None = None, camera: Camera | None = None, config: MjxConfig | None = None):
+        """Raises:
+        InputError: Warp cannot be imported.
+        """
+        self.shelf = shelf or Shelf()
+        self.camera = camera or Camera()
+        self.config = config or MjxConfig()
+        self.world: World | None = None
+        self._model = MjxModel(self.shelf, self.camera, self.config)
+        self._fields: BodyFields | None = None
+        self._data: Any = None
+        # What all worlds are at, and of which nothing was said since they were done; which of them move.
+        self._tasks: tuple[Task, Progress, Array] | None = None
+        self._moving = np.zeros(0, bool)
+        # They hang on this simulator's model, so that no other process could use them.
+        self._start = Kept(self._model.start, on_disk=False)
+        self._place = Kept(_placed, on_disk=False, donate_argnums=(1,))
+        self._begin = Kept(self._begun, on_disk=False, donate_argnums=(0,))
+        self._go_on = Kept(self._gone_on, on_disk=False, donate_argnums=(1,))
+        self._prepared: frozenset[int] = frozenset()
+        self._merge = Kept(_merged, on_disk=False)
+        self._settle = jax.jit(self._simulate, donate_argnums=1)
+        self._rollout = jax.jit(self._follow, donate_argnums=1)
+
+    def reset(self, scenarios: Sequence[Scenario]) -> World:
+        """Start episodes, one world for each scenario; see `Simulator.reset`.
+
+        Raises:
+          InputError: there are no scenarios, or more objects in one than slots.
+        """
+        if not scenarios:
+            raise InputError("MjxSimulator: no scenarios are given; reset it with one for each world")
+        worlds = [from_scenario(scenario) for scenario in scenarios]
+        return self.load(jax.tree.map(lambda *leaves: np.stack(leaves), *worlds))
+
+    def replace(self, scenarios: Mapping[int, Scenario]) -> World:
+        """Start episodes in some of the worlds; see `Simulator.replace`.
+
+        Raises:
+          InputError: the simulator was not reset, or there are more objects in a scenario than slots.
+        """
+        count = self._count()
+        new = jax.tree.map(np.array, self.world)
+        for i, scenario in scenarios.items():
+            for old, value in zip(jax.tree.leaves(new), jax.tree.leaves(from_scenario(scenario)), strict=True):
+                old[i] = value
+        return self.load(new, np.isin(np.arange(count), list(scenarios)))
+
+    def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
+        """Take over the state of all worlds, or of some; see `Simulator.load`.
+
+        Raises:
+          InputError: some worlds are to be kept, but there are none, or not as many.
+        """
+        count = len(world.kind)
+        if only is not None and (self.world is None or len(self.world.kind) != count or len(only) != count):
+            raise InputError(f"MjxSimulator: some of {count} worlds can be replaced only where there are as many")
+        world = jax.tree.map(lambda a: a if isinstance(a, jax.Array) else jax.device_put(a), world)
+        fields, qpos, ctrl = self._start(world)
+        new = fields, world
+        if only is None:
+            if self._data is None or self._data.qpos.shape[0] != count:
+                self._data = self._model.make_data(count)
+            self._tasks, self._moving = None, np.zeros(count, bool)
+        changed = jax.device_put(np.ones(count, bool) if only is None else np.array(only))
+        data, self._data = self._data, None
+        old = new if only is None else (self._fields, self.world)
+        self._data, (self._fields, placed) = self._place(changed, data, qpos, ctrl, new, old)
+        self.world = placed
+        return placed
+
+    def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcome:
+        """Execute an action in every world and let the bodies come to rest; see `Simulator.execute`.
+
+        Raises:
+          InputError: the simulator was not reset, there are not as many actions as worlds, or a kind is unknown.
+        """
+        self.begin(actions, active)
+        found = self._advanced(self._count())[1]
+        self._moving[:] = False
+        return found
+
+    def begin(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> None:
+        """Begin with actions; worlds that are not active go on with what they are at.
+
+        Args:
+          actions: of any kinds; fields with a leading axis for the worlds.
+          active: in which worlds; all by default. None of them may be moving.
+
+        Raises:
+          InputError: as `execute`, or one of the worlds is moving.
+        """
+        count = self._count()
+        check_actions(self.engine, actions, count)
+        begins = np.ones(count, bool) if active is None else np.array(active)
+        if np.any(begins & self._moving):
+            raise InputError(f"MjxSimulator: world {np.argmax(begins & self._moving)} is moving; advance it to its end")
+        data, self._data = self._data, None
+        self._data, *new = self._begin(data, actions, jax.device_put(begins))
+        if self._moving.any():
+            new = self._merge(jax.device_put(self._moving), self._tasks, tuple(new))
+        self._tasks, self._moving = tuple(new), self._moving | begins
+
+    def advance(self, least: int) -> tuple[Bool[np.ndarray, " worlds"], Outcome]:
+        """Step what moves until some more worlds are done; `world` has then what became of these.
+
+        Args:
+          least: how many, at least; all that move where they are fewer.
+
+        Returns:
+          Which worlds are done, and were not before; and what came of their actions: of others the outcome says
+          nothing.
+
+        Raises:
+          InputError: the simulator was not reset.
+        """
+        self._count()
+        done, outcome = jax.device_get(self._advanced(least))
+        self._moving = self._moving & ~done
+        return done, outcome
+
+    def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
+        """Let time pass, with the robot where it is, until everything is at rest; see `Simulator.settle`.
+
+        Raises:
+          InputError: the simulator was not reset.
+        """
+        active = jnp.ones(self._count(), bool) if active is None else jnp.asarray(active)
+        data, self._data = self._data, None
+        self._data, self.world, outcome = self._settle(self._fields, data, self.world, None, active)
+        return outcome
+
+    def programs(self, world: World) -> list[Program]:
+        """All that is compiled to reset, and to act in, worlds of these shapes; see `preparing.Prepares`."""
+        count = len(world.kind)
+        mask = jax.ShapeDtypeStruct((count,), bool)
+        actions = jax.tree.map(lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), no_action())
+
+        # Tracing takes its time, and who lowers does it.
+        @functools.cache
+        def shapes() -> tuple[Any, Any, Any]:
+            start = jax.eval_shape(self._model.start, world)
+            data, *tasks = jax.eval_shape(self._begun, self._model.data_shapes(count), actions, mask)
+            return start, data, tuple(tasks)
+
+        def going() -> Callable[[], None] | None:
+            (fields, _, _), data, tasks = shapes()
+            return self._go_on.begin(fields, data, world, tasks, np.int32(count))
+
+        def placing() -> Callable[[], None] | None:
+            (fields, qpos, ctrl), data, _ = shapes()
+            return self._place.begin(mask, data, qpos, ctrl, (fields, world), (fields, world))
+
+        begins = {
+            "kernels": lambda: self._model.kernels(count),
+            "simulate": going,
+            "motions": lambda: self._begin.begin(shapes()[1], actions, mask),
+            "reset": lambda: self._start.begin(world),
+            "next episodes": placing,
+            "next motions": lambda: self._merge.begin(mask, shapes()[2], shapes()[2]),
+        }
+        known, self._prepared = self._prepared, self._prepared | {count}
+        return [Program(name, lambda: count in known, begin) for name, begin in begins.items()]
+
+    def simulate(self, world: World, actions: Action | None) -> tuple[World, Outcome]:
+        """What actions would make of worlds: `load` and `execute` without memory, to be traced.
+
+        This simulator's own worlds stay as they are. An action of an unknown kind changes nothing and fails as such.
+
+        Args:
+          world, actions: fields with a leading axis for the worlds; without actions the worlds settle.
+
+        Returns:
+          The worlds afterwards, and what came of the actions.
+        """
+        count = len(world.kind)
+        fields, qpos, ctrl = self._start(world)
+        data = self._model.make_data(count).replace(qpos=qpos, ctrl=ctrl)
+        _, world, outcome = self._simulate(fields, data, world, actions, jnp.ones(count, bool))
+        return world, outcome
+
+    def follow(
+        self, controls: Float[Array, "steps worlds 9"], start: Float[Array, "worlds 9"] | None = None
+    ) -> Outcome:
+        """Step all worlds with these controls, without any verdict: for measurements, and for motions of one's own.
+
+        Args:
+          controls: joint angles [rad] and distances of the two fingers from the middle [m] that the position actuators
+            are told.
+          start: where the robot is put first, at rest; by default it begins where it is.
+        """
+        self._count()
+        data, self._data = self._data, None
+        if start is not None:
+            data = data.replace(
+                qpos=data.qpos.at[:, :ROBOT].set(start), qvel=data.qvel.at[:, :ROBOT].set(jnp.zeros_like(start))
+            )
+        self._data, self.world, outcome = self._rollout(self._fields, data, self.world, controls)
+        return outcome
+
+    def bytes_per_world(self) -> int:
+        """About how much of the device's memory a world takes [bytes]; see `MjxModel.bytes_per_world`."""
+        return self._model.bytes_per_world()
+
+    def _count(self) -> int:
+        """Number of worlds."""
+        if self.world is None:
+            raise InputError("MjxSimulator: reset it before use")
+        return len(self.world.kind)
+
+    def _advanced(self, least: int) -> tuple[Array, Outcome]:
+        """Which worlds are done now, and what came of it."""
+        data, self._data = self._data, None
+        self._data, self.world, self._tasks, done, outcome = self._go_on(
+            self._fields, data, self.world, self._tasks, np.int32(least)
+        )
+        return done, outcome
+
+    def _begun(self, data: Any, actions: Action, active: Array) -> tuple[Any, Task, Progress, Array]:
+        """`begin`, compiled, where nothing else moves: the state, the tasks, and how far they are.
+
+        The last says where nothing is to be said of a world that is done.
+        """
+        task, start = acting(data, actions, active, self._model.robot, self.config.simulator)
+        data = data.replace(qpos=data.qpos.at[:, :ROBOT].set(where(task.moves, start, data.qpos[:, :ROBOT])))
+        data = _at_rest(data, task.moves)
+        return data, task, begin(task, data), ~active
+
+    def _gone_on(self, fields: BodyFields, data: Any, world: World, tasks: tuple[Task, Progress, Array], least: Array):
+        """`advance`, compiled: the state, the worlds, the tasks, which are done, and what came of them."""
+        task, progress, known = tasks
+        chunk, step = self.config.chunk, self._one_step(fields, task)
+
+        def some(state):
+            return jax.lax.scan(lambda state, _: (step(state), None), state, None, chunk)[0]
+
+        def waits(state):
+            done = state[1].done
+            return (jnp.sum(done & ~known) < least) & ~jnp.all(done)
+
+        data, progress = jax.lax.while_loop(waits, some, (data, progress))
+        ended = progress.done & ~known
+        # What moved is stopped. Where all was undone, the robot is again told what it was told before.
+        controls = where(progress.diverged, task.idle, task.controls[-1])
+        resting = _at_rest(data, ended & task.moves)
+        touch = self._model.step(fields, resting)
+        in_hand = self._model.holds_target(touch._impl)
+        data = touch.replace(
+            qpos=resting.qpos, qvel=resting.qvel, ctrl=where(ended, controls, data.ctrl), time=resting.time
+        )
+        warm = resting.qacc_warmstart
+        data = data.replace(qacc_warmstart=where(ended, jnp.zeros_like(warm), warm))
+        # Of the others nothing is to be said, and nothing to be taken over.
+        ending = task.replace(moves=task.moves & ended, kind=jnp.where(ended, task.kind, ActionKind.NONE))
+        simulator = self.config.simulator
+        world, outcome = verdicts(self.shelf, simulator, ending, progress, world, data.qpos, in_hand)
+        return data, world, (task, progress, known | ended), ended, outcome
+
+    def _simulate(self, fields: BodyFields, data: Any, world: World, actions: Action | None, active: Array):
+        """`execute` or `settle` as a whole: the state, the world and what came of it."""
+        if actions is None:
+            task = waiting(data, active)
+            data = _at_rest(data, task.moves)
+            tasks = task, begin(task, data), ~active
+        else:
+            data, task, progress, known = self._begun(data, actions, active)
+            tasks = task, progress, known
+        data, world, _, _, outcome = self._gone_on(fields, data, world, tasks, jnp.int32(len(active)))
+        return data, world, outcome
+
+    def _follow(self, fields: BodyFields, data: Any, world: World, controls: Array):
+        """`follow`, compiled."""
+        worlds, steps = len(world.kind), len(controls)
+        everywhere = jnp.ones(worlds, bool)
+        task = waiting(data, everywhere).replace(controls=controls, length=jnp.full(worlds, steps + 1, jnp.int32))
+        step = self._one_step(fields, task)
+        state = (data, begin(task, data))
+        (data, progress), _ = jax.lax.scan(lambda state, _: (step(state), None), state, None, steps)
+        world, fallen = taken_over(self.shelf, world, data.qpos, everywhere)
+        failure = jnp.where(progress.diverged, int(Failure.UNSTABLE), int(Failure.NONE)).astype(jnp.int32)
+        none = ~everywhere
+        told = (progress.steps, none, fallen, none, none, none, progress.overflow, progress.error)
+        return data, world, Outcome(failure, *told)
+
+    def _one_step(self, fields: BodyFields, task: Task):
+        step = functools.partial(self._model.step, fields)
+        return functools.partial(advance, self.config.simulator, step, self._model.robot, task)
+
+
+def _placed(
+    changed: Bool[Array, " worlds"], data: Any, qpos: Array, ctrl: Array, new: tuple[Any, World], old: tuple[Any, World]
+) -> tuple[Any, tuple[Any, World]]:
+    """`load`, compiled: the state, and fields and worlds, where some are changed and at rest."""
+    data = _at_rest(data, changed).replace(qpos=where(changed, qpos, data.qpos), ctrl=where(changed, ctrl, data.ctrl))
+    return data, jax.tree.map(functools.partial(where, changed), new, old)
+
+
+def _at_rest(data: Any, which: Bool[Array, " worlds"]) -> Any:
+    """The state, with nothing moving in these worlds."""
+    still = jnp.zeros_like(data.qvel)
+    return data.replace(qvel=where(which, still, data.qvel), qacc_warmstart=where(which, still, data.qacc_warmstart))
+
+
+def _merged(keep: Bool[Array, " worlds"], old: tuple[Task, Progress, Array], new: tuple[Task, Progress, Array]):
+    """What worlds are at: the old where it is to be kept, the new elsewhere."""
+    task, progress = merged(keep, old[:2], new[:2])
+    return task, progress, jnp.where(keep, old[2], new[2])

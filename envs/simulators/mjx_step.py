@@ -1,0 +1,318 @@
+"""What the worlds of the batch simulator are to do, how far they have come at each step, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.spatial.transform import Rotation
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.actions import KINDS, Action, ActionKind, Kind
+from mechsearch_jax.envs.simulators.mjx_model import overflow_of, where
+from mechsearch_jax.envs.simulators.simulator import ARM, LAG, ROBOT, SimulatorConfig, unhindered
+from mechsearch_jax.envs.world.outcome import Failure, Outcome
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World
+from mechsearch_jax.robot.kinematics import gripper_pose
+from mechsearch_jax.robot.motion import Reference
+from mechsearch_jax.workspace.shelf import Shelf
+
+# A state beyond this has diverged; the same bound as in C MuJoCo.
+LARGEST = 1e10
+
+
+class Task(flax.struct.PyTreeNode):
+    """What every world is to do; fields have a leading axis for the worlds, `controls` for time before it.
+
+    Attributes:
+      controls: of the actuators; the last row is held, shape (steps, W, 9).
+      length: time steps of the motion, after which the bodies come to rest.
+      closed, opens: the time steps, counted from 1, after which the hand has closed and begins to open.
+      home: whether the robot is then set to its home configuration.
+      moves: whether there is anything to simulate.
+      kind: of the action; NONE where there is none.
+      object: index of the body that the action is about.
+      before: the configuration before the action, which a diverged world gets back, shape (W, nq).
+      idle: what the robot was told before, shape (W, 9).
+    """
+
+    controls: jax.Array
+    length: jax.Array
+    closed: jax.Array
+    opens: jax.Array
+    home: jax.Array
+    moves: jax.Array
+    kind: jax.Array
+    object: jax.Array
+    before: jax.Array
+    idle: jax.Array
+
+
+class Progress(flax.struct.PyTreeNode):
+    """How far every world has come; fields have a leading axis for the worlds.
+
+    Attributes:
+      done: nothing is to be simulated any more.
+      settled, diverged: how it ended.
+      moving: whether any body was not at rest in the present block of steps.
+      steps: simulated so far.
+      overflow: flags of `Overflow` so far.
+      at_grasp, at_release: configurations when the hand has closed, and when it is to open, shape (W, nq).
+      reference: where the arm's joints would be if nothing held them up [rad], shape (W, 7).
+      error: the largest distance of a joint from there so far [rad].
+    """
+
+    done: jax.Array
+    settled: jax.Array
+    diverged: jax.Array
+    moving: jax.Array
+    steps: jax.Array
+    overflow: jax.Array
+    at_grasp: jax.Array
+    at_release: jax.Array
+    reference: jax.Array
+    error: jax.Array
+
+
+def commands(reference: Reference) -> Float[Array, "worlds steps 9"]:
+    """What the actuators are told at each step; as `simulator.controls`, for references with a leading axis.
+
+    When a motion is over, its last row goes on.
+    """
+    arm = reference.q + jnp.asarray(LAG, jnp.float32)[None, None] * reference.velocity
+    fingers = reference.fingers[..., None]
+    return jnp.concatenate([arm, fingers, fingers], axis=-1)
+
+
+def waiting(data: Any, active: Bool[Array, " worlds"]) -> Task:
+    """Hold still: the robot is told what it was told before."""
+    none = jnp.zeros(len(active), jnp.int32)
+    return Task(data.ctrl[None], none, none, none, none > 0, active, none, none, data.qpos, data.ctrl)
+
+
+def acting(
+    data: Any, actions: Action, active: Bool[Array, " worlds"], home: Float[Array, " 9"], config: SimulatorConfig
+) -> tuple[Task, Float[Array, "worlds 9"]]:
+    """What actions ask of the actuators, and where the robot begins.
+
+    Where the arm does not reach all of a motion, nothing moves: the robot is told what it was told before.
+
+    Args:
+      data: the state before.
+      actions: of any kinds; fields with a leading axis for the worlds.
+      active: in which worlds they are executed.
+      home: the robot's home configuration.
+      config: lengths and durations.
+    """
+    kind = jnp.where(active, actions.kind, ActionKind.NONE)
+    motions = []
+    for each in KINDS.values():
+        motion = jax.vmap(lambda action, each=each: each.reference(action, config.motion))(actions)
+        if motion is not None:
+            motions.append((each, *motion))
+    # One row more than the longest: the robot at home, or the last command, held from then on.
+    steps = max(reference.fingers.shape[1] for _, reference, _ in motions) + 1
+    controls = jnp.broadcast_to(data.ctrl, (steps, *data.ctrl.shape))
+    start, length = data.qpos[:, :ROBOT], jnp.zeros_like(kind)
+    closed = opens = length
+    moves = goes_home = jnp.zeros(len(kind), bool)
+    for each, reference, reached in motions:
+        this = (kind == int(each.code)) & reached
+        told = jnp.moveaxis(commands(reference), 1, 0)
+        after = jnp.broadcast_to(home, told[-1].shape) if each.returns_home else told[-1]
+        over = jnp.arange(len(told))[:, None] >= reference.length[None]
+        told = jnp.where(over[..., None], after[None], told)
+        padded = jnp.concatenate([told, jnp.broadcast_to(after, (steps - len(told), *after.shape))])
+        controls = jnp.where(this[None, :, None], padded, controls)
+        finger = jnp.maximum(reference.start[:, ARM:], 0.0)
+        start = where(this, jnp.concatenate([reference.start[:, :ARM], finger, finger], axis=1), start)
+        length = jnp.where(this, reference.length, length)
+        closed = jnp.where(this, reference.closed, closed)
+        opens = jnp.where(this, reference.opens, opens)
+        goes_home |= this & each.returns_home
+        moves |= this
+    return Task(controls, length, closed, opens, goes_home, moves, kind, actions.object, data.qpos, data.ctrl), start
+
+
+def merged(
+    keep: Bool[Array, " worlds"], old: tuple[Task, Progress], new: tuple[Task, Progress]
+) -> tuple[Task, Progress]:
+    """Tasks and progress: the old ones in the worlds to keep, the new ones in the others."""
+    controls = jnp.where(keep[None, :, None], old[0].controls, new[0].controls)
+    task, progress = jax.tree.map(
+        lambda a, b: where(keep, a, b), (old[0].replace(controls=keep), old[1]), (new[0].replace(controls=keep), new[1])
+    )
+    return task.replace(controls=controls), progress
+
+
+def begin(task: Task, data: Any) -> Progress:
+    """No step yet; done where there is nothing to do."""
+    none = jnp.zeros(len(task.moves), bool)
+    zero = jnp.zeros(len(task.moves), jnp.int32)
+    q = data.qpos[:, :ARM]
+    return Progress(~task.moves, ~task.moves, none, none, zero, zero, data.qpos, data.qpos, q, jnp.zeros_like(q[:, 0]))
+
+
+def advance(
+    config: SimulatorConfig,
+    step: Callable[[Any], Any],
+    home: Float[Array, " 9"],
+    task: Task,
+    state: tuple[Any, Progress],
+) -> tuple[Any, Progress]:
+    """One time step of all worlds that are not done, each the next of its own task.
+
+    Args:
+      config: when a world is at rest.
+      step: steps all worlds.
+      home: the robot's home configuration.
+      task: what they are to do.
+      state: where they are, and how far they have come.
+    """
+    data, progress = state
+    frozen, i = progress.done, progress.steps
+    row = task.controls[jnp.minimum(i, len(task.controls) - 1), jnp.arange(len(i))]
+    goes_home = task.home & (i == task.length) & ~frozen
+    robot = jnp.broadcast_to(home, (len(frozen), ROBOT))
+    qpos = data.qpos.at[:, :ROBOT].set(where(goes_home, robot, data.qpos[:, :ROBOT]))
+    qvel = data.qvel.at[:, :ROBOT].set(where(goes_home, jnp.zeros_like(robot), data.qvel[:, :ROBOT]))
+    clear = data._impl.replace(overflow=jnp.zeros_like(data._impl.overflow))
+    # Warp records its kernels anew whenever an array lies elsewhere. A plain row would be read where it lies among
+    # all commands, another place at every step; chosen from two, it is written to where the last one was.
+    ctrl = where(frozen, data.ctrl, row)
+    before = data.replace(qpos=qpos, qvel=qvel, ctrl=ctrl, _impl=clear)
+    after = step(before)
+
+    fine = _finite(after.qpos) & _finite(after.qvel)
+    diverged = ~frozen & ~fine
+    # Finite everywhere, whatever became of a world: a state that is not would flood the contacts that all share.
+    qpos = where(frozen, before.qpos, where(diverged, task.before, after.qpos))
+    qvel = where(frozen, before.qvel, where(diverged, jnp.zeros_like(qvel), after.qvel))
+    warm = where(frozen, before.qacc_warmstart, where(diverged, jnp.zeros_like(qvel), after.qacc_warmstart))
+    data = after.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warm, time=before.time)
+
+    resting = i + 1 - task.length
+    limit = config.rest_speed * jnp.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
+    speed = jnp.abs(qvel[:, ROBOT:]).reshape(-1, BODIES, 6)
+    moving = progress.moving | ((resting >= 1) & jnp.any(speed >= limit[None, None], axis=(1, 2)))
+    looks = (resting >= 1) & (resting % config.settle_block == 0)
+    rests = looks & ~moving
+    late = resting >= config.settle_steps // config.settle_block * config.settle_block
+    reference = unhindered(progress.reference, row[:, :ARM], config.motion.timestep)
+    off = jnp.max(jnp.abs(qpos[:, :ARM] - reference), axis=1)
+    follows = ~frozen & ~diverged & (i < task.length)
+    return data, Progress(
+        done=frozen | diverged | rests | late,
+        settled=jnp.where(frozen, progress.settled, rests & ~diverged),
+        diverged=progress.diverged | diverged,
+        moving=moving & ~looks,
+        steps=progress.steps + ~frozen,
+        overflow=progress.overflow | jnp.where(frozen, 0, overflow_of(after._impl.overflow)),
+        at_grasp=where(i + 1 == task.closed, qpos, progress.at_grasp),
+        at_release=where(i + 1 == task.opens, qpos, progress.at_release),
+        reference=reference,
+        error=jnp.where(follows, jnp.maximum(progress.error, off), progress.error),
+    )
+
+
+def off_board(shelf: Shelf, valid: Bool[Array, "worlds 9"], qpos: Float[Array, "worlds nq"]) -> Bool[Array, "worlds 9"]:
+    """Which bodies are off the board in a configuration."""
+    position = qpos[:, ROBOT:].reshape(-1, BODIES, 7)[..., :3]
+    return valid & ((position[..., 0] < shelf.front) | (position[..., 2] < shelf.board))
+
+
+def taken_over(shelf: Shelf, world: World, qpos: Array, moves: Bool[Array, " worlds"]) -> tuple[World, Array]:
+    """The worlds with the bodies where a state has them, and which bodies have fallen off the board."""
+    poses = qpos[:, ROBOT:].reshape(-1, BODIES, 7)
+    fallen = off_board(shelf, world.valid, qpos)
+    changed = moves[:, None] & world.valid
+    quaternion = poses[..., np.array([4, 5, 6, 3])].reshape(-1, 4)
+    rotation = Rotation.from_quat(quaternion).as_matrix().reshape(world.rotation.shape)
+    world = world.replace(
+        position=jnp.where(changed[..., None], poses[..., :3], world.position),
+        rotation=jnp.where(changed[..., None, None], rotation, world.rotation),
+    )
+    return world, fallen
+
+
+def verdicts(
+    shelf: Shelf,
+    config: SimulatorConfig,
+    task: Task,
+    progress: Progress,
+    world: World,
+    qpos: Array,
+    in_hand: Bool[Array, " worlds"],
+) -> tuple[World, Outcome]:
+    """The worlds after a task, and what came of it.
+
+    Args:
+      shelf: whose front edge and board things fall off.
+      config: how far a held object may slip, and a joint be from its reference.
+      task, progress: what was to be done, and how far it got.
+      world: before.
+      qpos: the configuration afterwards.
+      in_hand: whether both fingers press on the target.
+    """
+    kind = task.kind
+    world, fallen = taken_over(shelf, world, qpos, task.moves)
+    retrieves = (
+        _is_one_of(kind, [each for each in KINDS.values() if each.takes_target]) & task.moves & ~progress.diverged
+    )
+    held = retrieves & in_hand
+    outside = retrieves & (qpos[:, ROBOT:].reshape(-1, BODIES, 7)[:, TARGET, 0] < shelf.front)
+    fallen = fallen & ~(held[:, None] & (jnp.arange(BODIES) == TARGET)[None])
+    gone = off_board(shelf, world.valid, task.before)
+    error = jnp.where(progress.diverged, 0.0, progress.error)
+    holds = _is_one_of(kind, [each for each in KINDS.values() if each.holds_object])
+    dropped = holds & (_slip(progress, task.object) >= config.slip)
+    failure = jnp.zeros_like(kind)
+    for code, applies in (
+        (Failure.FALLEN, retrieves & jnp.any(fallen & ~gone, axis=1)),
+        (Failure.INSIDE, retrieves & ~outside),
+        (Failure.MISSED, retrieves & ~held),
+        (Failure.DROPPED, dropped),
+        (Failure.HELD_UP, error > config.tracking_bound),
+        (Failure.UNSTABLE, progress.diverged),
+        (Failure.UNREACHABLE, (kind != ActionKind.NONE) & ~task.moves),
+        (Failure.UNKNOWN, ~_is_one_of(kind, list(KINDS.values()))),
+    ):
+        failure = jnp.where(applies, int(code), failure)
+    return world, Outcome(
+        failure=failure,
+        steps=progress.steps,
+        settled=progress.settled,
+        fallen=fallen,
+        held=held,
+        outside=outside,
+        retrieved=retrieves & (failure == Failure.NONE),
+        overflow=progress.overflow,
+        tracking_error=error,
+    )
+
+
+def _is_one_of(kind: Int[Array, " worlds"], kinds: Sequence[Kind]) -> Bool[Array, " worlds"]:
+    """In which worlds the action is of one of these kinds."""
+    codes = jnp.array([int(each.code) for each in kinds], jnp.int32)
+    return jnp.any(kind[:, None] == codes[None], axis=1)
+
+
+def _slip(progress: Progress, body: Int[Array, " worlds"]) -> Float[Array, " worlds"]:
+    """How far a body has moved in the hand between when it closed and when it was to open [m]."""
+    places = []
+    for qpos in (progress.at_grasp, progress.at_release):
+        T = gripper_pose(qpos[:, :ARM])
+        poses = qpos[:, ROBOT:].reshape(-1, BODIES, 7)
+        position = jnp.take_along_axis(poses, body[:, None, None], axis=1)[:, 0, :3]
+        offset = position - T[:, :3, 3]
+        places.append(jnp.sum(T[:, :3, :3] * offset[:, :, None], axis=1))
+    return jnp.sqrt(jnp.sum((places[1] - places[0]) ** 2, axis=1))
+
+
+def _finite(state: Array) -> Array:
+    """In which worlds a state has not diverged."""
+    return jnp.all(jnp.abs(state) < LARGEST, axis=1)

@@ -1,0 +1,360 @@
+"""The MuJoCo model: a Panda in front of a shelf with eight object slots and the target (docs/method.md,
+"The simulator").
+
+One MJCF serves every scenario. Each slot is a free body with a geometry of every shape; those that are not in use are
+shrunk into the inside of the one that is, and an unused slot is parked in front of the shelf as a weightless
+millimetre. Sizes, masses and inertias are set per world, on a copy of the compiled model.
+"""
+
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.envs.world.world import BODIES
+from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
+from mechsearch_jax.robot.kinematics import FINGER_TIPS, FLANGE, HAND_ANGLE, HOME, JOINT_LOWER, JOINT_UPPER, JOINTS
+from mechsearch_jax.shapes import Shape, by_shape, in_order, shape_of
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body
+from mechsearch_jax.workspace.shelf import Shelf
+
+# Torsional friction of a rubber pad of about 18 x 18 mm that is pressed evenly: two thirds of its mean radius [m].
+FINGER_TORSION = 0.006
+FINGER_FRICTION = 1.0
+
+ARM_STIFFNESS = (18000.0, 18000.0, 14000.0, 14000.0, 8000.0, 8000.0, 8000.0)
+ARM_VELOCITY_GAIN = (450.0, 450.0, 350.0, 350.0, 200.0, 200.0, 200.0)
+ARM_DAMPING = 1.0
+ARM_FORCE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
+FINGER_STIFFNESS, FINGER_VELOCITY_GAIN, FINGER_FORCE = 1000.0, 40.0, 70.0
+FINGER_TRAVEL = 0.04
+
+# Contacts are found, and push, at MARGIN from either geometry, which is that much smaller than what it stands for:
+# resting things touch where they should, yet what collision detection sees is always a little apart.
+MARGIN = 5e-4
+# Keeps tall cylinders from rolling on their rim for ever [N m s, N s/m]; too little to be noticed otherwise.
+BODY_DAMPING = 2e-3
+TINY = 1e-3
+# What an empty slot weighs [kg], and its moments of inertia [kg m2].
+EMPTY_MASS, EMPTY_INERTIA = 1e-3, 1e-6
+OBJECT_BIT, ROBOT_BIT = 1, 2
+
+# Mass [kg], centre of mass [m], and inertia about it (xx, yy, zz, xy, xz, yz) [kg m2] of links 1 to 7: C. Gaz et al.,
+# "Dynamic identification of the Franka Emika Panda robot with retrieval of feasible parameters", RA-L 2019. The hand
+# and fingers: the maker's data sheet.
+LINK_INERTIAS = (
+    (4.970684, (0.003875, 0.002081, -0.04762), (0.70337, 0.70661, 0.009117, -0.000139, 0.006772, 0.019169)),
+    (0.646926, (-0.003141, -0.02872, 0.003495), (0.007962, 0.02811, 0.025995, -0.003925, 0.010254, 0.000704)),
+    (3.228604, (0.027518, 0.039252, -0.066502), (0.037242, 0.036155, 0.01083, -0.004761, -0.011396, -0.012805)),
+    (3.587895, (-0.05317, 0.104419, 0.027454), (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641)),
+    (1.225946, (-0.011953, 0.041065, -0.038437), (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229)),
+    (1.666555, (0.060149, -0.014117, -0.010517), (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341)),
+    (0.735522, (0.010517, -0.004252, 0.061597), (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741)),
+)
+HAND_INERTIA = (0.73, (-0.01, 0.0, 0.03), (0.001, 0.0025, 0.0017, 0.0, 0.0, 0.0))
+FINGER_INERTIA = (0.015, (0.0, 0.0, 0.0), (2.375e-6, 2.375e-6, 7.5e-7, 0.0, 0.0, 0.0))
+
+
+def _text(*numbers: float | np.floating) -> str:
+    return " ".join(f"{float(n):.9g}" for n in numbers)
+
+
+def _element(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
+    return ElementTree.SubElement(parent, tag, {k.rstrip("_"): v for k, v in attributes.items()})
+
+
+def _inertial(body: ElementTree.Element, inertia: tuple) -> None:
+    mass, centre, full = inertia
+    _element(body, "inertial", mass=_text(mass), pos=_text(*centre), fullinertia=_text(*full))
+
+
+def _solids(body: ElementTree.Element, solids: Sequence[Primitive]) -> None:
+    for solid in solids:
+        turn = Rotation.from_matrix(solid.T_frame_primitive[:3, :3]).as_quat(scalar_first=True)
+        # A capsule is drawn in by its radius alone; a box on every side.
+        drawn_in = (MARGIN, MARGIN, MARGIN) if solid.kind == "box" else (MARGIN, 0.0)
+        _element(
+            body,
+            "geom",
+            class_="robot",
+            type=solid.kind,
+            size=_text(*np.subtract(solid.size, drawn_in)),
+            pos=_text(*solid.T_frame_primitive[:3, 3]),
+            quat=_text(*turn),
+        )
+
+
+def _add_defaults(root: ElementTree.Element) -> None:
+    default = _element(root, "default")
+    _element(default, "geom", condim="4", margin=_text(MARGIN))
+    robot = _element(default, "default", class_="robot")
+    # The robot's own contact parameters count, stiffer than the default: a soft grip lets what it holds creep and turn.
+    _element(
+        robot,
+        "geom",
+        contype=str(ROBOT_BIT),
+        conaffinity=str(OBJECT_BIT),
+        priority="1",
+        friction=_text(FINGER_FRICTION, FINGER_TORSION, 0.0),
+        solref="0.01 1",
+        group="3",
+    )
+    objects = _element(default, "default", class_="object")
+    _element(objects, "geom", contype=str(OBJECT_BIT), conaffinity=str(OBJECT_BIT), size=_text(*[TINY] * 3), group="0")
+    # Friction of a contact is the larger of the two: what touches the planes brings its own.
+    planes = _element(default, "default", class_="plane")
+    _element(planes, "geom", type="plane", contype="0", conaffinity=str(OBJECT_BIT), friction="0 0 0", group="4")
+    boards = _element(default, "default", class_="board")
+    _element(boards, "geom", type="box", contype="0", conaffinity=str(ROBOT_BIT), group="1", rgba="0.8 0.75 0.65 1")
+
+
+def _add_shelf(world: ElementTree.Element, shelf: Shelf) -> None:
+    for name, axis, value, normal in (
+        ("board", 2, shelf.board, (0.0, 0.0, 1.0)),
+        ("back", 0, shelf.back, (-1.0, 0.0, 0.0)),
+        ("right", 1, shelf.right, (0.0, 1.0, 0.0)),
+        ("left", 1, shelf.left, (0.0, -1.0, 0.0)),
+    ):
+        position = [0.0, 0.0, 0.0]
+        position[axis] = value - MARGIN * sum(normal)
+        _element(
+            world,
+            "geom",
+            class_="plane",
+            name=f"{name}_plane",
+            pos=_text(*position),
+            zaxis=_text(*normal),
+            size="1 1 1",
+        )
+    for name, (low, high) in shelf_boxes(shelf).items():
+        centre, half = (high + low) / 2, (high - low) / 2
+        # What is carried in front of the shelf may be higher than the upper board, which therefore is no plane.
+        meets = {"conaffinity": str(ROBOT_BIT | OBJECT_BIT)} if name == "ceiling" else {}
+        _element(world, "geom", class_="board", name=f"{name}_box", pos=_text(*centre), size=_text(*half), **meets)
+
+
+def _add_robot(root: ElementTree.Element, world: ElementTree.Element) -> None:
+    parent = world
+    quarter = {0: (1.0, 0.0, 0.0, 0.0), 1: (0.5**0.5, 0.5**0.5, 0.0, 0.0), -1: (0.5**0.5, -(0.5**0.5), 0.0, 0.0)}
+    actuator = _element(root, "actuator")
+    for i, (a, turns, d) in enumerate(JOINTS):
+        position = (a, -turns * d, 0.0) if turns else (a, 0.0, d)
+        parent = _element(
+            parent, "body", name=f"link{i + 1}", pos=_text(*position), quat=_text(*quarter[turns]), gravcomp="1"
+        )
+        _inertial(parent, LINK_INERTIAS[i])
+        _element(
+            parent,
+            "joint",
+            name=f"joint{i + 1}",
+            axis="0 0 1",
+            range=_text(JOINT_LOWER[i], JOINT_UPPER[i]),
+            damping=_text(ARM_DAMPING),
+            armature="0.1",
+        )
+        _solids(parent, LINKS[i])
+        _element(
+            actuator,
+            "position",
+            name=f"joint{i + 1}",
+            joint=f"joint{i + 1}",
+            kp=_text(ARM_STIFFNESS[i]),
+            kv=_text(ARM_VELOCITY_GAIN[i]),
+            forcerange=_text(-ARM_FORCE[i], ARM_FORCE[i]),
+        )
+    turned = (np.cos(HAND_ANGLE / 2), 0.0, 0.0, np.sin(HAND_ANGLE / 2))
+    hand = _element(parent, "body", name="hand", pos=_text(0.0, 0.0, FLANGE), quat=_text(*turned), gravcomp="1")
+    _inertial(hand, HAND_INERTIA)
+    _solids(hand, HAND)
+    _element(hand, "site", name="gripper", pos=_text(0.0, 0.0, FINGER_TIPS), group="5")
+    for name, quaternion in (("left", (1.0, 0.0, 0.0, 0.0)), ("right", (0.0, 0.0, 0.0, 1.0))):
+        finger = _element(
+            hand, "body", name=f"{name}_finger", pos=_text(0.0, 0.0, FINGER_BASE), quat=_text(*quaternion), gravcomp="1"
+        )
+        _inertial(finger, FINGER_INERTIA)
+        _element(
+            finger,
+            "joint",
+            name=f"{name}_finger",
+            type="slide",
+            axis="0 1 0",
+            range=_text(0.0, FINGER_TRAVEL),
+            armature="0.1",
+        )
+        _solids(finger, FINGER)
+        _element(
+            actuator,
+            "position",
+            name=f"{name}_finger",
+            joint=f"{name}_finger",
+            kp=_text(FINGER_STIFFNESS),
+            kv=_text(FINGER_VELOCITY_GAIN),
+            forcerange=_text(-FINGER_FORCE, FINGER_FORCE),
+        )
+    equality = _element(root, "equality")
+    _element(equality, "joint", joint1="right_finger", joint2="left_finger", polycoef="0 1 0 0 0")
+
+
+def _add_bodies(world: ElementTree.Element) -> None:
+    for i in range(BODIES):
+        body = _element(world, "body", name=f"body{i}", pos=_text(*parking_place(i)), gravcomp="1")
+        _element(body, "joint", name=f"body{i}", type="free", damping=_text(BODY_DAMPING))
+        _element(body, "inertial", mass=_text(EMPTY_MASS), pos="0 0 0", diaginertia=_text(*[EMPTY_INERTIA] * 3))
+        for shape in in_order():
+            name = geometry_name(shape, i)
+            _element(body, "geom", class_="object", name=name, type=shape.geometry, friction=_text(shape.friction))
+
+
+def geometry_name(shape: Shape, slot: int) -> str:
+    """What the geometry of a shape in a slot is called."""
+    return f"{shape.name}{slot}"
+
+
+def parking_place(slot: int) -> tuple[float, float, float]:
+    """Where an unused slot waits: far in front of the shelf, on the free side of all of its infinite planes."""
+    return (-2.0, 0.02 * slot, 0.6)
+
+
+def shelf_corners(shelf: Shelf) -> dict[str, tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]]:
+    """The shelf's boards as axis-aligned boxes: their lower and upper corners in the world [m]; the shelf may be
+    traced."""
+    t = shelf.thickness
+    low, high = (shelf.front, shelf.right - t), (shelf.back + t, shelf.left + t)
+    return {
+        "board": ((*low, shelf.board - t), (*high, shelf.board)),
+        "ceiling": ((*low, shelf.ceiling), (*high, shelf.ceiling + t)),
+        "back": ((shelf.back, low[1], shelf.board), (*high, shelf.ceiling)),
+        "right": ((*low, shelf.board), (shelf.back, shelf.right, shelf.ceiling)),
+        "left": ((shelf.front, shelf.left, shelf.board), (shelf.back, high[1], shelf.ceiling)),
+    }
+
+
+def shelf_boxes(shelf: Shelf) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """`shelf_corners` as arrays of the host."""
+    return {name: (np.array(low), np.array(high)) for name, (low, high) in shelf_corners(shelf).items()}
+
+
+def panda_shelf_mjcf(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> str:
+    """The MJCF of the robot, the shelf, the camera, eight empty object slots and an empty slot for the target.
+
+    Args:
+      shelf: the shelf's dimensions.
+      camera: the camera, for renderers; it must have square pixels and its principal point in the middle.
+      timestep: of the simulation [s].
+    """
+    root = ElementTree.Element("mujoco", model="panda-shelf")
+    _element(root, "compiler", angle="radian", autolimits="true")
+    option = _element(
+        root,
+        "option",
+        timestep=_text(timestep),
+        integrator="implicitfast",
+        cone="elliptic",
+        impratio="10",
+        iterations="100",
+        ls_iterations="50",
+    )
+    # Bounding volumes inside a body are not kept up to date when its sizes are set per world.
+    _element(option, "flag", midphase="disable")
+    _element(_element(root, "visual"), "map", znear="0.01")
+    _add_defaults(root)
+    world = _element(root, "worldbody")
+    _element(world, "light", pos="-0.5 0.1 2", dir="0.6 0 -1")
+    right, down, _ = np.array(camera.rotation).T
+    _element(
+        world,
+        "camera",
+        name="camera",
+        pos=_text(*camera.position),
+        xyaxes=_text(*right, *-down),
+        fovy=_text(np.degrees(2 * np.arctan(camera.height / 2 / camera.fy))),
+    )
+    _add_shelf(world, shelf)
+    _add_robot(root, world)
+    _add_bodies(world)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def compile_model(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> mujoco.MjModel:
+    """The compiled `panda_shelf_mjcf`.
+
+    From then on MuJoCo, in this process, writes no MUJOCO_LOG.TXT into the folder that it was started in: what goes
+    wrong in a simulation, its outcome tells.
+    """
+    log = mujoco.MjLogConfig.get()
+    log.logto_file = False
+    mujoco.MjLogConfig.set(log)
+    return mujoco.MjModel.from_xml_string(panda_shelf_mjcf(shelf, camera, timestep))
+
+
+def masses_and_inertias(
+    kind: Int[Any, "*batch"], half_size: Float[Any, "*batch 3"], library: Any = np
+) -> tuple[Float[Any, "*batch"], Float[Any, "*batch 3"]]:
+    """Masses [kg] and principal moments of inertia [kg m2] of solid bodies, along their own axes.
+
+    Args:
+      kind: codes of their shapes.
+      half_size: half-extents [m].
+      library: NumPy or `jax.numpy`, whichever the arrays are of.
+    """
+    volume = by_shape(kind, lambda shape: shape.volume(half_size, library), library)
+    mass = volume * by_shape(kind, lambda shape: shape.density, library)
+    moments = by_shape(kind[..., None], lambda shape: shape.moments(half_size, library), library)
+    return library.asarray(mass), mass[..., None] * moments
+
+
+def mass_and_inertia(body: Body) -> tuple[float, Float[np.ndarray, " 3"]]:
+    """Mass [kg] and principal moments of inertia [kg m2] of a solid body, along its own axes."""
+    mass, inertia = masses_and_inertias(np.array(shape_of(body.shape).code), np.array(body.half_size, float))
+    return float(mass), inertia
+
+
+def with_bodies(
+    model: mujoco.MjModel, bodies: Sequence[Body | None], skin: float = MARGIN, mass: float = 1.0
+) -> mujoco.MjModel:
+    """A copy of the model whose slots have the shapes and masses of `bodies`; poses are part of the state, not of it.
+
+    Args:
+      model: the compiled model.
+      bodies: one for each slot, the target last; None leaves a slot empty.
+      skin: how much smaller the contact geometry is than the bodies [m]; 0 for pictures.
+      mass: of the bodies, as a multiple of what it is.
+    """
+    model = copy.copy(model)
+    for i, body in enumerate(bodies):
+        index = model.body(f"body{i}").id
+        own, inertia = mass_and_inertia(body) if body else (EMPTY_MASS, np.full(3, EMPTY_INERTIA))
+        model.body_mass[index], model.body_inertia[index] = mass * own, mass * inertia
+        model.body_gravcomp[index] = 0.0 if body else 1.0
+        for shape in in_order():
+            used = body is not None and body.shape == shape.name
+            half = np.array(body.half_size) - skin if body is not None and used else np.full(3, TINY)
+            geom = model.geom(geometry_name(shape, i)).id
+            model.geom_size[geom] = shape.geometry_size(half, np)
+            model.geom_rbound[geom] = shape.bounding_radius(half, np)
+            model.geom_aabb[geom] = [0.0, 0.0, 0.0, *half]
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def initial_state(model: mujoco.MjModel, bodies: Sequence[Body | None]) -> mujoco.MjData:
+    """The robot at home with closed fingers and the bodies where they say they are, all at rest."""
+    data = mujoco.MjData(model)
+    for i, angle in enumerate(HOME):
+        data.joint(f"joint{i + 1}").qpos[0] = angle
+    for i, body in enumerate(bodies):
+        pose = (*body.position, *body.quaternion) if body else (*parking_place(i), 1.0, 0.0, 0.0, 0.0)
+        data.joint(f"body{i}").qpos[:] = pose
+    mujoco.mj_forward(model, data)
+    return data

@@ -1,0 +1,87 @@
+"""Imports point one way: from benchmarks and training to the simulated shelf, from that to the planner, in no circle."""
+
+import ast
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("benchmarks", "train", "envs")
+# What a package may import, beside itself.
+BELOW = {
+    "benchmarks": {"train", "envs", "mechsearch_jax"},
+    "train": {"envs", "mechsearch_jax"},
+    "envs": {"mechsearch_jax"},
+}
+
+
+def place(name):
+    """The package and the room that a module of ours is in; None for any other."""
+    first, *rest = name.split(".")
+    if first != "mechsearch_jax":
+        return None
+    package, room = [*rest, "", ""][:2]
+    return (package, room) if package in PACKAGES else (first, package)
+
+
+def imports(file):
+    """The places that a file imports from, also inside of functions."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            submodules = node.module in ("mechsearch_jax", *(f"mechsearch_jax.{name}" for name in PACKAGES))
+            yield from (place(f"{node.module}.{name.name}" if submodules else node.module) for name in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (place(name.name) for name in node.names)
+
+
+def arrows():
+    """From each room of the packages beside the planner: which places it imports from."""
+    found = {}
+    for package in PACKAGES:
+        for file in (ROOT / package).rglob("*.py"):
+            inside = file.relative_to(ROOT / package).parts
+            room = package, inside[0] if len(inside) > 1 else ""
+            found.setdefault(room, set()).update(other for other in imports(file) if other and other != room)
+    return found
+
+
+def test_packages_import_what_is_below_them_alone():
+    found = arrows()
+    assert {package for package, _ in found} == set(PACKAGES)
+    wrong = {
+        (room, other)
+        for room, others in found.items()
+        for other in others
+        if other[0] not in BELOW[room[0]] | {room[0]}
+    }
+    assert wrong == set()
+
+
+def test_no_room_needs_one_that_needs_it():
+    found = arrows()
+
+    def reached(room):
+        seen, left = set(), [room]
+        while left:
+            for other in found.get(left.pop(), ()):
+                if other not in seen:
+                    seen.add(other)
+                    left.append(other)
+        return seen
+
+    assert {room for room in found if room in reached(room)} == set()
+    # What the rooms are for: the trials need the simulators, the episodes need both.
+    assert {("envs", "simulators"), ("envs", "world")} <= reached(("envs", "trials"))
+    assert ("envs", "trials") in reached(("envs", "episode"))
+
+
+def test_the_planner_knows_neither_simulators_nor_benchmarks():
+    outside = {"commands"}
+    for file in (ROOT / "mechsearch_jax").rglob("*.py"):
+        inside = file.relative_to(ROOT / "mechsearch_jax").parts
+        if inside[0] not in outside:
+            assert {other[0] for other in imports(file) if other} <= {"mechsearch_jax"}, file
+
+
+def test_a_room_holds_no_more_than_a_newcomer_looks_through():
+    for package in ("benchmarks", "envs"):
+        for room in (folder for folder in (ROOT / package).rglob("*") if (folder / "__init__.py").is_file()):
+            assert len([file for file in room.glob("*.py") if file.name != "__init__.py"]) <= 15, room
