@@ -1,4 +1,4 @@
-"""Imports point one way: from benchmarks and training to the simulated shelf, from that to the planner, in no circle."""
+"""Imports point one way: from benchmarks and training to the simulated shelf, from that to the planner, never round."""
 
 import ast
 from pathlib import Path
