@@ -20,26 +20,26 @@ if TYPE_CHECKING:
     from mechsearch_jax.actions.registry import ActionKind
     from mechsearch_jax.actions.trajectory import JointTrajectory, joint_trajectory
     from mechsearch_jax.actions.types import Action
-    from mechsearch_jax.errors import InputError
+    from mechsearch_jax.belief.belief import Belief, initial_belief, update_belief
+    from mechsearch_jax.config.config import Config
+    from mechsearch_jax.config.presets import best, paper, standard
     from mechsearch_jax.geometry.superquadric import Superquadrics
     from mechsearch_jax.observation import Observation
     from mechsearch_jax.perception.examples import example_images
     from mechsearch_jax.perception.recogniser import Recogniser
-    from mechsearch_jax.planner.belief import Belief, initial_belief, update_belief
-    from mechsearch_jax.planner.cache import cached_problem, keep_compilations
-    from mechsearch_jax.planner.config import Config
     from mechsearch_jax.planner.policies import Policy, random_action, search_and_grasp, search_for_grasp
-    from mechsearch_jax.planner.presets import best, paper, standard
-    from mechsearch_jax.planner.problem import Problem, build_problem
-    from mechsearch_jax.planner.settings import Settings, load_settings
     from mechsearch_jax.planner.state import Decision
-    from mechsearch_jax.planner.workcell import Workcell
+    from mechsearch_jax.problem.cache import cached_problem, keep_compilations
+    from mechsearch_jax.problem.problem import Problem, build_problem
+    from mechsearch_jax.problem.settings import Settings, load_settings
+    from mechsearch_jax.problem.workcell import Workcell
     from mechsearch_jax.robot.arm_config import ArmConfig
     from mechsearch_jax.robot.gripper import Gripper
     from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
-    from mechsearch_jax.search.searcher import Searcher
-    from mechsearch_jax.search.step import SearchStep
-    from mechsearch_jax.search.whole_trajectory import whole_trajectory
+    from mechsearch_jax.runtime.errors import InputError
+    from mechsearch_jax.session.searcher import Searcher
+    from mechsearch_jax.session.step import SearchStep
+    from mechsearch_jax.session.whole_trajectory import whole_trajectory
     from mechsearch_jax.workspace.camera import Camera
     from mechsearch_jax.workspace.render import render_depth
     from mechsearch_jax.workspace.scenario import load_scenario
@@ -51,42 +51,42 @@ _ROOMS = {
     "Action": "actions.types",
     "ActionKind": "actions.registry",
     "ArmConfig": "robot.arm_config",
-    "Belief": "planner.belief",
+    "Belief": "belief.belief",
     "Camera": "workspace.camera",
-    "Config": "planner.config",
+    "Config": "config.config",
     "Decision": "planner.state",
     "Gripper": "robot.gripper",
-    "InputError": "errors",
+    "InputError": "runtime.errors",
     "JointTrajectory": "actions.trajectory",
     "Observation": "observation",
     "Policy": "planner.policies",
-    "Problem": "planner.problem",
+    "Problem": "problem.problem",
     "Recogniser": "perception.recogniser",
     "RobotTrajectory": "robot.robot_trajectory",
-    "SearchStep": "search.step",
-    "Searcher": "search.searcher",
-    "Settings": "planner.settings",
+    "SearchStep": "session.step",
+    "Searcher": "session.searcher",
+    "Settings": "problem.settings",
     "Shelf": "workspace.shelf",
     "Superquadrics": "geometry.superquadric",
     "Target": "workspace.target",
-    "Workcell": "planner.workcell",
-    "best": "planner.presets",
-    "build_problem": "planner.problem",
-    "cached_problem": "planner.cache",
+    "Workcell": "problem.workcell",
+    "best": "config.presets",
+    "build_problem": "problem.problem",
+    "cached_problem": "problem.cache",
     "example_images": "perception.examples",
-    "initial_belief": "planner.belief",
+    "initial_belief": "belief.belief",
     "joint_trajectory": "actions.trajectory",
-    "keep_compilations": "planner.cache",
+    "keep_compilations": "problem.cache",
     "load_scenario": "workspace.scenario",
-    "load_settings": "planner.settings",
-    "paper": "planner.presets",
+    "load_settings": "problem.settings",
+    "paper": "config.presets",
     "random_action": "planner.policies",
     "render_depth": "workspace.render",
     "search_and_grasp": "planner.policies",
     "search_for_grasp": "planner.policies",
-    "standard": "planner.presets",
-    "update_belief": "planner.belief",
-    "whole_trajectory": "search.whole_trajectory",
+    "standard": "config.presets",
+    "update_belief": "belief.belief",
+    "whole_trajectory": "session.whole_trajectory",
 }
 
 __all__ = [

@@ -29,13 +29,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import inverse, make, transform, upright_pose
-from mechsearch_jax.options import option
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.options import option
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.detector import FOUND_PIXELS, found_pixels, longer
@@ -80,7 +80,7 @@ class ExistenceConfig:
         not at all.
       erosion: by how much the target is drawn in for the collision test [m]. One that was pushed touches what pushed
         it, often on several sides, and hardly any of its cell's places fits in between.
-      reopen: whether f is opened again around what an action may have moved unseen; see `planner.unseen_motion`.
+      reopen: whether f is opened again around what an action may have moved unseen; see `belief.unseen_motion`.
       window: rows and columns of the window an object is rendered in, at the coarse resolution.
       points: points on the target's surface for the collision test.
     """

@@ -8,7 +8,7 @@ and a scene only adds the table H[pair, object] of who is hit. Moving one object
 
 An approximation: where the straight way in begins inside the shelf, the gripper first gets there along x. That the arm
 can is part of what is feasible, but H does not say what stands in the way there, nor what links 2 to 5 touch; for a
-target that has been found `planner.found_target` does.
+target that has been found `belief.found_target` does.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ import scipy.spatial
 import trimesh
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.collision import Clouds, collisions
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
-from mechsearch_jax.options import option
 from mechsearch_jax.robot.entry import gripper_enters
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.options import option
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target

@@ -158,7 +158,7 @@ def forget_compilations():
     """Drop compiled functions between files where the process holds many of their memory mappings, and keep none that
     a command has kept."""
     yield
-    from mechsearch_jax.compiled import keep_in
+    from mechsearch_jax.runtime.compiled import keep_in
 
     keep_in(None)
     maps = Path("/proc/self/maps")

@@ -11,12 +11,12 @@ import pytest
 from mechsearch_jax.actions import approach, pick_and_place, push
 from mechsearch_jax.actions.config import CLOSED, OPEN, ActionConfig, ActionSpace, action_tables
 from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.belief import found_target
 from mechsearch_jax.dynamics import rigid
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.collision import collisions
 from mechsearch_jax.geometry.transforms import make, transform, translate, upright_pose, yaw_rotation
 from mechsearch_jax.graspability import FoundGrasps, GraspConfig, grasp_hits, grasp_tables, gripper_rotation
-from mechsearch_jax.planner import found_target
 from mechsearch_jax.robot.entry import crossing_length
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud
 from mechsearch_jax.shapes import shape_of

@@ -19,9 +19,9 @@ from mechsearch_jax.actions.object_grasps import (
     object_grasps,
 )
 from mechsearch_jax.dynamics import rigid
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 

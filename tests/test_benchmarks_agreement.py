@@ -20,7 +20,7 @@ from mechsearch_jax.benchmarks.parts.agreement import (
 )
 from mechsearch_jax.benchmarks.report.tables import agreement_table
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, example_scenarios, load_scenario
 
 CASE = Case("scene", 2, "push", 0, None, None, 0.1, 0.11, 775, 775, 0.004, 1.0, 50.0, 0, 0.002, 4.0)

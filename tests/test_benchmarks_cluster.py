@@ -22,11 +22,11 @@ from mechsearch_jax.benchmarks.running.processes import ENVIRONMENT, Processes
 from mechsearch_jax.benchmarks.store.rows import episode_key
 from mechsearch_jax.commands.options import EpisodeOptions
 from mechsearch_jax.commands.runs import Here, OnRay, RunOptions
-from mechsearch_jax.cores import VARIABLE
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PRESETS
+from mechsearch_jax.runtime.cores import VARIABLE
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 
 TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from mechsearch_jax.benchmarks.parts import dense
 from mechsearch_jax.benchmarks.parts.dense import Tiling
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
+from mechsearch_jax.runtime.errors import InputError
 
 # A float32 coordinate 20 half-extents from a centre is known to about 5e-6 half-extents.
 CLOSE = {"rtol": 1e-5, "atol": 2e-5}

@@ -6,9 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.benchmarks.parts import ems
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics, sample_surface
 from mechsearch_jax.perception import scores
+from mechsearch_jax.runtime.errors import InputError
 
 SHAPES = {
     "box": ((0.03, 0.05, 0.08), (0.2, 0.2)),

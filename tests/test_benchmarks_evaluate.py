@@ -9,7 +9,6 @@ import sys
 import pytest
 from rich.console import Console
 
-from mechsearch_jax import versions
 from mechsearch_jax.benchmarks.report import tables
 from mechsearch_jax.benchmarks.report.episode_tables import rates_table
 from mechsearch_jax.benchmarks.running import evaluate as benchmark
@@ -19,8 +18,9 @@ from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.store.rows import episode_key, identity
 from mechsearch_jax.benchmarks.store.shards import OPEN, Results, ShardWriter
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.runtime import versions
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 
 standard = PRESETS["standard"]

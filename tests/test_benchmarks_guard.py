@@ -14,7 +14,7 @@ from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.commands import bench_episodes
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.scenes.scene_sets import recorded
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 ROW = Row(
     "one", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.5, "{}", "00"

@@ -19,9 +19,9 @@ from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.pushing import pushes as generator
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.push import PushConfig, PushNetwork
 from mechsearch_jax.networks.weights import ARCHITECTURES, save_weights
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.train.loop import TrainConfig
 from mechsearch_jax.train.push import outcome_scores
 

@@ -15,7 +15,7 @@ from mechsearch_jax.benchmarks.report.report_figures import reached, success_fig
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.store.rows import EVENTS, Row, write_rows
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 WON = Row("a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "both", 0, 1, 2, True, 3, None, 1.5, 0.6)
 LOST = dataclasses.replace(

@@ -24,9 +24,9 @@ from mechsearch_jax.benchmarks.statistics.variants import Key, column, label_var
 from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, options_of, write_rows
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import PRESETS
-from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf
 

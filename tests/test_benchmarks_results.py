@@ -31,10 +31,10 @@ from mechsearch_jax.envs.episode.earlier import EARLIER, GONE, RENAMED
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode, Step, load_episode, record_action, save_episode
 from mechsearch_jax.envs.recording.narration import verdict
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import check_writable, replacing
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.planner import PRESETS
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import check_writable, replacing
 from mechsearch_jax.viz.maps import Maps, load_maps, save_maps
 
 PUSH = no_action().replace(

@@ -14,7 +14,7 @@ from mechsearch_jax.benchmarks.parts.bench import Timing
 from mechsearch_jax.benchmarks.parts.ceilings import Ceiling
 from mechsearch_jax.benchmarks.report.tables import timings_table
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 

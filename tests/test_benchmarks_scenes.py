@@ -15,7 +15,7 @@ from mechsearch_jax.benchmarks.report.tables import scenes_table
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.envs.camera.simulated_camera import observe, target_pixels
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import FOUND_PIXELS
 from mechsearch_jax.workspace.scenario import Scenario

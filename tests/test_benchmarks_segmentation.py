@@ -14,7 +14,7 @@ from mechsearch_jax.benchmarks.parts.segmentation import Bench, overlaps
 from mechsearch_jax.benchmarks.report import tables
 from mechsearch_jax.envs.camera.recognisers import true_masks
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.drawing import save_figure
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 

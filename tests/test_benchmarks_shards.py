@@ -16,7 +16,7 @@ from mechsearch_jax.benchmarks.store.claims import CLAIMS, Claims
 from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, write_rows
 from mechsearch_jax.benchmarks.store.shards import OPEN, Results, ShardWriter, close_shards_of
 from mechsearch_jax.envs.episode.earlier import EARLIER
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 ROW = Row(
     "a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.6,

@@ -11,8 +11,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions.nothing import no_action
-from mechsearch_jax.compiled import Kept, keep_in
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import allowances, closer_image, existence, existence_tables, object_views
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import recogniser as recognising
@@ -23,6 +21,8 @@ from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.state import Decision
+from mechsearch_jax.runtime.compiled import Kept, keep_in
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics

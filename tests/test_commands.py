@@ -17,9 +17,9 @@ from mechsearch_jax.benchmarks.store.rows import Row, write_rows
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands import options
 from mechsearch_jax.envs.episode.records import Episode, save_episode
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS
-from mechsearch_jax.planner.settings import Settings, load_settings
+from mechsearch_jax.problem.settings import Settings, load_settings
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.maps import load_maps
 from mechsearch_jax.workspace.scenario import (
     Body,

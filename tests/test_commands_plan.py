@@ -22,10 +22,10 @@ from mechsearch_jax.perception.image_files import (
     save_depth,
     save_mask,
 )
-from mechsearch_jax.planner import problem as problems
-from mechsearch_jax.planner.problem import NOWHERE
-from mechsearch_jax.planner.workcell import Workcell
-from mechsearch_jax.search.searcher import Searcher
+from mechsearch_jax.problem import problem as problems
+from mechsearch_jax.problem.problem import NOWHERE
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.session.searcher import Searcher
 
 WRITTEN = {"step.json", "step.png", "trajectory.csv", "trajectory.json"}
 FILES = {"depth.png", "color.png", "mask.png", "camera.json"}

@@ -5,8 +5,8 @@ import pytest
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands import options
 from mechsearch_jax.envs.scenes import scene_sets
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner import cache
+from mechsearch_jax.problem import cache
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Scenario, example_scenarios, load_scenario, save_scenario
 
 BLOCK = scene_sets.SETS["d1"].blocks[0]

@@ -12,9 +12,9 @@ from mechsearch_jax.benchmarks.running.evaluate import make_jobs, present_code
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS
-from mechsearch_jax.versions import versions
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 
 standard = PRESETS["standard"]

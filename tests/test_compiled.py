@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax import compiled, executables
-from mechsearch_jax.compiled import Kept, KeptOnHost, keep_in
-from mechsearch_jax.identity import Unidentified, identity
-from mechsearch_jax.planner.config import PlannerConfig
+from mechsearch_jax.config.config import PlannerConfig
+from mechsearch_jax.runtime import compiled, executables
+from mechsearch_jax.runtime.compiled import Kept, KeptOnHost, keep_in
+from mechsearch_jax.runtime.identity import Unidentified, identity
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -314,9 +314,9 @@ SEARCH = """
     import jax
     from mechsearch_jax.envs.episode.episodes import run_episode, target_of
     from mechsearch_jax.envs.simulators.native import NativeSimulator
-    from mechsearch_jax.preparing import first_decision, prepared
+    from mechsearch_jax.session.preparing import first_decision, prepared
     from mechsearch_jax.planner import search_for_grasp
-    from mechsearch_jax.planner.cache import cached_problem, keep_compilations
+    from mechsearch_jax.problem.cache import cached_problem, keep_compilations
     from mechsearch_jax.robot.motion import MotionConfig
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 

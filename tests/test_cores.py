@@ -10,9 +10,9 @@ import pytest
 
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs
 from mechsearch_jax.benchmarks.running.processes import Processes
-from mechsearch_jax.cores import VARIABLE, cores, on_host, share_of_cores
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.world import model
+from mechsearch_jax.runtime.cores import VARIABLE, cores, on_host, share_of_cores
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios
 from mechsearch_jax.workspace.shelf import Shelf

@@ -10,13 +10,13 @@ import pytest
 from mechsearch_jax import actions, planner
 from mechsearch_jax.actions import SAMPLED_KINDS, ActionConfig, ActionKind
 from mechsearch_jax.actions.sampler import _shares
+from mechsearch_jax.belief.belief import possible_space
 from mechsearch_jax.dynamics import quasi_static, rigid
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.belief import possible_space
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.shelf import Shelf

@@ -19,8 +19,8 @@ from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.outcome import Failure, Overflow
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import search_for_grasp
+from mechsearch_jax.runtime.errors import InputError
 
 AT_ONCE = 2
 WON = Result(

@@ -11,6 +11,7 @@ from rich.console import Console
 from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO, UPRIGHT, Stage, grab, idle, push_off, reveal, topple
 
 from mechsearch_jax.actions import kind_of
+from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
@@ -20,10 +21,9 @@ from mechsearch_jax.envs.recording.narration import Narrator, events, verdict
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import search_for_grasp
-from mechsearch_jax.planner.moved_target import nearest_candidate
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target

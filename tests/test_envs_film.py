@@ -23,8 +23,8 @@ from mechsearch_jax.envs.recording.recording import (
 )
 from mechsearch_jax.envs.simulators.native import Trace
 from mechsearch_jax.envs.world.world import BODIES, TARGET
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME, VELOCITY_LIMIT
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.movie import save_movie
 
 

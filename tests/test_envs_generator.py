@@ -12,7 +12,7 @@ from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.scenes import generator
 from mechsearch_jax.envs.scenes.generator import GeneratorConfig, ScenarioGenerator, outline, separation
 from mechsearch_jax.envs.world import world
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.scenario import Body, format_scenario, parse_scenario

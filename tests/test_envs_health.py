@@ -10,12 +10,12 @@ from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.health import checks as health
 from mechsearch_jax.envs.health.finding import State
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks import weights
-from mechsearch_jax.planner import cache
-from mechsearch_jax.planner.problem import NOWHERE
-from mechsearch_jax.planner.settings import Settings
-from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.problem import cache
+from mechsearch_jax.problem.problem import NOWHERE
+from mechsearch_jax.problem.settings import Settings
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf

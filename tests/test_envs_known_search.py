@@ -11,6 +11,7 @@ from stage import BOX, HIDDEN, TWO
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
+from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.known_target import search as known_search
 from mechsearch_jax.envs.known_target.judgement import InFullView, Judgement, judge
@@ -18,13 +19,12 @@ from mechsearch_jax.envs.known_target.search import Frontier, KnownSearchConfig,
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, from_scenario
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import GraspChoice, Sequences, graspable_at
-from mechsearch_jax.planner.config import PlannerConfig, Weights
 from mechsearch_jax.planner.retrieval import best_grasps
 from mechsearch_jax.planner.rollout import present_state
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
 START = jax.device_get(from_scenario(TWO))

@@ -24,9 +24,9 @@ from mechsearch_jax.envs.simulators.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import model
 from mechsearch_jax.envs.world.outcome import Failure, Overflow
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, slots
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.preparing import prepare
 from mechsearch_jax.robot.motion import MotionConfig, Reference
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.preparing import prepare
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 

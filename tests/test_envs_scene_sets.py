@@ -14,9 +14,9 @@ from mechsearch_jax.envs.scenes.generator import GeneratorConfig, outline, separ
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block, find_scene, find_set, make_scene, recorded, scene_files
 from mechsearch_jax.envs.scenes.three_objects import LineConfig, LineGenerator
 from mechsearch_jax.envs.world import world
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner import cache
+from mechsearch_jax.problem import cache
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
 

@@ -9,9 +9,9 @@ from stage import HIDDEN, OPEN
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.cell.simulated_cell import SHELF, SensorNoise, SimulatedCell, _owner
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.robot_trajectory import Bounds, RobotTrajectory
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 
 SMALL = Camera(width=320, height=180, fx=152.4, fy=152.4, cx=160.0, cy=90.0)

@@ -18,7 +18,6 @@ from mechsearch_jax.envs.simulators import simulator
 from mechsearch_jax.envs.simulators.native import NativeSimulator, NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.envs.world.world import BODIES, TARGET
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.robot import motion
@@ -32,6 +31,7 @@ from mechsearch_jax.robot.kinematics import (
     line_kinematics,
 )
 from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.recording.recording import NAME, save_recording
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.arm_clearance import link_poses
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz import web
 from mechsearch_jax.viz.panda import panda_pieces, panda_solids
 from mechsearch_jax.viz.raycast import Capsule

@@ -15,11 +15,11 @@ from mechsearch_jax.envs.camera.simulated_camera import target_pixels
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
 from mechsearch_jax.envs.scenes.scene_sets import find_scene, make_scene
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import Rollout
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import found_pixels

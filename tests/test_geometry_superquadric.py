@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 
 sizes = st.tuples(*[st.floats(0.01, 0.2)] * 3)

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from mechsearch_jax import graspability, planner
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.graspability import GraspConfig
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.shelf import Shelf

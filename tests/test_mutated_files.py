@@ -14,9 +14,7 @@ import pytest
 from flax.traverse_util import unflatten_dict
 from mutations import bomb, damaged, mutated_archive, mutated_json, mutated_toml, seeded
 
-from mechsearch_jax.arrays import read_arrays
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.push import PushConfig
 from mechsearch_jax.networks.weights import load_weights, save_weights, weight_shapes
 from mechsearch_jax.perception.examples import Images, load_images, save_images
@@ -31,7 +29,9 @@ from mechsearch_jax.perception.image_files import (
     save_mask,
 )
 from mechsearch_jax.perception.trained_view import TrainedView
-from mechsearch_jax.planner.settings import example_config, load_settings
+from mechsearch_jax.problem.settings import example_config, load_settings
+from mechsearch_jax.runtime.arrays import read_arrays
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import check_name, example_scenarios, load_scenario
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.assignment import assign
+from mechsearch_jax.runtime.errors import InputError
 
 ASSIGN = jax.jit(assign)
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.perception.image_files import (
     load_camera,
@@ -19,6 +18,7 @@ from mechsearch_jax.perception.image_files import (
     save_depth,
     save_mask,
 )
+from mechsearch_jax.runtime.errors import InputError
 
 IMAGES = example_images()
 

@@ -10,7 +10,6 @@ from published import published_scenarios
 
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import plausibility
@@ -25,6 +24,7 @@ from mechsearch_jax.perception.plausibility import (
     image_faults,
     sight_faults,
 )
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.scenario import Body, Scenario, example_scenarios, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf

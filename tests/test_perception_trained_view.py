@@ -9,7 +9,6 @@ import jax
 import numpy as np
 import pytest
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.recognition import RecognitionConfig
 from mechsearch_jax.networks.segmentation import SegmentationConfig
 from mechsearch_jax.networks.weights import ARCHITECTURES, load_weights, read_card, save_weights
@@ -17,8 +16,9 @@ from mechsearch_jax.perception.cloud import BLOCK, shelf_view, thinned_view
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.recognition import nearness
 from mechsearch_jax.perception.trained_view import TOLERANCES, TrainedView, read_view, view_faults
-from mechsearch_jax.planner.settings import load_settings
-from mechsearch_jax.search.searcher import Searcher
+from mechsearch_jax.problem.settings import load_settings
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.searcher import Searcher
 from mechsearch_jax.train.recognition import RecognitionTask
 from mechsearch_jax.train.segmentation import SegmentationTask
 from mechsearch_jax.workspace.camera import Camera

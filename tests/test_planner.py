@@ -13,22 +13,22 @@ from mechsearch_jax.actions import ActionConfig, ActionKind
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.sampler import contact_risk
 from mechsearch_jax.actions.types import Prediction, Sample
+from mechsearch_jax.belief.belief import possible_space
+from mechsearch_jax.config.config import Weights
 from mechsearch_jax.dynamics.learned import LearnedPush
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.geometry import masked, superquadric
 from mechsearch_jax.graspability import GraspConfig, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import PlannerConfig, policies
 from mechsearch_jax.planner import rollout as rollouts
-from mechsearch_jax.planner.belief import possible_space
-from mechsearch_jax.planner.config import Weights
 from mechsearch_jax.planner.imitation import LaterPlacementsStay, in_the_present_scene
 from mechsearch_jax.planner.objective import SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import PredictByKind
 from mechsearch_jax.planner.proposal import ALONE, DEPTH, as_predicted, blame, passed_on, sampling_weights
 from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, present_state, repeated, sequence_values
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import scenario
 
 CONFIG = PlannerConfig()

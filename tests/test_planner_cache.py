@@ -4,9 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from mechsearch_jax.planner import cache
-from mechsearch_jax.planner import problem as problems
-from mechsearch_jax.planner.presets import paper
+from mechsearch_jax.config.presets import paper
+from mechsearch_jax.problem import cache
+from mechsearch_jax.problem import problem as problems
 from mechsearch_jax.workspace.target import Target
 
 

@@ -7,11 +7,11 @@ import pytest
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions.sampler import BLOCK, _numbers
+from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.geometry.superquadric import empty, pad
 from mechsearch_jax.graspability import INFEASIBLE, graspability, pairs
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.config import PlannerConfig, Weights
 from mechsearch_jax.planner.rollout import present_state
 from mechsearch_jax.workspace import scenario
 

@@ -10,11 +10,11 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.actions.registry import ActionKind
+from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.envs.camera.simulated_camera import target_pixels
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.transforms import make, translate
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.moved_target import nearest_candidate
 from mechsearch_jax.workspace import scenario
 from mechsearch_jax.workspace.detector import found_pixels
 

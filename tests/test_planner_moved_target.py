@@ -12,11 +12,11 @@ from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
+from mechsearch_jax.belief.belief import possible_poses, with_target
+from mechsearch_jax.belief.moved_target import BEYOND, beyond_candidates, candidate_of
+from mechsearch_jax.config.config import Weights
 from mechsearch_jax.graspability import INFEASIBLE, crowding, grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.belief import possible_poses, with_target
-from mechsearch_jax.planner.config import Weights
-from mechsearch_jax.planner.moved_target import BEYOND, beyond_candidates, candidate_of
 from mechsearch_jax.planner.rollout import Rollout
 from mechsearch_jax.workspace import scenario
 

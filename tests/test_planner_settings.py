@@ -8,16 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mechsearch_jax import errors, tables
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.colour import TargetColour
-from mechsearch_jax.planner import OPTIONS, PRESETS, settings
-from mechsearch_jax.planner.settings import Settings, load_settings
-from mechsearch_jax.planner.workcell import Workcell
-from mechsearch_jax.search.searcher import Searcher
+from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.problem import settings
+from mechsearch_jax.problem.settings import Settings, load_settings
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime import errors, tables
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.searcher import Searcher
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import load_scenario
 from mechsearch_jax.workspace.shelf import Shelf

@@ -12,10 +12,10 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind, no_action
 from mechsearch_jax.actions.types import Prediction, Sample
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
 from mechsearch_jax.planner.tree_search import tree_plan, width
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import scenario
 
 CONFIG = planner.PlannerConfig(horizon=2, sequences=64)

@@ -10,15 +10,15 @@ import pytest
 from mechsearch_jax import planner
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.actions.registry import ActionKind
+from mechsearch_jax.belief.moved_target import nearest_candidate
+from mechsearch_jax.belief.unseen_motion import reopened, same_objects
 from mechsearch_jax.envs.episode import slots
 from mechsearch_jax.envs.episode.episode_log import Choice
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.transforms import make, translate
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.moved_target import nearest_candidate
-from mechsearch_jax.planner.unseen_motion import reopened, same_objects
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
 LEFT = jnp.float32([0.0, 0.1, 0.0])

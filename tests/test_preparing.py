@@ -7,8 +7,8 @@ import pytest
 
 from mechsearch_jax.actions import KINDS
 from mechsearch_jax.planner import search_for_grasp
-from mechsearch_jax.preparing import Program, first_decision, prepare, prepared
 from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.session.preparing import Program, first_decision, prepare, prepared
 
 
 def program(name, ready=False, prepare=lambda: None):

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import pytest
 
 import mechsearch_jax as ms
+from mechsearch_jax.belief.belief import without_grasps
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import policies
-from mechsearch_jax.planner.belief import without_grasps
 
 # Equations and loops (`while`, `scan` and `cond`) of one decision: 30 sequences of 3 actions, 9 slots. The programs for
 # a CPU and for a GPU differ, and so do those for a target that is hidden and for one that has been found.

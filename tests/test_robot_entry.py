@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import back_off, make
 from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.robot import entry
@@ -19,6 +18,7 @@ from mechsearch_jax.robot.motion import (
     push_reference,
     retrieve_reference,
 )
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 
 GRIPPER, SHELF = Gripper(), Shelf()

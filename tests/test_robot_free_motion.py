@@ -11,7 +11,6 @@ import pytest
 
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.world import BODIES
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import WRIST_ORIGIN, gripper_rotation
@@ -19,6 +18,7 @@ from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Held, Obstacle
 from mechsearch_jax.robot.free_motion import FreeMotionConfig, check_joints, free_motion, free_path
 from mechsearch_jax.robot.kinematics import HOME, JOINT_LOWER, JOINT_UPPER, gripper_pose, inverse_kinematics
 from mechsearch_jax.robot.robot_trajectory import limit_shares
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body
 from mechsearch_jax.workspace.shelf import Shelf

@@ -10,10 +10,10 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot import gripper as module
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import FINGER, HAND, LINKS, Gripper, Primitive
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
 GRIPPER = Gripper()

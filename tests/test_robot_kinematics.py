@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.kinematics import HOME, JOINT_LOWER, JOINT_UPPER
+from mechsearch_jax.runtime.errors import InputError
 
 inverse = jax.jit(kinematics.inverse_kinematics)
 forward = jax.jit(kinematics.gripper_pose)

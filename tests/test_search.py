@@ -12,6 +12,8 @@ import pytest
 from stage import HIDDEN, OPEN, grab, idle
 
 from mechsearch_jax.actions import Action, ActionKind
+from mechsearch_jax.belief.impasse import impasse
+from mechsearch_jax.config.presets import standard
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.envs.camera.simulated_camera import observe
@@ -20,21 +22,19 @@ from mechsearch_jax.envs.cell.loading import load_searcher
 from mechsearch_jax.envs.episode.compile_clock import CompileClock
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import compose
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.perception.plausibility import image_faults
 from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, update_belief
-from mechsearch_jax.planner.impasse import impasse
-from mechsearch_jax.planner.presets import standard
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
-from mechsearch_jax.search.images import alike
-from mechsearch_jax.search.searcher import DRAWS, Searcher
-from mechsearch_jax.search.step import Motion
-from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.images import alike
+from mechsearch_jax.session.searcher import DRAWS, Searcher
+from mechsearch_jax.session.step import Motion
+from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import camera_faults

@@ -14,7 +14,6 @@ from mechsearch_jax.actions import Action
 from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.world.world import from_scenario, true_superquadrics
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import gripper_rotation
@@ -27,7 +26,8 @@ from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.robot.robot_trajectory import Bounds, Part
 from mechsearch_jax.robot.trajectory_files import csv_header, ros_messages, save_csv, save_ros
-from mechsearch_jax.search.whole_trajectory import TrajectoryConfig, whole_trajectory
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, whole_trajectory
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 from mechsearch_jax.workspace.shelf import Shelf

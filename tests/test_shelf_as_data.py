@@ -13,14 +13,13 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.actions.candidates import candidates
 from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.nothing import no_action
-from mechsearch_jax.compiled import Kept
+from mechsearch_jax.belief.belief import possible_space, with_target
 from mechsearch_jax.envs.camera import recognisers, simulated_camera
 from mechsearch_jax.envs.camera.recognisers import recogniser
 from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle, sight_of
 from mechsearch_jax.envs.episode import slots
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import recogniser as recognising
 from mechsearch_jax.perception import recognition
@@ -28,13 +27,14 @@ from mechsearch_jax.perception.cloud import thinned_view
 from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
-from mechsearch_jax.planner.belief import possible_space, with_target
-from mechsearch_jax.planner.problem import build_problem
 from mechsearch_jax.planner.retrieval import graspable_at
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.state import Decision
+from mechsearch_jax.problem.problem import build_problem
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.runtime.compiled import Kept
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf, on_host

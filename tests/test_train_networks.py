@@ -12,7 +12,6 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks import recognition as model
 from mechsearch_jax.networks import segmentation as layers
 from mechsearch_jax.networks.recognition import BASE_ROTATIONS, HYPOTHESES, IS_ROUND, RecognitionConfig
@@ -27,6 +26,7 @@ from mechsearch_jax.perception import segments as clouds
 from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
 from mechsearch_jax.perception.segments import CLEAR, CONTEXT, HIDDEN_EDGE, INNER, OUTLINE, segment_clouds
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.box import CODE as BOX
 from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
 from mechsearch_jax.train import loop, recognition, scenes, segmentation

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from published import published_scenarios
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import scenario as scenarios
 from mechsearch_jax.workspace.scenario import Body, Scenario
 

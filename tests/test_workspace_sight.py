@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig, target_window
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner import build_problem
-from mechsearch_jax.planner import problem as problems
-from mechsearch_jax.planner.cache import cached_problem
-from mechsearch_jax.planner.settings import load_settings
-from mechsearch_jax.planner.workcell import Workcell
-from mechsearch_jax.search.searcher import Searcher
+from mechsearch_jax.problem import problem as problems
+from mechsearch_jax.problem.cache import cached_problem
+from mechsearch_jax.problem.settings import load_settings
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.searcher import Searcher
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import BODY, OPENGL, blindness, camera_faults, check_camera

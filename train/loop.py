@@ -25,8 +25,8 @@ from flax import serialization
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Key
 
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import replacing
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import replacing
 
 HELD_OUT_SEED = 2**31 - 1
 CHECKPOINT = "checkpoint.msgpack"

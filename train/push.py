@@ -23,12 +23,12 @@ from mechsearch_jax.envs.pushing.push_portions import portions
 from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, joined, push_tables
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.world import superquadrics
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import matmul
 from mechsearch_jax.networks.push import PushConfig, PushMotion, PushNetwork, apply_network
 from mechsearch_jax.networks.push_geometry import CHAIN, NORMALS, REACH, PushStart, push_start, pusher_distance
 from mechsearch_jax.networks.weights import save_weights
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.train.scenes import SceneConfig, origin, random_world
 from mechsearch_jax.workspace.shelf import Shelf

@@ -15,7 +15,7 @@ import jax
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from mechsearch_jax.planner.cache import keep_compilations
+from mechsearch_jax.problem.cache import keep_compilations
 from mechsearch_jax.train.loop import Task, TrainConfig, train
 from mechsearch_jax.train.recognition import RecognitionTask
 from mechsearch_jax.train.segmentation import SegmentationTask

@@ -24,11 +24,11 @@ from mechsearch_jax.envs.known_target.judgement import InFullView
 from mechsearch_jax.envs.known_target.search import Found, KnownSearchConfig, Node, known_search
 from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.planner import PRESETS, Config, search
-from mechsearch_jax.planner.cache import cached_problem
-from mechsearch_jax.versions import versions
+from mechsearch_jax.problem.cache import cached_problem
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, save_json
+from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.viz.drawing import save_figure
 from mechsearch_jax.workspace.scenario import Scenario
 

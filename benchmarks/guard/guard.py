@@ -20,9 +20,9 @@ from mechsearch_jax.benchmarks.parts.images import save_rows
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.store.rows import Row, set_by_retrievals
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike
-from mechsearch_jax.versions import versions
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike
+from mechsearch_jax.runtime.versions import versions
 
 REFERENCE = Path(__file__).parents[1] / "results" / "guard-cpu.json"
 # Of each number of objects in the set `development`, in a suite of that many scenes.

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 from mechsearch_jax.envs.scenes.scene_sets import Block, find_set
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 TableName = Literal["table1", "table3", "table4", "table5"]
 BOTH, PICK_AND_PLACE, PUSH = ("push", "pick-and-place"), ("pick-and-place",), ("push",)

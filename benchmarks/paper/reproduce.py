@@ -18,7 +18,7 @@ from mechsearch_jax.benchmarks.running.evaluate import Job
 from mechsearch_jax.benchmarks.statistics.intervals import RESAMPLES, SEED, share_interval
 from mechsearch_jax.benchmarks.statistics.rates import says, scene_of, step_of
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.files import PathLike, check_writable, replacing
+from mechsearch_jax.runtime.files import PathLike, check_writable, replacing
 
 # What cells differ in, and in the words of tables. Differences are told against the first value of each.
 FACTORS = {

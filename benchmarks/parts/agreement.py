@@ -25,11 +25,11 @@ from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import World, from_scenario, true_superquadrics
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.planner import Problem, build_problem
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, save_json
+from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.shapes import by_shape
-from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Scenario
 
 # What counts as the same final pose [m, degrees].

@@ -31,22 +31,22 @@ from mechsearch_jax.envs.simulators.mjx_model import MjxConfig
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.mjx_step import commands
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario, true_superquadrics
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import existence, object_views
-from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Config, Decision, Problem
 from mechsearch_jax.planner import trials as trying
-from mechsearch_jax.planner.settings import Settings
 from mechsearch_jax.planner.trials import Trials
-from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.problem.settings import Settings
+from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot import motion
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, save_json
+from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.train.push import push_scenes
 from mechsearch_jax.train.scenes import random_world
-from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS

@@ -25,13 +25,13 @@ from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.envs.cell.loading import load_searcher
 from mechsearch_jax.envs.cell.simulated_cell import SensorNoise, SimulatedCell
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, read_json, save_json
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.settings import Settings, load_settings
-from mechsearch_jax.search.searcher import Searcher
-from mechsearch_jax.search.step import SearchStep
-from mechsearch_jax.versions import versions
+from mechsearch_jax.problem.settings import Settings, load_settings
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, read_json, save_json
+from mechsearch_jax.runtime.versions import versions
+from mechsearch_jax.session.searcher import Searcher
+from mechsearch_jax.session.step import SearchStep
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.scenario import Scenario, rotation_matrix
 

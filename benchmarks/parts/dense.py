@@ -25,11 +25,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.collision_kernel import kernel_available, log_gauge, special
 from mechsearch_jax.geometry.masked import block_size
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make
+from mechsearch_jax.runtime.errors import InputError
 
 Method = Literal["auto", "xla", "kernel"]
 

@@ -20,8 +20,8 @@ from jaxtyping import Float, Int
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.runtime.errors import InputError
 
 EXPONENTS = (0.05, 2.0)
 LEAST_POINTS = 11

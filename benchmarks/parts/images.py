@@ -15,10 +15,10 @@ from jaxtyping import Array, Key
 
 from mechsearch_jax.envs.camera.recognisers import true_labels
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.perception.cloud import View
 from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, measured_depth, no_noise
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import cast_world, random_world
 from mechsearch_jax.workspace.camera import Camera

@@ -27,14 +27,14 @@ from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, push_tables, toppled
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.world import superquadrics
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, save_json
 from mechsearch_jax.geometry.transforms import translate
 from mechsearch_jax.networks.weights import load_weights
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, save_json
+from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.push import no_motion, outcome_scores, predictions, push_scenes, random_pushes
 from mechsearch_jax.train.run import commit
-from mechsearch_jax.versions import versions
 
 RowName = Literal["no motion", "quasi-static", "learned", "physics", "nudged"]
 ROWS: tuple[str, ...] = get_args(RowName)

@@ -21,8 +21,6 @@ from jaxtyping import Array, Float, Int, Key
 from mechsearch_jax.benchmarks.parts import ems
 from mechsearch_jax.benchmarks.parts.images import NOISES, Look, Scene, Shown, image_of, named, save_rows
 from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.networks.recognition import RecognitionNetwork
 from mechsearch_jax.networks.weights import Weights, shipped_weights
@@ -30,10 +28,12 @@ from mechsearch_jax.perception.cloud import View, thinned_view
 from mechsearch_jax.perception.recognition import recognise
 from mechsearch_jax.perception.refinement import RefinementConfig, refine, select
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
-from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike
+from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.shapes import by_shape, in_order
 from mechsearch_jax.train.scenes import PIXELS
-from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from mechsearch_jax.benchmarks.parts.images import Shown
 from mechsearch_jax.benchmarks.parts.recognition import Bench, Row
 from mechsearch_jax.envs.world.world import true_superquadrics
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.perception.scores import sharpened
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.workspace.camera import Camera
 

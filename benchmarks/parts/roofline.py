@@ -19,13 +19,13 @@ import numpy as np
 from mechsearch_jax.benchmarks.parts import dense
 from mechsearch_jax.benchmarks.parts.bench import Timing, measure
 from mechsearch_jax.benchmarks.parts.ceilings import CEILINGS, has_kernels
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.masked import block_size
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
-from mechsearch_jax.versions import versions
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, replacing
+from mechsearch_jax.runtime.versions import versions
 
 # Grasps that the planner has of a cylinder, each with a cloud of its own.
 CLOUDS = 63

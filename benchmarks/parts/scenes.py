@@ -23,14 +23,14 @@ from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.envs.camera.simulated_camera import target_pixels
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario, true_superquadrics
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.planner import Problem, initial_belief, update_belief
-from mechsearch_jax.planner.cache import cached_problem
+from mechsearch_jax.problem.cache import cached_problem
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike
+from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.train.scenes import PIXELS, cast_world
-from mechsearch_jax.versions import versions
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import FOUND_PIXELS
 from mechsearch_jax.workspace.scenario import Scenario

@@ -28,13 +28,13 @@ from mechsearch_jax.envs.known_target.judgement import retrievals_of
 from mechsearch_jax.envs.simulators.simulator import ARM, LAG, ROBOT
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.world import BODIES, from_scenario, true_superquadrics
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import save_json
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Problem, build_problem
 from mechsearch_jax.robot.arm_clearance import tip_positions
 from mechsearch_jax.robot.robot_trajectory import Part, RobotTrajectory
-from mechsearch_jax.search.whole_trajectory import Setting, whole_trajectory
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import save_json
+from mechsearch_jax.session.whole_trajectory import Setting, whole_trajectory
 from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
 # Of the actions so many are retrievals; from a scene with at most so many objects, at most so many of them.

@@ -13,8 +13,8 @@ from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.rates import says
 from mechsearch_jax.benchmarks.statistics.variants import label_variants
 from mechsearch_jax.benchmarks.store.rows import Row, episode_key, options_of
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.workspace.scenario import Scenario
 
 # Of each kind.

@@ -23,8 +23,8 @@ from mechsearch_jax.benchmarks.statistics.variants import VARIANT, Key, canonica
 from mechsearch_jax.benchmarks.store.rows import Row, identity, options_of
 from mechsearch_jax.benchmarks.store.shards import result_tables
 from mechsearch_jax.envs.scenes.scene_sets import CHOSEN_ON, is_chosen_on
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, check_writable, replacing
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, check_writable, replacing
 from mechsearch_jax.viz.drawing import save_figure
 
 # What every report consists of, and what one has that was asked for more; the folder `films.FOLDER` holds pictures.

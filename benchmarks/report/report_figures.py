@@ -18,7 +18,7 @@ from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.rates import GOALS, Rates, says, scene_of, step_of, summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, canonical, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.drawing import INK, MUTED
 
 # Told apart without colour vision too (Okabe and Ito).

@@ -21,9 +21,9 @@ from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.processes import ProcessTrials
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner.trials import Trials
-from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.target import Target
 
 # More worlds at once are no faster per world, but every round takes longer.

@@ -23,8 +23,8 @@ from typing import Any, NamedTuple
 from mechsearch_jax.benchmarks.running.cluster_workers import Host, Kind, Place
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.store.rows import Row, episode_key
-from mechsearch_jax.cores import cores
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.cores import cores
+from mechsearch_jax.runtime.errors import InputError
 
 # Starts a Ray of its own on this machine.
 LOCAL = "local"

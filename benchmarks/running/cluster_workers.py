@@ -19,9 +19,9 @@ from mechsearch_jax.benchmarks.running.evaluate import Job, Runner, present_code
 from mechsearch_jax.benchmarks.running.processes import ENVIRONMENT, TIME_LIMIT
 from mechsearch_jax.benchmarks.running.worker import Worker
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.cores import VARIABLE
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner.cache import keep_compilations
+from mechsearch_jax.problem.cache import keep_compilations
+from mechsearch_jax.runtime.cores import VARIABLE
+from mechsearch_jax.runtime.errors import InputError
 
 # A worker's episodes take seconds: longer chunks would only end at different times.
 MOST_IN_TURN = 4

@@ -14,9 +14,9 @@ from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.store.shards import Results
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.files import PathLike
 from mechsearch_jax.planner import PlannerConfig
-from mechsearch_jax.versions import versions
+from mechsearch_jax.runtime.files import PathLike
+from mechsearch_jax.runtime.versions import versions
 
 # Of an episode and of a compilation where nothing was measured [s]: on one CPU core, and in batches on one H200
 # (docs/results.md, "Speed").

@@ -21,9 +21,9 @@ from mechsearch_jax.benchmarks.store.claims import Claims
 from mechsearch_jax.benchmarks.store.rows import Row, episode_key
 from mechsearch_jax.benchmarks.store.shards import CLOSED_ENDING, Results, ShardWriter
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike
-from mechsearch_jax.versions import source_digest
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike
+from mechsearch_jax.runtime.versions import source_digest
 from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
 # How often a process that has nothing to do looks at what the others do [s].

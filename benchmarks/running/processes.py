@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.store.rows import Row, identity
-from mechsearch_jax.cores import share_of_cores
+from mechsearch_jax.runtime.cores import share_of_cores
 
 WORKER = (sys.executable, "-m", "mechsearch_jax.benchmarks.running.worker")
 # An episode takes seconds, the first of a worker minutes for compilations [s].

@@ -21,8 +21,8 @@ from mechsearch_jax.envs.camera.recognisers import recogniser
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.planner.cache import keep_compilations
-from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.problem.cache import keep_compilations
+from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
 

@@ -12,7 +12,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from mechsearch_jax.benchmarks.statistics.rates import GOALS, says, step_of
 from mechsearch_jax.benchmarks.statistics.variants import canonical, column, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 # What makes a pair where nothing else is asked for.
 PAIRED = ("scenario", "seed")

@@ -11,7 +11,7 @@ from typing import Any
 
 from mechsearch_jax.benchmarks.store.rows import OPTIONS, Row, options_of
 from mechsearch_jax.envs.episode.earlier import GONE
-from mechsearch_jax.errors import InputError, nearest
+from mechsearch_jax.runtime.errors import InputError, nearest
 
 # A label that is longer does not fit into a table or a picture; variants are numbered then.
 LONGEST = 16

@@ -22,8 +22,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from mechsearch_jax.benchmarks.store.shards import OPEN, close_shards_of
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, check_writable
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, check_writable
 
 CLAIMS = "claims"
 OWNER_ENDING = ".owner"

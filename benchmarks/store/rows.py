@@ -17,9 +17,9 @@ import pyarrow.parquet
 
 from mechsearch_jax.envs.episode.earlier import RENAMED, present_options
 from mechsearch_jax.envs.episode.records import Episode, Step
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.planner import OPTIONS as PLANNER_OPTIONS
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.workspace.scenario import Scenario
 
 # The stages of a step that the robot spends thinking; simulation is another.

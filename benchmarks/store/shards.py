@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import IO
 
 from mechsearch_jax.benchmarks.store.rows import Row, episode_key, parse_row, read_rows, write_rows
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, check_writable
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, check_writable
 
 # Readers of Parquet pass over names that begin so.
 OPEN = "_open"

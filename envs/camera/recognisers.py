@@ -17,11 +17,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.world.world import TARGET, World
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.assignment import assign
@@ -31,6 +29,8 @@ from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, depth_o
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf

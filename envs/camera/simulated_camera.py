@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.world.model import shelf_corners
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World
 from mechsearch_jax.geometry.transforms import rotate
+from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.shapes import by_shape, in_order, shape_of
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project, rays
 from mechsearch_jax.workspace.detector import found_pixels

@@ -15,13 +15,13 @@ from collections.abc import Callable
 from typing import Any
 
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.files import PathLike
 from mechsearch_jax.perception.recogniser import Recogniser
-from mechsearch_jax.planner.cache import keep_compilations
-from mechsearch_jax.planner.problem import Problem
-from mechsearch_jax.planner.settings import Settings, load_settings
-from mechsearch_jax.search.searcher import Searcher
-from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
+from mechsearch_jax.problem.cache import keep_compilations
+from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.problem.settings import Settings, load_settings
+from mechsearch_jax.runtime.files import PathLike
+from mechsearch_jax.session.searcher import Searcher
+from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.camera import Camera
 
 

@@ -28,9 +28,9 @@ from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import ARM, LAG, ROBOT
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.world import BODIES, TARGET, slots
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Scenario
 
 # Colours of the objects' slots, the shelf, the robot and what is behind: none of a strong hue but the target's own.

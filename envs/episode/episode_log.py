@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.actions import Action, ActionKind, kind_of
-from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.episode.records import Episode, Step, record_action
 from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world.world import TARGET, fallen_over
 from mechsearch_jax.planner import Decision
-from mechsearch_jax.versions import versions
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 

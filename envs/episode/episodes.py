@@ -26,7 +26,6 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int, UInt
 
-from mechsearch_jax.compiled import kept
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.episode.compile_clock import CompileClock
 from mechsearch_jax.envs.episode.episode_log import (
@@ -47,11 +46,12 @@ from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.simulators.simulator import Flowing, Prepares, Simulator
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem
 from mechsearch_jax.planner.trials import Trials
-from mechsearch_jax.preparing import Program, prepared, program
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.preparing import Program, prepared, program
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.target import Target
 
@@ -185,9 +185,9 @@ def run_episodes(
 ) -> None:
     """Run episodes to their ends, many at a time.
 
-    With several slots everything is compiled before the first of them begins; see `preparing.prepare`. In a simulator
-    that can, `Flowing`, slots do not wait for each other: those that have acted look and decide again, while what the
-    others do goes on afterwards.
+    With several slots everything is compiled before the first of them begins; see `session.preparing.prepare`. In a
+    simulator that can, `Flowing`, slots do not wait for each other: those that have acted look and decide again, while
+    what the others do goes on afterwards.
 
     Args:
       starts: the episodes.

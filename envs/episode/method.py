@@ -14,10 +14,10 @@ from mechsearch_jax.envs.episode.policy_numbers import mould
 from mechsearch_jax.envs.episode.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.trials.named import rehearsal
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
 from mechsearch_jax.planner.trials import Trials
-from mechsearch_jax.planner.workcell import Workcell
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError
 
 EngineName = Literal["NativeSimulator", "MjxSimulator"]
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.envs.episode.earlier import present_options
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, replacing
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,19 +19,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action, no_action
-from mechsearch_jax.compiled import kept
+from mechsearch_jax.belief.belief import without_grasps
+from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, sight_of, true_target_pose
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.episode.policy_numbers import as_pytree, mould, numbers, with_numbers
 from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge, judge_many, judged_sets, swept_free
 from mechsearch_jax.envs.world.world import World
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
-from mechsearch_jax.planner.belief import without_grasps
-from mechsearch_jax.planner.moved_target import nearest_candidate
 from mechsearch_jax.planner.trials import AsksTwice, TrialResult, Trials, TrialScenes, choose, decide, scenes_of
-from mechsearch_jax.preparing import Program, program
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.preparing import Program, program
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.compiled import kept
+from mechsearch_jax.belief.found_target import no_grasps
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.geometry.masked import masked_vmap
@@ -18,10 +18,10 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, transform, upright_pose
 from mechsearch_jax.graspability import grasp_hits
 from mechsearch_jax.planner import Problem, paper
-from mechsearch_jax.planner.found_target import no_grasps
-from mechsearch_jax.planner.problem import TargetGrasps, target_grasps
 from mechsearch_jax.planner.retrieval import best_grasp, graspable_at
+from mechsearch_jax.problem.problem import TargetGrasps, target_grasps
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 from mechsearch_jax.workspace.target import Target

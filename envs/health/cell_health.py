@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from mechsearch_jax.envs.health.finding import Finding, State
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.trained_view import view_faults
-from mechsearch_jax.planner.settings import Settings
-from mechsearch_jax.search.searcher import LEAST_REACH
+from mechsearch_jax.problem.settings import Settings
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.searcher import LEAST_REACH
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.sight import blindness, camera_faults, share_seen
 

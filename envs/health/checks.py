@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mechsearch_jax.envs.health.finding import Finding, State
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
-    from mechsearch_jax.planner.settings import Settings
+    from mechsearch_jax.problem.settings import Settings
     from mechsearch_jax.workspace.scenario import Scenario
 
 PACKAGES = ("mechsearch-jax", "jax", "jaxlib", "flax", "numpy", "mujoco", "mujoco-mjx")
@@ -91,7 +91,7 @@ def _version(name: str) -> str:
 def _devices() -> Iterator[Finding]:
     import jax
 
-    from mechsearch_jax.cores import cores
+    from mechsearch_jax.runtime.cores import cores
 
     devices = jax.devices()
     told = ", ".join(f"{device.platform}: {device.device_kind}" for device in devices)
@@ -171,8 +171,8 @@ def _weights() -> Iterator[Finding]:
 
 
 def _cache() -> Iterator[Finding]:
-    from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import VARIABLE, cache_folder
+    from mechsearch_jax.problem.cache import VARIABLE, cache_folder
+    from mechsearch_jax.runtime.files import check_writable
 
     kept = {"problems, compilations": cache_folder()}
     if given := os.environ.get("JAX_COMPILATION_CACHE_DIR"):

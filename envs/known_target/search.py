@@ -26,8 +26,8 @@ from mechsearch_jax.envs.known_target.judgement import Judgement, judge, retriev
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import TARGET, World
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner import Problem, Search
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Scenario
 
 # Worlds in which no body is farther than this from where it is in another are taken for the same [m].

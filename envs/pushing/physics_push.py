@@ -31,7 +31,6 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.cores import cores
 from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.envs.pushing.pushes import push_simulation, toppled
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxConfig, MjxSimulator
@@ -39,12 +38,13 @@ from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.outcome import Overflow
 from mechsearch_jax.envs.world.world import BODIES, World, bodies_of
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
 from mechsearch_jax.geometry.superquadric import Superquadrics, pad
 from mechsearch_jax.geometry.transforms import matmul, rotate
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference, push_reference
+from mechsearch_jax.runtime.cores import cores
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import by_shape, in_order
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf, on_host
@@ -168,7 +168,7 @@ class NativePhysics:
 
     Attributes:
       simulation: how it is simulated.
-      threads: how many; one for each of `cores.cores` if left out.
+      threads: how many; one for each of `runtime.cores.cores` if left out.
     """
 
     simulation: SimulatorConfig = dataclasses.field(default_factory=push_simulation)

@@ -17,8 +17,8 @@ from jaxtyping import Array
 from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig, generate_pushes
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.world import World
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import replacing
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import replacing
 
 
 def save_pushes(path: Path, pushes: Pushes, identity: str) -> None:

@@ -23,7 +23,6 @@ from mechsearch_jax.actions.push_starts import away_from_robot, contact_height
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT
 from mechsearch_jax.envs.simulators.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world.world import TARGET, World, superquadrics
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.footprints import bounding_half_extents, footprints
 from mechsearch_jax.geometry.transforms import back_off, inverse, make, transform, translate
@@ -32,6 +31,7 @@ from mechsearch_jax.networks.push_geometry import pusher_distance
 from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
 from mechsearch_jax.robot.kinematics import path_kinematics
 from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 

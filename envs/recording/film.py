@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from mechsearch_jax.cores import cores
 from mechsearch_jax.envs.camera.simulated_camera import AMBIENT, BACKGROUND_COLOUR, LIGHT, PALETTE, SHELF
 from mechsearch_jax.envs.recording.pictures import recorded_frame
 from mechsearch_jax.envs.recording.playback import Playback, playback
@@ -17,6 +16,7 @@ from mechsearch_jax.envs.recording.recording import Recording
 from mechsearch_jax.envs.world.model import shelf_boxes
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.robot.arm_clearance import link_poses
+from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.shapes import in_order, shape_of
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.viz.film import Layout, Moving, Page

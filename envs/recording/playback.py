@@ -14,10 +14,10 @@ from jaxtyping import Float, Int
 
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording
 from mechsearch_jax.envs.world.world import BODIES, superquadrics
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.arm_clearance import ArmBody, Obstacles
 from mechsearch_jax.robot.free_motion import free_motion
 from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import rotation_matrix
 from mechsearch_jax.workspace.shelf import Shelf
 

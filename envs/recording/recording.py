@@ -16,17 +16,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.actions import Action, no_action
-from mechsearch_jax.arrays import read_arrays
 from mechsearch_jax.envs.episode.episodes import Moment
 from mechsearch_jax.envs.recording.sampled import Sampled, nothing_sampled, packed, sampled, unpacked
 from mechsearch_jax.envs.simulators.native import Trace
 from mechsearch_jax.envs.simulators.simulator import ARM
 from mechsearch_jax.envs.world.world import BODIES, World
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, read_bytes, replacing
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner import Problem
+from mechsearch_jax.runtime.arrays import read_arrays
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, read_bytes, replacing
 from mechsearch_jax.shapes import in_order
 from mechsearch_jax.viz.filmstrip import Frame
 from mechsearch_jax.workspace.camera import Camera

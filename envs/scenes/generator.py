@@ -17,11 +17,11 @@ from scipy.spatial import ConvexHull
 from mechsearch_jax.envs.camera.simulated_camera import target_pixels
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.world import from_scenario
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import GraspConfig, GraspTables, feasible_grasps, grasp_tables
-from mechsearch_jax.planner.settings import Settings
+from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.object_sizes import ObjectSizes

@@ -17,8 +17,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.workspace.scenario import HASH_DIGITS, Scenario, load_scenario, save_scenario
 
 RECORD = Path(__file__).with_name("scene_sets.json")
@@ -235,7 +235,7 @@ def holds(file: PathLike, block: Block, index: int) -> bool:
 
 def _kept_scenes() -> Path:
     # Brings the planner along, which who only asks for names can do without.
-    from mechsearch_jax.planner.cache import cache_folder
+    from mechsearch_jax.problem.cache import cache_folder
 
     folder = cache_folder()
     return folder / "scenes" if folder is not None else Path(_temporary_folder().name)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.envs.scenes.generator import GeneratorConfig, ScenarioGenerator
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf

@@ -25,8 +25,8 @@ from mechsearch_jax.envs.simulators.warp_kernels import compile_kernels
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.outcome import Overflow
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 

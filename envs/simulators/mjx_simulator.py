@@ -36,7 +36,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.compiled import Kept
 from mechsearch_jax.envs.simulators.batch_model import BodyFields
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel, where
 from mechsearch_jax.envs.simulators.mjx_step import (
@@ -53,8 +52,9 @@ from mechsearch_jax.envs.simulators.mjx_step import (
 from mechsearch_jax.envs.simulators.simulator import ROBOT, check_actions
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import World, from_scenario
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.preparing import Program
+from mechsearch_jax.runtime.compiled import Kept
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.preparing import Program
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -206,7 +206,7 @@ class MjxSimulator:
         return outcome
 
     def programs(self, world: World) -> list[Program]:
-        """All that is compiled to reset, and to act in, worlds of these shapes; see `preparing.Prepares`."""
+        """All that is compiled to reset, and to act in, worlds of these shapes; see `session.preparing.Prepares`."""
         count = len(world.kind)
         mask = jax.ShapeDtypeStruct((count,), bool)
         actions = jax.tree.map(lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), no_action())

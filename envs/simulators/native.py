@@ -28,15 +28,15 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, Kind, kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
-from mechsearch_jax.cores import cores
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig, check_actions, controls
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, bodies_of, fallen_over, from_scenario, slots
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.preparing import Program, motions
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import Reference
+from mechsearch_jax.runtime.cores import cores
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.preparing import Program, motions
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, rotation_matrix
 from mechsearch_jax.workspace.shelf import Shelf
@@ -481,7 +481,7 @@ class NativeSimulator:
         return self._each(active, lambda i: self._worlds[i].execute(_row(actions, i)))
 
     def programs(self, world: World) -> list[Program]:
-        """The motions of all kinds of action; see `preparing.Prepares`."""
+        """The motions of all kinds of action; see `session.preparing.Prepares`."""
         return motions(self.config.motion)
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:

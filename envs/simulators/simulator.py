@@ -16,10 +16,10 @@ from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import World
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.preparing import Program
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.preparing import Program
 from mechsearch_jax.workspace.scenario import Scenario
 
 ARM = len(HOME)

@@ -26,7 +26,7 @@ from typing import Any
 
 import mujoco
 
-from mechsearch_jax.cores import cores
+from mechsearch_jax.runtime.cores import cores
 
 
 def compile_kernels(

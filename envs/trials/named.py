@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.planner.trials import Trials
+from mechsearch_jax.runtime.errors import InputError
 
 
 @functools.cache

@@ -24,21 +24,21 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
-from mechsearch_jax.compiled import kept
-from mechsearch_jax.cores import cores
 from mechsearch_jax.envs.pushing.physics_push import bodies, sound
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.trials.scene import TrialScene
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.planner.trials import TrialResult, TrialScenes
-from mechsearch_jax.preparing import Program, motions, program
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.cores import cores
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.preparing import Program, motions, program
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -61,7 +61,7 @@ class NativeTrials:
 
     Attributes:
       simulation: how it is simulated.
-      threads: how many; one for each of `cores.cores` if left out.
+      threads: how many; one for each of `runtime.cores.cores` if left out.
       friction: sliding friction of everything, as a multiple of what it is taken to be; too little of it holds the arm
         up where a trial was not.
 

@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action
-from mechsearch_jax.compiled import keep_in, kept_in
-from mechsearch_jax.cores import cores, share_of_cores
 from mechsearch_jax.envs.trials.native import Cell, NativeTrials
 from mechsearch_jax.planner import Problem
 from mechsearch_jax.planner.trials import TrialResult, TrialScenes
-from mechsearch_jax.preparing import Program
+from mechsearch_jax.runtime.compiled import keep_in, kept_in
+from mechsearch_jax.runtime.cores import cores, share_of_cores
+from mechsearch_jax.session.preparing import Program
 
 # Settings of JAX that say what it keeps on disk.
 CACHE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
@@ -47,7 +47,7 @@ class ProcessTrials:
     def __init__(self, trials: NativeTrials | None = None, processes: int | None = None) -> None:
         """Args:
         trials: the default if left out; its threads do not count.
-        processes: one for each of `cores.cores` if left out.
+        processes: one for each of `runtime.cores.cores` if left out.
         """
         self.trials = dataclasses.replace(trials or NativeTrials(), threads=1)
         self.processes = processes or cores()

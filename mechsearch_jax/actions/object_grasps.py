@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.footprints import QUARTER_TURN, Footprints
 from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import gripper_rotation
-from mechsearch_jax.options import option
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.options import option
 from mechsearch_jax.workspace.shelf import Shelf
 
 # How close to an object's front the palm may pass, and how far above the board the finger tips' centres stay [m].

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from mechsearch_jax.actions import nothing, pick_and_place, push, retrieve
 from mechsearch_jax.actions.kind import Kind, SampledKind
-from mechsearch_jax.errors import InputError, shown
+from mechsearch_jax.runtime.errors import InputError, shown
 
 
 class ActionKind(enum.IntEnum):

@@ -10,10 +10,10 @@ from jaxtyping import Array, Bool
 from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.compiled import kept
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.errors import InputError
 
 
 class JointTrajectory(flax.struct.PyTreeNode):

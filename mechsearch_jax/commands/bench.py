@@ -21,7 +21,7 @@ from mechsearch_jax.commands.options import (
     chosen_policies,
     forget_kept_compilations,
 )
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
     from mechsearch_jax.benchmarks.parts.bench import Timing

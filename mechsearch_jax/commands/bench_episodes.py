@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from mechsearch_jax.commands.options import JsonFile, SomeScenarios, at_least_one, check_files, files_of, find_scenarios
-from mechsearch_jax.cores import cores
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.cores import cores
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
     from mechsearch_jax.envs.known_target.search import Node
@@ -82,8 +82,8 @@ def bench_ceiling(
     from mechsearch_jax.benchmarks.ceiling import solvability
     from mechsearch_jax.benchmarks.report.episode_tables import ceiling_table
     from mechsearch_jax.envs.known_target.search import KnownSearchConfig
-    from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import check_writable
 
     at_least_one("bench ceiling", sequences=sequences, simulated=simulated, worlds=worlds, rounds=rounds)
     at_least_one("bench ceiling", grasps=grasps, max_steps=max_steps)
@@ -183,7 +183,7 @@ def bench_cell(
 
     from mechsearch_jax.benchmarks.parts import cell_searches as cell
     from mechsearch_jax.envs.cell.simulated_cell import SensorNoise
-    from mechsearch_jax.files import check_writable
+    from mechsearch_jax.runtime.files import check_writable
 
     at_least_one("bench cell", searches=searches, **{f"objects {n}": n for n in objects})
     noise = SensorNoise(depth=depth_noise, colour=color_noise)

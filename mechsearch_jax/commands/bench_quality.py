@@ -21,10 +21,10 @@ from mechsearch_jax.commands.options import (
     forget_kept_compilations,
     settings_of,
 )
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
-    from mechsearch_jax.planner.workcell import Workcell
+    from mechsearch_jax.problem.workcell import Workcell
     from mechsearch_jax.workspace.scenario import Scenario
 
 
@@ -64,7 +64,7 @@ def bench_agreement(
     from mechsearch_jax.benchmarks.parts.agreement import agreement, draw_actions, generated_scenes, save_agreement
     from mechsearch_jax.benchmarks.report.tables import agreement_table
     from mechsearch_jax.envs.simulators.mjx_model import import_mjx
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
 
     at_least_one("bench agreement", actions=actions, scenes=scenes)
     given = _loaded(scenarios)
@@ -165,7 +165,7 @@ def _places(command: str, files: Sequence[Path], scenarios: Sequence[str]) -> di
       InputError: a file cannot be used, two have the same name, or scenario files, which stand on the default shelf,
         are given too.
     """
-    from mechsearch_jax.planner.workcell import Workcell
+    from mechsearch_jax.problem.workcell import Workcell
 
     if files and scenarios:
         raise InputError(f"{command}: --config is for generated scenes; leave the scenario files out")
@@ -253,8 +253,8 @@ def bench_push(
 
     from mechsearch_jax.benchmarks.parts import push
     from mechsearch_jax.benchmarks.report.tables import push_scores_tables
-    from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import check_writable
     from mechsearch_jax.train.run import counting
 
     worlds = (64 if jax.default_backend() == "cpu" else 512) if worlds is None else worlds
@@ -288,7 +288,7 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
 
     from mechsearch_jax.benchmarks.parts import scenes
     from mechsearch_jax.benchmarks.report.tables import scenes_table
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
 
     names = [Path(name).resolve().name for name in scenarios]
     twice = next((name for name in names if names.count(name) > 1), None)

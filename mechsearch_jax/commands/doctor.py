@@ -25,7 +25,7 @@ def doctor(
 
     from mechsearch_jax.envs.health.checks import checks, examine
     from mechsearch_jax.envs.health.finding import State
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import load_scenario
 
     settings = settings_of(config)
@@ -48,6 +48,6 @@ def doctor(
 
 def print_config() -> None:
     """Print a configuration file with every key and its default, to be changed and given to others with --config."""
-    from mechsearch_jax.planner.settings import example_config
+    from mechsearch_jax.problem.settings import example_config
 
     print(example_config(), end="")

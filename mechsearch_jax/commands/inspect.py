@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mechsearch_jax.commands.options import DEFAULTS, EpisodeOptions, Scenarios, find_scenarios
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 
 def inspect(
@@ -29,8 +29,8 @@ def inspect(
     from mechsearch_jax.envs.camera.recognisers import recogniser
     from mechsearch_jax.envs.episode.episodes import target_of
     from mechsearch_jax.envs.recording.pictures import inspect_scenario
-    from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import check_writable
     from mechsearch_jax.viz.drawing import save_figure
     from mechsearch_jax.viz.maps import save_maps
     from mechsearch_jax.workspace.scenario import Scenario, load_scenario

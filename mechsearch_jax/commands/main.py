@@ -32,7 +32,7 @@ from mechsearch_jax.commands.search import search
 from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
 from mechsearch_jax.commands.video import video
 from mechsearch_jax.commands.view import view
-from mechsearch_jax.errors import InputError, nearest
+from mechsearch_jax.runtime.errors import InputError, nearest
 
 Commands = Mapping[str, Callable[..., None]]
 

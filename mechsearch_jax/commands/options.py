@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import check_writable, is_file, is_folder
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import check_writable, is_file, is_folder
 from mechsearch_jax.shapes import SHAPES
 
 if TYPE_CHECKING:
     from mechsearch_jax.envs.episode.method import EngineName, Method
     from mechsearch_jax.envs.scenes.scene_sets import Block
     from mechsearch_jax.planner import Option
-    from mechsearch_jax.planner.settings import Settings
+    from mechsearch_jax.problem.settings import Settings
 
 PaperMethod = Literal["search-for-grasp", "search-and-grasp"]
 PushModel = Literal["quasi-static", "learned", "physics"]
@@ -183,7 +183,7 @@ def settings_of(file: Path | None) -> Settings:
     Raises:
       InputError: the file cannot be used.
     """
-    from mechsearch_jax.planner.settings import Settings, load_settings
+    from mechsearch_jax.problem.settings import Settings, load_settings
 
     return Settings() if file is None else load_settings(file)
 
@@ -329,7 +329,7 @@ def _files_in(folder: Path) -> list[Path]:
 def files_of(scenes: Sequence[tuple[Block, int]]) -> list[Path]:
     """Files of scenes of sets; making them shows its progress on standard error."""
     from mechsearch_jax.envs.scenes.scene_sets import scene_files
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
 
     def progress(missing: Sequence[Any]) -> Iterable[Any]:
         from rich.console import Console

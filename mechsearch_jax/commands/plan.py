@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
-    from mechsearch_jax.search.searcher import Check
-    from mechsearch_jax.search.step import SearchStep
+    from mechsearch_jax.session.searcher import Check
+    from mechsearch_jax.session.step import SearchStep
     from mechsearch_jax.workspace.camera import Camera
 
 # What stands for no object in a mask of 8 bits, if not said otherwise.
@@ -57,9 +57,9 @@ def plan(
 
     from mechsearch_jax.commands.options import settings_of
     from mechsearch_jax.envs.cell.loading import searcher_of
-    from mechsearch_jax.files import check_writable, is_file
     from mechsearch_jax.perception.image_files import load_camera
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import check_writable, is_file
 
     if example == (depth is not None):
         raise InputError("plan: give either --depth IMAGE or --example, not both")
@@ -149,8 +149,8 @@ def _write(step: SearchStep, check: Check, out: Path) -> list[Path]:
 
     Without a trajectory those of an earlier one are removed: nobody is to follow it.
     """
-    from mechsearch_jax.files import save_json
     from mechsearch_jax.robot.trajectory_files import save_csv, save_ros
+    from mechsearch_jax.runtime.files import save_json
     from mechsearch_jax.viz.drawing import save_figure
 
     files = {"trajectory.csv": save_csv, "trajectory.json": save_ros}

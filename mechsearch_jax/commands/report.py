@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mechsearch_jax.commands.options import find_scenario, find_scenarios
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
     from mechsearch_jax.benchmarks.report.films import Draw
@@ -89,7 +89,7 @@ def report(
 def _drawer(scenes: Sequence[str], status) -> Draw:
     """What draws an episode's filmstrip, its scenario found among these, the shipped ones or those of scene sets."""
     from mechsearch_jax.benchmarks.report.films import replay
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
     keep_compilations()

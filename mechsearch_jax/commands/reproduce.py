@@ -13,7 +13,7 @@ import tyro
 
 from mechsearch_jax.commands.options import EpisodeOptions, PaperMethod, at_least_one, files_of, with_planner_options
 from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, run_jobs
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol
 import tyro
 
 from mechsearch_jax.commands.options import EpisodeOptions, at_least_one, find_scenarios, has_gpu
-from mechsearch_jax.cores import cores
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.cores import cores
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -155,7 +155,7 @@ class Here:
         """See `Site`."""
         from mechsearch_jax.benchmarks.running.batches import Batches
         from mechsearch_jax.benchmarks.running.processes import TIME_LIMIT, Processes
-        from mechsearch_jax.planner.cache import keep_compilations
+        from mechsearch_jax.problem.cache import keep_compilations
 
         if in_processes:
             return Processes(run.workers or cores(), run.time_limit or TIME_LIMIT)

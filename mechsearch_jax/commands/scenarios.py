@@ -18,10 +18,10 @@ from mechsearch_jax.commands.options import (
     settings_of,
     tell_strange,
 )
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
-    from mechsearch_jax.planner.settings import Settings
+    from mechsearch_jax.problem.settings import Settings
 
 
 def list_sets() -> None:
@@ -54,8 +54,8 @@ def generate(
       seed: of the first scenario, 0 if not given; the next ones follow.
       config: a file of settings, of which camera, shelf, gripper, target and objects count.
     """
-    from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import check_writable
 
     if (objects is None) == (scene_set is None):
         raise InputError("scenarios generate: give either --objects N or --set NAME, not both")
@@ -92,8 +92,8 @@ def _generate_set(name: str, out: Path) -> int:
     from rich.progress import track
 
     from mechsearch_jax.envs.scenes.scene_sets import find_set, holds, scene_files, set_scenes
-    from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import check_writable
 
     scenes = set_scenes(find_set(name))
     for block, index in scenes:

@@ -17,7 +17,7 @@ from mechsearch_jax.commands.options import (
     find_scenario,
 )
 from mechsearch_jax.commands.video import make_film
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,7 +57,7 @@ def _run(
     """Run the episode; what was told of it, and what was recorded."""
     from mechsearch_jax.envs.episode.episodes import run_episode
     from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
-    from mechsearch_jax.preparing import first_decision, prepared
+    from mechsearch_jax.session.preparing import first_decision, prepared
 
     policy, workcell = chosen.policy(), chosen.workcell
     first = first_decision(problem, policy, SimulatorConfig().motion)
@@ -121,8 +121,8 @@ def search(
 
     from mechsearch_jax.envs.episode.episodes import target_of
     from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
-    from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import check_writable
     from mechsearch_jax.viz.movie import check_movie_path
     from mechsearch_jax.workspace.scenario import load_scenario
 

@@ -19,7 +19,7 @@ from mechsearch_jax.commands.options import (
     with_planner_options,
 )
 from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, run_episodes_of
-from mechsearch_jax.errors import InputError, nearest
+from mechsearch_jax.runtime.errors import InputError, nearest
 
 if TYPE_CHECKING:
     from mechsearch_jax.planner import Option
@@ -144,7 +144,7 @@ def read_sweep(path: Path) -> dict[str, Any]:
         and key.
     """
     from mechsearch_jax.planner import PRESETS
-    from mechsearch_jax.tables import checked, read_document
+    from mechsearch_jax.runtime.tables import checked, read_document
 
     document = read_document(path)
     for table in document.tables:

@@ -24,7 +24,7 @@ def _training_of(name: Literal["segmentation", "recognition"], batch: int, rate:
         chunk: int = 20,
         held_out: int = 512,
     ) -> None:
-        from mechsearch_jax.files import check_writable
+        from mechsearch_jax.runtime.files import check_writable
         from mechsearch_jax.train.loop import TrainConfig
         from mechsearch_jax.train.run import TASKS, run
 
@@ -100,8 +100,8 @@ def train_push(
     import jax
 
     from mechsearch_jax.envs.pushing.pushes import Generation
-    from mechsearch_jax.files import check_writable
     from mechsearch_jax.networks.push import PushConfig
+    from mechsearch_jax.runtime.files import check_writable
     from mechsearch_jax.train.loop import TrainConfig
     from mechsearch_jax.train.push import push_task
     from mechsearch_jax.train.run import counting, run

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -39,8 +39,8 @@ def video(
     """
     from rich.console import Console
 
-    from mechsearch_jax.files import check_writable
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import check_writable
     from mechsearch_jax.viz.movie import check_movie_path
 
     check_option("video", "width", width, 320, WIDEST)
@@ -79,7 +79,7 @@ def recording_of(episode: Path) -> Recording:
       InputError: there is none, or it cannot be read.
     """
     from mechsearch_jax.envs.recording.recording import NAME, load_recording
-    from mechsearch_jax.files import is_file
+    from mechsearch_jax.runtime.files import is_file
 
     if not is_file(episode / NAME):
         raise InputError(f"{episode / NAME}: there is none; search once more with --record")

@@ -39,7 +39,7 @@ def view(
     viser = import_viser()
     recording = recording_of(episode)
     from mechsearch_jax.envs.recording.viewer import Viewer
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
 
     keep_compilations()
     console = Console(highlight=False)

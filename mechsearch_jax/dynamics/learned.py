@@ -15,11 +15,11 @@ from jaxtyping import Array
 from mechsearch_jax.dynamics.contacts import unresolved
 from mechsearch_jax.dynamics.push_model import PushOutcome
 from mechsearch_jax.dynamics.rigid import rigid_motion
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.networks.push import PushNetwork, apply_network
 from mechsearch_jax.networks.push_geometry import push_start
 from mechsearch_jax.networks.weights import Weights, load_weights, read_archive, read_card
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
 NAME = "push"

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 PushModelName = Literal["quasi-static", "learned", "physics"]
 

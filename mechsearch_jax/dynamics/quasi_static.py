@@ -19,10 +19,10 @@ from mechsearch_jax.dynamics.contacts import (
 )
 from mechsearch_jax.dynamics.push_model import LEVERAGE, LOW_CONTACT, TOUCH, PushOutcome
 from mechsearch_jax.dynamics.rigid import rigid_motion
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.footprints import dot, extents, footprints, turned
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
 

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import align, inverse, make, transform
+from mechsearch_jax.runtime.errors import InputError
 
 # Exponent of the sharpest edges that the paper plans with.
 EDGE_EXPONENT = 0.2

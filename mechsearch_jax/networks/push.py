@@ -24,7 +24,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.layers import FeedForward
 from mechsearch_jax.networks.push_geometry import (
     Parity,
@@ -33,6 +32,7 @@ from mechsearch_jax.networks.push_geometry import (
     perpendicular,
     push_geometry,
 )
+from mechsearch_jax.runtime.errors import InputError
 
 # Units of the network's outputs: lengths [m], angles [rad].
 _SHIFT, _TURN = 0.05, 0.3

@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import matmul
 from mechsearch_jax.networks.layers import Attention, FeedForward, fourier_features
 from mechsearch_jax.perception.segments import MARKS
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import by_shape, shape_of
 
 BOX_YAWS, LYING_YAWS = 6, 6

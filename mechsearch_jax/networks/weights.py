@@ -21,9 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from mechsearch_jax.arrays import ARRAYS_LIMIT, read_arrays
-from mechsearch_jax.errors import InputError, shown
-from mechsearch_jax.files import PathLike, read_bytes, read_json, replacing
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.networks.push import PushConfig, PushNetwork
 from mechsearch_jax.networks.push_geometry import push_start
@@ -31,6 +28,9 @@ from mechsearch_jax.networks.recognition import RecognitionConfig, RecognitionNe
 from mechsearch_jax.networks.segmentation import SegmentationConfig, SegmentationNetwork
 from mechsearch_jax.perception.segments import SegmentConfig
 from mechsearch_jax.perception.trained_view import TrainedView, read_view
+from mechsearch_jax.runtime.arrays import ARRAYS_LIMIT, read_arrays
+from mechsearch_jax.runtime.errors import InputError, shown
+from mechsearch_jax.runtime.files import PathLike, read_bytes, read_json, replacing
 from mechsearch_jax.workspace.shelf import Shelf
 
 FORMAT = "mechsearch-weights"

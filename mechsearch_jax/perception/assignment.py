@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 # The work grows as n^2 2^n.
 _MOST = 10

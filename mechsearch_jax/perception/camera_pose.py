@@ -22,10 +22,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import compose, exponential, inverse, make, matmul, rotate, transform
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import FINGER, FINGER_BASE, HAND, LINKS, Primitive
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 
 HAND_FRAME = 7

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, project
 from mechsearch_jax.workspace.shelf import Shelf
 

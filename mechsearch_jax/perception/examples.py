@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from mechsearch_jax.arrays import ARRAYS_LIMIT, read_arrays
-from mechsearch_jax.errors import InputError, shown
-from mechsearch_jax.files import PathLike, read_bytes, replacing
 from mechsearch_jax.perception.labels import INSTANCES
-from mechsearch_jax.tables import Document, with_table
+from mechsearch_jax.runtime.arrays import ARRAYS_LIMIT, read_arrays
+from mechsearch_jax.runtime.errors import InputError, shown
+from mechsearch_jax.runtime.files import PathLike, read_bytes, replacing
+from mechsearch_jax.runtime.tables import Document, with_table
 from mechsearch_jax.workspace.camera import Camera
 
 # The shipped file, in the folder `data` of the package.

@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from mechsearch_jax.errors import InputError, nearest, shown
-from mechsearch_jax.files import PathLike, read_bytes, read_json, replacing, save_json
 from mechsearch_jax.perception.labels import INSTANCES, OTHER
+from mechsearch_jax.runtime.errors import InputError, nearest, shown
+from mechsearch_jax.runtime.files import PathLike, read_bytes, read_json, replacing, save_json
 from mechsearch_jax.workspace.camera import Camera
 
 # What is larger is no image of a depth camera [bytes, pixels].

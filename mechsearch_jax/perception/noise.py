@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project, project
 
 

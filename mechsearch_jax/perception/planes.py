@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 UP = (0.0, 0.0, 1.0)
 

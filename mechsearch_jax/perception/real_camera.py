@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.perception.camera_pose import PoseConfig, PoseEstimate, estimate_pose
 from mechsearch_jax.perception.colour import ClusterConfig, Detection, TargetColour, cluster_by_colour, detect_target
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.planes import Plane, PlaneConfig, find_plane
 from mechsearch_jax.perception.target_pixels import evened
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.shelf import Shelf
 

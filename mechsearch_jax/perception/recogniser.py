@@ -16,8 +16,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.compiled import kept
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
@@ -28,6 +26,8 @@ from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
 from mechsearch_jax.perception.target_pixels import coloured_pixels, fitted_pose, near_target
 from mechsearch_jax.perception.trained_view import TrainedView
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf

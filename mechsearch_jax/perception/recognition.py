@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from mechsearch_jax.compiled import kept
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import matmul, transform
 from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
@@ -20,6 +19,7 @@ from mechsearch_jax.perception.refinement import RefinementConfig, refine
 from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
 from mechsearch_jax.perception.target_pixels import fitted_pose, near_target, without_phantoms
 from mechsearch_jax.perception.trained_view import TrainedView
+from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target

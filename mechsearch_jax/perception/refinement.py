@@ -25,11 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import exponential, make, matmul, rotate, transform, yaw_rotation
 from mechsearch_jax.perception.scores import EDGE
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, pixel_rays, project
 from mechsearch_jax.workspace.shelf import Shelf
 

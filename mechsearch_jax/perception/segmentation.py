@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.networks.segmentation import SegmentationNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.perception.cloud import above_board, cloud_of, middle, resample
 from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.trained_view import TrainedView
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
 

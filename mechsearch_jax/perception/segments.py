@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import inverse, make, transform
 from mechsearch_jax.perception.cloud import draw
 from mechsearch_jax.perception.labels import FREE, MISSING
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 

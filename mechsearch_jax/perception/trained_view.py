@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from mechsearch_jax.errors import InputError, shown
 from mechsearch_jax.perception.cloud import density, distance, middle, shelf_view, thinned_view
-from mechsearch_jax.tables import checked
+from mechsearch_jax.runtime.errors import InputError, shown
+from mechsearch_jax.runtime.tables import checked
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 

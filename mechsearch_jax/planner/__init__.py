@@ -1,7 +1,17 @@
 """Deciding: from an observation and a belief to the next action."""
 
-from mechsearch_jax.planner.belief import Belief, graspability_map, initial_belief, update_belief
-from mechsearch_jax.planner.config import OPTIONS, Config, Option, PlannerConfig, ProblemConfig
+from mechsearch_jax.belief.belief import Belief, graspability_map, initial_belief, update_belief
+from mechsearch_jax.config.config import OPTIONS, Config, Option, PlannerConfig, ProblemConfig
+from mechsearch_jax.config.presets import (
+    DEFAULT_PRESET,
+    PRESETS,
+    action_set,
+    best,
+    expanded,
+    paper,
+    published_code,
+    standard,
+)
 from mechsearch_jax.planner.policies import (
     POLICIES,
     Policy,
@@ -14,19 +24,9 @@ from mechsearch_jax.planner.policies import (
     search_and_grasp,
     search_for_grasp,
 )
-from mechsearch_jax.planner.presets import (
-    DEFAULT_PRESET,
-    PRESETS,
-    action_set,
-    best,
-    expanded,
-    paper,
-    published_code,
-    standard,
-)
-from mechsearch_jax.planner.problem import Problem, build_problem
 from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at
 from mechsearch_jax.planner.state import Decision, Sequences
+from mechsearch_jax.problem.problem import Problem, build_problem
 
 __all__ = [
     "DEFAULT_PRESET",

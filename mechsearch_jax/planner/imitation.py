@@ -13,13 +13,13 @@ from jaxtyping import Array, Bool
 
 from mechsearch_jax.actions.registry import KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
+from mechsearch_jax.config.config import Imitated
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.planner.config import Imitated
 from mechsearch_jax.planner.objective import Objective, SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import Predict
-from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted
 from mechsearch_jax.planner.state import State
+from mechsearch_jax.problem.problem import Problem
 
 # How much the published code's J minds what is in the way of a grasp; the paper's minds it as much as f.
 HINDRANCE = 0.1

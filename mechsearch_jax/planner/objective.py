@@ -8,11 +8,11 @@ from typing import Protocol
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mechsearch_jax.belief.belief import Belief, possible_poses
+from mechsearch_jax.config.config import Weights
 from mechsearch_jax.graspability import INFEASIBLE, crowding, graspability, pairs
-from mechsearch_jax.planner.belief import Belief, possible_poses
-from mechsearch_jax.planner.config import Weights
-from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.state import State
+from mechsearch_jax.problem.problem import Problem
 
 
 class Objective(Protocol):

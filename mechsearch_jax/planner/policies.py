@@ -20,23 +20,23 @@ from jaxtyping import Array
 
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
-from mechsearch_jax.compiled import kept
+from mechsearch_jax.belief.belief import Belief, without_grasps
+from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.push_model import PushModel
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.belief import Belief, without_grasps
-from mechsearch_jax.planner.config import PlannerConfig
 from mechsearch_jax.planner.imitation import IMITATIONS, Slots
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import Predict, PredictByKind
-from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted, guided_draw
 from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at, worth_trying
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import grasps_to_try, in_turn, sequences_to_try
+from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.errors import InputError
 
 
 class Policy(Protocol):
@@ -113,11 +113,11 @@ class Search(flax.struct.PyTreeNode):
     def begin(
         self, key: Array, problem: Problem, belief: Belief, observation: Observation
     ) -> Callable[[], None] | None:
-        """Lower what a plan with such arguments needs, without planning; see `compiled.Kept.begin`."""
+        """Lower what a plan with such arguments needs, without planning; see `runtime.compiled.Kept.begin`."""
         return _plan.begin(self._planning, key, problem, _as_known(belief), observation)
 
     def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
-        """Whether nothing has to be compiled for a plan with such arguments; see `compiled.Kept.is_ready`."""
+        """Whether nothing has to be compiled for a plan with such arguments; see `runtime.compiled.Kept.is_ready`."""
         return _plan.is_ready(self._planning, key, problem, _as_known(belief), observation)
 
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:

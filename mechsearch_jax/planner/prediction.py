@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool
 
 from mechsearch_jax.actions.registry import KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
+from mechsearch_jax.belief.moved_target import beyond_candidates
 from mechsearch_jax.dynamics.push_model import PushModel
-from mechsearch_jax.planner.moved_target import beyond_candidates
-from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.state import State
+from mechsearch_jax.problem.problem import Problem
 
 
 class Predict(Protocol):

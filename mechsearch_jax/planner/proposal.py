@@ -10,13 +10,13 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions.sampler import sample_action
 from mechsearch_jax.actions.types import Sample
+from mechsearch_jax.belief.belief import Belief, possible_space
 from mechsearch_jax.existence import occluders
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import pairs
-from mechsearch_jax.planner.belief import Belief, possible_space
 from mechsearch_jax.planner.objective import Objective
-from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.state import State
+from mechsearch_jax.problem.problem import Problem
 
 # How much more an object matters that is in the way alone than one of two that are, one of two than one of three, ...
 ALONE = 4.0

@@ -17,13 +17,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.compiled import kept
+from mechsearch_jax.belief.found_target import found_grasps, found_hits
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, upright_pose
 from mechsearch_jax.graspability import INFEASIBLE, grasp_hits
-from mechsearch_jax.planner.found_target import found_grasps, found_hits
-from mechsearch_jax.planner.problem import Problem, TargetGrasps
 from mechsearch_jax.planner.trials import TRIES
+from mechsearch_jax.problem.problem import Problem, TargetGrasps
+from mechsearch_jax.runtime.compiled import kept
 
 # By how much objects are grown to find the grasp that keeps furthest from them [m].
 CLEARANCES = (0.004, 0.008, 0.012, 0.02)

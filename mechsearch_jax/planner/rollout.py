@@ -20,19 +20,19 @@ from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.sampler import contact_risk
 from mechsearch_jax.actions.types import Action, Prediction, Sample
+from mechsearch_jax.belief.belief import Belief, possible_space, with_target
+from mechsearch_jax.belief.found_target import found_hits
+from mechsearch_jax.belief.moved_target import candidate_of
+from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.existence import existence, no_views, object_views
 from mechsearch_jax.geometry.masked import on_cpu
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import grasp_hits, no_hits, pairs, split_found
-from mechsearch_jax.planner.belief import Belief, possible_space, with_target
-from mechsearch_jax.planner.config import PlannerConfig
-from mechsearch_jax.planner.found_target import found_hits
-from mechsearch_jax.planner.moved_target import candidate_of
 from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.prediction import Predict
-from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted
 from mechsearch_jax.planner.state import Decision, Sequences, State
+from mechsearch_jax.problem.problem import Problem
 
 # A sequence whose value is a smaller share of J gains nothing.
 GAIN = 0.02

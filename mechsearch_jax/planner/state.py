@@ -22,7 +22,7 @@ class State(flax.struct.PyTreeNode):
       is_target: which slot is the target's, shape (N,).
       exists: f, shape (X,). Once the target is found: the pose that it was pushed to, if it could be hidden there.
       target_at: the candidate pose that stands for where a found target was pushed to, as a mask, shape (X,); nowhere
-        as long as it was not. See `planner.moved_target`.
+        as long as it was not. See `belief.moved_target`.
       views: the objects as the camera sees them.
       hits: H, shape (K, N).
       options: the ways to move the objects.

@@ -20,11 +20,11 @@ from jaxtyping import Array
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.planner.config import PlannerConfig
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
 from mechsearch_jax.planner.state import Decision, State
+from mechsearch_jax.runtime.errors import InputError
 
 
 class Node(flax.struct.PyTreeNode):

@@ -19,12 +19,12 @@ from jaxtyping import Array, Bool, Float, Int
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import SAMPLED_KINDS, ActionKind
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.compiled import kept
+from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.belief import Belief
-from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.state import Alternatives, Decision, Sequences
+from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.runtime.compiled import kept
 
 # So many alternatives of a kind are tried out at most: grasps of a found target, or first actions of sequences.
 TRIES = 8

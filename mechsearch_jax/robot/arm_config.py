@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.free_motion import check_joints
 from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.runtime.errors import InputError
 
 
 @dataclasses.dataclass(frozen=True)

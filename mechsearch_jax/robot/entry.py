@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.masked import masked_vmap, taken
 from mechsearch_jax.geometry.transforms import back_off, translate
 from mechsearch_jax.robot.gripper import Gripper, joints_hit_shelf
 from mechsearch_jax.robot.kinematics import path_joints, path_kinematics, still_ahead
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf
 
 # How far in front of the shelf the gripper has to be to count as outside [m]: a target in the hand is outside then,

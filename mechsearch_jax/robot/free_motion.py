@@ -18,11 +18,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Obstacles, clearance
 from mechsearch_jax.robot.kinematics import JOINT_LOWER, JOINT_UPPER
 from mechsearch_jax.robot.robot_trajectory import limit_shares
 from mechsearch_jax.robot.time_scaling import smooth_curve, timing, travelled
+from mechsearch_jax.runtime.errors import InputError
 
 # No point of the arm, the hand or what it holds is farther than this from the axis of each joint [m].
 REACH = np.array([1.15, 1.15, 0.85, 0.8, 0.4, 0.4, 0.2])

@@ -22,9 +22,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.kinematics import Numbers
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf, placed_spheres_hit_shelf
 
 FINGER_BASE = 0.0584  # z of the fingers' frames in the hand frame [m]

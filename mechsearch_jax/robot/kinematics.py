@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import back_off
+from mechsearch_jax.runtime.errors import InputError
 
 Numbers = Array | np.ndarray
 

@@ -19,12 +19,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.interpolate import CubicSpline
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.transforms import translate
 from mechsearch_jax.robot.entry import way_in, ways_in
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import path_kinematics
 from mechsearch_jax.robot.time_scaling import angles_along, progress, smooth_curve, timing
+from mechsearch_jax.runtime.errors import InputError
 
 # Time steps that a stretch takes at least: where the hand hardly moves, rounding errors must not decide how long it is.
 SHORTEST = 25

@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.robot.kinematics import (
     ACCELERATION_LIMIT,
     JERK_LIMIT,
@@ -18,6 +17,7 @@ from mechsearch_jax.robot.kinematics import (
     JOINT_UPPER,
     VELOCITY_LIMIT,
 )
+from mechsearch_jax.runtime.errors import InputError
 
 
 class Part(enum.IntEnum):

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, replacing
 
 JOINT_NAMES = tuple(f"panda_joint{i}" for i in range(1, 8))
 GRIPPER_NAME = "panda_gripper"

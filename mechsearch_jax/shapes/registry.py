@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mechsearch_jax.errors import InputError, shown
+from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.shapes.box import Box
 from mechsearch_jax.shapes.cylinder import Cylinder
 from mechsearch_jax.shapes.shape import Shape

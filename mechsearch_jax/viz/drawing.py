@@ -18,9 +18,9 @@ from matplotlib.patheffects import Normal, Stroke
 from matplotlib.text import Text
 from scipy.spatial import ConvexHull
 
-from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.graspability import INFEASIBLE
+from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf

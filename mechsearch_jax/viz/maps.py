@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf

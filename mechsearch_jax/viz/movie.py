@@ -10,8 +10,8 @@ from typing import IO
 import numpy as np
 from jaxtyping import UInt8
 
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, replacing
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, replacing
 
 Images = Iterable[UInt8[np.ndarray, "h w 3"]]
 # Of H.264, the smaller the better; and of WebP, the larger the better.

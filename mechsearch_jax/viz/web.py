@@ -16,8 +16,8 @@ from jaxtyping import Float, UInt8, UInt32
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz import drawing, sketches
 from mechsearch_jax.viz.filmstrip import Frame, draw_seen
 from mechsearch_jax.viz.raycast import Solid

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax.errors import InputError, check_range
 from mechsearch_jax.geometry.transforms import rotate
+from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.workspace.leaves import are_given
 
 # More pixels along a side, or metres from the robot, no camera here has.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 # Objects are no larger, nor smaller [m].
 LEAST, LARGEST = 0.001, 1.0

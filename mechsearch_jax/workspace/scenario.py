@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.errors import InputError, shown
-from mechsearch_jax.files import read_json, replacing
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.runtime.errors import InputError, shown
+from mechsearch_jax.runtime.files import read_json, replacing
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.errors import InputError, check_range
 from mechsearch_jax.geometry.transforms import transform_rows
+from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.workspace.leaves import are_given
 
 # Nothing is farther from the robot, and no board thicker [m].

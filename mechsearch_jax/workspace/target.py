@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax.errors import InputError, check_range
+from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 

@@ -66,7 +66,7 @@ def run_episode(path, method, recognition, rehearsal="physics", seed=0):
     from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.simulators.native import NativeSimulator
     from mechsearch_jax.planner import PRESETS
-    from mechsearch_jax.planner.cache import cached_problem
+    from mechsearch_jax.problem.cache import cached_problem
     from mechsearch_jax.workspace.scenario import load_scenario
 
     scenario = load_scenario(path)
@@ -96,7 +96,7 @@ def episode_answer(path, method, recognition, rehearsal):
 
 
 def some_episodes(share):
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
 
     keep_compilations()
     found = {}
@@ -129,7 +129,7 @@ def chosen_actions():
     from mechsearch_jax import planner
     from mechsearch_jax.actions import ActionKind, no_action
     from mechsearch_jax.observation import Observation
-    from mechsearch_jax.planner.cache import cached_problem
+    from mechsearch_jax.problem.cache import cached_problem
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 
     scenario = load_scenario(example_scenarios()["first-light"])
@@ -180,7 +180,7 @@ def simulator(kept):
 def maps(kept):
     from mechsearch_jax.envs.episode.episodes import target_of
     from mechsearch_jax.envs.recording.pictures import inspect_scenario
-    from mechsearch_jax.planner.cache import cached_problem
+    from mechsearch_jax.problem.cache import cached_problem
     from mechsearch_jax.workspace.scenario import load_scenario
 
     found = {}
@@ -197,7 +197,7 @@ def shapes(kept):
     from mechsearch_jax.envs.camera.snapshot import Snapshot
     from mechsearch_jax.envs.episode.episodes import target_of
     from mechsearch_jax.envs.world.world import from_scenario
-    from mechsearch_jax.planner.cache import cached_problem
+    from mechsearch_jax.problem.cache import cached_problem
     from mechsearch_jax.workspace.scenario import load_scenario
 
     found = {}
@@ -350,7 +350,7 @@ def main():
     parser.add_argument("do", choices=("write", "compare"))
     parser.add_argument("--only", nargs="+", choices=tuple(PARTS), default=tuple(PARTS))
     options = parser.parse_args()
-    from mechsearch_jax.planner.cache import keep_compilations
+    from mechsearch_jax.problem.cache import keep_compilations
 
     keep_compilations()
     found = 0

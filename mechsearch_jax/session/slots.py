@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from mechsearch_jax.config.config import Config
 from mechsearch_jax.dynamics.named import own_push_model
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner.config import Config
 from mechsearch_jax.planner.policies import Policy, Search, search_for_grasp
 from mechsearch_jax.planner.trials import Trials
+from mechsearch_jax.runtime.errors import InputError
 
 # What is said where no action is tried out.
 UNTRIED = (

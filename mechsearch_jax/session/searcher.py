@@ -26,9 +26,11 @@ from jaxtyping import Array
 
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.registry import KINDS, ActionKind, kind_of
+from mechsearch_jax.belief.belief import Belief, initial_belief, update_belief
+from mechsearch_jax.belief.impasse import impasse
+from mechsearch_jax.config.config import Config
+from mechsearch_jax.config.presets import standard
 from mechsearch_jax.dynamics.push_model import PushModel
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.overlaps import overlap_faults
 from mechsearch_jax.perception.plausibility import (
@@ -41,24 +43,22 @@ from mechsearch_jax.perception.plausibility import (
 )
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.trained_view import view_faults
-from mechsearch_jax.planner.belief import Belief, initial_belief, update_belief
-from mechsearch_jax.planner.config import Config
-from mechsearch_jax.planner.impasse import impasse
 from mechsearch_jax.planner.policies import Policy
-from mechsearch_jax.planner.presets import standard
-from mechsearch_jax.planner.problem import NOWHERE, Problem
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, decide
-from mechsearch_jax.planner.workcell import Workcell
-from mechsearch_jax.preparing import first_decision, prepared
+from mechsearch_jax.problem.problem import NOWHERE, Problem
+from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.free_motion import check_joints
 from mechsearch_jax.robot.motion import MotionConfig
-from mechsearch_jax.search import warming
-from mechsearch_jax.search.images import Images, alike
-from mechsearch_jax.search.slots import UNTRIED, filled, tries_nothing
-from mechsearch_jax.search.state import State, beginning, load_state, save_state
-from mechsearch_jax.search.step import Motion, SearchStep, motion, shown
-from mechsearch_jax.search.whole_trajectory import TrajectoryConfig
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike
+from mechsearch_jax.session import warming
+from mechsearch_jax.session.images import Images, alike
+from mechsearch_jax.session.preparing import first_decision, prepared
+from mechsearch_jax.session.slots import UNTRIED, filled, tries_nothing
+from mechsearch_jax.session.state import State, beginning, load_state, save_state
+from mechsearch_jax.session.step import Motion, SearchStep, motion, shown
+from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.sight import camera_faults, check_camera
 
 # Share of the candidate poses below which a target that is found would often be out of reach.

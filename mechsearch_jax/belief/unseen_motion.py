@@ -25,7 +25,7 @@ from mechsearch_jax.actions.registry import KINDS, ActionKind
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
-from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.problem.problem import Problem
 
 # An object whose centre moved by less was recognised anew a little elsewhere, or moved no target to another cell [m].
 STILL = 0.003

@@ -11,8 +11,8 @@ import types
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from mechsearch_jax.errors import InputError, nearest, shown
-from mechsearch_jax.files import PathLike, read_text
+from mechsearch_jax.runtime.errors import InputError, nearest, shown
+from mechsearch_jax.runtime.files import PathLike, read_text
 
 # More than this no file of settings has [bytes].
 LIMIT = 2**18

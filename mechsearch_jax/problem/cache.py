@@ -15,16 +15,16 @@ import jax
 import numpy as np
 
 from mechsearch_jax.actions.config import ActionTables
-from mechsearch_jax.compiled import keep_in
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import ExistenceTables
-from mechsearch_jax.files import replacing
 from mechsearch_jax.graspability import GraspTables
-from mechsearch_jax.planner import problem as problems
-from mechsearch_jax.planner.config import ProblemConfig
-from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.problem import problem as problems
+from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.gripper import Gripper
-from mechsearch_jax.versions import source_digest
+from mechsearch_jax.runtime.compiled import keep_in
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import replacing
+from mechsearch_jax.runtime.versions import source_digest
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera

@@ -18,9 +18,9 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
 
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import replacing
-from mechsearch_jax.versions import source_digest
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import replacing
+from mechsearch_jax.runtime.versions import source_digest
 
 FORMAT = b"mechsearch-executable 1\n"
 # Those of older versions of the package are of no use; what is left serves who switches between versions and settings.

@@ -17,10 +17,10 @@ from jaxtyping import Array
 from mechsearch_jax.actions.config import ActionConfig
 from mechsearch_jax.actions.object_grasps import ObjectGraspConfig
 from mechsearch_jax.dynamics.named import PushModelName, check_name
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.graspability import GraspConfig
-from mechsearch_jax.options import option
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.options import option
 
 Imitated = Literal["nothing", "published-code"]
 RehearsalName = Literal["none", "physics"]

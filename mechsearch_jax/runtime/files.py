@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.runtime.errors import InputError
 
 PathLike = str | os.PathLike[str]
 # A text that is larger is none of ours [bytes]: the largest scenario has 10 kB.

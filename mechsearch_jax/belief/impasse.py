@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from mechsearch_jax.actions.candidates import candidates, free_ways
+from mechsearch_jax.belief.belief import Belief, possible_space, with_target
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.planner.belief import Belief, possible_space, with_target
-from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.problem.problem import Problem
 
 
 @jax.jit

@@ -13,7 +13,6 @@ from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.errors import InputError
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.observation import Observation
@@ -33,6 +32,7 @@ from mechsearch_jax.robot.robot_trajectory import (
     places_when_slowed,
     slowed,
 )
+from mechsearch_jax.runtime.errors import InputError
 
 # How fast the fingers open and close on the ways through free space: how fast the distance between them changes [m/s].
 FINGER_SPEED = 0.1

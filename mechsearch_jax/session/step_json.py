@@ -19,7 +19,7 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 
 if TYPE_CHECKING:
-    from mechsearch_jax.search.step import SearchStep
+    from mechsearch_jax.session.step import SearchStep
 
 
 def step_json(step: SearchStep) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, transform
 from mechsearch_jax.graspability import FoundGrasps, GraspTables, feasible_grasps, grasp_hits
-from mechsearch_jax.planner.problem import TargetGrasps
+from mechsearch_jax.problem.problem import TargetGrasps
 from mechsearch_jax.robot.arm_hits import arm_hits
 from mechsearch_jax.robot.entry import arm_path, crossing_length, crossing_poses, way_in
 from mechsearch_jax.robot.gripper import Gripper

@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.perception.colour import RED, TargetColour
-from mechsearch_jax.planner.cache import cached_problem, is_cached
-from mechsearch_jax.planner.config import ProblemConfig
-from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.problem.cache import cached_problem, is_cached
+from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target

@@ -14,18 +14,18 @@ from matplotlib.figure import Figure
 
 from mechsearch_jax.actions.registry import ActionKind, kind_of
 from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.belief.belief import Belief, graspability_map
+from mechsearch_jax.belief.impasse import impasse
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import check_recognition
 from mechsearch_jax.perception.plausibility import sight_faults
-from mechsearch_jax.planner.belief import Belief, graspability_map
-from mechsearch_jax.planner.impasse import impasse
-from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.state import Decision
+from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
-from mechsearch_jax.search.step_json import step_json
-from mechsearch_jax.search.whole_trajectory import TrajectoryConfig, whole_trajectory
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.step_json import step_json
+from mechsearch_jax.session.whole_trajectory import TrajectoryConfig, whole_trajectory
 from mechsearch_jax.viz.filmstrip import Frame, filmstrip
 
 

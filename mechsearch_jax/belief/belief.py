@@ -9,16 +9,16 @@ from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
-from mechsearch_jax.compiled import kept
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.belief.found_target import found_grasps, no_grasps
+from mechsearch_jax.belief.unseen_motion import reopened
 from mechsearch_jax.existence import allowances, closer_image, existence, object_views, plainly_elsewhere
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import FoundGrasps, grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.found_target import found_grasps, no_grasps
-from mechsearch_jax.planner.problem import Problem
-from mechsearch_jax.planner.unseen_motion import reopened
+from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.errors import InputError
 
 
 class Belief(flax.struct.PyTreeNode):

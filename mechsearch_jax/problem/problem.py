@@ -8,13 +8,13 @@ import numpy as np
 
 from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tables
 from mechsearch_jax.actions.registry import check_kinds
-from mechsearch_jax.cores import on_host
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import ExistenceTables, existence_tables
 from mechsearch_jax.graspability import GraspConfig, GraspTables, grasp_tables
-from mechsearch_jax.planner.config import ProblemConfig
 from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.runtime.cores import on_host
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera

@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
-from mechsearch_jax.errors import InputError, check_range, nearest
-from mechsearch_jax.files import PathLike
+from mechsearch_jax.config.config import OPTIONS, Config, Option
+from mechsearch_jax.config.presets import DEFAULT_PRESET, PRESETS, expanded
 from mechsearch_jax.perception.colour import RED, TargetColour
-from mechsearch_jax.planner.config import OPTIONS, Config, Option
-from mechsearch_jax.planner.presets import DEFAULT_PRESET, PRESETS, expanded
-from mechsearch_jax.planner.workcell import Workcell
-from mechsearch_jax.tables import Document, apply, check_names, checked, read_document, with_table
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.runtime.errors import InputError, check_range, nearest
+from mechsearch_jax.runtime.files import PathLike
+from mechsearch_jax.runtime.tables import Document, apply, check_names, checked, read_document, with_table
 from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.target import Target
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.problem.problem import Problem
 
 # How far beyond the outermost candidate poses a target may be pushed, in cells of their grid.
 BEYOND = 1.0

@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.planner.config import Config
+from mechsearch_jax.config.config import Config
+from mechsearch_jax.runtime.errors import InputError
 
 # How often preset `paper` draws an action until one is possible: an approximation of the paper's, which never gives up.
 REDRAWS = 8

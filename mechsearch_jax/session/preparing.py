@@ -19,12 +19,12 @@ import numpy as np
 
 from mechsearch_jax.actions import KINDS, no_action
 from mechsearch_jax.actions.trajectory import reference_motion
-from mechsearch_jax.cores import cores
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Policy, Problem, initial_belief, update_belief
 from mechsearch_jax.planner.policies import Search
 from mechsearch_jax.robot.motion import MotionConfig
+from mechsearch_jax.runtime.cores import cores
 
 # Objects that an observation has room for.
 SLOTS = 8
@@ -49,7 +49,7 @@ def program(name: str, function: Any, *args: Any) -> Program:
 
     Args:
       name: of what it computes.
-      function: a `compiled.Kept`, or what has its `begin` and `is_ready`.
+      function: a `runtime.compiled.Kept`, or what has its `begin` and `is_ready`.
       *args: of the call; for what is data, shapes will do.
     """
     return Program(name, lambda: function.is_ready(*args), lambda: function.begin(*args))

@@ -14,15 +14,15 @@ from jaxtyping import Float
 from mechsearch_jax.actions.registry import KINDS
 from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.errors import InputError
+from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.recogniser import Recogniser
-from mechsearch_jax.planner.belief import Belief
-from mechsearch_jax.planner.problem import Problem
 from mechsearch_jax.planner.trials import PLANNED, Trials, scenes_of
+from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.motion import MotionConfig
-from mechsearch_jax.search.images import Images
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.images import Images
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 

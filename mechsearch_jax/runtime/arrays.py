@@ -8,8 +8,8 @@ import zipfile
 
 import numpy as np
 
-from mechsearch_jax.errors import InputError, shown
-from mechsearch_jax.files import PathLike
+from mechsearch_jax.runtime.errors import InputError, shown
+from mechsearch_jax.runtime.files import PathLike
 
 # What is larger, packed or not, is none of ours [bytes]: the largest has 20 MB.
 ARRAYS_LIMIT = 512 * 2**20

@@ -14,13 +14,13 @@ import numpy as np
 
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.arrays import ARRAYS_LIMIT, read_arrays
-from mechsearch_jax.errors import InputError
-from mechsearch_jax.files import PathLike, read_bytes, replacing
+from mechsearch_jax.belief.belief import Belief, initial_belief
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.belief import Belief, initial_belief
-from mechsearch_jax.planner.problem import Problem
+from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.runtime.arrays import ARRAYS_LIMIT, read_arrays
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import PathLike, read_bytes, replacing
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 
 FORMAT = "mechsearch-search"

@@ -4,7 +4,7 @@ JAX's own cache of compilations spares the compiling alone: to find an entry a f
 for a planner that takes longer than all the rest. Here an entry is found by what a function would be traced from: the
 package's source, the versions and the machine, the shapes and types of the arguments, and what is static about them.
 
-Nothing is kept unless a program asks for it (`keep_in`, which `planner.cache.keep_compilations` calls).
+Nothing is kept unless a program asks for it (`keep_in`, which `problem.cache.keep_compilations` calls).
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import get_opaque_trace_state
 
-from mechsearch_jax.cores import on_host
-from mechsearch_jax.executables import Executables
-from mechsearch_jax.identity import Unidentified, identity
+from mechsearch_jax.runtime.cores import on_host
+from mechsearch_jax.runtime.executables import Executables
+from mechsearch_jax.runtime.identity import Unidentified, identity
 
 # What makes XLA on a CPU compile twice as fast, with the same results at the same speed. One that an XLA does not know
 # is done without.
@@ -79,7 +79,7 @@ class Kept:
     What was prepared with `begin` or `prepare` is called as it is. Where a program keeps what it compiles, all is
     prepared at the latest when it is called. Anywhere else, inside of other transformations, and for arguments on
     another device than the first, it is what `jax.jit` makes of it. Arguments that cannot be told apart on disk
-    (`identity.identity`) are compiled in every process.
+    (`runtime.identity.identity`) are compiled in every process.
     """
 
     def __init__(

@@ -1,0 +1,1 @@
+"""What is known of the target and the objects, and how a look changes it."""

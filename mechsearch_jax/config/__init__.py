@@ -1,0 +1,1 @@
+"""Every setting of the planner, and the presets."""

@@ -1,0 +1,1 @@
+"""What does not change in an episode, and the workcell that it is built from."""
