@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from mechsearch_jax.config.config import Config
     from mechsearch_jax.config.presets import best, paper, standard
     from mechsearch_jax.geometry.superquadric import Superquadrics
+    from mechsearch_jax.images.examples import example_images
     from mechsearch_jax.observation import Observation
-    from mechsearch_jax.perception.examples import example_images
     from mechsearch_jax.perception.recogniser import Recogniser
     from mechsearch_jax.planner.policies import Policy, random_action, search_and_grasp, search_for_grasp
     from mechsearch_jax.planner.state import Decision
@@ -73,7 +73,7 @@ _ROOMS = {
     "best": "config.presets",
     "build_problem": "problem.problem",
     "cached_problem": "problem.cache",
-    "example_images": "perception.examples",
+    "example_images": "images.examples",
     "initial_belief": "belief.belief",
     "joint_trajectory": "actions.trajectory",
     "keep_compilations": "problem.cache",

@@ -16,7 +16,7 @@ from mechsearch_jax.benchmarks.parts.recognition import Bench, Method, Row
 from mechsearch_jax.benchmarks.report import tables
 from mechsearch_jax.commands import bench_quality
 from mechsearch_jax.envs.world.world import true_superquadrics
-from mechsearch_jax.perception.cloud import shelf_view
+from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.perception.scores import sharpened
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.viz.drawing import save_figure

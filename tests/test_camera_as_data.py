@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.actions.nothing import no_action
 from mechsearch_jax.existence import allowances, closer_image, existence, existence_tables, object_views
+from mechsearch_jax.images.cloud import BLOCK, thinned_view, view
+from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import recogniser as recognising
 from mechsearch_jax.perception import recognition
-from mechsearch_jax.perception.cloud import BLOCK, thinned_view, view
-from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences

@@ -13,7 +13,7 @@ from test_search import IMAGES, TRUSTING, seen
 
 from mechsearch_jax.commands import plan
 from mechsearch_jax.envs.cell import loading as cell
-from mechsearch_jax.perception.image_files import (
+from mechsearch_jax.images.image_files import (
     load_camera,
     load_colour,
     load_depth,

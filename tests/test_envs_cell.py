@@ -8,7 +8,7 @@ import pytest
 from mechsearch_jax.envs.cell import loading as cell
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.trials.named import rehearsal
-from mechsearch_jax.perception.examples import example_images
+from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.problem.settings import Settings, load_settings
 from mechsearch_jax.runtime.compiled import _KEEPING
 from mechsearch_jax.runtime.errors import InputError

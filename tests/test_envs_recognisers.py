@@ -12,9 +12,9 @@ from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics
-from mechsearch_jax.perception.cloud import shelf_view
-from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
-from mechsearch_jax.perception.noise import measured_depth
+from mechsearch_jax.images.cloud import shelf_view
+from mechsearch_jax.images.labels import FREE, MISSING, OTHER
+from mechsearch_jax.images.noise import measured_depth
 from mechsearch_jax.perception.scores import intersection_over_union, sharpened
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of

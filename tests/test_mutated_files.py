@@ -15,10 +15,8 @@ from flax.traverse_util import unflatten_dict
 from mutations import bomb, damaged, mutated_archive, mutated_json, mutated_toml, seeded
 
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.networks.push import PushConfig
-from mechsearch_jax.networks.weights import load_weights, save_weights, weight_shapes
-from mechsearch_jax.perception.examples import Images, load_images, save_images
-from mechsearch_jax.perception.image_files import (
+from mechsearch_jax.images.examples import Images, load_images, save_images
+from mechsearch_jax.images.image_files import (
     load_camera,
     load_colour,
     load_depth,
@@ -28,7 +26,9 @@ from mechsearch_jax.perception.image_files import (
     save_depth,
     save_mask,
 )
-from mechsearch_jax.perception.trained_view import TrainedView
+from mechsearch_jax.images.trained_view import TrainedView
+from mechsearch_jax.networks.push import PushConfig
+from mechsearch_jax.networks.weights import load_weights, save_weights, weight_shapes
 from mechsearch_jax.problem.settings import example_config, load_settings
 from mechsearch_jax.runtime.arrays import read_arrays
 from mechsearch_jax.runtime.errors import InputError

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE
 from mechsearch_jax.envs.world import world
-from mechsearch_jax.perception import colour, planes
-from mechsearch_jax.perception.colour import TargetColour
+from mechsearch_jax.images import colour, planes
+from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.scenario import Body, Scenario

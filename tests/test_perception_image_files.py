@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mechsearch_jax.perception.examples import example_images
-from mechsearch_jax.perception.image_files import (
+from mechsearch_jax.images.examples import example_images
+from mechsearch_jax.images.image_files import (
     load_camera,
     load_colour,
     load_depth,

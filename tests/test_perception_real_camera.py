@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from mechsearch_jax.envs.camera.simulated_camera import SHELF
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.perception import camera_pose, real_camera
-from mechsearch_jax.perception.camera_pose import PoseConfig, with_pose
-from mechsearch_jax.perception.colour import TargetColour
-from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
-from mechsearch_jax.perception.real_camera import RealCameraConfig
+from mechsearch_jax.images import camera_pose, real_camera
+from mechsearch_jax.images.camera_pose import PoseConfig, with_pose
+from mechsearch_jax.images.colour import TargetColour
+from mechsearch_jax.images.labels import FREE, MISSING, OTHER
+from mechsearch_jax.images.real_camera import RealCameraConfig
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.errors import InputError

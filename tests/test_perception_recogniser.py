@@ -11,9 +11,9 @@ import pytest
 
 from mechsearch_jax.envs.camera.example_images import SCENARIO, sensed_images
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.perception.colour import TargetColour
-from mechsearch_jax.perception.examples import STEP, example_images, save_images
-from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
+from mechsearch_jax.images.colour import TargetColour
+from mechsearch_jax.images.examples import STEP, example_images, save_images
+from mechsearch_jax.images.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.scores import intersection_over_union, sharpened
 from mechsearch_jax.perception.segmentation import NetworkSegmenter

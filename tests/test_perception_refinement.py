@@ -13,8 +13,8 @@ from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.world import world
 from mechsearch_jax.geometry.superquadric import sample_surface
 from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
+from mechsearch_jax.images.noise import TimeOfFlight, measured_depth
 from mechsearch_jax.perception import refinement, scores
-from mechsearch_jax.perception.noise import TimeOfFlight, measured_depth
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.perception import segmentation
-from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, leave_out_smallest
-from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.workspace.shelf import Shelf
 
 SIZES = np.array([9, 8, 3, 7, 6, 12, 5, 4, 10])

@@ -11,14 +11,14 @@ import pytest
 from mechsearch_jax.envs.camera.example_images import SCENARIO, sensed_images
 from mechsearch_jax.envs.camera.simulated_camera import PALETTE, observe
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
+from mechsearch_jax.images.cloud import above_board
+from mechsearch_jax.images.colour import RED, TargetColour
+from mechsearch_jax.images.labels import FREE, OTHER
+from mechsearch_jax.images.target_pixels import coloured_pixels, elected, evened, near_target, without_phantoms
+from mechsearch_jax.images.target_pose import distance
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.cloud import above_board
-from mechsearch_jax.perception.colour import RED, TargetColour
-from mechsearch_jax.perception.labels import FREE, OTHER
 from mechsearch_jax.perception.overlaps import overlap_faults
 from mechsearch_jax.perception.recogniser import Recogniser
-from mechsearch_jax.perception.target_pixels import coloured_pixels, elected, evened, near_target, without_phantoms
-from mechsearch_jax.perception.target_pose import distance
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, example_scenarios, load_scenario, superquadrics
 from mechsearch_jax.workspace.shelf import Shelf

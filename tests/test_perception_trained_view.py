@@ -9,13 +9,13 @@ import jax
 import numpy as np
 import pytest
 
+from mechsearch_jax.images.cloud import BLOCK, shelf_view, thinned_view
+from mechsearch_jax.images.trained_view import TOLERANCES, TrainedView, read_view, view_faults
 from mechsearch_jax.networks.recognition import RecognitionConfig
 from mechsearch_jax.networks.segmentation import SegmentationConfig
 from mechsearch_jax.networks.weights import ARCHITECTURES, load_weights, read_card, save_weights
-from mechsearch_jax.perception.cloud import BLOCK, shelf_view, thinned_view
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.perception.recognition import nearness
-from mechsearch_jax.perception.trained_view import TOLERANCES, TrainedView, read_view, view_faults
 from mechsearch_jax.problem.settings import load_settings
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.searcher import Searcher

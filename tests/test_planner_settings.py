@@ -11,7 +11,7 @@ import pytest
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.perception.colour import TargetColour
+from mechsearch_jax.images.colour import TargetColour
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.problem import settings
 from mechsearch_jax.problem.settings import Settings, load_settings

@@ -24,8 +24,8 @@ from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import compose
+from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.perception.doubt import DoubtConfig
-from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.perception.plausibility import image_faults
 from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences

@@ -20,8 +20,8 @@ from mechsearch_jax.envs.pushing import physics_push
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world import model, world
+from mechsearch_jax.images.target_pose import target_pose
 from mechsearch_jax.perception import scores
-from mechsearch_jax.perception.target_pose import target_pose
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import SHAPES, by_shape, in_order, shape_of

@@ -20,11 +20,11 @@ from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle, sight_of
 from mechsearch_jax.envs.episode import slots
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.world.world import from_scenario
+from mechsearch_jax.images.cloud import thinned_view
+from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import recogniser as recognising
 from mechsearch_jax.perception import recognition
-from mechsearch_jax.perception.cloud import thinned_view
-from mechsearch_jax.perception.examples import example_images
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.retrieval import graspable_at

@@ -12,6 +12,9 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
+from mechsearch_jax.images import segments as clouds
+from mechsearch_jax.images.labels import FREE, MISSING, OTHER
+from mechsearch_jax.images.segments import CLEAR, CONTEXT, HIDDEN_EDGE, INNER, OUTLINE, segment_clouds
 from mechsearch_jax.networks import recognition as model
 from mechsearch_jax.networks import segmentation as layers
 from mechsearch_jax.networks.recognition import BASE_ROTATIONS, HYPOTHESES, IS_ROUND, RecognitionConfig
@@ -22,10 +25,7 @@ from mechsearch_jax.networks.segmentation import (
     strongest_neighbour,
 )
 from mechsearch_jax.networks.weights import load_weights, save_weights
-from mechsearch_jax.perception import segments as clouds
-from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of, spread_labels
-from mechsearch_jax.perception.segments import CLEAR, CONTEXT, HIDDEN_EDGE, INNER, OUTLINE, segment_clouds
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.box import CODE as BOX
 from mechsearch_jax.shapes.cylinder import CODE as CYLINDER

@@ -10,9 +10,9 @@ import pytest
 
 from mechsearch_jax.envs.scenes.generator import outline, separation
 from mechsearch_jax.envs.world.world import TARGET
-from mechsearch_jax.perception.cloud import above_board, cloud_of, draw, resample, shelf_view, view
-from mechsearch_jax.perception.labels import FREE, MISSING, OTHER
-from mechsearch_jax.perception.noise import RandomDirection, TimeOfFlight, no_noise
+from mechsearch_jax.images.cloud import above_board, cloud_of, draw, resample, shelf_view, view
+from mechsearch_jax.images.labels import FREE, MISSING, OTHER
+from mechsearch_jax.images.noise import RandomDirection, TimeOfFlight, no_noise
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
 from mechsearch_jax.train import scenes

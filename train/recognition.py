@@ -18,6 +18,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.transforms import matmul, rotate
+from mechsearch_jax.images.cloud import View, shelf_view
+from mechsearch_jax.images.segments import SegmentConfig, Segments, segment_clouds
+from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.recognition import (
     BASE_ROTATIONS,
     HYPOTHESES,
@@ -29,11 +32,8 @@ from mechsearch_jax.networks.recognition import (
     apply_network,
 )
 from mechsearch_jax.networks.weights import save_weights
-from mechsearch_jax.perception.cloud import View, shelf_view
 from mechsearch_jax.perception.recognition import best_hypothesis
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened
-from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
-from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import (

@@ -16,8 +16,8 @@ from mechsearch_jax.envs.camera.simulated_camera import cast_body, cast_shelf
 from mechsearch_jax.envs.scenes.generator import CATALOGUE
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World
 from mechsearch_jax.geometry.transforms import matmul, yaw_rotation
-from mechsearch_jax.perception.cloud import View, shelf_view
-from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
+from mechsearch_jax.images.cloud import View, shelf_view
+from mechsearch_jax.images.noise import NoiseModel, RandomDirection, TimeOfFlight, no_noise
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import by_shape, shape_of
 from mechsearch_jax.workspace.camera import Camera, rays

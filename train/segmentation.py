@@ -15,13 +15,13 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.envs.world.world import TARGET
+from mechsearch_jax.images.cloud import POINTS, View, cloud_of, resample, shelf_view
+from mechsearch_jax.images.labels import INSTANCES, OTHER
+from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.segmentation import SegmentationConfig, SegmentationNetwork, apply_network
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.perception.assignment import assign
-from mechsearch_jax.perception.cloud import POINTS, View, cloud_of, resample, shelf_view
-from mechsearch_jax.perception.labels import INSTANCES, OTHER
 from mechsearch_jax.perception.segmentation import clean_up, labels_of
-from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, origin, random_world, worth_seeing
 from mechsearch_jax.workspace.shelf import Shelf

@@ -15,8 +15,8 @@ from jaxtyping import Array, Key
 
 from mechsearch_jax.envs.camera.recognisers import true_labels
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario
-from mechsearch_jax.perception.cloud import View
-from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, TimeOfFlight, measured_depth, no_noise
+from mechsearch_jax.images.cloud import View
+from mechsearch_jax.images.noise import NoiseModel, RandomDirection, TimeOfFlight, measured_depth, no_noise
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.train.loop import HELD_OUT_SEED

@@ -22,9 +22,9 @@ from mechsearch_jax.benchmarks.parts import ems
 from mechsearch_jax.benchmarks.parts.images import NOISES, Look, Scene, Shown, image_of, named, save_rows
 from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.images.cloud import View, thinned_view
 from mechsearch_jax.networks.recognition import RecognitionNetwork
 from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import View, thinned_view
 from mechsearch_jax.perception.recognition import recognise
 from mechsearch_jax.perception.refinement import RefinementConfig, refine, select
 from mechsearch_jax.perception.scores import EDGE, centre_error, intersection_over_union, sharpened

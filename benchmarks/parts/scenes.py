@@ -23,8 +23,8 @@ from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.envs.camera.simulated_camera import target_pixels
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario, true_superquadrics
+from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.planner import Problem, initial_belief, update_belief
 from mechsearch_jax.problem.cache import cached_problem
 from mechsearch_jax.runtime.errors import InputError

@@ -21,8 +21,8 @@ from mechsearch_jax.benchmarks.parts.images import NOISES, Look, Scene, image_of
 from mechsearch_jax.envs.camera.recognisers import Labeller, Segmenter
 from mechsearch_jax.envs.camera.simulated_camera import is_found
 from mechsearch_jax.envs.world.world import TARGET
+from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.networks.weights import shipped_weights
-from mechsearch_jax.perception.cloud import shelf_view
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.versions import versions

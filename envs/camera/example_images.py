@@ -10,7 +10,7 @@ import numpy as np
 from mechsearch_jax.envs.camera.recognisers import true_labels
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
-from mechsearch_jax.perception.examples import Images, save_images
+from mechsearch_jax.images.examples import Images, save_images
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.detector import found_pixels

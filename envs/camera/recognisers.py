@@ -20,12 +20,12 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, oracle
 from mechsearch_jax.envs.world.world import TARGET, World
+from mechsearch_jax.images.cloud import MARGIN, View, above_board
+from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.networks.weights import Weights, shipped_weights
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.assignment import assign
-from mechsearch_jax.perception.cloud import MARGIN, View, above_board
-from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
-from mechsearch_jax.perception.noise import NoiseModel, RandomDirection, depth_of, measured_depth
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter
@@ -46,7 +46,7 @@ def true_labels(
     points: Float[Array, "h w 3"], owner: Int[Array, "h w"], shelf: Shelf, margin: float = MARGIN
 ) -> Int[Array, "h w"]:
     """Labels of an image whose pixels show the slots `owner`, as `observe` has them: objects' slots, TARGET, and what
-    `perception.labels` has for the rest. What is measured near the shelf counts as the shelf, whatever it is.
+    `images.labels` has for the rest. What is measured near the shelf counts as the shelf, whatever it is.
     """
     body = jnp.where((owner >= 0) & (owner <= TARGET), owner, OTHER)
     labels = jnp.where(above_board(shelf, points, margin), body, FREE)

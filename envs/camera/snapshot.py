@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.envs.camera.simulated_camera import Image, is_found, observe, target_window
 from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.images.cloud import View, thinned_view
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.cloud import View, thinned_view
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera

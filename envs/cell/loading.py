@@ -44,7 +44,7 @@ def load_searcher(
 
     Args:
       path: of the file; all defaults if left out.
-      camera: in the place of the file's, such as one of `perception.image_files.load_camera`.
+      camera: in the place of the file's, such as one of `images.image_files.load_camera`.
       policy: what decides, by its name or import path, as `--policy` of the command line.
       preset: in the place of the file's.
       seed: of all random numbers.

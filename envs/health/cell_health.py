@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from mechsearch_jax.envs.health.finding import Finding, State
+from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.perception.recogniser import Recogniser
-from mechsearch_jax.perception.trained_view import view_faults
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.searcher import LEAST_REACH

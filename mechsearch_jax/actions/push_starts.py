@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from mechsearch_jax.actions.config import ActionConfig, ActionSpace, ActionTables
 from mechsearch_jax.actions.object_grasps import PASSING_GAP
-from mechsearch_jax.dynamics.push_model import LOW_CONTACT, TOUCH
-from mechsearch_jax.geometry.footprints import Footprints, extents, turned
+from mechsearch_jax.dynamics.push_model import LOW_CONTACT
+from mechsearch_jax.geometry.footprints import TOUCH, Footprints, extents, turned
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make, transform

@@ -57,7 +57,7 @@ def plan(
 
     from mechsearch_jax.commands.options import settings_of
     from mechsearch_jax.envs.cell.loading import searcher_of
-    from mechsearch_jax.perception.image_files import load_camera
+    from mechsearch_jax.images.image_files import load_camera
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable, is_file
 
@@ -107,8 +107,8 @@ def _images(
     depth: Path, color: Path | None, mask: Path | None, background: int, target_id: int | None
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """The arguments of `Searcher.next` from files, and what is to be said of them."""
-    from mechsearch_jax.perception import image_files
-    from mechsearch_jax.perception.labels import INSTANCES
+    from mechsearch_jax.images import image_files
+    from mechsearch_jax.images.labels import INSTANCES
 
     images: dict[str, Any] = {"depth": image_files.load_depth(depth)}
     missing = ()
@@ -133,8 +133,8 @@ def _images(
 
 def _example(out: Path) -> tuple[dict[str, Any], Camera]:
     """The shipped images, and copies of them as files."""
-    from mechsearch_jax.perception import image_files
-    from mechsearch_jax.perception.examples import example_images
+    from mechsearch_jax.images import image_files
+    from mechsearch_jax.images.examples import example_images
 
     images = example_images()
     image_files.save_depth(images.depth, out / "depth.png")

@@ -16,8 +16,6 @@ from mechsearch_jax.workspace.shelf import Shelf
 # very bottom never does.
 LEVERAGE = (1.8, 1.5)
 LOW_CONTACT = 0.03
-# Parts of the gripper that come this close together touch an object together [m].
-TOUCH = 0.004
 
 
 class PushOutcome(flax.struct.PyTreeNode):

@@ -17,9 +17,9 @@ from mechsearch_jax.dynamics.contacts import (
     unresolved,
     wall_depth,
 )
-from mechsearch_jax.dynamics.push_model import LEVERAGE, LOW_CONTACT, TOUCH, PushOutcome
+from mechsearch_jax.dynamics.push_model import LEVERAGE, LOW_CONTACT, PushOutcome
 from mechsearch_jax.dynamics.rigid import rigid_motion
-from mechsearch_jax.geometry.footprints import dot, extents, footprints, turned
+from mechsearch_jax.geometry.footprints import TOUCH, dot, extents, footprints, turned
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
 from mechsearch_jax.runtime.errors import InputError

@@ -18,6 +18,9 @@ QUARTER_TURN = math.pi / 2
 
 Numbers = Array | np.ndarray
 
+# What comes this close together touches together [m].
+TOUCH = 0.004
+
 
 class Footprints(flax.struct.PyTreeNode):
     """Objects seen from above: a rectangle or an ellipse and a range of heights, every field with leading axis N."""

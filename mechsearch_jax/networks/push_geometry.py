@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.dynamics.push_model import TOUCH
-from mechsearch_jax.geometry.footprints import Footprints, footprints, turned
+from mechsearch_jax.geometry.footprints import TOUCH, Footprints, footprints, turned
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
 from mechsearch_jax.workspace.shelf import Shelf

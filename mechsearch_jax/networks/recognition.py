@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from mechsearch_jax.geometry.transforms import matmul
+from mechsearch_jax.images.segments import MARKS
 from mechsearch_jax.networks.layers import Attention, FeedForward, fourier_features
-from mechsearch_jax.perception.segments import MARKS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import by_shape, shape_of
 
@@ -164,7 +164,7 @@ class RecognitionNetwork(nn.Module):
     ) -> Hypotheses:
         """Args:
         points: of each segment, in its frame [m].
-        mark: their fourth channel, see `perception.segments`.
+        mark: their fourth channel, see `images.segments`.
         camera: the camera's position in that frame [m].
         """
         config = self.config
@@ -201,7 +201,7 @@ def apply_network(
     Args:
       network, parameters: the network and its Flax parameters.
       points: of each segment, in its frame [m].
-      mark: their fourth channel, see `perception.segments`.
+      mark: their fourth channel, see `images.segments`.
       camera: the camera's position in that frame [m].
     """
     return cast(Hypotheses, network.apply({"params": parameters}, points, mark, camera))

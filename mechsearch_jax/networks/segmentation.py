@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from mechsearch_jax.images.labels import INSTANCES
 from mechsearch_jax.networks.layers import Attention, FeedForward, fourier_features
-from mechsearch_jax.perception.labels import INSTANCES
 from mechsearch_jax.runtime.errors import InputError
 
 # The middle of the shelf's space [m]: where the network's frame has its origin.

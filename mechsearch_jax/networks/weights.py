@@ -22,12 +22,12 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
 from mechsearch_jax.geometry.superquadric import empty
+from mechsearch_jax.images.segments import SegmentConfig
+from mechsearch_jax.images.trained_view import TrainedView, read_view
 from mechsearch_jax.networks.push import PushConfig, PushNetwork
 from mechsearch_jax.networks.push_geometry import push_start
 from mechsearch_jax.networks.recognition import RecognitionConfig, RecognitionNetwork
 from mechsearch_jax.networks.segmentation import SegmentationConfig, SegmentationNetwork
-from mechsearch_jax.perception.segments import SegmentConfig
-from mechsearch_jax.perception.trained_view import TrainedView, read_view
 from mechsearch_jax.runtime.arrays import ARRAYS_LIMIT, read_arrays
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.files import PathLike, read_bytes, read_json, replacing

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from mechsearch_jax.images.cloud import OVERHANG, shelf_view
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.cloud import OVERHANG, shelf_view
 from mechsearch_jax.perception.recogniser import Setting
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mechsearch_jax.images.cloud import BLOCK, above_board, shelf_view, thinned_view
+from mechsearch_jax.images.planes import PlaneConfig, find_plane
+from mechsearch_jax.images.target_pixels import coloured_pixels, fitted_pose
+from mechsearch_jax.images.target_pose import distance
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.cloud import BLOCK, above_board, shelf_view, thinned_view
-from mechsearch_jax.perception.planes import PlaneConfig, find_plane
-from mechsearch_jax.perception.target_pixels import coloured_pixels, fitted_pose
-from mechsearch_jax.perception.target_pose import distance
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project, project
 from mechsearch_jax.workspace.shelf import Shelf

@@ -16,16 +16,16 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from mechsearch_jax.images.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
+from mechsearch_jax.images.colour import TargetColour
+from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.target_pixels import coloured_pixels, fitted_pose, near_target
+from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.weights import Weights
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception.cloud import MARGIN, OVERHANG, View, above_board, thinned_view
-from mechsearch_jax.perception.colour import TargetColour
-from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
 from mechsearch_jax.perception.recognition import LabelledImage, ShapeNetwork, recognise_image
 from mechsearch_jax.perception.refinement import RefinementConfig
 from mechsearch_jax.perception.segmentation import NetworkSegmenter, Segmenter
-from mechsearch_jax.perception.target_pixels import coloured_pixels, fitted_pose, near_target
-from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project
@@ -164,7 +164,7 @@ class Recogniser:
             known that nothing is there, for at least 3 m.
           colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
           mask: integers (H, W), registered to the depth image: for each pixel the number of its object, 0 to 8, or
-            what `perception.labels` has: OTHER (-1), FREE (-2), MISSING (-3). What was measured on the shelf's faces
+            what `images.labels` has: OTHER (-1), FREE (-2), MISSING (-3). What was measured on the shelf's faces
             counts as FREE, whatever the mask says.
           target_id: the number in the mask that is the target's, an integer; negative where the mask does not show it.
 
@@ -226,7 +226,7 @@ def _labelled(
 
 
 def _instances(mask: Int[Array, "h w"]) -> Int[Array, "h w"]:
-    """A mask whose numbers are those of `perception.labels`, int8; what it has beside them is OTHER."""
+    """A mask whose numbers are those of `images.labels`, int8; what it has beside them is OTHER."""
     known = (mask >= MISSING) & (mask < INSTANCES)
     return jnp.where(known, mask, OTHER).astype(jnp.int8)
 

@@ -12,13 +12,13 @@ from jaxtyping import Array, Float, Int, Key
 
 from mechsearch_jax.geometry.superquadric import Superquadrics, standard_edges
 from mechsearch_jax.geometry.transforms import matmul, transform
+from mechsearch_jax.images.cloud import middle
+from mechsearch_jax.images.segments import SegmentConfig, Segments, segment_clouds
+from mechsearch_jax.images.target_pixels import fitted_pose, near_target, without_phantoms
+from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.recognition import Hypotheses, RecognitionNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import middle
 from mechsearch_jax.perception.refinement import RefinementConfig, refine
-from mechsearch_jax.perception.segments import SegmentConfig, Segments, segment_clouds
-from mechsearch_jax.perception.target_pixels import fitted_pose, near_target, without_phantoms
-from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -77,7 +77,7 @@ def recognise(
       network, parameters: as `networks.weights` loads them; the network is static.
       camera: the camera of the image, a `View`'s as in training.
       points: in the world [m]; NaN invalidates the pixel, whose label is then MISSING.
-      labels: a segment's number, or one of `perception.labels`.
+      labels: a segment's number, or one of `images.labels`.
       shelf: the shelf; the default shelf if None.
       count: number of slots; static.
       config: how segments' clouds are drawn; static.
@@ -115,7 +115,7 @@ class LabelledImage(flax.struct.PyTreeNode):
       points: in the world [m], shape (h, w, 3); NaN invalidates the pixel: nothing was measured.
       depth: of the points along the camera's axis [m], shape (h, w); infinite where nothing is, NaN where nothing was
         measured.
-      labels: as `perception.labels` has them, shape (h, w).
+      labels: as `images.labels` has them, shape (h, w).
       of_target: which of the points the target's pose is fitted to, bool, shape (h, w).
     """
 

@@ -12,11 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.images.cloud import above_board, cloud_of, middle, resample
+from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.segmentation import SegmentationNetwork, apply_network
 from mechsearch_jax.networks.weights import Weights, shipped_weights
-from mechsearch_jax.perception.cloud import above_board, cloud_of, middle, resample
-from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
-from mechsearch_jax.perception.trained_view import TrainedView
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -36,7 +36,7 @@ class Segmenter(Protocol):
           of_target: where the detector sees the target.
 
         Returns:
-          Labels as `perception.labels` has them, with no more than eight segments, 0 to 7; the target's pixels are
+          Labels as `images.labels` has them, with no more than eight segments, 0 to 7; the target's pixels are
           OTHER.
         """
         ...
@@ -129,7 +129,7 @@ def spread_labels(
       reach: a pixel with no cloud point so near becomes OTHER [m]; static.
 
     Returns:
-      Labels as `perception.labels` has them, int8.
+      Labels as `images.labels` has them, int8.
     """
     measured = jnp.isfinite(points).all(axis=-1)
     pixels = jnp.where(measured[..., None], points, 0.0).reshape(-1, 3)

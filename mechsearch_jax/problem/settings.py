@@ -10,7 +10,7 @@ from typing import Any, Literal
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.config.config import OPTIONS, Config, Option
 from mechsearch_jax.config.presets import DEFAULT_PRESET, PRESETS, expanded
-from mechsearch_jax.perception.colour import RED, TargetColour
+from mechsearch_jax.images.colour import RED, TargetColour
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError, check_range, nearest
 from mechsearch_jax.runtime.files import PathLike

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Any
 
 from mechsearch_jax.config.config import ProblemConfig
-from mechsearch_jax.perception.colour import RED, TargetColour
+from mechsearch_jax.images.colour import RED, TargetColour
 from mechsearch_jax.problem.cache import cached_problem, is_cached
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import ArmConfig

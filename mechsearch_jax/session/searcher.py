@@ -31,6 +31,7 @@ from mechsearch_jax.belief.impasse import impasse
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.config.presets import standard
 from mechsearch_jax.dynamics.push_model import PushModel
+from mechsearch_jax.images.trained_view import view_faults
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.overlaps import overlap_faults
 from mechsearch_jax.perception.plausibility import (
@@ -42,7 +43,6 @@ from mechsearch_jax.perception.plausibility import (
     sight_faults,
 )
 from mechsearch_jax.perception.recogniser import Recogniser
-from mechsearch_jax.perception.trained_view import view_faults
 from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, decide

@@ -15,7 +15,7 @@ import scipy.sparse.csgraph
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
-from mechsearch_jax.perception.labels import OTHER
+from mechsearch_jax.images.labels import OTHER
 from mechsearch_jax.runtime.errors import InputError
 
 # Maps colours (..., 3) and a reference colour (3,) to dissimilarities (...).

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from mechsearch_jax.geometry.transforms import inverse, make, transform
-from mechsearch_jax.perception.cloud import draw
-from mechsearch_jax.perception.labels import FREE, MISSING
+from mechsearch_jax.images.cloud import draw
+from mechsearch_jax.images.labels import FREE, MISSING
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -120,7 +120,7 @@ def segment_clouds(
       key: PRNG key.
       camera: the camera of the image; only its position counts.
       points: in the world [m]; those that are MISSING may be NaN.
-      labels: a segment's number, or one of `perception.labels`.
+      labels: a segment's number, or one of `images.labels`.
       shelf: the shelf; the default shelf if None.
       count: number of slots; static.
       config: how clouds are drawn; static.

@@ -13,9 +13,9 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from mechsearch_jax.perception.cloud import draw
-from mechsearch_jax.perception.labels import INSTANCES, OTHER
-from mechsearch_jax.perception.target_pose import distance, target_pose
+from mechsearch_jax.images.cloud import draw
+from mechsearch_jax.images.labels import INSTANCES, OTHER
+from mechsearch_jax.images.target_pose import distance, target_pose
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
@@ -128,7 +128,7 @@ def without_phantoms(
     of it is, and a pose that is fitted to one may reach into what stands beside it.
 
     Args:
-      labels: as `perception.labels` has them.
+      labels: as `images.labels` has them.
       on_it: which pixels are on the found target; none where it is not found.
       of_target: which are known to be its.
     """

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mechsearch_jax.perception.cloud import density, distance, middle, shelf_view, thinned_view
+from mechsearch_jax.images.cloud import density, distance, middle, shelf_view, thinned_view
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.tables import checked
 from mechsearch_jax.workspace.camera import Camera

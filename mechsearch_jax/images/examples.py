@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from mechsearch_jax.perception.labels import INSTANCES
+from mechsearch_jax.images.labels import INSTANCES
 from mechsearch_jax.runtime.arrays import ARRAYS_LIMIT, read_arrays
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.files import PathLike, read_bytes, replacing
@@ -34,7 +34,7 @@ class Images:
     Attributes:
       depth: float32 (H, W), metres along the camera's z; 0 where nothing was measured.
       colour: uint8 (H, W, 3), red, green and blue.
-      mask: int8 (H, W), the number of the object that a pixel shows, or what `perception.labels` has.
+      mask: int8 (H, W), the number of the object that a pixel shows, or what `images.labels` has.
       target_id: the number in the mask that is the target's; None where it is not visible.
       camera: intrinsics and pose in the world, the robot's base.
     """

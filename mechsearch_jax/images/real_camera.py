@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.perception.camera_pose import PoseConfig, PoseEstimate, estimate_pose
-from mechsearch_jax.perception.colour import ClusterConfig, Detection, TargetColour, cluster_by_colour, detect_target
-from mechsearch_jax.perception.labels import FREE, INSTANCES, MISSING, OTHER
-from mechsearch_jax.perception.planes import Plane, PlaneConfig, find_plane
-from mechsearch_jax.perception.target_pixels import evened
+from mechsearch_jax.images.camera_pose import PoseConfig, PoseEstimate, estimate_pose
+from mechsearch_jax.images.colour import ClusterConfig, Detection, TargetColour, cluster_by_colour, detect_target
+from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
+from mechsearch_jax.images.planes import Plane, PlaneConfig, find_plane
+from mechsearch_jax.images.target_pixels import evened
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.shelf import Shelf
@@ -79,7 +79,7 @@ class PreparedImage(flax.struct.PyTreeNode):
     """What was made of a depth and a colour image.
 
     Attributes:
-      segmentation: what every pixel shows, as `perception.labels` has it, int32, shape (h, w): a segment's number, the
+      segmentation: what every pixel shows, as `images.labels` has it, int32, shape (h, w): a segment's number, the
         one with the most pixels first where they were clustered; FREE for the shelf and what is seen beside it; OTHER
         for the robot, whatever else is before the shelf, and what is on it but in no segment; MISSING where nothing
         was measured. It is a `mask` of the `Recogniser`.

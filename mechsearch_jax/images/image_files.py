@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from mechsearch_jax.perception.labels import INSTANCES, OTHER
+from mechsearch_jax.images.labels import INSTANCES, OTHER
 from mechsearch_jax.runtime.errors import InputError, nearest, shown
 from mechsearch_jax.runtime.files import PathLike, read_bytes, read_json, replacing, save_json
 from mechsearch_jax.workspace.camera import Camera
