@@ -226,16 +226,17 @@ class QuickStage(Stage):
 @pytest.mark.parametrize("how", ["batch", "worker"])
 def test_96_settings_trace_the_plan_once(tmp_path, files, monkeypatch, how):
     """The real policy, with all that is continuous; in worker processes as in batches."""
-    traced, real = [], policies.plan
+    traced, real = [], policies.Rollout
 
-    def plan(rollout, key, scene):
-        traced.append(rollout.config.sequences)
-        return real(rollout, key, scene)
+    def rollout(problem, belief, config, *slots):
+        traced.append(config.sequences)
+        return real(problem, belief, config, *slots)
 
-    monkeypatch.setattr(policies, "plan", plan)
+    monkeypatch.setattr(policies, "Rollout", rollout)
     monkeypatch.setattr(batches, "new_simulator", QuickStage)
     names = ("gamma", "guided_fraction", "unseen_contact_penalty", "crowding_weight")
-    values = list(itertools.product((0.5, 0.6, 0.7, 0.8, 0.9, 1.0), (0.0, 0.7), (0.0, 1.0), (0.0, 0.5), (0.0, 0.02)))
+    crowding = (0.0, 0.01, 0.02, 0.05)
+    values = list(itertools.product((0.5, 0.6, 0.7, 0.8, 0.9, 1.0), (0.0, 0.7), (0.0, 1.0), crowding))
     small = {"max_steps": 1, "horizon": 2, "sequences": 7 if how == "batch" else 6}
     methods = [Method(config=PRESETS["standard"](**dict(zip(names, value, strict=True)), **small)) for value in values]
     jobs = make_jobs(files[:1], methods, (0,))
@@ -247,7 +248,8 @@ def test_96_settings_trace_the_plan_once(tmp_path, files, monkeypatch, how):
         rows = [worker.run(job.path, job.method, job.seed) for job in jobs]
     assert len({identity(row) for row in rows}) == 96
     assert not any(row.is_error for row in rows)
-    assert traced == [small["sequences"]]
+    # A batch has a program for found targets, too.
+    assert traced == [small["sequences"]] * (2 if how == "batch" else 1)
 
 
 def test_beside_a_gpu_a_batch_tries_actions_out_in_processes_that_end_with_it(monkeypatch):

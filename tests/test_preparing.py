@@ -6,9 +6,13 @@ import time
 import pytest
 
 from mechsearch_jax.actions import KINDS
+from mechsearch_jax.envs.simulators.native import NativeSimulator
+from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
+from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.planner import search_for_grasp
 from mechsearch_jax.robot.motion import MotionConfig
-from mechsearch_jax.session.preparing import Program, first_decision, prepare, prepared
+from mechsearch_jax.session.preparing import Program, first_decision, motions, prepare, prepared
+from mechsearch_jax.workspace.scenario import example_scenarios
 
 
 def program(name, ready=False, prepare=lambda: None):
@@ -91,3 +95,12 @@ def test_no_more_is_compiled_at_once_than_there_are_cores(monkeypatch):
         assert begun == ["a", "b", "c"]
         first.set()
     assert begun == ["a", "b", "c", "d"]
+
+
+@pytest.mark.parametrize("config", [None, SimulatorConfig(motion=MotionConfig(waypoints=9))])
+def test_a_native_simulator_knows_the_motions_that_it_computes(config):
+    world = from_scenario(example_scenarios()["first-light"])
+    found = NativeSimulator(config=config).programs(world)
+    usual = (config or SimulatorConfig()).motion
+    assert [each.name for each in found] == [each.name for each in motions(usual)]
+    assert all(each.is_ready() == other.is_ready() for each, other in zip(found, motions(usual), strict=True))

@@ -482,7 +482,7 @@ class NativeSimulator:
 
     def programs(self, world: World) -> list[Program]:
         """The motions of all kinds of action; see `session.preparing.Prepares`."""
-        return motions(self.config.motion)
+        return motions((self._config or SimulatorConfig()).motion)
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
         """Let time pass in every active world; see `Simulator.settle`.
