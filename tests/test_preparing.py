@@ -12,7 +12,7 @@ from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.planner import search_for_grasp
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.session.preparing import Program, first_decision, motions, prepare, prepared
-from mechsearch_jax.workspace.scenario import example_scenarios
+from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
 
 def program(name, ready=False, prepare=lambda: None):
@@ -99,7 +99,7 @@ def test_no_more_is_compiled_at_once_than_there_are_cores(monkeypatch):
 
 @pytest.mark.parametrize("config", [None, SimulatorConfig(motion=MotionConfig(waypoints=9))])
 def test_a_native_simulator_knows_the_motions_that_it_computes(config):
-    world = from_scenario(example_scenarios()["first-light"])
+    world = from_scenario(load_scenario(example_scenarios()["first-light"]))
     found = NativeSimulator(config=config).programs(world)
     usual = (config or SimulatorConfig()).motion
     assert [each.name for each in found] == [each.name for each in motions(usual)]
