@@ -256,7 +256,7 @@ def target_extent(
 
 @jax.jit
 def _seen_at(camera: Camera, T: Float[Array, "*batch 4 4"], points: Float[Array, "k 3"]) -> Float[Array, "*batch k 2"]:
-    """Where a camera sees points of bodies at some poses."""
+    """Where a camera sees points of bodies that stand at these poses."""
     return project(camera, transform(T[..., None, :, :], points))[0]
 
 

@@ -373,16 +373,16 @@ def by_scene(*runs):
 def test_what_the_rebuilt_engine_loses_is_what_is_stored():
     *c2, published = stored_runs("standard-h100.json")
     pairs = (c2, stored_runs("standard-h200.json")[1:2]), ([published], stored_runs("standard-cpu.json"))
-    told = []
+    differences = []
     for after, before in pairs:
         now, then = by_scene(*after), by_scene(*before)
         assert set(now) == set(then)
         changes = [100 * (now[scene] - then[scene]) for scene in now]
         low, high = mean_interval(changes, list(now))
         assert low > -2.0
-        told.append([round(value, 1) + 0.0 for value in (statistics.fmean(changes), low, high)])
+        differences.append([round(value, 1) + 0.0 for value in (statistics.fmean(changes), low, high)])
     page = " ".join(read("docs/results.md").split())
-    (one, low, high), (other, least, most) = told
+    (one, low, high), (other, least, most) = differences
     assert f"three runs against one, {one:.1f} ({low:+.1f} to {high:+.1f}) points" in page
     assert f"the native simulator, {other:+.1f} ({least:+.1f} to {most:+.1f})." in page
     clock = c2[0]["clock"]["nothing kept"]

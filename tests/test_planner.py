@@ -269,8 +269,8 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
         return q7 < 0.3
 
     def seldom(problem, state, sample, first):
-        told = (sample.action.q7, jnp.any(state.available), jnp.any(state.scene.valid))
-        possible = jax.pure_callback(note, jax.ShapeDtypeStruct((), bool), *told, vmap_method="broadcast_all")
+        seen = (sample.action.q7, jnp.any(state.available), jnp.any(state.scene.valid))
+        possible = jax.pure_callback(note, jax.ShapeDtypeStruct((), bool), *seen, vmap_method="broadcast_all")
         return Prediction(state.scene, state.scene.valid, possible)
 
     config = dataclasses.replace(CONFIG, draws=1, first_draws=draws)

@@ -33,7 +33,7 @@ def imports(file):
 
 
 def arrows(*packages):
-    """From each room of some packages: which places it imports from."""
+    """From each room of these packages: which places it imports from."""
     found = {}
     for package in packages:
         for file in (ROOT / package).rglob("*.py"):

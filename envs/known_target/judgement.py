@@ -19,7 +19,7 @@ from mechsearch_jax.graspability import no_hits, pairs
 from mechsearch_jax.planner import Belief, Problem, Search, Sequences, initial_belief
 from mechsearch_jax.planner.objective import Objective, SearchForGrasp
 from mechsearch_jax.planner.retrieval import GraspChoice, best_grasps
-from mechsearch_jax.planner.rollout import Rollout, plan, present_state
+from mechsearch_jax.planner.rollout import plan, present_state
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,9 +82,7 @@ def _known(problem: Problem, world: World, active: Bool[Array, ""] | bool = True
 def sample(search: Search, key: Array, problem: Problem, world: World) -> Sequences:
     """Sequences of actions from a world, best first, as the planner samples them."""
     objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-    slots = search.propose, search.predict, search.objective, search.drawn_in
-    rollout = Rollout(problem, _known(problem, world), search.config, *slots)
-    return plan(rollout, key, objects).sequences
+    return plan(search.rollout(problem, _known(problem, world)), key, objects).sequences
 
 
 def retrievals_of(problem: Problem, world: World, count: int) -> GraspChoice:

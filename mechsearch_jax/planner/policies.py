@@ -105,6 +105,10 @@ class Search(flax.struct.PyTreeNode):
     plan: Plan = flax.struct.field(pytree_node=False, default=plan)
     tries: bool = flax.struct.field(pytree_node=False, default=False)
 
+    def rollout(self, problem: Problem, belief: Belief) -> Rollout:
+        """The engine with this policy's slots, for what is known."""
+        return Rollout(problem, belief, self.config, self.propose, self.predict, self.objective, self.drawn_in)
+
     @property
     def _planning(self) -> Search:
         """What a plan depends on: it is the same, and compiled once, whether or not anything is tried out."""
@@ -188,9 +192,7 @@ def _grasps_first(grasp: Decision, planned: Decision) -> Decision:
 
 @kept()
 def _plan(search: Search, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
-    slots = search.propose, search.predict, search.objective, search.drawn_in
-    rollout = Rollout(problem, belief, search.config, *slots)
-    return search.plan(rollout, key, observation.objects)
+    return search.plan(search.rollout(problem, belief), key, observation.objects)
 
 
 @kept()

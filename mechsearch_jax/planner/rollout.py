@@ -135,7 +135,7 @@ class Rollout:
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, of_found]))
 
     def options(self, state: State, moved: Bool[Array, " n"]):
-        """What can be done after some objects moved, where an action of a state is drawn."""
+        """What can be done where an action of a state is drawn, after the `moved` objects did."""
         possible = possible_space(self.problem, self.belief, state.exists)
         space, tables, drawn_in = self.problem.space, self.problem.actions, self.drawn_in(self.present, state)
         return candidates(space, tables, drawn_in.scene, possible, state.options, moved, state.able)

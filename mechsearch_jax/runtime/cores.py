@@ -27,7 +27,7 @@ def share_of_cores(processes: int) -> dict[str, str]:
 def on_host() -> contextlib.AbstractContextManager[Any]:
     """In this block JAX computes on the host, for what a GPU takes longer to compile or to get through.
 
-    Where JAX was told to know nothing but the GPU (`JAX_PLATFORMS`), it computes there all the same.
+    Where JAX may use nothing but the GPU (`JAX_PLATFORMS`), it computes there all the same.
     """
     # Who asks for help alone does not wait for it.
     import jax
