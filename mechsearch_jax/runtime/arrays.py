@@ -1,4 +1,4 @@
-"""NumPy archives from outside: bounded in size; whatever they hold, an `InputError` is the worst that happens."""
+"""Read NumPy archives of unknown origin: their size is bounded, and damage of any kind raises an `InputError`."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import numpy as np
 from mechsearch_jax.runtime.errors import InputError, shown
 from mechsearch_jax.runtime.files import PathLike
 
-# What is larger, packed or not, is none of ours [bytes]: the largest has 20 MB.
+# Larger archives, packed or not, are not ours [bytes]: the largest of ours has 20 MB.
 ARRAYS_LIMIT = 512 * 2**20
 
 
 def read_arrays(data: bytes, where: PathLike, limit: int = ARRAYS_LIMIT) -> dict[str, np.ndarray]:
-    """The arrays in a NumPy archive, by name; no code can run from it.
+    """The arrays in a NumPy archive, by name. Nothing in it is executed.
 
     Args:
-      data: what the archive's file holds.
-      where: how to name it in messages.
-      limit: an archive that unpacks to more bytes is refused.
+      data: the bytes of the archive.
+      where: how messages name it.
+      limit: largest size after unpacking [bytes].
 
     Raises:
-      InputError: it is damaged or none, or unpacks to too much.
+      InputError: it is damaged, not an archive of arrays, or too large.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -40,6 +40,6 @@ def read_arrays(data: bytes, where: PathLike, limit: int = ARRAYS_LIMIT) -> dict
         return arrays
     except InputError:
         raise
-    # To damage the parsers beneath answer with a dozen kinds of exception, and document none.
+    # The parsers raise a dozen undocumented kinds of exception on damaged files.
     except Exception as error:
         raise InputError(f"{where}: is no whole archive of arrays, .npz ({type(error).__name__})") from error

@@ -1,4 +1,4 @@
-"""The host's processors: how many cores this process may keep busy, and computing on them beside a GPU."""
+"""The host's processors: how many cores this process may use, and how to compute on them if there is a GPU."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import os
 from typing import Any
 
-# Set for processes that share the cores with others.
+# Environment variable that limits the cores of a process.
 VARIABLE = "MECHSEARCH_CORES"
 
 
@@ -19,17 +19,16 @@ def cores() -> int:
 
 
 def share_of_cores(processes: int) -> dict[str, str]:
-    """What the environment of each of several processes must hold, so that together they keep no more cores busy than
-    this one may."""
+    """Environment variables for each of several processes that share this process's cores."""
     return {VARIABLE: str(max(cores() // processes, 1))}
 
 
 def on_host() -> contextlib.AbstractContextManager[Any]:
-    """In this block JAX computes on the host, for what a GPU takes longer to compile or to get through.
+    """A block in which JAX computes on the host, for work that takes longer on a GPU, compiling included.
 
-    Where JAX may use nothing but the GPU (`JAX_PLATFORMS`), it computes there all the same.
+    If `JAX_PLATFORMS` excludes the host, JAX computes on the GPU.
     """
-    # Who asks for help alone does not wait for it.
+    # Imported here so that `--help` does not wait for it.
     import jax
 
     if jax.default_backend() != "cpu":

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-# Longer values are cut in messages.
+# Messages show at most so many characters of a value.
 SHOWN = 60
 
 
@@ -19,7 +19,7 @@ class InputError(ValueError):
 
 
 def shown(value: Any) -> str:
-    """A value that came from outside, for a message: as JSON has it, on one line, cut where it is long."""
+    """A user's value for a message: as JSON, on one line, cut if it is long."""
     try:
         text = json.dumps(value, default=str)
     except (ValueError, TypeError, RecursionError):
@@ -27,18 +27,18 @@ def shown(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """How to mend a name that is unknown: the end of a message, which names the known one that it resembles, or all."""
-    names = list(known)
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """The end of a message about an unknown name: the valid name that resembles it, or all valid names."""
+    names = list(valid)
     alike = difflib.get_close_matches(name[:SHOWN], names, n=1)
     return f"did you mean {alike[0]}?" if alike else f"known are {', '.join(names)}"
 
 
 def check_range(name: str, value: float | int, low: float | int, high: float | int, unit: str = "") -> None:
-    """Refuse a number that is not from `low` to `high`; NaN is not.
+    """Check that a number is from `low` to `high`.
 
     Raises:
-      InputError: it is not.
+      InputError: it is not, or it is NaN.
     """
     if not low <= value <= high:
         raise InputError(f"{name} ({value}) must be from {low:g} to {high:g}{unit and ' '}{unit}")

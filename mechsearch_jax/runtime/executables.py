@@ -23,70 +23,70 @@ from mechsearch_jax.runtime.files import replacing
 from mechsearch_jax.runtime.versions import source_digest
 
 FORMAT = b"mechsearch-executable 1\n"
-# Those of older versions of the package are of no use; what is left serves who switches between versions and settings.
+# The oldest entries are deleted beyond this size [bytes]; the rest serves users who switch between versions.
 MOST_BYTES = 1 << 30
-# What an executable holds that only works in the process that compiled it: calls back into Python.
 LAPACK = b"lapack"
+# Executables with calls back into Python only work in the process that compiled them.
 UNKEEPABLE = (b"python_cpu_callback", b"python_gpu_callback")
 
 
 class Executables:
     """A folder of executables.
 
-    An entry is told apart by the package's source, the versions of what compiled it, the device, the processor, the
-    flags of XLA, the function and what is said of its arguments. What is damaged, of something else, or cannot be
-    loaded, is as if it were not there.
+    The key of an entry is made of the package's source, the versions of the compilers, the device, the processor, the
+    flags of XLA, the function and the signature of its arguments. Entries that are damaged, have another key or cannot
+    be loaded are ignored.
 
-    Loading runs what the file says: only files of a folder are read that belong to the user and that nobody else may
-    write to. Never point it at files of others.
+    Loading an entry can run code from its file. Therefore the folder must belong to the user, and nobody else may have
+    write access. Never use it with files of others.
     """
 
     def __init__(self, folder: Path) -> None:
         """Args:
-        folder: made when it is first needed, for the user alone.
+        folder: created on demand, with access for the user alone.
         """
         self.folder = folder
         self._warned = False
 
-    def has(self, name: str, said: str) -> bool:
-        """Whether there is an entry, whole or not."""
-        return self._trusted() and self._file(name, said).exists()
+    def has(self, name: str, signature: str) -> bool:
+        """Whether there is an entry, damaged or not."""
+        return self._trusted() and self._file(name, signature).exists()
 
-    def load(self, name: str, said: str, structure: Any) -> Any:
+    def load(self, name: str, signature: str, structure: Any) -> Any:
         """The executable of a function; None if there is none that can be used.
 
         Args:
           name: of the function.
-          said: all that is to be known of its arguments.
+          signature: identifies its arguments, see `runtime.identity.identity`.
           structure: of its arguments, as a pytree `(args, kwargs)`.
         """
-        file = self._file(name, said)
+        file = self._file(name, signature)
         if not self._trusted():
             return None
         try:
             head, key, digest, data = file.read_bytes().split(b"\n", 3)
-            if head + b"\n" != FORMAT or key.decode() != self._key(name, said):
+            if head + b"\n" != FORMAT or key.decode() != self._key(name, signature):
                 return None
             if hashlib.sha256(data).hexdigest() != digest.decode():
                 return None
             blob, results = pickle.loads(data)
             if LAPACK in blob:
                 _set_up_lapack()
-            found = serialize_executable.deserialize_and_load(
+            executable = serialize_executable.deserialize_and_load(
                 blob, structure, results, execution_devices=jax.devices()[:1]
             )
             os.utime(file)
-        # Whatever is wrong with it, it is compiled anew.
+        # Whatever is wrong with it, the caller compiles it again.
         except Exception:
             return None
-        return found
+        return executable
 
-    def save(self, name: str, said: str, compiled: Any) -> None:
-        """Keep an executable, if it can be kept; a folder that cannot be written to is done without."""
+    def save(self, name: str, signature: str, compiled: Any) -> None:
+        """Keep an executable if it can be serialised and the folder can be written to."""
         try:
             blob, _, results = serialize_executable.serialize(compiled)
             data = pickle.dumps((blob, results))
-        # Not all can be, and what is raised then depends on JAX.
+        # The exception for an executable that cannot be serialised depends on JAX's version.
         except Exception:
             return
         if any(word in blob for word in UNKEEPABLE):
@@ -96,25 +96,25 @@ class Executables:
             if not self._trusted():
                 return
             digest = hashlib.sha256(data).hexdigest()
-            with replacing(self._file(name, said)) as file:
-                file.write(FORMAT + f"{self._key(name, said)}\n{digest}\n".encode() + data)
+            with replacing(self._file(name, signature)) as file:
+                file.write(FORMAT + f"{self._key(name, signature)}\n{digest}\n".encode() + data)
             self._forget_old()
 
-    def _file(self, name: str, said: str) -> Path:
-        return self.folder / f"{name.rpartition('.')[2].strip('_')}-{self._key(name, said)[:32]}.exe"
+    def _file(self, name: str, signature: str) -> Path:
+        return self.folder / f"{name.rpartition('.')[2].strip('_')}-{self._key(name, signature)[:32]}.exe"
 
-    def _key(self, name: str, said: str) -> str:
-        return hashlib.sha256(f"{_source()} {_machine()} {name} {said}".encode()).hexdigest()
+    def _key(self, name: str, signature: str) -> str:
+        return hashlib.sha256(f"{_source()} {_machine()} {name} {signature}".encode()).hexdigest()
 
     def _trusted(self) -> bool:
-        """Whether the folder is the user's own, and nobody else may write to it; one that is not there is."""
+        """Whether the folder belongs to the user and nobody else may write to it, or it does not exist."""
         if not hasattr(os, "getuid"):
             return True
         try:
-            told = self.folder.stat()
+            status = self.folder.stat()
         except OSError:
             return True
-        trusted = told.st_uid == os.getuid() and not told.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        trusted = status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
         if not trusted and not self._warned:
             self._warned = True
             warnings.warn(
@@ -127,44 +127,44 @@ class Executables:
     def _forget_old(self) -> None:
         files = sorted(((f.stat(), f) for f in self.folder.glob("*.exe")), key=lambda pair: -pair[0].st_mtime)
         total = 0
-        for told, file in files:
-            total += told.st_size
+        for status, file in files:
+            total += status.st_size
             if total > MOST_BYTES:
                 file.unlink(missing_ok=True)
 
 
 @functools.cache
 def _set_up_lapack() -> None:
-    """Make LAPACK known to XLA, which JAX does when it first lowers something that uses it; without, a process dies."""
+    """Register LAPACK's functions with XLA. JAX does so when it first lowers a call; without them the process dies."""
     square, row = jax.ShapeDtypeStruct((1, 1), jnp.float32), jax.ShapeDtypeStruct((1,), jnp.float32)
     jax.jit(jnp.linalg.solve).lower(square, row)
 
 
 @functools.cache
 def _source() -> str:
-    """A digest of all source that may be traced."""
+    """SHA-256 of all source that may be traced."""
     return source_digest((".py",), ("mechsearch_jax", "mechsearch_jax.envs"))
 
 
 @functools.cache
 def _machine() -> str:
-    """Versions, device, processor and flags: what else an executable depends on, of this process."""
+    """Versions, device, processor and flags of this process, on which an executable depends."""
     device = jax.devices()[0]
     versions = [importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy", "flax")]
     flags = [os.environ.get(name, "") for name in ("XLA_FLAGS", "LIBTPU_INIT_ARGS")]
-    said = (versions, device.platform, device.device_kind, device.client.platform_version, len(jax.devices()), flags)
-    return repr((platform.python_version(), said, processor()))
+    parts = (versions, device.platform, device.device_kind, device.client.platform_version, len(jax.devices()), flags)
+    return repr((platform.python_version(), parts, processor()))
 
 
 def processor() -> str:
-    """What tells this processor from others that the same code need not run on: its model and what it can do.
+    """The processor's model and instruction sets, without which machine code may not run.
 
-    Where the system does not say what it can do, the machine's name.
+    If the system does not list them, the machine's name.
     """
     try:
-        told = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
+        lines = Path("/proc/cpuinfo").read_text().partition("\n\n")[0].splitlines()
     except OSError:
         return f"{platform.machine()} {platform.processor()} {platform.platform()} {platform.node()}"
     wanted = ("vendor_id", "cpu family", "model", "model name", "flags", "Features", "CPU implementer", "CPU part")
-    pairs = (line.partition(":") for line in told)
+    pairs = (line.partition(":") for line in lines)
     return "; ".join(f"{name.strip()}={value.strip()}" for name, _, value in pairs if name.strip() in wanted)

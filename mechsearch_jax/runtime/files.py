@@ -1,5 +1,4 @@
-"""Files as they come and go: written beside their place and then moved there, so that each is either whole or not there
-at all; read with bounds on their size, and whatever they hold, an `InputError` is the worst that can happen."""
+"""Write files atomically, and read files of unknown origin: size is bounded, and bad content raises `InputError`."""
 
 from __future__ import annotations
 
@@ -15,13 +14,13 @@ from typing import IO, Any
 from mechsearch_jax.runtime.errors import InputError
 
 PathLike = str | os.PathLike[str]
-# A text that is larger is none of ours [bytes]: the largest scenario has 10 kB.
+# Larger text files are not ours [bytes]: the largest scenario has 10 kB.
 TEXT_LIMIT = 4 * 2**20
 
 
 @contextlib.contextmanager
 def replacing(path: PathLike) -> Iterator[IO[bytes]]:
-    """A binary file to write to; it takes the place of `path` at the end, unless an exception leaves the block.
+    """A binary file to write to; it replaces `path` at the end, unless an exception leaves the block.
 
     Raises:
       InputError: the file cannot be written.
@@ -42,7 +41,7 @@ def replacing(path: PathLike) -> Iterator[IO[bytes]]:
 
 
 def save_json(value: dict[str, Any], path: PathLike) -> None:
-    """Write numbers, texts, lists and dictionaries as JSON; there may be no NaN among them.
+    """Write a dictionary as JSON; it may hold no NaN.
 
     Raises:
       InputError: the file cannot be written.
@@ -52,10 +51,10 @@ def save_json(value: dict[str, Any], path: PathLike) -> None:
 
 
 def check_writable(folder: PathLike) -> None:
-    """Fail before the work begins rather than after it, if files cannot be written into a folder.
+    """Check before the work begins that files can be written into a folder, which is created if it is missing.
 
     Raises:
-      InputError: the folder does not exist and cannot be made, or nothing can be written into it.
+      InputError: they cannot.
     """
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
@@ -66,7 +65,7 @@ def check_writable(folder: PathLike) -> None:
 
 
 def is_file(path: PathLike) -> bool:
-    """Whether there is a file; there is none at a path that cannot be one, or may not be looked at."""
+    """Whether there is a readable path to a file; False instead of an error for an impossible path."""
     try:
         return Path(path).is_file()
     except OSError:
@@ -74,7 +73,7 @@ def is_file(path: PathLike) -> bool:
 
 
 def is_folder(path: PathLike) -> bool:
-    """The same of a folder."""
+    """`is_file` for a folder."""
     try:
         return Path(path).is_dir()
     except OSError:
@@ -82,14 +81,10 @@ def is_folder(path: PathLike) -> bool:
 
 
 def read_bytes(path: PathLike, limit: int) -> bytes:
-    """What a file holds.
-
-    Args:
-      path: of the file.
-      limit: a file with more bytes is refused.
+    """The content of a file.
 
     Raises:
-      InputError: the file cannot be read, or is too large.
+      InputError: the file cannot be read, or has more than `limit` bytes.
     """
     try:
         with open(path, "rb") as file:
@@ -102,7 +97,7 @@ def read_bytes(path: PathLike, limit: int) -> bytes:
 
 
 def read_text(path: PathLike, limit: int = TEXT_LIMIT) -> str:
-    """What a text file holds.
+    """The content of a text file.
 
     Raises:
       InputError: the file cannot be read, is too large, or is not UTF-8.
@@ -114,7 +109,7 @@ def read_text(path: PathLike, limit: int = TEXT_LIMIT) -> str:
 
 
 def read_json(path: PathLike, limit: int = TEXT_LIMIT) -> Any:
-    """What a JSON file holds, as `json.loads` returns it.
+    """The content of a JSON file, as `json.loads` returns it.
 
     Raises:
       InputError: as `read_text`, or it is not JSON.

@@ -1,4 +1,4 @@
-"""Values told apart across processes: equal texts for what a function would be traced to the same program from."""
+"""Identify values across processes: arguments with equal identities make JAX trace the same program."""
 
 from __future__ import annotations
 
@@ -9,26 +9,25 @@ import io
 import pickle
 from typing import Any
 
-# Packages whose functions and classes are told by their names: this one, whose source counts, and those whose versions
-# do, in what tells one executable from another.
+# Packages whose functions and classes are identified by their names. The key of an executable holds a digest of this
+# package's source and the versions of the others.
 KNOWN = ("builtins", "mechsearch_jax", "jax", "jaxlib", "numpy", "flax", "functools", "enum", "pathlib", "copyreg")
 
 
 class Unidentified(Exception):
-    """A value that another process could not be told to be the same."""
+    """A value that cannot be identified in another process."""
 
 
-class _Teller(pickle.Pickler):
-    """Writes values, and refuses what is not of a known package."""
+class _IdentityPickler(pickle.Pickler):
+    """Writes values, and refuses those that are not of a package in `KNOWN`."""
 
     def __init__(self, file: io.BytesIO) -> None:
         super().__init__(file, protocol=5)
-        # Without notes of what was written before: whether equal parts are one object does not count.
+        # No memo: whether equal parts are the same object does not count.
         self.fast = True
 
     def reducer_override(self, obj: Any) -> Any:
-        # Functions that are wrapped, as by `jax.jit`, are told by the name that they stand under. Pickle itself looks
-        # whether it is what is found there.
+        # Wrapped functions, as by `jax.jit`, are identified by their names; pickle checks that these lead to them.
         if isinstance(obj, type) or inspect.isroutine(obj) or hasattr(obj, "__wrapped__"):
             module = getattr(obj, "__module__", None) or ""
             if module.partition(".")[0] not in KNOWN:
@@ -44,20 +43,19 @@ class _Teller(pickle.Pickler):
 
 
 def identity(value: Any) -> str:
-    """A text that is the same in every process for equal values, and another for others.
+    """A SHA-256 in hexadecimal that is equal for equal values in every process, and differs between other values.
 
     Args:
-      value: what can be pickled and is made of the packages in `KNOWN`: numbers, texts, arrays, enumerations, functions
-        and classes, partial applications and dataclasses of these, containers, and structures of pytrees whose static
-        parts are such. Of a dataclass those fields count that its comparison looks at; all of them where it has none.
-        The order of a dictionary counts.
+      value: anything that can be pickled and is made of the packages in `KNOWN`: numbers, texts, arrays, enumerations,
+        functions, classes, partial applications, dataclasses, containers, and pytree structures. Of a dataclass the
+        compared fields count, or all fields if it has no comparison. The order of a dictionary counts.
 
     Raises:
-      Unidentified: it is something else, such as a function of a user's own, whose source is not known.
+      Unidentified: it is something else, such as a user's function, whose source is not part of any key.
     """
     written = io.BytesIO()
     try:
-        _Teller(written).dump(value)
+        _IdentityPickler(written).dump(value)
     except (pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError) as error:
         raise Unidentified(str(error)) from error
     return hashlib.sha256(written.getvalue()).hexdigest()

@@ -7,11 +7,5 @@ from typing import Any
 
 
 def option(default: Any, help: str, choices: tuple[str, ...] | None = None) -> Any:
-    """A dataclass field that is an option.
-
-    Args:
-      default: its value.
-      help: one line for the command line.
-      choices: the values it may have; None where any will do.
-    """
+    """A dataclass field that is an option, with one line of help and the values it may have (any if None)."""
     return dataclasses.field(default=default, metadata={"help": help, "choices": choices})

@@ -1,5 +1,4 @@
-"""Frozen dataclasses from tables of a TOML file: checked by their annotations, with file, line and key in every
-complaint."""
+"""Frozen dataclasses from tables of a TOML file, checked by their annotations; errors name file, line and key."""
 
 from __future__ import annotations
 
@@ -14,26 +13,26 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 from mechsearch_jax.runtime.errors import InputError, nearest, shown
 from mechsearch_jax.runtime.files import PathLike, read_text
 
-# More than this no file of settings has [bytes].
+# Largest size of a settings file [bytes].
 LIMIT = 2**18
 T = TypeVar("T")
 
 _BARE = re.compile(r"[A-Za-z0-9_-]{1,60}")
 _HEADER = re.compile(r"\s*\[\s*([A-Za-z0-9_-]+)\s*\]\s*(?:#.*)?$")
 _KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")
-# What complaints of dataclasses begin with.
+# The prefix of error messages of dataclasses.
 _CLASS = re.compile(r"^[A-Z]\w+: ")
 _LINE = re.compile(r"\s*\(at line (\d+), column \d+\)")
 
 
 @dataclasses.dataclass(frozen=True)
 class Document:
-    """A TOML file of tables without tables inside.
+    """A TOML file of tables that are not nested.
 
     Attributes:
-      path: how the file is named.
-      tables: its tables, by their names; "" holds what stands before the first.
-      lines: where tables and keys stand, by (table, "") and (table, key).
+      path: how messages name the file.
+      tables: its tables by name; "" holds the keys before the first table.
+      lines: line numbers of tables and keys, by (table, "") and (table, key).
     """
 
     path: str
@@ -41,13 +40,13 @@ class Document:
     lines: Mapping[tuple[str, str], int]
 
     def where(self, table: str, key: str = "") -> str:
-        """How a complaint about a table, or a key in it, begins."""
+        """The beginning of an error message about a table, or a key in it."""
         line = self.lines.get((table, key), self.lines.get((table, "")))
         place = f"{self.path}:{line}" if line else self.path
-        return f"{place}:{table and f' [{_told(table)}]'}{key and f' {_told(key)}'}"
+        return f"{place}:{table and f' [{_quoted(table)}]'}{key and f' {_quoted(key)}'}"
 
 
-def _told(name: str) -> str:
+def _quoted(name: str) -> str:
     return name if _BARE.fullmatch(name) else shown(name)
 
 
@@ -61,17 +60,17 @@ def read_document(path: PathLike) -> Document:
     try:
         value = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        told = " ".join(str(error).split()) or type(error).__name__
-        line = _LINE.search(told)
+        message = " ".join(str(error).split()) or type(error).__name__
+        line = _LINE.search(message)
         place = f"{path}:{line[1]}" if line else f"{path}"
-        raise InputError(f"{place}: is not TOML ({_LINE.sub('', told)[:200]})") from error
+        raise InputError(f"{place}: is not TOML ({_LINE.sub('', message)[:200]})") from error
     tables = {name: part for name, part in value.items() if isinstance(part, dict)}
     tables[""] = {name: part for name, part in value.items() if name not in tables}
     return Document(str(path), tables, _lines(text, tables))
 
 
 def _lines(text: str, tables: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], int]:
-    """Where the tables and keys of a text stand that are written in the usual way; of others nothing is known."""
+    """Line numbers of the tables and keys that are written plainly; others, such as quoted keys, have none."""
     lines: dict[tuple[str, str], int] = {}
     table = ""
     for number, line in enumerate(text.splitlines(), start=1):
@@ -84,29 +83,29 @@ def _lines(text: str, tables: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str
     return lines
 
 
-def check_names(document: Document, table: str, known: Mapping[str, Any]) -> None:
-    """Refuse keys that a table cannot have.
+def check_names(document: Document, table: str, valid: Mapping[str, Any]) -> None:
+    """Check the keys of a table.
 
     Raises:
-      InputError: it has one.
+      InputError: a key is not among the valid ones.
     """
     for key in document.tables.get(table, {}):
-        if key not in known:
-            raise InputError(f"{document.where(table, key)} is unknown; {nearest(key, known)}")
+        if key not in valid:
+            raise InputError(f"{document.where(table, key)} is unknown; {nearest(key, valid)}")
 
 
 def with_table(document: Document, table: str, usual: T) -> T:
-    """A dataclass with what a table of a file gives in place of its fields.
+    """A dataclass whose fields are replaced by the values in a table of a file.
 
     Args:
       document: the file.
       table: name of the table; it may be missing.
-      usual: what the dataclass is without the table.
+      usual: the dataclass with its defaults.
 
     Raises:
-      InputError: a key is no field, or a value is of another type or impossible.
+      InputError: a key is not a field, or a value is impossible or of the wrong type.
     """
-    known: Any = usual
+    defaults: Any = usual
     kind: Any = type(usual)
     hints = get_type_hints(kind)
     check_names(document, table, {field.name: field for field in dataclasses.fields(kind)})
@@ -114,11 +113,11 @@ def with_table(document: Document, table: str, usual: T) -> T:
         key: checked(value, hints[key], document.where(table, key))
         for key, value in document.tables.get(table, {}).items()
     }
-    return apply(document, table, given, lambda changes: dataclasses.replace(known, **changes))
+    return apply(document, table, given, lambda changes: dataclasses.replace(defaults, **changes))
 
 
 def apply(document: Document, table: str, given: Mapping[str, Any], make: Callable[[Mapping[str, Any]], T]) -> T:
-    """What `make` makes of a table's values; where it refuses them, its complaint with the place of the one at fault.
+    """`make(given)`, with the file's place in front of its error messages.
 
     Raises:
       InputError: as `make`.
@@ -126,15 +125,15 @@ def apply(document: Document, table: str, given: Mapping[str, Any], make: Callab
     try:
         return make(given)
     except InputError as error:
-        said = str(error)
-    # Without the value at fault there is no complaint, or another one.
-    key = next((key for key in given if _complaint(make, given, key) != said), "")
-    said = _CLASS.sub("", said)
+        message = str(error)
+    # Without the value at fault `make` raises nothing, or another error.
+    key = next((key for key in given if _error_message(make, given, key) != message), "")
+    message = _CLASS.sub("", message)
     place = document.where(table, key)
-    raise InputError(f"{place.removesuffix(key) if key and said.startswith(key) else f'{place}: '}{said}")
+    raise InputError(f"{place.removesuffix(key) if key and message.startswith(key) else f'{place}: '}{message}")
 
 
-def _complaint(make: Callable[[Mapping[str, Any]], Any], given: Mapping[str, Any], without: str) -> str | None:
+def _error_message(make: Callable[[Mapping[str, Any]], Any], given: Mapping[str, Any], without: str) -> str | None:
     try:
         make({key: value for key, value in given.items() if key != without})
     except InputError as error:
@@ -143,12 +142,12 @@ def _complaint(make: Callable[[Mapping[str, Any]], Any], given: Mapping[str, Any
 
 
 def checked(value: Any, hint: Any, where: str) -> Any:
-    """A value of a TOML file as an annotation has it: lists become tuples, and whole numbers numbers where any will do.
+    """A value of a TOML file, converted to its annotated type: lists become tuples, and integers floats.
 
     Args:
       value: as the parser returned it.
-      hint: `bool`, `int`, `float`, `str`, a `Literal` of texts, or a tuple of such; or None beside one of these.
-      where: how the complaint begins.
+      hint: `bool`, `int`, `float`, `str`, a `Literal` of texts, or a tuple of these; each may be optional.
+      where: the beginning of an error message.
 
     Raises:
       InputError: it is of another type, or not finite.
@@ -158,9 +157,9 @@ def checked(value: Any, hint: Any, where: str) -> Any:
     if get_origin(hint) is tuple:
         return _checked_list(value, get_args(hint), where)
     if get_origin(hint) is Literal:
-        known = get_args(hint)
-        if value not in known:
-            raise InputError(f"{where} must be one of {', '.join(map(shown, known))}, not {shown(value)}")
+        choices = get_args(hint)
+        if value not in choices:
+            raise InputError(f"{where} must be one of {', '.join(map(shown, choices))}, not {shown(value)}")
         return value
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         try:
@@ -186,4 +185,4 @@ def _checked_list(value: Any, parts: tuple[Any, ...], where: str) -> tuple[Any, 
         parts = (parts[0],) * len(value)
     if len(parts) != len(value):
         raise InputError(f"{where} must be a list of {len(parts)}, not of {len(value)}: {shown(value)}")
-    return tuple(checked(one, part, f"{where}[{i}]") for i, (one, part) in enumerate(zip(value, parts, strict=True)))
+    return tuple(checked(item, part, f"{where}[{i}]") for i, (item, part) in enumerate(zip(value, parts, strict=True)))

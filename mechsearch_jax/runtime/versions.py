@@ -1,4 +1,4 @@
-"""What a result depends on: versions, the device, the source."""
+"""What a result depends on: versions, device and source."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from pathlib import Path
 
 import jax
 
-# Folders of `mechsearch_jax` that decide nothing, and those that are packages of their own although they are installed
-# beneath it.
+# Folders of `mechsearch_jax` that do not influence decisions, and packages that are installed beneath it.
 UNDECIDING = ("commands", "viz", "data", "envs", "train", "benchmarks")
 
 
 def versions() -> dict[str, str]:
-    """The versions of what a result depends on, and the device that it was computed on."""
+    """Versions of the packages that a result depends on, and the device."""
     packages = ("mechsearch-jax", "jax", "mujoco", "numpy")
     device = jax.devices()[0]
     return {
@@ -29,12 +28,7 @@ def versions() -> dict[str, str]:
 
 
 def source_digest(endings: Sequence[str], packages: Sequence[str] = ("mechsearch_jax",)) -> str:
-    """SHA-256 of the source that decides, in hexadecimal: of all folders of packages but those of `UNDECIDING`.
-
-    Args:
-      endings: of the files that count.
-      packages: names of packages.
-    """
+    """SHA-256, in hexadecimal, of the source that decides: files with these endings in all folders but `UNDECIDING`."""
     digest = hashlib.sha256()
     for package in packages:
         root = Path(str(importlib.resources.files(package)))
