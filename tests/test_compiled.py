@@ -28,7 +28,7 @@ def scaled(camera, values, factor=2.0, config=None):
     return {"scaled": values * factor * camera.width, "sum": jnp.sum(values) * (config.gamma if config else 1.0)}
 
 
-def told(value):
+def called_back(value):
     return jax.pure_callback(lambda a: np.asarray(a), jax.ShapeDtypeStruct((), jnp.float32), value)
 
 
@@ -90,9 +90,9 @@ def test_what_is_data_compiles_nothing_anew(folder):
     ],
 )
 def test_other_arguments_are_other_entries(folder, arguments):
-    known = [(Camera(), VALUES), (Camera(), VALUES, 2.5, PlannerConfig(horizon=1)), (Camera(), VALUES, jnp.ones(3))]
-    for others in known:
-        another_process()(*others)
+    calls = [(Camera(), VALUES), (Camera(), VALUES, 2.5, PlannerConfig(horizon=1)), (Camera(), VALUES, jnp.ones(3))]
+    for call in calls:
+        another_process()(*call)
     again = another_process()
     assert not again.is_ready(*arguments)
     result = again(*arguments)
@@ -242,7 +242,7 @@ def test_what_cannot_be_told_apart_is_not_kept(folder):
 
     assert float(function(Own(), VALUES)["scaled"][0]) == 6.0
     # A function that calls back into Python holds an address of this process.
-    assert float(another_process(told, ())(VALUES[0])) == 1.0
+    assert float(another_process(called_back, ())(VALUES[0])) == 1.0
     assert not folder.exists() or not list(folder.iterdir())
 
 

@@ -1,4 +1,4 @@
-"""What a first decision needs is prepared while other things begin, and who waits is told for what."""
+"""The programs of a first decision are compiled in parallel with the rest, and progress is reported."""
 
 import threading
 import time
@@ -100,7 +100,7 @@ def test_no_more_is_compiled_at_once_than_there_are_cores(monkeypatch):
 @pytest.mark.parametrize("config", [None, SimulatorConfig(motion=MotionConfig(waypoints=9))])
 def test_a_native_simulator_knows_the_motions_that_it_computes(config):
     world = from_scenario(load_scenario(example_scenarios()["first-light"]))
-    found = NativeSimulator(config=config).programs(world)
-    usual = (config or SimulatorConfig()).motion
-    assert [each.name for each in found] == [each.name for each in motions(usual)]
-    assert all(each.is_ready() == other.is_ready() for each, other in zip(found, motions(usual), strict=True))
+    programs = NativeSimulator(config=config).programs(world)
+    expected = motions((config or SimulatorConfig()).motion)
+    assert [program.name for program in programs] == [program.name for program in expected]
+    assert all(a.is_ready() == b.is_ready() for a, b in zip(programs, expected, strict=True))

@@ -31,7 +31,7 @@ from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, u
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.session.images import alike
+from mechsearch_jax.session.images import converted
 from mechsearch_jax.session.searcher import DRAWS, Searcher
 from mechsearch_jax.session.step import Motion
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
@@ -56,9 +56,9 @@ def searcher_of(problem, scenario, policy=grab, **arguments):
     """A searcher that sees what stands in a scenario, whatever the images show."""
     observation = seen(scenario) if isinstance(scenario, type(HIDDEN)) else scenario
     given = {"trajectories": TRUSTING, **arguments}
-    found = Searcher(policy=policy, recogniser=lambda problem: lambda *images: observation, **given)
-    found.problem = problem
-    return found
+    searcher = Searcher(policy=policy, recogniser=lambda problem: lambda *images: observation, **given)
+    searcher.problem = problem
+    return searcher
 
 
 def turned(camera, by):
@@ -226,39 +226,39 @@ def test_where_nothing_is_tried_out_it_says_so(problem):
         searcher.problem, searcher.recogniser = problem, lambda *images: seen(OPEN)
     assert "no action is tried out before it is made" in plain.check().notices[0]
     assert bold.check().notices == ()
-    # Of a policy of one's own nothing is known.
+    # A user's policy may try actions by itself.
     assert searcher_of(problem, OPEN).check().notices == ()
     done = Motion("retrieve", "it is found", object())
-    assert plain._allowed(done).reason == "it is found; not tried out before"
-    assert bold._allowed(done).reason == "it is found"
+    assert plain._within_limit(done).reason == "it is found; not tried out before"
+    assert bold._within_limit(done).reason == "it is found"
 
 
 def test_after_all_actions_only_the_target_is_taken_out(problem):
     searcher = searcher_of(problem, OPEN, config=standard(max_steps=1))
     push, take = Motion("push", "to push object 1", object()), Motion("retrieve", "to take it", object())
-    assert searcher._allowed(push) == push
+    assert searcher._within_limit(push) == push
     searcher._state = dataclasses.replace(searcher._now, index=1)
-    kept = searcher._allowed(push)
+    kept = searcher._within_limit(push)
     assert (kept.kind, kept.trajectory) == ("none", None)
     assert kept.reason.startswith("to push object 1; not done: all 1 actions of max_steps are used up")
-    assert searcher._allowed(take) == take
+    assert searcher._within_limit(take) == take
 
 
 def test_a_step_is_told_as_json(problem):
     step = searcher_of(problem, OPEN).next(IMAGES.depth, IMAGES.colour)
-    told = json.loads(json.dumps(step.to_json(), allow_nan=False))
-    assert (told["kind"], told["found"], told["warnings"]) == ("retrieve", True, [])
-    assert told["motion"]["duration"] > 0
-    (box,) = told["objects"]
+    values = json.loads(json.dumps(step.to_json(), allow_nan=False))
+    assert (values["kind"], values["found"], values["warnings"]) == ("retrieve", True, [])
+    assert values["motion"]["duration"] > 0
+    (box,) = values["objects"]
     assert box["position"] == pytest.approx(OPEN.objects[0].position, abs=1e-5)
     assert box["size"] == pytest.approx(OPEN.objects[0].half_size, abs=1e-5)
     assert (np.shape(box["rotation"]), box["slot"], len(box["exponents"])) == ((3, 3), 0, 2)
     assert box["quaternion"] == pytest.approx((1.0, 0.0, 0.0, 0.0), abs=1e-5)
-    target = told["target"]
+    target = values["target"]
     assert target["visible"]
     assert target["found_pose"][:2] == pytest.approx(OPEN.target.position[:2], abs=1e-5)
     assert np.array(target["T_world_target"])[:3, 3] == pytest.approx(OPEN.target.position, abs=1e-3)
-    action, hand = told["action"], told["hand"]
+    action, hand = values["action"], values["hand"]
     assert (action["kind"], action["object"], action["displacement"]) == ("retrieve", None, [0.0, 0.0, 0.0])
     T = np.array(action["T_world_gripper"])
     assert np.linalg.norm(T[:3, 3] - OPEN.target.position) < 0.05
@@ -266,22 +266,30 @@ def test_a_step_is_told_as_json(problem):
 
 
 def test_a_step_without_a_motion_has_neither_action_nor_hand(problem):
-    told = searcher_of(problem, HIDDEN).next(IMAGES.depth).to_json()
-    assert (told["kind"], told["motion"], told["action"], told["hand"]) == ("none", None, None, None)
-    assert (told["target"]["visible"], told["target"]["pose"], told["target"]["found_pose"]) == (False, None, None)
-    assert told["target"]["belief_size"] == told["poses"] > 0
+    values = searcher_of(problem, HIDDEN).next(IMAGES.depth).to_json()
+    assert (values["kind"], values["motion"], values["action"], values["hand"]) == ("none", None, None, None)
+    assert (values["target"]["visible"], values["target"]["pose"], values["target"]["found_pose"]) == (
+        False,
+        None,
+        None,
+    )
+    assert values["target"]["belief_size"] == values["poses"] > 0
 
 
 @pytest.mark.parametrize("colour", [IMAGES.colour, (IMAGES.colour / 255.0).astype(np.float32), IMAGES.colour / 255.0])
 def test_images_of_any_type_are_made_alike(colour):
-    depth, red, mask, target_id = alike(IMAGES.depth.astype(float), colour, IMAGES.mask.astype(np.int64), np.int64(3))
+    depth, red, mask, target_id = converted(
+        IMAGES.depth.astype(float), colour, IMAGES.mask.astype(np.int64), np.int64(3)
+    )
     assert (depth.dtype, red.dtype, mask.dtype, type(target_id)) == (np.float32, np.uint8, np.int32, int)
     np.testing.assert_array_equal(red, IMAGES.colour)
     np.testing.assert_array_equal(mask, IMAGES.mask)
 
 
 def test_images_that_are_wrong_stay_wrong():
-    depth, colour, mask, _ = alike(np.ones((2, 2), np.uint16), np.full((2, 2, 3), 255.0), np.full((2, 2), 2**40), None)
+    depth, colour, mask, _ = converted(
+        np.ones((2, 2), np.uint16), np.full((2, 2, 3), 255.0), np.full((2, 2), 2**40), None
+    )
     assert (depth.dtype, colour.max(), mask.min() > 8) == (np.uint16, 255.0, True)
 
 

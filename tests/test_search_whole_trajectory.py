@@ -274,12 +274,12 @@ def test_ros_messages_hold_it(tmp_path):
     np.testing.assert_allclose(seconds, trajectory.time, atol=1e-9)
     assert all(isinstance(p["time_from_start"]["nsecs"], int) for p in arm["points"])
     for name in ("position", "velocity", "acceleration"):
-        found = [p[f"{name.replace('y', 'ie') if name == 'velocity' else name}s"] for p in arm["points"]]
-        np.testing.assert_allclose(found, getattr(trajectory, name))
+        values = [p[f"{name.replace('y', 'ie') if name == 'velocity' else name}s"] for p in arm["points"]]
+        np.testing.assert_allclose(values, getattr(trajectory, name))
     times = [p["time_from_start"]["secs"] + 1e-9 * p["time_from_start"]["nsecs"] for p in gripper["points"]]
     for values, key in ((trajectory.width, "positions"), (trajectory.force, "effort")):
-        told = [p[key][0] for p in gripper["points"]]
-        np.testing.assert_allclose(np.interp(trajectory.time, times, told), values, atol=1e-9)
+        written = [p[key][0] for p in gripper["points"]]
+        np.testing.assert_allclose(np.interp(trajectory.time, times, written), values, atol=1e-9)
     assert len(times) < len(seconds) / 2
     with pytest.raises(InputError, match="7 different names"):
         ros_messages(trajectory, joint_names=["a"] * 7)

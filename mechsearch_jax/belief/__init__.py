@@ -1,1 +1,1 @@
-"""What is known of the target and the objects, and how a look changes it."""
+"""The belief about the target, and how an observation changes it."""

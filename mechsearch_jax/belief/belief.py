@@ -1,4 +1,4 @@
-"""What is known of the target: where it can still be, or where it was found (equation 4)."""
+"""The belief about the target: where it can still be, or where it was found (equation 4)."""
 
 from __future__ import annotations
 
@@ -22,17 +22,16 @@ from mechsearch_jax.runtime.errors import InputError
 
 
 class Belief(flax.struct.PyTreeNode):
-    """What is known of the target.
+    """The belief about the target.
 
     Attributes:
       exists: f_t, shape (X,). It grows only where an action may have moved the target: see `update_belief`.
-      found: c_t, whether the target has been seen and may still be where it was seen last: it is not found any more
-        once it is neither seen nor can be there unseen.
-      found_pose: where, as x, y [m], yaw [rad].
+      found: c_t, whether the target has been seen and may still be where it was seen last.
+      found_pose: that pose as x, y [m], yaw [rad].
       allowed: how many coarse pixels the target may show at each place of its candidate poses while it is hidden, shape
         (X, S); see `existence.allowances`.
-      grasps: the grasps that arm and shelf allow there.
-      restarts: how often f became empty and was started anew.
+      grasps: the grasps of the found target that arm and shelf allow.
+      restarts: how often f became empty and was reset.
     """
 
     exists: jax.Array
@@ -45,7 +44,7 @@ class Belief(flax.struct.PyTreeNode):
 
 @kept()
 def initial_belief(problem: Problem) -> Belief:
-    """Nothing is known: the target can be at every candidate pose."""
+    """The belief before the first observation: the target can be at every candidate pose."""
     allowed = problem.config.existence.allowed(problem.camera)
     return Belief(
         exists=jnp.ones(problem.poses.shape[0], bool),
@@ -65,24 +64,22 @@ def update_belief(
     before: Observation | None = None,
     action: Action | None = None,
 ) -> Belief:
-    """Fold an observation into the belief: `f_t = f_{t-1} * f_hat(s_t)` (equation 4), or the target's pose once it is
-    seen.
+    """The belief after an observation: `f_t = f_{t-1} * f_hat(s_t)` (equation 4), and the target's pose if it is seen.
 
-    A target that is found and then hidden again stays found, at the pose where it was seen last. Where it is not seen
-    although it would be in plain sight there, or an object stands there now, it was shoved away or never was there:
-    then it is not found any more, and f starts anew from what the objects allow now. One look is enough, so that a
-    detector that misses all of the target once, or a sensor that measures less than a third of it, costs one decision.
+    A found target that is hidden again stays found at the pose where it was seen last. If it would be in plain sight
+    there but is not seen, or an object stands there now, it was moved or was a false detection: it is not found any
+    more, and f is reset to what the present objects allow. One observation suffices for this, so that a detector that
+    misses the target once, or a sensor that measures less than a third of it, costs one decision.
 
-    Where the action since then may have moved a target that nobody sees, f is opened again before the observation is
-    folded in; see `unseen_motion.reopened`. Where f becomes empty nevertheless, which is a contradiction, it starts
-    anew from what the objects allow now, and `restarts` counts it.
+    If the action may have moved a hidden target, f is first reopened (`unseen_motion.reopened`). If f becomes empty
+    nevertheless, which is a contradiction, it is reset to what the present objects allow, and `restarts` counts it.
 
     Args:
-      problem: what does not change.
+      problem: the constants.
       belief: before the observation.
-      observation: what is seen now.
-      before: what was seen before the action; None, as `action`, if nothing was done since `belief`.
-      action: what the robot did or tried to do.
+      observation: the present one.
+      before: the observation before the action; None, as `action`, if nothing was done since `belief`.
+      action: executed or attempted since then.
 
     Raises:
       InputError: one of the last two is given without the other.
@@ -90,39 +87,39 @@ def update_belief(
     if (before is None) != (action is None):
         raise InputError("update_belief: give what was seen before the action and the action, or neither")
     everywhere = jnp.ones_like(belief.exists)
-    settings, found = problem.config.existence, jnp.asarray(observation.target_visible)
+    settings, visible = problem.config.existence, jnp.asarray(observation.target_visible)
     tables, camera, target, objects = problem.existence, problem.camera, problem.target, observation.objects
     views = object_views(tables, camera, objects, everywhere, settings)
     closer = closer_image(camera, objects, views, settings)
     allowed = allowances(tables, camera, target, views, closer, settings)
     now = existence(tables, camera, views, everywhere, allowed, settings)
     T_last = upright_pose(belief.found_pose, target.height(problem.shelf))
-    lost = belief.found & ~found & plainly_elsewhere(tables, camera, target, objects, closer, T_last, settings)
-    # Where a false detection kept f from being known, or an action took the target anywhere, nothing is ruled out yet.
-    known = belief.exists | lost
-    exists = known
+    lost = belief.found & ~visible & plainly_elsewhere(tables, camera, target, objects, closer, T_last, settings)
+    # A lost target may be at any candidate pose: f was not updated while it counted as found.
+    prior = belief.exists | lost
+    exists = prior
     if before is not None and action is not None and settings.reopen:
         exists |= reopened(problem, exists, before.objects, objects, action)
     both = exists & now
-    seen = (belief.found & ~lost) | found
-    contradiction = ~jnp.any(both) & ~seen
-    exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, known), both)
-    pose = jnp.where(found, observation.target_pose, belief.found_pose)
+    found = (belief.found & ~lost) | visible
+    contradiction = ~jnp.any(both) & ~found
+    exists = jnp.where(contradiction, jnp.where(jnp.any(now), now, prior), both)
+    pose = jnp.where(visible, observation.target_pose, belief.found_pose)
     T_world_target = upright_pose(pose, problem.target.height(problem.shelf))
     return Belief(
-        exists=jnp.where(seen, belief.exists, exists),
-        found=seen,
+        exists=jnp.where(found, belief.exists, exists),
+        found=found,
         found_pose=pose,
         allowed=allowed,
-        grasps=found_grasps(problem.target_grasps, T_world_target, seen),
+        grasps=found_grasps(problem.target_grasps, T_world_target, found),
         restarts=belief.restarts + contradiction,
     )
 
 
 def without_grasps(belief: Belief) -> Belief:
-    """What is known while the target is not found, without the grasps that it then could be taken out with.
+    """The belief without grasps of the found target, for programs that are traced for a target that is not found.
 
-    They would be masked out all the same; a program that is traced without them has nothing to compute of them.
+    They would be masked out; without them, nothing is computed for them.
     """
     grasps = belief.grasps
     return belief.replace(grasps=grasps.replace(feasible=grasps.feasible[..., :0], q=grasps.q[..., :0, :, :]))
@@ -134,9 +131,9 @@ def possible_poses(
     """f at the candidate poses and at the found pose (Y = X + 1): one or the other.
 
     Args:
-      belief: what was known at the start.
+      belief: at the root of the search.
       exists: f of the state.
-      target_at: the candidate that stands for where a found target was pushed to; nowhere if left out.
+      target_at: the candidate pose nearest to where a found target was pushed; none if left out.
     """
     if target_at is None:
         target_at = jnp.zeros_like(exists)
@@ -145,7 +142,7 @@ def possible_poses(
 
 
 def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) -> PossibleSpace:
-    """Raster of the space that an unseen target may take; empty once it is found, and an obstacle like any other."""
+    """Raster of the space that a hidden target may take; empty once it is found, when it is an ordinary obstacle."""
     grid = jnp.sum(exists.reshape(*problem.target.grid, -1), axis=-1) * ~belief.found
     return PossibleSpace(
         occupied=widen(grid > 0),
@@ -157,9 +154,9 @@ def possible_space(problem: Problem, belief: Belief, exists: Bool[Array, " x"]) 
 
 
 def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tuple[Superquadrics, Bool[Array, " n"]]:
-    """The objects and, in one more slot, the target, absent until it is found; and which of the slots is the target's.
+    """The objects and, in one more slot, the target, which is absent until found; and which slot is the target's.
 
-    It can be pushed like any object, but neither hides itself nor is in the way of its own grasp.
+    The target can be pushed like any object, but does not hide itself and does not obstruct its own grasp.
     """
     T = belief.grasps.T_world_target
     target = Superquadrics(
@@ -175,6 +172,6 @@ def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tup
 
 @kept()
 def graspability_map(problem: Problem, belief: Belief, objects: Superquadrics) -> Int[Array, " x"]:
-    """g at every candidate pose, whether the target can be there or not: 1, 0, -1, ... (section B.4), shape (X,)."""
+    """g at every candidate pose, also where f is 0: 1, 0, -1, ... (section B.4), shape (X,)."""
     everywhere = jnp.ones(problem.poses.shape[0], bool)
     return graspability(pairs(problem.grasps), grasp_hits(problem.grasps, None, objects, everywhere))

@@ -1,4 +1,4 @@
-"""Why nothing can be done: what a person is told where a decision has no action."""
+"""The explanation for a person why a decision has no action."""
 
 from __future__ import annotations
 
@@ -14,26 +14,20 @@ from mechsearch_jax.problem.problem import Problem
 
 @jax.jit
 def _movable(problem: Problem, belief: Belief, objects: Superquadrics) -> tuple[Bool[Array, " n"], Bool[Array, " n"]]:
-    """Which objects the arm reaches in some way that the shelf allows, and which with nothing in that way."""
+    """Which objects the arm can reach inside the shelf, and which it can reach without hitting another object."""
     scene, is_target = with_target(problem, belief, objects)
     possible = possible_space(problem, belief, belief.exists)
     ways = candidates(problem.space, problem.actions, scene, possible)
-    theirs = scene.valid & ~is_target
+    is_object = scene.valid & ~is_target
     reached, free = (
-        jnp.any(jnp.stack([jnp.any(which(kind), axis=(1, 2)) for kind in ways]), axis=0) & theirs
+        jnp.any(jnp.stack([jnp.any(which(kind), axis=(1, 2)) for kind in ways]), axis=0) & is_object
         for which in (lambda kind: kind.reached, free_ways)
     )
     return reached, free
 
 
 def impasse(problem: Problem, belief: Belief, objects: Superquadrics) -> str:
-    """Why no action is possible, in one line. Not to be called inside `jit`.
-
-    Args:
-      problem: what does not change.
-      belief: what is known of the target.
-      objects: as recognised, without the target.
-    """
+    """Why no action is possible, in one line; `objects` are those recognised, without the target. Not for `jit`."""
     count = int(jnp.sum(objects.valid))
     if count == 0:
         return "nothing that could be moved is recognised on the shelf"

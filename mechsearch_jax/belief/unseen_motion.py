@@ -1,13 +1,12 @@
-"""Where a hidden target may be now that an action may have moved it.
+"""Where a hidden target may be after an action that may have moved it.
 
-A target slides only while something that moves touches it, and comes to rest at once. So if it was moved, it stood
-beside the space that hand and objects swept, and stands beside that space now, no farther away than they travelled, and
-not behind where it stood, as seen along a straight way in or out. What swept it is known: the hand's way from the
-action, and the objects' ways from where they were seen before and after it. Which object is which afterwards is found
-out by what is seen, where they are and how large, and never by the slots that they are in. Whether the action succeeded
-does not matter: one that failed swept no more than it was meant to, and what it moved is seen.
+A target slides only while something that moves touches it, and comes to rest at once. So a target that was moved stood
+beside the space that hand and objects swept, and stands beside that space now: no farther from its old place than they
+travelled and, on a straight way in or out, not behind it. The swept space follows from the action (the hand) and from
+the poses of the objects before and after it. Objects are matched by pose and size, never by their slots. A failed
+action counts like a successful one: it swept no more than was planned, and what it moved is seen.
 
-Only what the camera allows now stays open: the belief folds the new observation in afterwards.
+The belief is updated with the new observation afterwards, which keeps only poses that the camera allows.
 """
 
 from __future__ import annotations
@@ -27,45 +26,44 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, inverse, make, transform
 from mechsearch_jax.problem.problem import Problem
 
-# An object whose centre moved by less was recognised anew a little elsewhere, or moved no target to another cell [m].
+# Smaller displacements of an object's centre are noise of recognition, or cannot move a target to another cell [m].
 STILL = 0.003
-# How far from what passed a target's surface may be at a pose that counts as touched [m]: a pose stands for its cell,
-# and what passed is a cloud of points.
+# Largest gap between the swept points and the surface of a target that counts as touched [m]: a pose represents its
+# cell, and the swept space is a cloud of points.
 REACH = 0.01
-# A hand that pushes travels no farther than this between the places where it is looked at [m].
+# Spacing of the samples along the way of a pushing hand [m].
 STRIDE = 0.03
-# What is carried and ends farther than this from its place was dropped or pushed on the way [m].
+# A carried object that ends farther than this from the planned pose was dropped or pushed on the way [m].
 DROPPED = 0.03
-# Places on the way of an object.
+# Samples along the way of an object.
 OBJECT_PLACES = 12
-# By how much two objects of different exponents seem to differ in size, for each unit of that difference [m].
+# Matching cost of a difference of 1 between the exponents of two objects, as a difference in size [m].
 SHAPE = 0.02
 
 
 def reopened(
     problem: Problem, exists: Bool[Array, " x"], before: Superquadrics, after: Superquadrics, action: Action
 ) -> Bool[Array, " x"]:
-    """Where a target may be that an action moved unseen.
+    """Candidate poses where a hidden target may be if the action moved it.
 
     Args:
-      problem: what does not change.
+      problem: the constants.
       exists: f before the action.
-      before, after: the objects as they were seen before and after it, in any order.
-      action: a single action, whether or not it was carried out to its end.
+      before, after: the objects observed before and after it, in any order.
+      action: a single action, executed to its end or not.
     """
     target = problem.target
     places = problem.poses.reshape(-1, target.yaws, 3)[:, 0, :2]
     radius = target.half_size[0] if target.yaws == 1 else math.hypot(*target.half_size[:2])
     now = jnp.any(exists.reshape(-1, target.yaws), axis=1)
-    away2 = jnp.sum((places[:, None] - places[None]) ** 2, axis=-1)
+    distance2 = jnp.sum((places[:, None] - places[None]) ** 2, axis=-1)
     opened = jnp.zeros_like(now)
     for sweep in _sweeps(problem, before, after, action):
-        # What does not count is far away.
         swept = jnp.where((sweep.counts & (action.kind != ActionKind.NONE))[:, None], sweep.points[:, :2], jnp.inf)
         gap2 = jnp.min(jnp.sum((places[:, None] - swept[None]) ** 2, axis=-1), axis=1)
         beside = gap2 < (radius + REACH) ** 2
-        within = away2 < (sweep.travel + 2 * REACH) ** 2
-        # What is pushed gives way forwards or sideways.
+        within = distance2 < (sweep.travel + 2 * REACH) ** 2
+        # A pushed target moves forwards or sideways.
         ahead = jnp.sum(places * sweep.heading[None], axis=-1)
         within &= ahead[:, None] - ahead[None] > -2 * REACH
         opened |= beside & jnp.any(within & (now & beside)[None], axis=1)
@@ -73,13 +71,13 @@ def reopened(
 
 
 class _Sweep(NamedTuple):
-    """What one stretch of an action passed.
+    """The space that one stretch of an action swept.
 
     Attributes:
-      points: that hand or objects passed, shape (P, 3) [m].
-      counts: which of them passed so low that they may have touched the target, shape (P,).
-      heading: which way they went, seen from above, shape (2,); 0 if it may have been any.
-      travel: how far they can have taken the target [m].
+      points: of the hand and the objects on their way, shape (P, 3) [m].
+      counts: which points are low enough to touch the target, shape (P,).
+      heading: direction of motion from above, shape (2,); 0 if unknown.
+      travel: how far the target can have been taken [m].
     """
 
     points: Float[Array, "p 3"]
@@ -89,44 +87,43 @@ class _Sweep(NamedTuple):
 
 
 def _sweeps(problem: Problem, before: Superquadrics, after: Superquadrics, action: Action) -> tuple[_Sweep, ...]:
-    """The stretches of an action: the way in, the push with what it moved, the way out, and the way in to a new place.
+    """The stretches of an action: the way in, the push with the objects it moved, the way out, the way to a new place.
 
-    Where something began to move is left out: it only moved away from what is there.
+    The first pose of a moving object is left out, for it moves away from what touches it there.
     """
     n, shelf, approach = before.capacity, problem.shelf, problem.gripper.approach
     holds = jnp.any(jnp.stack([action.kind == code for code, kind in KINDS.items() if kind.holds_object]))
-    own = (jnp.arange(n) == action.object) & before.valid
+    is_acted_on = (jnp.arange(n) == action.object) & before.valid
     carry = compose(action.T_world_place, inverse(action.T_world_gripper))
-    meant = jnp.where(holds, transform(carry, before.position), before.position + action.displacement[None])
-    same, known = same_objects(before, after, jnp.where(own[:, None], meant, before.position))
+    planned = jnp.where(holds, transform(carry, before.position), before.position + action.displacement[None])
+    same, matched = same_objects(before, after, jnp.where(is_acted_on[:, None], planned, before.position))
     start, end = _bodies(problem, before, after, same)
-    into = transform(carry, start)
-    # What the action moves is known to move even where it is not seen afterwards.
-    unseen = jnp.where(holds, into, start + action.displacement[None, None])
-    end = jnp.where((own & ~known)[:, None, None], unseen, end)
-    # What is held arrives at its place, or was dropped or pushed on the way there.
-    arrived = jnp.sum((jnp.mean(end, axis=1) - jnp.mean(into, axis=1)) ** 2, axis=-1) < DROPPED**2
-    carried = own & holds & arrived
-    apart = jnp.sqrt(jnp.sum((after.position[same] - before.position)[:, :2] ** 2, axis=-1))
-    moved = (known & (apart > STILL)) | own
+    placed = transform(carry, start)
+    # An object that the action moved and that is not seen afterwards is taken to have moved as planned.
+    unseen = jnp.where(holds, placed, start + action.displacement[None, None])
+    end = jnp.where((is_acted_on & ~matched)[:, None, None], unseen, end)
+    arrived = jnp.sum((jnp.mean(end, axis=1) - jnp.mean(placed, axis=1)) ** 2, axis=-1) < DROPPED**2
+    carried = is_acted_on & holds & arrived
+    shift = jnp.sqrt(jnp.sum((after.position[same] - before.position)[:, :2] ** 2, axis=-1))
+    moved = (matched & (shift > STILL)) | is_acted_on
 
     share = (jnp.arange(OBJECT_PLACES) + 1.0) / OBJECT_PLACES
     path = start[:, None] + share[None, :, None, None] * (end - start)[:, None]
     passed = jnp.broadcast_to((moved & ~carried)[:, None, None], path.shape[:-1])
-    turned = jnp.sqrt(jnp.max(jnp.sum((end - start) ** 2, axis=-1), axis=-1))
-    farthest = jnp.max(jnp.where(moved & ~carried, turned, 0.0), initial=0.0)
+    travelled = jnp.sqrt(jnp.max(jnp.sum((end - start) ** 2, axis=-1), axis=-1))
+    farthest = jnp.max(jnp.where(moved & ~carried, travelled, 0.0), initial=0.0)
     farthest = jnp.maximum(farthest, jnp.sqrt(jnp.sum(action.displacement**2)))
-    # An approximation: on its ways in and out, a hand that pushes takes the target no farther than the push does.
+    # An approximation: a pushing hand takes the target no farther on its ways in and out than during the push.
     ways = jnp.where(holds, approach, farthest)
 
-    # What is carried goes out along the gripper's z and in again.
+    # A carried object goes out along the gripper's z and in again.
     back = approach * jnp.linspace(0.0, 1.0, OBJECT_PLACES // 2 + 1)
 
     def behind(points, T, along):
         return points[:, None] - (along[:, None] * T[None, :3, 2])[None, :, None]
 
-    out, new = behind(start, action.T_world_gripper, back[1:]), behind(into, action.T_world_place, back[:-1])
-    with_it = jnp.broadcast_to((own & holds)[:, None, None], out.shape[:-1])
+    out, new = behind(start, action.T_world_gripper, back[1:]), behind(placed, action.T_world_place, back[:-1])
+    with_hand = jnp.broadcast_to((is_acted_on & holds)[:, None, None], out.shape[:-1])
     hand_in, hand_between, hand_at_end = _hand(problem, action)
     forward, backward = action.T_world_gripper[:2, 2], -action.T_world_place[:2, 2]
 
@@ -139,13 +136,13 @@ def _sweeps(problem: Problem, before: Superquadrics, after: Superquadrics, actio
         sweep([(hand_in, True)], forward, ways),
         sweep([(hand_between, ~holds), (path, passed)], jnp.zeros(2), farthest),
         sweep([(hand_at_end, ~holds)], backward, ways),
-        sweep([(out, with_it)], -forward, approach),
-        sweep([(hand_at_end, holds), (new, with_it)], -backward, approach),
+        sweep([(out, with_hand)], -forward, approach),
+        sweep([(hand_at_end, holds), (new, with_hand)], -backward, approach),
     )
 
 
 def _hand(problem: Problem, action: Action) -> tuple[Float[Array, "p 3"], Float[Array, "q 3"], Float[Array, "p 3"]]:
-    """Points that the gripper passed on the way in, in between if it pushed, and on the way to or from its end [m]."""
+    """Points of the gripper on the way in, during a push, and on the way to or from its last pose [m]."""
     tables = problem.actions
     opening = jnp.where(action.opening > 0.0, OPEN, CLOSED)
     wrist = jnp.argmin(jnp.abs(tables.q7[opening] - action.q7))
@@ -160,7 +157,7 @@ def _hand(problem: Problem, action: Action) -> tuple[Float[Array, "p 3"], Float[
 def _bodies(
     problem: Problem, before: Superquadrics, after: Superquadrics, same: Int[Array, " n"]
 ) -> tuple[Float[Array, "n p 3"], Float[Array, "n p 3"]]:
-    """Points of the objects before the action, and of those that they are afterwards [m]."""
+    """Points of the objects before the action, and at the poses of their matches after it [m]."""
     size = jnp.where(before.valid[:, None], before.size, 1.0)
     clouds = jnp.swapaxes(object_clouds(before.replace(size=size), problem.config.actions.object_points), -1, -2)
     start = transform(make(before.rotation, before.position)[:, None], clouds)
@@ -168,35 +165,34 @@ def _bodies(
 
 
 def same_objects(
-    before: Superquadrics, after: Superquadrics, meant: Float[Array, "n 3"]
+    before: Superquadrics, after: Superquadrics, planned: Float[Array, "n 3"]
 ) -> tuple[Int[Array, " n"], Bool[Array, " n"]]:
-    """Which object of `after` each of `before` is, and whether it is any.
+    """Match objects before and after an action: the index in `after` of each of `before`, and whether it has a match.
 
-    Those that are most alike in place, size and shape are taken for the same first, and no two for one. The slots that
-    they are in do not count.
+    A greedy one-to-one assignment by position, size and exponents; slots do not count.
 
     Args:
       before, after: the objects, fields (N, ...) and (M, ...).
-      meant: where each may be, too, if an action was to move it; elsewhere where it was, shape (N, 3) [m].
+      planned: the position to which the action was to move each, or its old position, shape (N, 3) [m].
     """
 
-    def apart(a, b):
+    def distance(a, b):
         return jnp.sqrt(jnp.sum((a[:, None] - b[None]) ** 2, axis=-1))
 
-    place = jnp.minimum(apart(before.position, after.position), apart(meant, after.position))
-    # Recognised from another side, width and depth may have changed their names.
-    size = apart(jnp.sort(before.size, axis=-1), jnp.sort(after.size, axis=-1))
-    cost = place + size + SHAPE * apart(before.exponents, after.exponents)
+    place = jnp.minimum(distance(before.position, after.position), distance(planned, after.position))
+    # Width and depth may be swapped if an object is recognised from another side.
+    size = distance(jnp.sort(before.size, axis=-1), jnp.sort(after.size, axis=-1))
+    cost = place + size + SHAPE * distance(before.exponents, after.exponents)
     cost = jnp.where(before.valid[:, None] & after.valid[None], cost, jnp.inf)
     rows, columns = jnp.arange(before.capacity), jnp.arange(after.capacity)
 
-    def pair(_, found):
-        cost, same, known = found
+    def pair(_, carry):
+        cost, same, matched = carry
         best = jnp.argmin(cost)
         i, j = best // columns.size, best % columns.size
         here = (rows == i) & jnp.isfinite(cost[i, j])
         cost = jnp.where((rows == i)[:, None] | (columns == j)[None], jnp.inf, cost)
-        return cost, jnp.where(here, j, same), known | here
+        return cost, jnp.where(here, j, same), matched | here
 
     nothing = jnp.zeros(rows.size, jnp.int32), jnp.zeros(rows.size, bool)
     return jax.lax.fori_loop(0, min(rows.size, columns.size), pair, (cost, *nothing))[1:]

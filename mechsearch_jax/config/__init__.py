@@ -1,1 +1,1 @@
-"""Every setting of the planner, and the presets."""
+"""All settings of the planner, and the presets."""

@@ -1,7 +1,7 @@
-"""Every setting in one place: of the planner, of the problem, and of an episode.
+"""All settings of the planner, the problem and an episode.
 
-What is discrete decides about the shapes of a computation and is static under jit; what is continuous is data, so that
-changing it compiles nothing.
+Discrete settings decide the shapes of a computation and are static under jit. Continuous ones of the planner are
+dynamic, so that changing them compiles nothing.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ RehearsalName = Literal["none", "physics"]
 
 
 class Weights(NamedTuple):
-    """How much J minds what it adds to equation 2; see `PlannerConfig`.
+    """Weights of the terms that J adds to equation 2; see `PlannerConfig`.
 
     Attributes:
-      crowding: what is in the way of all grasps of a pose.
+      crowding: of the objects that obstruct the grasps of a pose.
     """
 
     crowding: Array | float = 0.0
@@ -62,23 +62,23 @@ class PlannerConfig:
     Attributes:
       gamma: discount of equation 2, in (0, 1]. The paper gives none; 0.9 is ours.
       horizon: M, actions in a sequence; static.
-      sequences: how many sequences are sampled for a decision; static.
-      unseen_contact_penalty: what touching the target unseen would cost, in units of J: a sampled action is charged
-        with J times the share of the possible poses at which it would do so, unless no sequence gains anything then.
-        The paper charges nothing.
-      guided_fraction: share of the draws that go to objects by how much they hide or are in the way; the others are
-        even, as the paper's all are. 0 to below 1.
-      crowding_weight: how much J minds objects that only some of a pose's grasps hit; the paper's J sees the best grasp
+      sequences: number of sequences sampled for a decision; static.
+      unseen_contact_penalty: cost of touching the hidden target, in units of J: a sampled action is charged with J
+        times the share of the possible poses at which it would touch the target, unless no sequence gains anything
+        then. The paper charges nothing.
+      guided_fraction: share of the draws that prefer objects that hide much or are in the way, from 0 to below 1; the
+        other draws are uniform, as all are in the paper.
+      crowding_weight: weight in J of objects that only some of a pose's grasps hit; the paper's J counts the best grasp
         of a pose alone. Small enough that no number of hits outweighs one object of the cost proper.
-      draws: how often an action is drawn, until one is possible; static. The paper draws until one is.
-      first_draws: the same for the first action of a sequence, where that is more; static. Of the first actions one is
-        made, so that they are worth more draws.
+      draws: how often an action is drawn until one is possible; static. The paper has no limit.
+      first_draws: the same for the first action of a sequence, if that is more; static. A first action is executed, so
+        it is worth more draws.
       move_again: whether an object may move more than once in a sequence, as in the paper; static.
-      move_target: whether a found target may be pushed, too; static. Where every grasp of it hits an object that can
-        neither be grasped nor pushed, nothing else helps.
-      predicted_collisions: whether f also rules out, in predicted states, where the target would overlap objects
-        (equation 14), as in the paper; static. Without, what an action covers is not ruled out: a target there would be
-        pushed along, not found to be elsewhere.
+      move_target: whether a found target may be pushed, too; static. Nothing else helps if every grasp of it hits an
+        object that can neither be grasped nor pushed.
+      predicted_collisions: whether f rules out overlaps of the target with objects (equation 14) in predicted states,
+        too, as in the paper; static. If False, poses that an object is moved to stay possible: a target there would be
+        pushed along.
       imitates: whose peculiarities the slots of a policy have, one of `imitation.IMITATIONS`; static.
     """
 
@@ -107,11 +107,11 @@ class PlannerConfig:
 
     @property
     def weights(self) -> Weights:
-        """What an `Objective` weighs with."""
+        """The weights of an `Objective`."""
         return Weights(self.crowding_weight)
 
     def __post_init__(self):
-        # Rebuilt by JAX, the fields that are data hold whatever stands for their leaves, which is not checked.
+        # In a pytree rebuilt by JAX, dynamic fields may hold tracers or other stand-ins, which are not checked.
         number = lambda name: isinstance(getattr(self, name), int | float)  # noqa: E731
         if number("gamma") and not 0.0 < self.gamma <= 1.0:
             raise InputError(f"gamma {self.gamma} is outside (0, 1]; the default is 0.9")
@@ -134,10 +134,10 @@ class ProblemConfig:
     """How a problem is built; hashable, static under jit.
 
     Attributes:
-      existence: how f is decided.
+      existence: of f.
       grasps: the candidate grasps of g.
-      retrieval: a denser set of grasps, for the target once it is found.
-      actions: which actions there are.
+      retrieval: a denser set of grasps for the found target.
+      actions: the possible actions.
     """
 
     existence: ExistenceConfig = dataclasses.field(default_factory=ExistenceConfig)
@@ -148,13 +148,13 @@ class ProblemConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Everything that decides about an episode beside scenario, seed, policy, recognition and simulator.
+    """All settings of an episode apart from scenario, seed, policy, recognition and simulator.
 
     Attributes:
       problem: how the problem is built.
       planner: how the planner decides.
-      push_model: name of what predicts pushes; see `dynamics.named`, and `envs.pushing.push_models` for "physics".
-      rehearsal: name of what tries actions out before one is made; see `envs.trials`. The paper tries nothing.
+      push_model: name of a push model; see `dynamics.named`, and `envs.pushing.push_models` for "physics".
+      rehearsal: name of what tries actions before one is executed; see `envs.trials`. The paper tries nothing.
       max_steps: T, actions in an episode.
     """
 
@@ -180,12 +180,12 @@ class Config:
             raise InputError(f"max_steps {self.max_steps} must be at least 1")
 
     def options(self) -> dict[str, Any]:
-        """The values of all `OPTIONS` by name, as JSON has them: what rows and episodes keep."""
-        found = {option.name: _at(self, option.path) for option in OPTIONS}
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in found.items()}
+        """The values of all `OPTIONS` by name, as JSON values, for rows and episodes."""
+        values = {option.name: _at(self, option.path) for option in OPTIONS}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def with_options(self, **changes: Any) -> Config:
-        """The same configuration but for some of `OPTIONS`, by name; lists stand for tuples.
+        """The configuration with other values of some `OPTIONS`, by name; lists become tuples.
 
         Raises:
           InputError: there is no such option, or a value is impossible.
@@ -201,14 +201,14 @@ class Config:
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """A setting that rows keep and that the command line offers.
+    """A setting that is a column of results and an option of the command line.
 
     Attributes:
-      name: of the field, which is unique.
-      path: the fields that lead from a `Config` to it.
+      name: of the option, unique.
+      path: the fields that lead to it from a `Config`.
       type: of a value.
       help: one line.
-      choices: the values it may have; None where any will do.
+      choices: the values it may have; any if None.
     """
 
     name: str
@@ -230,7 +230,7 @@ def _with(value: Any, path: tuple[str, ...], new: Any) -> Any:
 
 
 def _fields(kind: type, path: tuple[str, ...], prefix: str = "") -> tuple[Option, ...]:
-    """The options among the fields of a configuration, in the order that they stand in."""
+    """The options among the fields of a configuration class, in their order."""
     hints = get_type_hints(kind)
     return tuple(
         Option(

@@ -1,4 +1,4 @@
-"""Presets: whole configurations under a name."""
+"""Presets: named configurations."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.runtime.errors import InputError
 
-# How often preset `paper` draws an action until one is possible: an approximation of the paper's, which never gives up.
+# Draws of an action in preset `paper` until one is possible: an approximation, since the paper's have no limit.
 REDRAWS = 8
 
 
 def standard(**changes: Any) -> Config:
-    """Our own settings, the default; `docs/method.md` lists where they leave the paper.
+    """Our settings, the default; `docs/method.md` lists how they differ from the paper's.
 
     Args:
       **changes: options by name, see `Config.with_options`.
@@ -23,12 +23,12 @@ def standard(**changes: Any) -> Config:
 
 
 def paper(**changes: Any) -> Config:
-    """The paper's settings, and where it gives none, as for gamma, those of `standard` (appendices B.2 to B.5).
+    """The paper's settings (appendices B.2 to B.5), and those of `standard` that it does not give, such as gamma.
 
-    f by the difference of depth images, never opened again, with the collision condition in predicted states too;
-    grasps tilted by 20 degrees; even draws, repeated until one is possible, of any object at any step; nothing in the
-    cost but J. Depth images are those of `standard`: the paper's integral of an occupancy takes ten times as long, and
-    changes f at less than 2% of the poses (docs/method.md, "Depth").
+    f compares depth images, is never reopened, and rules out collisions in predicted states, too; grasps are tilted by
+    20 degrees; actions are drawn uniformly, until one is possible, of any object at any step; the cost is J alone.
+    Depth images are those of `standard`: the paper's integral of an occupancy takes ten times as long, and changes f at
+    less than 2% of the poses (docs/method.md, "Depth").
 
     Args:
       **changes: options by name, see `Config.with_options`.
@@ -63,7 +63,7 @@ def paper(**changes: Any) -> Config:
 
 
 def best(**changes: Any) -> Config:
-    """What solves most, for who has a GPU or time: `standard` with up to four draws of every action, and 20 actions.
+    """The highest success rate, for users with a GPU or time: `standard` with 20 actions and up to 4 draws of each.
 
     Args:
       **changes: options by name, see `Config.with_options`.
@@ -74,8 +74,8 @@ def best(**changes: Any) -> Config:
 def published_code(**changes: Any) -> Config:
     """`paper` with the peculiarities of the code that the method's authors published.
 
-    Pushes go 10 cm; later actions of a sequence are drawn in the present scene, whatever has moved by then; later
-    pick-and-places are predicted to move nothing; what is in the way of a grasp counts a tenth in J.
+    Pushes go 10 cm; later actions of a sequence are drawn in the present scene, not the predicted one; later
+    pick-and-places are predicted to move nothing; objects in the way of a grasp count a tenth in J.
 
     Args:
       **changes: options by name, see `Config.with_options`.
@@ -95,21 +95,21 @@ PRESETS: Mapping[str, Callable[..., Config]] = {
 }
 DEFAULT_PRESET = "standard"
 
-# The options that say which actions there are, and not how they are chosen.
+# The options that define the possible actions, not how they are chosen.
 ACTION_OPTIONS = ("actions", "push_directions", "push_distances", "object_grasp_tilts")
 
 
 def action_set(name: str) -> dict[str, Any]:
-    """The options that say which actions there are, as in a preset."""
+    """The options that define the possible actions, from a preset."""
     options = PRESETS[name]().options()
     return {option: options[option] for option in ACTION_OPTIONS}
 
 
 def expanded(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options by name, with all that the name of a preset among `actions` stands for; what is given beside it counts.
+    """Options by name, with the name of a preset in `actions` replaced by its options; other given options win.
 
     Raises:
-      InputError: there is more than that name among them.
+      InputError: `actions` holds more than the preset's name.
     """
     sets = [name for name in options.get("actions", ()) if name in PRESETS]
     if not sets:

@@ -1,1 +1,1 @@
-"""What actions do to objects."""
+"""Prediction of what actions do to objects."""

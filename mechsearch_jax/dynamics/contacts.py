@@ -49,7 +49,7 @@ def outline_points(prints):
 
 
 def pusher_depth(prints, points):
-    """How deep the gripper's points are in each footprint, -1 at other heights, and where they are in its frame."""
+    """Depth of the gripper's points in each footprint, -1 at other heights, and their positions in its frame."""
     local = turned(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
     depth = point_depth(prints.half[:, None, :], prints.round[:, None], local)
     level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
@@ -64,7 +64,7 @@ def pair_contacts(prints):
     normal = point_normal(prints.half[None], prints.round[None], point)
     yaw = jnp.broadcast_to(prints.yaw[None, :], depth.shape)
     direction, arm = -turned(yaw, normal), turned(yaw, point)
-    # The same the other way round: a corner of j inside a face of i, where j gives way along i's normal.
+    # The reverse: a corner of j inside a face of i, where j gives way along i's normal.
     other_direction = -jnp.swapaxes(direction, 0, 1)
     world = arm + prints.position[None, :, :]
     other_arm = jnp.swapaxes(world, 0, 1) - prints.position[None, :, :]
@@ -82,7 +82,7 @@ def wall_depth(shelf, prints):
 
 
 def unresolved(shelf: Shelf, before: Footprints, after: Footprints, points: Float[Array, "p 3"]) -> Float[Array, ""]:
-    """Deepest penetration after a push [m]: of the gripper, of walls, and of objects as far as it is new; at least 0.
+    """Deepest penetration after a push [m]: of gripper, walls, and objects beyond what was there before; at least 0.
 
     Args:
       shelf: walls.

@@ -1,4 +1,4 @@
-"""The push model that was learnt from simulated pushes (paper section 4.3); a `push_model.PushModel`."""
+"""The push model learnt from simulated pushes (paper section 4.3); a `push_model.PushModel`."""
 
 from __future__ import annotations
 
@@ -23,12 +23,11 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
 NAME = "push"
-# An object is moved if it moves with a probability above this: of those that stay, less than 1 in 100 is then moved,
-# but 3 in 100 where there is one object and the target.
+# Probability of moving above which an object is predicted to move. At this value, less than 1 in 100 of the objects
+# that stay is predicted to move, but 3 in 100 where there is one object and the target.
 LIKELY = 0.75
-# The hand gives way and ends short of where it was sent: what simulated pushes come to overlaps in 1 of 20 cases by
-# 2 cm with the hand where it was sent or with a neighbour, and predictions next to a wall are as far off. Deeper by
-# more than 6 mm is jammed [m].
+# A real hand is compliant and stops short of its goal: in 1 of 20 simulated pushes, the result overlaps by 2 cm with
+# the hand at its goal or with a neighbour, and predictions next to a wall are off by as much. 6 mm more is jammed [m].
 MAX_PENETRATION = 0.026
 
 
@@ -40,13 +39,12 @@ def _weights(path: Path, digest: str) -> Weights:
 
 @dataclasses.dataclass(frozen=True)
 class LearnedPush:
-    """Predicts pushes with a trained network. Two are equal if their weights are.
+    """Predicts pushes with a trained network. Instances with equal weights are equal.
 
     Attributes:
-      path: of the weights; those that ship with the package if left out.
-      likely: an object is moved if it moves with a probability above this, and else left exactly where it is.
-      max_penetration: a push is not resolved if it leaves more overlap than this, with the hand, a wall or another
-        object [m]: what a push really comes to overlaps with the hand where it was sent, too.
+      path: of the weights; the package's if left out.
+      likely: probability of moving above which an object is moved; others stay exactly where they are.
+      max_penetration: a push with more overlap than this with the hand, a wall or another object is not resolved [m].
       digest: of the weights, read from their card.
 
     Raises:
@@ -66,13 +64,13 @@ class LearnedPush:
             )
         shipped = self.path is None
         path = self.path or Path(str(importlib.resources.files("mechsearch_jax") / "networks" / f"{NAME}.npz"))
-        # What a frozen instance derives from its arguments can be set in no other way.
+        # The class is frozen.
         object.__setattr__(self, "path", path)
         card = read_card(path, NAME)
         object.__setattr__(self, "digest", str(card.get("sha256")))
         if shipped:
-            # Of what ships it is known that the network fits; to find that out takes a second, and what was compiled
-            # before does not need the network any more.
+            # The package's weights fit the network. Checking that takes a second, and a compiled program does not need
+            # the network.
             read_archive(path, card)
         else:
             _weights(path, self.digest)
@@ -101,18 +99,18 @@ def predicted(
     displacement: Array,
     q7: Array,
 ) -> PushOutcome:
-    """What a network predicts of a push; see `LearnedPush` and `push_model.PushModel` for the arguments."""
+    """A network's prediction of a push; see `LearnedPush` and `push_model.PushModel` for the arguments."""
     start = push_start(shelf, scene, pusher, T_world_gripper, displacement)
-    told = apply_network(network, parameters, start)
-    moves = scene.valid & (jax.nn.sigmoid(told.moves) > likely)
+    output = apply_network(network, parameters, start)
+    moves = scene.valid & (jax.nn.sigmoid(output.moves) > likely)
     before = start.prints
     prints = before.replace(
-        position=before.position + jnp.where(moves[:, None], told.shift, 0.0),
-        yaw=before.yaw + jnp.where(moves, told.turn, 0.0),
+        position=before.position + jnp.where(moves[:, None], output.shift, 0.0),
+        yaw=before.yaw + jnp.where(moves, output.turn, 0.0),
     )
-    shifted = rigid_motion(scene, before.position, prints.position, told.turn)
+    shifted = rigid_motion(scene, before.position, prints.position, output.turn)
     after = jax.tree.map(lambda new, old: jnp.where(moves.reshape(-1, *[1] * (new.ndim - 1)), new, old), shifted, scene)
-    # Of the gripper, as much as the network sees: with all points, overlaps are deeper by half a millimetre.
+    # The points of the gripper that the network uses: with all points, overlaps are deeper by half a millimetre.
     end = start.points + displacement[None]
     residual = unresolved(shelf, before, prints, end)
     return PushOutcome(
@@ -120,5 +118,5 @@ def predicted(
         moved=moves,
         residual=residual,
         resolved=residual <= max_penetration,
-        topples=jnp.where(scene.valid, jax.nn.sigmoid(told.topples), 0.0),
+        topples=jnp.where(scene.valid, jax.nn.sigmoid(output.topples), 0.0),
     )

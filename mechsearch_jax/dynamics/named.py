@@ -13,10 +13,10 @@ PushModelName = Literal["quasi-static", "learned", "physics"]
 
 
 def check_name(name: str) -> None:
-    """Refuse what is not the name of a push model.
+    """Check the name of a push model.
 
     Raises:
-      InputError: it is none.
+      InputError: it is unknown.
     """
     if name not in get_args(PushModelName):
         raise InputError(f'push model "{name}" is unknown; use {", ".join(get_args(PushModelName))}')
@@ -30,7 +30,7 @@ def own_push_model(name: str) -> PushModel:
       name: "quasi-static" or "learned".
 
     Raises:
-      InputError: there is none of that name, it needs a simulator, or its weights are missing or damaged.
+      InputError: the name is unknown, the model needs a simulator, or its weights are missing or damaged.
     """
     check_name(name)
     if name == "physics":

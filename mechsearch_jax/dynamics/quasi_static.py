@@ -1,4 +1,4 @@
-"""The analytic push model: objects give way to the gripper and to each other without inertia."""
+"""The analytic push model: objects yield to the gripper and to each other without inertia."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 
 def _yield_to(prints, depth, normal, arm, heading, friction):
-    """Move footprints out of contacts, as quasi-static sliders under an ellipsoidal limit surface move.
+    """Move footprints out of contacts as quasi-static sliders under an ellipsoidal limit surface.
 
     A force f at `arm` from the centre moves the slider by f and turns it by (arm x f) / c^2, with c, the ratio of
     torque to force, that of a uniform pressure distribution: 0.6 of the footprint's half diagonal. The contact sticks,
@@ -47,7 +47,7 @@ def _yield_to(prints, depth, normal, arm, heading, friction):
     given = dot(normal, edge) + dot(normal, side) * dot(side, edge) / c2
     edge = edge / jnp.maximum(given, 0.1)[..., None]
     force = jnp.where(sticks[..., None], force, edge) * jnp.maximum(depth, 0.0)[..., None]
-    # A disc may spin as it likes: its footprint stays the same.
+    # Turning a disc does not change its footprint.
     turn = jnp.where(prints.round, 0.0, dot(side, force) / c2)
     return prints.replace(position=prints.position + force, yaw=prints.yaw + jnp.clip(turn, -0.2, 0.2))
 
@@ -60,7 +60,7 @@ def _resolve_pusher(prints, points, heading, friction):
 
 
 def _touched_high(scene, prints, points, heading, leverage):
-    """Which objects points touch so high above the board that a push along `heading` tips them."""
+    """Which objects are touched so high above the board that a push along `heading` topples them."""
     local = turned(-prints.yaw[:, None], points[None, :, :2] - prints.position[:, None, :])
     depth = point_depth(prints.half[:, None, :], prints.round[:, None], local)
     level = (points[None, :, 2] > prints.low[:, None]) & (points[None, :, 2] < prints.high[:, None])
@@ -68,12 +68,12 @@ def _touched_high(scene, prints, points, heading, leverage):
     lowest = jnp.min(jnp.where(touching, points[None, :, 2], jnp.inf), axis=1) - prints.low
     half = extents(scene, jnp.append(heading, 0.0)[:, None])[:, 0]
     limit = jnp.where(prints.round, leverage[1], leverage[0]) * half
-    # Half a centimetre more than a planned push is given, since this only sees where the push ends.
+    # 5 mm more than planned pushes are allowed, since only the last pose of the gripper is checked.
     return jnp.any(touching, axis=1) & (lowest > jnp.maximum(limit, LOW_CONTACT) + 0.005)
 
 
 def _resolve_neighbours(prints, heading, friction):
-    """Objects further along the push give way to those behind them."""
+    """Objects further along the push yield to those behind them."""
     depth, direction, arm = pair_contacts(prints)
     along = dot(prints.position[None] - prints.position[:, None], heading[None, None])
     depth = jnp.where(along > 0, depth, -1.0)
@@ -96,17 +96,17 @@ def _resolve_walls(shelf, prints):
 
 @dataclasses.dataclass(frozen=True)
 class QuasiStatic:
-    """An analytic `PushModel`: the gripper moves in small steps, and what it runs into gives way.
+    """An analytic `PushModel`: the gripper moves in small steps, and the objects in its way yield.
 
-    Objects are planar footprints that slide under an ellipsoidal limit surface without inertia; objects pushed back by
-    others are neglected, and only what the gripper itself touches too high is taken to topple.
+    Objects are planar footprints that slide under an ellipsoidal limit surface without inertia. Objects pushed
+    backwards by others are neglected, and only objects that the gripper itself touches too high topple.
 
     Attributes:
       steps: number of steps of the gripper.
-      sweeps: how often contacts are resolved in each.
+      sweeps: how often contacts are resolved in each step.
       gripper_friction, object_friction: coefficients at contacts with the gripper and between objects.
-      leverage: how high the gripper may touch an object without tipping it; see `LEVERAGE`.
-      max_penetration: a push of which more is left than this is not resolved [m].
+      leverage: how high the gripper may touch an object without toppling it; see `LEVERAGE`.
+      max_penetration: a push with more residual penetration is not resolved [m].
 
     Raises:
       InputError: `max_penetration` is negative.
@@ -141,7 +141,7 @@ class QuasiStatic:
         fraction = (jnp.arange(self.steps) + 1.0) / self.steps
         points = start[None] + fraction[:, None, None] * displacement[None, None]
         after, stages = jax.lax.scan(step, before, points)
-        # A gripper that cannot move what is jammed would pass through it, so the worst moment counts, not the last.
+        # The gripper would pass through a jammed object, so the deepest penetration of all steps counts.
         held = jnp.max(jax.vmap(pusher_depth)(stages, points)[0])
         residual = jnp.maximum(held, unresolved(shelf, before, after, points[-1]))
         turn = after.yaw - before.yaw

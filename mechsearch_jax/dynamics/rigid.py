@@ -24,8 +24,8 @@ def rigid_motion(
 def in_hand(scene: Superquadrics, index: Int[Array, ""], T_world_grasp: Float[Array, "4 4"]) -> Float[Array, "3 3"]:
     """`R_world_object` of an object once the fingers have closed on it.
 
-    An approximation: one with flat sides turns about its own vertical axis until the nearest of them lies flat against
-    a finger, and does not shift; a round one stays as it is.
+    An approximation: an object with flat sides turns about its vertical axis until the nearest side lies flat against
+    a finger, and does not shift; a round object stays as it is.
     """
     rotation = scene.rotation[index]
     now = headings(rotation, scene.exponents[index])

@@ -1,4 +1,4 @@
-"""What programs of this package keep from one run to the next: compiled functions and built problems."""
+"""What programs of this package keep on disk between runs: compiled functions and built problems."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
 
 VARIABLE = "MECHSEARCH_CACHE_DIR"
-# Problems of older versions of the package are of no use; a few are left for those who switch between versions.
+# So many built problems are kept, for users who switch between versions of the package.
 CACHED_PROBLEMS = 6
 
 _TABLES = {"existence": ExistenceTables, "grasps": GraspTables, "actions": ActionTables, "retrieval": GraspTables}
@@ -50,8 +50,8 @@ def cache_folder() -> Path | None:
 def keep_compilations() -> None:
     """Make this process keep what JAX compiles, so that the next one starts in seconds.
 
-    Meant for programs, which own their process; a library's user decides alone. A cache that the user has set up with
-    `JAX_COMPILATION_CACHE_DIR` is left as it is.
+    For programs; the library does not call it by itself. JAX's own cache stays as it is if the user has set
+    `JAX_COMPILATION_CACHE_DIR`.
     """
     folder = cache_folder()
     if folder is None:
@@ -60,7 +60,7 @@ def keep_compilations() -> None:
     if os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    # Small ones too: the many that a start needs add up to most of a second.
+    # Also short compilations: a start needs many, which add up to most of a second.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
@@ -72,10 +72,10 @@ def cached_problem(
     shelf: Shelf | None = None,
     gripper: Gripper | None = None,
 ) -> Problem:
-    """`build_problem`, read from disk if the same was built before.
+    """`build_problem`, read from disk if the same problem was built before.
 
-    The file is told apart by the package's source, the versions of what computes it, the device and the settings. One
-    that is damaged or of something else is built anew, and a folder that cannot be written to is done without.
+    The key of a file is made of the package's source, the versions of its dependencies, the device and the arguments. A
+    problem whose file is damaged is built again; if the folder cannot be written to, nothing is kept.
 
     Raises:
       InputError: as `build_problem`.
@@ -132,15 +132,15 @@ def _file(folder: Path, key: str) -> Path:
 
 @functools.cache
 def _source() -> str:
-    """A digest of the package's source: a problem is no better than the code that built it."""
+    """SHA-256 of the source that builds problems."""
     return source_digest((".py",))
 
 
 def _key(parts: dict[str, Any]) -> str:
     device = jax.devices()[0]
     versions = [importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy", "scipy", "trimesh")]
-    said = (_source(), versions, device.platform, device.device_kind, jax.config.read("jax_enable_x64"), parts)
-    return hashlib.sha256(repr(said).encode()).hexdigest()
+    key = (_source(), versions, device.platform, device.device_kind, jax.config.read("jax_enable_x64"), parts)
+    return hashlib.sha256(repr(key).encode()).hexdigest()
 
 
 def _digest(arrays: dict[str, np.ndarray], key: str) -> str:
@@ -159,7 +159,7 @@ def _save(problem: Problem, file: Path, key: str) -> None:
 
 
 def _load(file: Path, key: str, parts: dict[str, Any]) -> Problem | None:
-    """The problem in a file; None if there is none that is whole and has this key."""
+    """The problem in a file; None if it is missing, damaged or has another key."""
     try:
         with np.load(file, allow_pickle=False) as saved:
             arrays = {name: saved[name] for name in saved.files}

@@ -1,4 +1,4 @@
-"""What does not change in an episode, and all that can be computed from it before it begins."""
+"""The constants of an episode: the workcell and the target, and all tables computed from them beforehand."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
 
-# What is said of a shelf in which no grasp of the target is feasible.
+# The error for a shelf in which no grasp of the target is feasible.
 NOWHERE = "shelf: the arm reaches the target nowhere; check the shelf's place before the robot"
 
 
 class TargetGrasps(flax.struct.PyTreeNode):
-    """The grasps that a found target may be taken out with, and what else decides which of them are feasible.
+    """The grasps for taking out a found target, and what decides which of them are feasible.
 
     Attributes:
-      tables: their constants; they have no candidate poses.
+      tables: of the grasps, without candidate poses.
       shelf: data.
       gripper, target, config: static.
     """
@@ -41,7 +41,7 @@ class TargetGrasps(flax.struct.PyTreeNode):
 
 
 def target_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: GraspConfig) -> TargetGrasps:
-    """The grasps of a configuration for a target that has been found. Not to be called inside `jit`.
+    """The grasps of a configuration for a found target. Not to be called inside `jit`.
 
     Raises:
       InputError: the target is too wide for the gripper.
@@ -51,14 +51,14 @@ def target_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: GraspC
 
 
 class Problem(flax.struct.PyTreeNode):
-    """What does not change in an episode: the world around the objects, and all that follows from it.
+    """The constants of an episode: everything but the objects, and the tables that follow from it.
 
     Attributes:
-      existence, grasps, actions: constants of f, of g and of the actions.
-      retrieval: a denser set of grasps, for the target once it is found; it has no candidate poses.
+      existence, grasps, actions: tables of f, g and the actions.
+      retrieval: a denser set of grasps for the found target, without candidate poses.
       poses: the candidate poses X as x, y [m], yaw [rad], shape (X, 3).
       cell: their spacing in x and y [m], shape (2,).
-      camera, shelf: data, but for the image's size, so that other poses compile nothing.
+      camera, shelf: dynamic but for the image's size, so that other poses compile nothing.
       gripper, target, config: static.
     """
 
@@ -76,7 +76,7 @@ class Problem(flax.struct.PyTreeNode):
 
     @property
     def space(self) -> ActionSpace:
-        """What all actions share: static but for the shelf."""
+        """The settings that all actions share: static but for the shelf."""
         return ActionSpace(
             shelf=self.shelf,
             gripper=self.gripper,
@@ -99,14 +99,11 @@ def build_problem(
     gripper: Gripper | None = None,
     config: ProblemConfig | None = None,
 ) -> Problem:
-    """Precompute everything about a target, a camera, a shelf and a gripper that no object changes.
-
-    Takes seconds; what is left out takes its default. Not to be called inside `jit`.
+    """Precompute everything that does not depend on the objects. Takes seconds; not to be called inside `jit`.
 
     Raises:
-      InputError: the camera does not see the shelf, the target cannot be grasped by the gripper, or nowhere on the
-        shelf, a kind of action cannot be sampled, the gripper's places outside the shelf are not, or `config` is of
-        something else.
+      InputError: the camera does not see the shelf, the gripper cannot grasp the target, or reaches it nowhere, a kind
+        of action cannot be sampled, the gripper's poses outside the shelf are inside, or `config` is of another class.
     """
     target, camera, shelf = target or Target(), camera or Camera(), shelf or Shelf()
     gripper, config = gripper or Gripper(), ProblemConfig() if config is None else config
@@ -115,7 +112,7 @@ def build_problem(
     check_camera(camera, shelf)
     check_outside(gripper, shelf)
     check_kinds(config.actions.actions)
-    # A GPU would compile a hundred small programs for it, each of them more slowly.
+    # This compiles a hundred small programs, which takes longer for a GPU.
     with on_host():
         grasps = grasp_tables(shelf, gripper, target, config.grasps)
         if grasps.pair_pose.shape[0] == 0:

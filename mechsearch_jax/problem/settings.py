@@ -19,7 +19,7 @@ from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.target import Target
 
 PLANNER = "planner"
-# The base is no farther than this from the origin of a file's frame [m].
+# Largest coordinate of the base in a file's frame [m].
 FARTHEST = 10.0
 # The example in the folder `data` of the package.
 EXAMPLE = "example-config.toml"
@@ -27,10 +27,10 @@ EXAMPLE = "example-config.toml"
 
 @dataclasses.dataclass(frozen=True)
 class Base:
-    """Where the robot's base stands in the frame that a file gives camera and shelf in.
+    """Where the robot's base stands in the frame in which a file gives camera and shelf.
 
     Attributes:
-      position: of the base; its axes are those of the frame [m].
+      position: of the base, whose axes are parallel to the frame's [m].
     """
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -42,12 +42,12 @@ class Base:
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What a configuration file says.
+    """The content of a configuration file.
 
     Attributes:
       workcell: camera, shelf, gripper and target.
-      objects: what scenes are generated with.
-      preset: where the planner's settings come from that `given` does not hold.
+      objects: sizes of the objects of generated scenes.
+      preset: holds the planner's settings that are not in `given`.
       given: options of the planner by name.
     """
 
@@ -62,21 +62,20 @@ class Settings:
         return PRESETS[self.preset]().with_options(**self.given)
 
     def with_options(self, preset: str | None = None, **options: Any) -> Settings:
-        """The same settings with another preset or other options of the planner, which go before those of a file.
+        """The settings with another preset or other options of the planner, which override those of the file.
 
         Raises:
           InputError: an option is impossible.
         """
-        told = dataclasses.replace(self, preset=preset or self.preset, given={**self.given, **expanded(options)})
-        # What is impossible is told of now.
-        check_kinds(told.config.problem.actions.actions)
-        return told
+        settings = dataclasses.replace(self, preset=preset or self.preset, given={**self.given, **expanded(options)})
+        check_kinds(settings.config.problem.actions.actions)
+        return settings
 
 
-# The key of the target's table that is not of its shape: the workcell's `colour`.
+# The key of the target's table that is the workcell's `colour`; all others are of the `Target`.
 COLOR = "color"
 
-# The tables of a file beside the planner's, and what they are without it.
+# The defaults of a file's tables, without the planner's.
 _PARTS: Mapping[str, Any] = {
     **{field.name: getattr(Workcell(), field.name) for field in dataclasses.fields(Workcell) if field.name != "colour"},
     "base": Base(),
@@ -85,7 +84,7 @@ _PARTS: Mapping[str, Any] = {
 
 
 def tables() -> dict[str, dict[str, Any]]:
-    """Every table and key that a file may have, and what each is where it is not given."""
+    """Every table and key that a file may have, with its default."""
     parts = {
         name: {field.name: getattr(usual, field.name) for field in dataclasses.fields(usual)}
         for name, usual in _PARTS.items()
@@ -95,30 +94,30 @@ def tables() -> dict[str, dict[str, Any]]:
 
 
 def load_settings(path: PathLike) -> Settings:
-    """Read a configuration file (TOML); what it does not give takes its default.
+    """Read a configuration file (TOML); missing keys take their defaults.
 
-    Lengths in metres, angles in radians, poses in the robot's base frame, or in one in which `[base]` gives its place.
+    Lengths in metres, angles in radians, poses in the robot's base frame, or in a frame in which `[base]` locates it.
 
     Raises:
       InputError: the file cannot be read or is not TOML; a table or key is unknown; a value is of the wrong type or
         impossible. The message names file, line, table and key.
     """
     document = read_document(path)
-    known = [*_PARTS, PLANNER]
+    names = [*_PARTS, PLANNER]
     for table in document.tables:
-        if table and table not in known:
-            raise InputError(f"{document.where(table)} is unknown; {nearest(table, known)}")
+        if table and table not in names:
+            raise InputError(f"{document.where(table)} is unknown; {nearest(table, names)}")
     for key in document.tables[""]:
-        begin = ", ".join(f"[{table}]" for table in known)
+        begin = ", ".join(f"[{table}]" for table in names)
         raise InputError(f"{document.where('', key)} stands in no table; begin one of {begin}")
     colour = _colour(document)
-    of_shape = {key: value for key, value in document.tables.get("target", {}).items() if key != COLOR}
-    document = dataclasses.replace(document, tables={**document.tables, "target": of_shape})
+    without_colour = {key: value for key, value in document.tables.get("target", {}).items() if key != COLOR}
+    document = dataclasses.replace(document, tables={**document.tables, "target": without_colour})
     parts = {name: with_table(document, name, usual) for name, usual in _PARTS.items() if name != "target"}
     objects, base = parts.pop("objects"), parts.pop("base")
     x, y, z = base.position
-    around = lambda _: {name: parts[name].moved((-x, -y, -z)) for name in ("camera", "shelf")}  # noqa: E731
-    parts |= apply(document, "base", {}, around)
+    in_base_frame = lambda _: {name: parts[name].moved((-x, -y, -z)) for name in ("camera", "shelf")}  # noqa: E731
+    parts |= apply(document, "base", {}, in_base_frame)
     target = _target(document)
     workcell = apply(
         document,
@@ -137,19 +136,19 @@ def _colour(document: Document) -> tuple[float, float, float]:
     if COLOR not in table:
         return Workcell().colour
     given = checked(table[COLOR], tuple[float, float, float], document.where("target", COLOR))
-    return apply(document, "target", {COLOR: given}, lambda said: TargetColour.lit(said.get(COLOR, RED))).rgb
+    return apply(document, "target", {COLOR: given}, lambda values: TargetColour.lit(values.get(COLOR, RED))).rgb
 
 
 def _target(document: Document) -> Target:
-    """The target; where its shape is given, the rest is what is usual for that."""
-    told = document.tables.get("target", {}).get("shape", Target().shape)
-    shape = checked(told, str, document.where("target", "shape"))
+    """The target; the defaults of its other keys depend on its shape."""
+    name = document.tables.get("target", {}).get("shape", Target().shape)
+    shape = checked(name, str, document.where("target", "shape"))
     usual = apply(document, "target", {"shape": shape}, lambda given: Target.of(given.get("shape", Target().shape)))
     return with_table(document, "target", usual)
 
 
 def _with_planner(document: Document, settings: Settings) -> Settings:
-    """Settings with what the planner's table gives."""
+    """The settings with the planner's table."""
     types = {option.name: _type(option) for option in OPTIONS}
     check_names(document, PLANNER, {"preset": str, **types})
     table = dict(document.tables.get(PLANNER, {}))

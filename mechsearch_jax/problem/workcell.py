@@ -1,4 +1,4 @@
-"""What stands around the objects, and what is searched among them: everything of a problem but how it is decided."""
+"""The workcell: everything of a problem but its configuration."""
 
 from __future__ import annotations
 
@@ -22,13 +22,9 @@ class Workcell:
     """Camera, shelf, gripper, target and arm; hashable. Frame: the robot's base.
 
     Attributes:
-      camera: what looks into the shelf.
-      shelf: where the objects stand.
-      gripper: what grasps them.
-      target: what is searched; of a scenario, which has its own, how finely it is searched.
-      arm: how the arm is used.
-      colour: of the target, by which it is seen in colour images: red, green and blue in 0 to 1. What is compiled for a
-        problem does not depend on it.
+      target: what is searched; for a scenario, which has its own target, how finely it is searched.
+      arm: home and speed.
+      colour: of the target in colour images: red, green and blue in 0 to 1. Compiled programs do not depend on it.
     """
 
     camera: Camera = dataclasses.field(default_factory=Camera)
@@ -47,7 +43,7 @@ class Workcell:
             )
 
     def problem(self, target: Target | None = None, config: ProblemConfig | None = None) -> Problem:
-        """The problem of a target, this workcell's if None; read from disk if it was built before.
+        """The problem of a target, by default this workcell's; read from disk if it was built before.
 
         Raises:
           InputError: the target cannot be grasped by the gripper.
@@ -56,11 +52,11 @@ class Workcell:
 
     @property
     def detector(self) -> TargetColour:
-        """What tells the target's pixels from others in a colour image: a `detector` of a `Recogniser`."""
+        """A `detector` of a `Recogniser`, which finds the target's pixels by their colour."""
         return TargetColour.lit(self.colour)
 
     def is_cached(self, target: Target, config: ProblemConfig) -> bool:
-        """Whether the problem of a target was built before, and need only be read."""
+        """Whether the problem of a target was built before and is on disk."""
         return is_cached(target, config, **self._around)
 
     @property

@@ -1,1 +1,1 @@
-"""The search as a robot programmer runs it: an object that keeps what is known between images."""
+"""The search as a robot programmer runs it: an object that keeps the belief between images."""

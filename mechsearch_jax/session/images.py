@@ -1,4 +1,4 @@
-"""Images as they come from a robot, made alike: for other types of numbers everything would be compiled once more."""
+"""Convert a robot's images to fixed types, since every other type would be compiled for anew."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _LEAST, _MOST = np.iinfo(np.int32).min, np.iinfo(np.int32).max
 
 
 class Images(NamedTuple):
-    """The arguments of a `Recogniser`; see there."""
+    """The image arguments of a `Recogniser`."""
 
     depth: Any
     colour: Any
@@ -18,10 +18,10 @@ class Images(NamedTuple):
     target_id: Any
 
 
-def alike(depth: Any, colour: Any, mask: Any, target_id: Any) -> Images:
-    """The same images, depth as float32, colour as uint8, mask as int32, the target's number as an int.
+def converted(depth: Any, colour: Any, mask: Any, target_id: Any) -> Images:
+    """The images with depth as float32, colour as uint8, mask as int32, and the target's number as an int.
 
-    What is of no type that images have is left as it is, so that a recogniser can say what is wrong with it.
+    Arrays of other kinds stay as they are; the recogniser raises an error about them.
     """
     depth = np.asarray(depth)
     if depth.dtype.kind == "f":

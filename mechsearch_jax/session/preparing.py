@@ -1,8 +1,7 @@
-"""Programs that are compiled before they are needed, all at the same time.
+"""Compile programs before they are needed, in parallel.
 
-A program is lowered first, which needs Python and so happens to one after the other, the longest first; it is compiled,
-or read from disk, in a thread of its own meanwhile. What takes its time elsewhere, such as the kernels of a simulator,
-begins with the first of them.
+Lowering holds Python's lock, so programs are lowered one at a time, the longest first. Each is then compiled, or read
+from disk, in a thread of its own.
 """
 
 from __future__ import annotations
@@ -26,17 +25,18 @@ from mechsearch_jax.planner.policies import Search
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.cores import cores
 
-# Objects that an observation has room for.
+# Slots for objects in an observation.
 SLOTS = 8
 
 
 class Program(NamedTuple):
-    """Something that is compiled as a whole.
+    """A function that is compiled as a whole for certain arguments.
 
     Attributes:
-      name: of what it computes.
-      is_ready: whether it was compiled before.
-      begin: lowers it, and gives what compiles or reads it, to be called in any thread; None where nothing is left.
+      name: for progress messages.
+      is_ready: whether it is compiled already.
+      begin: lowers it and returns a function that compiles it or reads it from disk, for any thread; None if there is
+        nothing to do.
     """
 
     name: str
@@ -45,83 +45,75 @@ class Program(NamedTuple):
 
 
 def program(name: str, function: Any, *args: Any) -> Program:
-    """The program that a call needs.
+    """The program of a call.
 
     Args:
-      name: of what it computes.
-      function: a `runtime.compiled.Kept`, or what has its `begin` and `is_ready`.
-      *args: of the call; for what is data, shapes will do.
+      name: for progress messages.
+      function: a `runtime.compiled.Kept`, or an object with its `begin` and `is_ready`.
+      *args: of the call; arrays may be given as shapes.
     """
     return Program(name, lambda: function.is_ready(*args), lambda: function.begin(*args))
 
 
 def first_decision(problem: Problem, policy: Policy, motion: MotionConfig) -> list[Program]:
-    """What takes long to compile of a first look, a first decision and a first action; that which takes longest first.
-
-    Args:
-      problem, policy: of the episode.
-      motion: how actions are executed.
-    """
-    # Only shapes and types count.
+    """The programs of the first decision and action that take long to compile, the longest first."""
     shapes = jax.eval_shape(lambda: Observation(empty(SLOTS), jax.numpy.array(False), jax.numpy.zeros(3)))
     seen: Observation = jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
     belief = initial_belief(problem)
-    found = []
+    programs = []
     if isinstance(policy, Search):
-        found.append(program("plan", policy, jax.random.key(0), problem, belief, seen))
-    found.append(program("belief", update_belief, problem, belief, seen, seen, no_action()))
-    return [*found, *motions(motion)]
+        programs.append(program("plan", policy, jax.random.key(0), problem, belief, seen))
+    programs.append(program("belief", update_belief, problem, belief, seen, seen, no_action()))
+    return [*programs, *motions(motion)]
 
 
 def motions(config: MotionConfig) -> list[Program]:
-    """The motions of all kinds of action, one at a time, as a simulator on the host makes them."""
+    """The reference motion of each kind of action, unbatched, as a simulator on the host calls it."""
     return [program(f"motion of {kind.name}", reference_motion, kind, no_action(), config) for kind in KINDS.values()]
 
 
 @contextlib.contextmanager
 def prepared(programs: Sequence[Program], report: Callable[[str], None]) -> Iterator[None]:
-    """Prepare programs in threads while the block runs; who calls one before it is ready waits for it.
+    """Prepare programs in threads, one per core, while the block runs; a call of one of them waits until it is ready.
 
-    As many are compiled at the same time as there are cores. What is wrong with a program is said by who calls it.
-    Where the block raises, what has not begun is left out.
+    An error in a program is raised when it is called. If the block raises, programs that have not begun are left out.
 
     Args:
       programs: the longest first.
-      report: is given a line when programs have to be compiled, and whenever one was: which are left, and how many are
-        done.
+      report: called with a progress message at the beginning, if there is anything to compile, and after each program.
     """
     missing = [program.name for program in programs if not program.is_ready()]
     count, lock, ended = len(missing), threading.Lock(), threading.Event()
-    # What is lowered is compiled at once: a call would wait for it in vain where it never was.
-    free = threading.Semaphore(max(cores(), 2))
+    # A lowered program must be compiled at once, since a call waits for it: lower only where a core is free.
+    free_cores = threading.Semaphore(max(cores(), 2))
 
-    def say() -> None:
+    def report_progress() -> None:
         left = f": {', '.join(dict.fromkeys(missing))}" if missing else ""
         report(f"compiling{left}; {count - len(missing)} of {count} done")
 
-    def over(name: str, future: Future[None]) -> None:
-        free.release()
+    def on_compiled(name: str, future: Future[None]) -> None:
+        free_cores.release()
         with lock:
             if name in missing and future.exception() is None:
                 missing.remove(name)
-                say()
+                report_progress()
 
-    def lower() -> None:
-        for each in programs:
-            free.acquire()
-            work = None
+    def lower_all() -> None:
+        for program in programs:
+            free_cores.acquire()
+            finish = None
             if not ended.is_set():
                 with contextlib.suppress(Exception):
-                    work = each.begin()
-            if work is None:
-                free.release()
+                    finish = program.begin()
+            if finish is None:
+                free_cores.release()
             else:
-                threads.submit(work).add_done_callback(functools.partial(over, each.name))
+                threads.submit(finish).add_done_callback(functools.partial(on_compiled, program.name))
 
     if missing:
-        say()
+        report_progress()
     with ThreadPoolExecutor(len(programs) + 1) as threads:
-        lowering = threads.submit(lower)
+        lowering = threads.submit(lower_all)
         try:
             yield
         except BaseException:
@@ -131,6 +123,6 @@ def prepared(programs: Sequence[Program], report: Callable[[str], None]) -> Iter
 
 
 def prepare(programs: Sequence[Program], report: Callable[[str], None]) -> None:
-    """Prepare programs, and wait for all of them; see `prepared`."""
+    """Prepare programs and wait for all of them; see `prepared`."""
     with prepared(programs, report):
         pass

@@ -1,4 +1,4 @@
-"""The search as a robot programmer runs it: images in, the next motion out, told again when it is over.
+"""The search as a robot programmer runs it: images in, the next motion out, and `acted` when the motion is over.
 
     searcher = ms.Searcher(ms.Workcell(camera=..., shelf=..., target=...))  # or envs.cell.loading.load_searcher(FILE)
     while True:
@@ -6,8 +6,8 @@
         ...                                         # move along step.trajectory
         searcher.acted(ok=True)
 
-A thin shell over `Recogniser`, `update_belief`, a policy and `whole_trajectory`; it keeps the belief between the steps,
-and says in words what the arrays say. It is the only part of the library that has a state.
+A thin layer over `Recogniser`, `update_belief`, a policy and `whole_trajectory` that keeps the belief between steps and
+puts decisions into words. It is the only part of the library that has a state.
 """
 
 from __future__ import annotations
@@ -53,19 +53,19 @@ from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.session import warming
-from mechsearch_jax.session.images import Images, alike
+from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.preparing import first_decision, prepared
 from mechsearch_jax.session.slots import UNTRIED, filled, tries_nothing
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
-from mechsearch_jax.session.step import Motion, SearchStep, motion, shown
+from mechsearch_jax.session.step import Motion, SearchStep, display_image, motion_of
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.sight import camera_faults, check_camera
 
-# Share of the candidate poses below which a target that is found would often be out of reach.
+# Reachable share of the candidate poses below which `check` warns.
 LEAST_REACH = 0.5
-# Names of the kinds that leave the target where it is, or put it back.
+# Names of the kinds of action that leave the target on the shelf.
 KEEPS_TARGET = frozenset(kind.name for kind in KINDS.values() if not kind.takes_target and kind.code != ActionKind.NONE)
-# How often is decided anew in one step where the arm cannot do what was decided on.
+# Decisions drawn in one step, until the arm can execute one.
 DRAWS = 4
 # What `warm_up` compiles, in this order.
 STAGES = ("the problem", "recognition", "the belief", "the plan", "the grasp", "the motion")
@@ -73,12 +73,12 @@ STAGES = ("the problem", "recognition", "the belief", "the plan", "the grasp", "
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """What is known of a workcell before the first image.
+    """A check of a workcell before the first image.
 
     Attributes:
       reach: share of the target's candidate poses at which the arm could grasp it in an empty shelf.
-      warnings: what should be looked at, a line each.
-      notices: what is as it was asked for and may surprise all the same, a line each.
+      warnings: probable mistakes, a line each.
+      notices: settings that may surprise, a line each.
     """
 
     reach: float
@@ -87,10 +87,7 @@ class Check:
 
 
 class Searcher:
-    """Searches for a target with a camera and an arm; the one object of this package that has a state.
-
-    Not thread-safe. What decides is a `Policy`, and what sees is a `Recogniser`; both can be others.
-    """
+    """Searches for a target with a camera and an arm. Not thread-safe."""
 
     def __init__(
         self,
@@ -109,24 +106,23 @@ class Searcher:
 
         Args:
           workcell: camera, shelf, gripper and target; the defaults if left out.
-          config: how the problem is built and how the planner decides, and how many actions it may take; preset
-            `standard` without a rehearsal if left out. What it names and needs a simulator has to be given beside it:
-            `envs.cell.loading.load_searcher` makes all of that from a file.
+          config: of the problem and the planner, and the largest number of actions; preset `standard` without a
+            rehearsal if left out. A push model or rehearsal that needs a simulator must be given as an argument, too;
+            `envs.cell.loading.load_searcher` makes them from a file.
           seed: of all random numbers.
-          policy: what decides; by default search-for-grasp with the planner's part of `config`. One that is given has
-            that part and its models itself.
-          push_model, later_push_model: predict pushes, the latter those that are not the first action of a sequence; by
-            default what `config` names.
-          rehearsal: tries the policy's actions out before one is made, such as `envs.trials.native.NativeTrials()`. If
-            left out, nothing does, and the target is only taken out where nothing is touched; `check` and each step's
-            reason say so.
-          recogniser: makes what recognises of a problem, with the signature of `Recogniser`.
+          policy: decides; by default search-for-grasp with `config.planner`. A policy brings its own planner
+            configuration and push models.
+          push_model, later_push_model: predict pushes, the latter those after the first action of a sequence; by
+            default the one that `config` names.
+          rehearsal: tries the policy's actions before one is executed, such as `envs.trials.native.NativeTrials()`.
+            Without it, the target is only taken out where nothing is touched; `check` and each step's reason say so.
+          recogniser: makes a recogniser of a problem; it is called like `Recogniser`.
           trajectories: how motions are made, where a controller should stop, and when recognition is too doubtful to
             move; the default if left out.
 
         Raises:
           InputError: the target cannot be grasped by the gripper, the camera does not see the shelf, a policy is given
-            beside what it should have itself, or `config` names what is not given.
+            together with push models, or `config` names a push model or rehearsal that is not given.
         """
         slots: dict[str, Any] = {
             "push_model": push_model,
@@ -143,19 +139,19 @@ class Searcher:
 
     @functools.cached_property
     def problem(self) -> Problem:
-        """What does not change; built when it is first needed, and kept on disk."""
+        """The constants of the search; built when first needed, and kept on disk."""
         return self.workcell.problem(config=self.config.problem)
 
     @functools.cached_property
     def recogniser(self) -> Any:
-        """What sees."""
+        """The recogniser of this search."""
         if self._make_recogniser is Recogniser:
             return Recogniser(self.problem, detector=self.workcell.detector)
         return self._make_recogniser(self.problem)
 
     @property
     def belief(self) -> Belief:
-        """What is known of the target."""
+        """The belief after the last images."""
         return self._now.belief
 
     @property
@@ -165,7 +161,7 @@ class Searcher:
 
     @property
     def moving(self) -> bool:
-        """Whether a motion was handed out of which nothing was said since."""
+        """Whether `next` returned a motion and `acted` was not called since."""
         return self._now.handed
 
     @property
@@ -175,7 +171,7 @@ class Searcher:
         return self._state
 
     def check(self) -> Check:
-        """Whether the arm can work in this shelf, the camera sees it, and the networks are used to such a view."""
+        """Check that the arm reaches into the shelf, the camera sees it, and the networks know such views."""
         poses = self.problem.poses.shape[0]
         reach = len(np.unique(np.asarray(self.problem.grasps.pair_pose))) / poses
         warnings = list(self._camera_faults)
@@ -193,12 +189,11 @@ class Searcher:
         mask: bool = False,
         target_id: bool = False,
     ) -> None:
-        """Compile and load all that `next` needs with such images, so that nothing is left to compile.
+        """Compile and load everything that `next` needs for such images.
 
         Args:
-          progress: told what comes next, and how many things come after it.
-          colour, mask, target_id: which of them `next` is given beside the depth image. Who uses several combinations
-            calls this once for each.
+          progress: called with the name of each stage and the number of stages after it.
+          colour, mask, target_id: whether `next` will be called with them. Call `warm_up` once for each combination.
 
         Raises:
           InputError: as `next`, or target_id is used without a mask.
@@ -214,41 +209,41 @@ class Searcher:
         images = warming.images(self.workcell.camera, self.workcell.shelf, colour, mask, target_id)
         config = self._trajectories.motion if self._trajectories else None
         first = first_decision(problem, self._policy, config or MotionConfig(gripper=problem.gripper))
-        # What takes longest is compiled while the rest is gone through, which waits for it where it needs it.
+        # The longest programs are compiled in threads while the stages run, which wait for them where they call them.
         with prepared(first, lambda text: None):
             stage()
             seen = jax.block_until_ready(self.recogniser(key, *images))
-            hidden, found = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
+            hidden, visible = warming.hidden(problem, seen), warming.in_the_open(problem, seen)
             stage()
             belief = update_belief(problem, initial_belief(problem), hidden)
             jax.block_until_ready(update_belief(problem, belief, hidden, hidden, no_action()))
             stage()
             twin = self._twin()
-            step = twin._looking(hidden, images)
+            searching = twin._step_on(hidden, images)
             stage()
             twin._state = dataclasses.replace(twin._now, handed=False, acted=True)
-            taken = twin._looking(found, images)
+            retrieving = twin._step_on(visible, images)
             stage()
-            impasse(problem, step.belief, hidden.objects)
-            action = taken.decision.action
+            impasse(problem, searching.belief, hidden.objects)
+            action = retrieving.decision.action
             warming.motions(problem, action, config)
             if self._trials is not None:
                 warming.trials(self._trials, problem, belief, hidden, action)
-            for each in (step, taken):
-                each.to_json()
-                _ = each.picture
+            for step in (searching, retrieving):
+                step.to_json()
+                _ = step.picture
 
     def _twin(self) -> Searcher:
-        """A searcher at the beginning of a search, that shares all but how far it is, and makes any motion."""
+        """A copy of this searcher at the beginning of its search, for which no recognition is too doubtful to move."""
         _ = self._camera_faults
         twin = copy.copy(self)
         twin._state = beginning(self.problem)
         twin._trajectories = dataclasses.replace(self._trajectories or TrajectoryConfig(), doubt=warming.TRUSTING)
         return twin
 
-    def _looking(self, observation: Observation, images: Images) -> SearchStep:
-        """The next step where images show what is said, whatever they show."""
-        self.__dict__["recogniser"] = warming.saying(self.recogniser, observation)
+    def _step_on(self, observation: Observation, images: Images) -> SearchStep:
+        """The next step as if `observation` had been recognised in the images."""
+        self.__dict__["recogniser"] = warming.fixed_recogniser(self.recogniser, observation)
         return self.next(*images)
 
     def next(
@@ -259,10 +254,10 @@ class Searcher:
         target_id: int | None = None,
         joints: Any = None,
     ) -> SearchStep:
-        """Look, and decide what to do next.
+        """Recognise the objects, update the belief and decide what to do next.
 
-        Asked again without `acted` in between, it looks again: nothing was done since. Where all that was tried out did
-        harm, or the arm could do none of what was decided on, it then draws other actions.
+        Call it again without `acted` if nothing was done since. If no action was possible, other actions are then
+        drawn.
 
         Args:
           depth: float (H, W), metres along the camera's z; 0 or NaN where nothing was measured.
@@ -272,49 +267,49 @@ class Searcher:
           joints: where the arm is, seven angles [rad]; at home if left out.
 
         Returns:
-          The step. Its trajectory is to be followed as it is; then `acted` is to be told.
+          The step. Follow its trajectory as it is, then call `acted`.
 
         Raises:
-          InputError: an image's shape, type or unit is not as said, nothing was measured, or the search is finished.
+          InputError: an image has the wrong shape, type or unit, nothing was measured, or the search is finished.
         """
         problem, now = self.problem, self._now
         if now.finished:
             raise InputError("next: the target was taken out, and the search is finished; make another Searcher")
-        here = jax.random.fold_in(jax.random.key(self._seed), now.index)
-        # What was refused or doubted would be drawn again.
-        seeing, deciding = jax.random.split(jax.random.fold_in(here, now.refusals))
-        depth, colour, mask, target_id = alike(depth, colour, mask, target_id)
+        step_key = jax.random.fold_in(jax.random.key(self._seed), now.index)
+        # With the same key, a refused action would be drawn again.
+        recognition_key, decision_key = jax.random.split(jax.random.fold_in(step_key, now.refusals))
+        depth, colour, mask, target_id = converted(depth, colour, mask, target_id)
         if joints is not None:
             joints = np.asarray(joints, float)
             check_joints("joints", joints)
-        observation = self.recogniser(seeing, depth, colour, mask, target_id)
+        observation = self.recogniser(recognition_key, depth, colour, mask, target_id)
         check_measured(problem.camera, problem.shelf, depth)
         warnings = [*self._camera_faults, *self._faults(depth, colour, mask, target_id)]
-        nothing = sight_faults(problem.camera, problem.shelf, depth, observation)
-        warnings += [*nothing, *crowd_faults(observation), *overlap_faults(problem, observation)]
+        unseen = sight_faults(problem.camera, problem.shelf, depth, observation)
+        warnings += [*unseen, *crowd_faults(observation), *overlap_faults(problem, observation)]
         last = (now.observation, now.action) if now.acted else (None, None)
         belief = update_belief(problem, now.belief, observation, *last)
-        # Of an empty shelf f is empty because the target is not there.
-        if int(belief.restarts) > int(now.belief.restarts) and EMPTY_SHELF not in nothing:
+        # On an empty shelf f becomes empty because the target is not there.
+        if int(belief.restarts) > int(now.belief.restarts) and EMPTY_SHELF not in unseen:
             warnings.append(
                 "f became empty and was started anew: something moved that was not seen, or a shape is wrong"
             )
         if bool(now.belief.found) and not bool(belief.found):
             warnings.append("the target is not where it was found any more: it is searched for anew")
-        decision, done = self._decided(deciding, belief, observation, depth, joints)
+        decision, motion = self._decide(decision_key, belief, observation, depth, joints)
         step = SearchStep(
             index=now.index,
-            kind=done.kind,
-            reason=done.reason,
+            kind=motion.kind,
+            reason=motion.reason,
             warnings=tuple(warnings),
-            trajectory=done.trajectory,
+            trajectory=motion.trajectory,
             observation=observation,
             belief=belief,
             decision=decision,
             problem=problem,
-            image=shown(depth, colour),
+            image=display_image(depth, colour),
         )
-        handed = done.trajectory is not None
+        handed = motion.trajectory is not None
         refusals = now.refusals + (not handed)
         self._state = State(
             now.index,
@@ -328,49 +323,46 @@ class Searcher:
         )
         return step
 
-    def _decided(
+    def _decide(
         self, key: Array, belief: Belief, observation: Observation, depth: np.ndarray, joints: np.ndarray | None
     ) -> tuple[Decision, Motion]:
-        """What is decided on, and its motion; decided anew, a few times, where the arm cannot do it.
+        """A decision and its motion, drawn up to `DRAWS` times until the arm can execute it.
 
-        Which grasp takes the target out does not hang on chance, so that there another draw finds no other.
+        A retrieval is drawn only once, for its grasp does not depend on the key.
         """
         problem, arm = self.problem, self.workcell.arm
         for draw in range(DRAWS):
-            # The first is that of a policy by itself.
-            drawn = jax.random.fold_in(key, draw) if draw else key
-            decision = decide(self._policy, self._trials, drawn, problem, belief, observation)
-            done = motion(problem, belief, observation, decision, depth, joints, arm, self._trajectories)
-            if not done.blocked or kind_of(int(decision.action.kind)).takes_target:
+            draw_key = jax.random.fold_in(key, draw) if draw else key
+            decision = decide(self._policy, self._trials, draw_key, problem, belief, observation)
+            motion = motion_of(problem, belief, observation, decision, depth, joints, arm, self._trajectories)
+            if not motion.blocked or kind_of(int(decision.action.kind)).takes_target:
                 break
-        return decision, self._allowed(done)
+        return decision, self._within_limit(motion)
 
-    def _allowed(self, done: Motion) -> Motion:
-        """What is done, where there are actions left; afterwards only the target is taken out, as in an episode."""
+    def _within_limit(self, motion: Motion) -> Motion:
+        """The motion if the limit of actions allows it; beyond it only the target is taken out, as in an episode."""
         most = self.config.max_steps
-        if self._now.index >= most and done.kind in KEEPS_TARGET:
+        if self._now.index >= most and motion.kind in KEEPS_TARGET:
             why = (
                 f"all {most} actions of max_steps are used up; only a found target is still taken out (raise max_steps "
                 "to go on)"
             )
-            return Motion(kind_of(ActionKind.NONE).name, f"{done.reason}; not done: {why}", None)
+            return Motion(kind_of(ActionKind.NONE).name, f"{motion.reason}; not done: {why}", None)
         untried = (
             "; not tried out before"
-            if tries_nothing(self._policy, self._trials) and done.trajectory is not None
+            if tries_nothing(self._policy, self._trials) and motion.trajectory is not None
             else ""
         )
-        return done._replace(reason=done.reason + untried)
+        return motion._replace(reason=motion.reason + untried)
 
     def acted(self, ok: bool = True) -> None:
-        """Say that the last step's motion is over.
-
-        After a failure, too: whatever the hand may have moved unseen until it stopped is then reckoned with.
+        """Report that the last step's motion is over, after a failure, too: the hand may have moved something unseen.
 
         Args:
-          ok: whether it was carried out to its end. With a retrieval that was, the search is finished.
+          ok: whether it was executed to its end. A retrieval that was finishes the search.
 
         Raises:
-          InputError: there is no step whose motion could be over.
+          InputError: no motion was returned since the last call.
         """
         now = self._now
         if not now.handed:
@@ -379,7 +371,7 @@ class Searcher:
         self._state = dataclasses.replace(now, index=now.index + 1, handed=False, acted=True, finished=took, refusals=0)
 
     def save(self, path: PathLike) -> None:
-        """Write down how far the search is, so that `load` can go on after a crash: an archive of arrays, .npz.
+        """Save the search's state as an archive of arrays, .npz, so that `load` can continue it after a crash.
 
         Raises:
           InputError: the file cannot be written.
@@ -387,29 +379,29 @@ class Searcher:
         save_state(self._now, self._digest, path)
 
     def load(self, path: PathLike) -> None:
-        """Go on where a search was that was saved by a searcher that was made as this one.
+        """Continue a search that was saved by a searcher with the same workcell, configuration and seed.
 
         Raises:
-          InputError: the file cannot be read, is none of `save`, or is of another workcell or configuration.
+          InputError: the file cannot be read, was not made by `save`, or belongs to another searcher.
         """
         self._state = load_state(self.problem, self._digest, path)
 
     @functools.cached_property
     def _camera_faults(self) -> tuple[str, ...]:
-        """What is wrong with the camera's pose, or far from what the networks know; it does not change."""
+        """Warnings about the camera's pose and its distance from the views that the networks were trained on."""
         faults = camera_faults(self.workcell.camera, self.workcell.shelf)
         recogniser = self.recogniser
-        # What else recognises may have no networks, or others.
+        # Another recogniser may have other networks, or none.
         if faults or not isinstance(recogniser, Recogniser):
             return faults
         return view_faults(recogniser.camera, recogniser.shelf, recogniser.trained)
 
     def _faults(self, depth: np.ndarray, colour: Any, mask: Any, target_id: int | None) -> list[str]:
-        """What in the images does not fit camera, shelf and target."""
+        """Warnings about images that do not fit camera, shelf and target."""
         problem, recogniser = self.problem, self.recogniser
         mask, colour = (None if image is None else np.asarray(image) for image in (mask, colour))
         faults = list(image_faults(problem.camera, problem.shelf, depth, mask))
-        # What else recognises may know the target in another way.
+        # Another recogniser may identify the target in another way.
         if isinstance(recogniser, Recogniser):
             faults += identity_faults(colour, mask, target_id)
             if colour is not None and target_id is None:
@@ -419,12 +411,12 @@ class Searcher:
 
     @functools.cached_property
     def _digest(self) -> str:
-        """What tells searches apart that cannot go on with each other's state."""
+        """SHA-256 of everything that a saved state depends on."""
         return hashlib.sha256(repr((self.workcell, self.config, self._seed)).encode()).hexdigest()
 
 
 def crowd_faults(observation: Observation) -> list[str]:
-    """What there is too much of."""
+    """A warning if every slot for objects is taken."""
     slots = observation.objects.capacity
     if not bool(jnp.all(observation.objects.valid)):
         return []

@@ -1,4 +1,4 @@
-"""What a searcher decides with: a policy that it is given, or one with the models that it is given."""
+"""The policy of a searcher: a given one, or search-for-grasp with given models."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mechsearch_jax.planner.policies import Policy, Search, search_for_grasp
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.errors import InputError
 
-# What is said where no action is tried out.
+# The notice where no action is tried in physics.
 UNTRIED = (
     "rehearsal: no action is tried out before it is made, so that less is found and retrieved than the results say; "
     "envs.cell.loading.load_searcher, or rehearsal=NativeTrials(), tries them in simulation"
@@ -18,16 +18,16 @@ UNTRIED = (
 
 
 def tries_nothing(policy: Policy, trials: Trials | None) -> bool:
-    """Whether it is known that no action of a policy is tried out before it is made."""
+    """Whether no action of a search-for-grasp policy is tried in physics; False for other policies, which may try."""
     return isinstance(policy, Search) and (trials is None or not policy.tries)
 
 
 def filled(policy: Policy | None, config: Config, trials: Trials | None, slots: dict[str, Any]) -> Policy:
-    """The policy that is given, or search-for-grasp with what is given for it.
+    """The given policy, or search-for-grasp with the given models.
 
     Raises:
-      InputError: a push model is given beside a policy, what is to be tried has a policy that does not propose it, or
-        the configuration names what is not given.
+      InputError: a push model is given together with a policy, a rehearsal is given with a policy that proposes no
+        trials, or the configuration names a model that is not given.
     """
     given = [name for name, value in slots.items() if value is not None]
     if policy is not None:

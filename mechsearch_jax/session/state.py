@@ -1,4 +1,4 @@
-"""How far a search is, in memory and in a file."""
+"""The state of a search, in memory and in a file."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ VERSION = 2
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class State:
-    """How far a search is.
+    """The state of a search.
 
     Attributes:
-      index: how many actions were taken.
-      belief: after the last look.
-      observation, action: of the last look and decision.
-      handed: whether the action's motion was handed out, and nothing was said of it since.
-      acted: whether the action was tried since the last look.
+      index: number of actions taken.
+      belief: after the last images.
+      observation, action: recognised in the last images, and decided on.
+      handed: whether the action's motion was returned and is not over yet.
+      acted: whether the action was executed or attempted since the last images.
       finished: whether the target was taken out.
-      refusals: how many looks since the last action ended without a motion.
+      refusals: number of steps without a motion since the last action.
     """
 
     index: int
@@ -62,12 +62,7 @@ _PYTREES = ("belief", "observation", "action")
 
 
 def save_state(state: State, digest: str, path: PathLike) -> None:
-    """Write a state as an archive of arrays, .npz.
-
-    Args:
-      state: to be written.
-      digest: of what it belongs to.
-      path: of the file.
+    """Write a state as an archive of arrays, .npz, with a digest of the searcher that it belongs to.
 
     Raises:
       InputError: the file cannot be written.
@@ -81,15 +76,10 @@ def save_state(state: State, digest: str, path: PathLike) -> None:
 
 
 def load_state(problem: Problem, digest: str, path: PathLike) -> State:
-    """Read what `save_state` wrote.
-
-    Args:
-      problem: of the search.
-      digest: as it was given then.
-      path: of the file.
+    """Read a file of `save_state`.
 
     Raises:
-      InputError: the file cannot be read, is no state, or belongs to something else.
+      InputError: the file cannot be read, is not a state, or has another digest.
     """
     arrays = read_arrays(read_bytes(path, ARRAYS_LIMIT), path)
     try:
@@ -107,28 +97,28 @@ def load_state(problem: Problem, digest: str, path: PathLike) -> State:
 
 
 def beginning(problem: Problem) -> State:
-    """Nothing was seen, and nothing done."""
+    """The state before the first images."""
     nothing = Observation(empty(MAX_OBJECTS), jnp.array(False), jnp.zeros(3))
     return State(0, initial_belief(problem), nothing, no_action(), handed=False, acted=False, finished=False)
 
 
 def _arrays(state: State) -> dict[str, Any]:
-    """The arrays of a state by the path to each."""
+    """The arrays of a state, by their paths in the pytree."""
     trees = {name: getattr(state, name) for name in _PYTREES}
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(trees)}
 
 
 def _restored(like: State, arrays: dict[str, np.ndarray], rest: dict[str, Any], path: PathLike) -> State:
-    """A state from the arrays that `_arrays` gave, of the shapes and types of another one.
+    """A state from arrays that must have the shapes and types of those of `like`.
 
     Raises:
       InputError: an array is missing, or of another shape or type.
     """
-    wanted = _arrays(like)
-    for name, value in wanted.items():
-        found = arrays.get(name)
-        if found is None or found.shape != value.shape or found.dtype != value.dtype:
+    expected = _arrays(like)
+    for name, value in expected.items():
+        array = arrays.get(name)
+        if array is None or array.shape != value.shape or array.dtype != value.dtype:
             raise InputError(f"{path}: {name} is missing or of another shape; begin a new search")
     trees = {name: getattr(like, name) for name in _PYTREES}
-    leaves = [jnp.asarray(arrays[name]) for name in wanted]
+    leaves = [jnp.asarray(arrays[name]) for name in expected]
     return State(**jax.tree.unflatten(jax.tree.structure(trees), leaves), **rest)

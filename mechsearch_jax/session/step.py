@@ -1,4 +1,4 @@
-"""What to do next, and why, in words and in a picture."""
+"""A step of a search: what to do next and why, in words and as a picture."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ class SearchStep:
     """What to do next, and why.
 
     Attributes:
-      index: how many actions were taken before.
-      kind: name of the kind of action: "push", "pick-and-place", "retrieve", or "none" where nothing is possible,
-        or all that was tried out does harm.
-      reason: what is to be done and what for, or why nothing can be, in one line.
-      warnings: what does not fit, a line each; empty where all is well.
-      trajectory: the motion, from where the arm is, through the action, and home; None where there is no action.
-      observation, belief, decision: everything behind it.
-      problem: what it was decided for.
-      image: what was seen, uint8 (H, W, 3): the colour image, or the depth as shades of grey.
+      index: number of actions taken before.
+      kind: name of the kind of action: "push", "pick-and-place", "retrieve", or "none" if no action is possible or all
+        that were tried do harm.
+      reason: what to do and what for, or why nothing can be done, in one line.
+      warnings: inconsistencies in the images or the belief, a line each.
+      trajectory: the motion from the present joints through the action and home; None without an action.
+      observation, belief, decision: what it is based on.
+      problem: the constants of the search.
+      image: the colour image, or the depth as shades of grey, uint8 (H, W, 3).
     """
 
     index: int
@@ -57,15 +57,15 @@ class SearchStep:
     image: np.ndarray
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as JSON values but the trajectory's rows: objects, target, action, and where the hand goes.
+        """Everything but the trajectory's rows as JSON values: objects, target, action, and where the hand goes.
 
-        Metres and radians in the frame of the robot's base; docs/commands.md, "A step's file", tells of each key.
+        Metres and radians in the frame of the robot's base; docs/commands.md, "A step's file", explains each key.
         """
         return step_json(self)
 
     @functools.cached_property
     def picture(self) -> Figure:
-        """What was seen, where the target can be and how it could be grasped there, and the action."""
+        """The image, f and g from above, and the action."""
         objects, after = (jax.tree.map(np.asarray, s) for s in (self.observation.objects, self.decision.predicted))
         action, found = self.decision.action, bool(self.belief.found)
         kind, moves = kind_of(int(action.kind)), self.trajectory is not None
@@ -88,13 +88,13 @@ class SearchStep:
 
 
 class Motion(NamedTuple):
-    """What is done.
+    """The motion of a decision.
 
     Attributes:
-      kind: name of the kind of action; that of doing nothing where the action cannot be executed.
+      kind: name of the kind of action; "none" if it cannot be executed.
       reason: why it is done, or why nothing is.
-      trajectory: the motion, if anything is done.
-      blocked: whether something was decided on that the arm cannot do; it may be able to do something else.
+      trajectory: of the arm; None if nothing is done.
+      blocked: whether the arm cannot execute the action; another one may be possible.
     """
 
     kind: str
@@ -103,7 +103,7 @@ class Motion(NamedTuple):
     blocked: bool = False
 
 
-def motion(
+def motion_of(
     problem: Problem,
     belief: Belief,
     observation: Observation,
@@ -116,27 +116,26 @@ def motion(
     """The motion of a decision, or why there is none.
 
     Args:
-      problem, belief, observation, decision: what was decided, and on what.
-      depth: what `observation` comes from.
-      joints: where the arm is [rad]; at home if None.
-      arm: how it is used.
+      problem, belief, observation, decision: the decision and what it is based on.
+      depth: the image that `observation` comes from.
+      joints: present joint angles [rad]; home if None.
+      arm: home and speed.
       config: how trajectories are made.
     """
     kind, nothing = kind_of(int(decision.action.kind)), kind_of(ActionKind.NONE).name
-    found = bool(belief.found)
-    known = "the target is found" if found else f"the target can be at {int(jnp.sum(belief.exists))} poses"
+    target = "the target is found" if belief.found else f"the target can be at {int(jnp.sum(belief.exists))} poses"
     if kind.code == ActionKind.NONE:
         if faults := sight_faults(problem.camera, problem.shelf, depth, observation):
             return Motion(nothing, "; ".join(faults), None)
         refused = int(decision.refused)
         why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
-        return Motion(nothing, f"{known}; {why if refused else impasse(problem, belief, observation.objects)}", None)
-    does = kind.describe(decision.action, observation.objects.capacity)
+        return Motion(nothing, f"{target}; {why if refused else impasse(problem, belief, observation.objects)}", None)
+    verb = kind.describe(decision.action, observation.objects.capacity)
     config = config or TrajectoryConfig()
     try:
         check_recognition(problem, observation, depth, config.doubt)
     except InputError as error:
-        return Motion(nothing, f"{known}; to {does} is not possible: {error}", None)
+        return Motion(nothing, f"{target}; to {verb} is not possible: {error}", None)
     try:
         trajectory = whole_trajectory(
             problem,
@@ -148,15 +147,15 @@ def motion(
             config=config,
         )
     except InputError as error:
-        return Motion(nothing, f"{known}; to {does} is not possible: {error}", None, blocked=True)
+        return Motion(nothing, f"{target}; to {verb} is not possible: {error}", None, blocked=True)
     if kind.takes_target:
-        return Motion(kind.name, f"{known}; {does}: a grasp that takes it out is known", trajectory)
+        return Motion(kind.name, f"{target}; {verb}: a grasp that takes it out is known", trajectory)
     cost = f"cost {float(decision.cost):.0f}, {float(decision.predicted_cost):.0f} expected afterwards"
-    return Motion(kind.name, f"{known}; {does}: {cost}", trajectory)
+    return Motion(kind.name, f"{target}; {verb}: {cost}", trajectory)
 
 
-def shown(depth: np.ndarray, colour: Any) -> np.ndarray:
-    """What was seen, as an image of 8 bits a channel."""
+def display_image(depth: np.ndarray, colour: Any) -> np.ndarray:
+    """The colour image, or else the depth as shades of grey, uint8 (H, W, 3)."""
     if colour is not None:
         image = np.asarray(colour)
         return image if image.dtype == np.uint8 else np.round(255 * image).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""A step as JSON values: for who drives a robot with another program.
+"""A step as JSON values, for robots that another program drives.
 
 Lengths in metres, angles in radians, everything in the frame of the robot's base (x into the shelf, y to the left, z
 up). Poses are rows of 4 x 4 matrices.
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def step_json(step: SearchStep) -> dict[str, Any]:
-    """All that a step says but its trajectory's rows; there is no NaN in it."""
+    """Everything of a step but its trajectory's rows, without NaN."""
     acts = step.trajectory is not None
     return {
         "index": step.index,
@@ -51,7 +51,7 @@ def _list(array: Any) -> list[Any]:
 
 
 def _is_finite(scene: Superquadrics) -> np.ndarray:
-    """Which objects have a shape and a place; of the others a warning says that they have none."""
+    """Which objects have finite shapes and poses; a warning names the others."""
     parts = (scene.size, scene.exponents, scene.position, scene.rotation)
     finite = [np.isfinite(np.asarray(part)).reshape(scene.capacity, -1).all(axis=1) for part in parts]
     return np.logical_and.reduce(finite)
@@ -74,7 +74,7 @@ def _objects(step: SearchStep) -> list[dict[str, Any]]:
 
 
 def _target(step: SearchStep) -> dict[str, Any]:
-    """What is known of the target; poses are x, y [m] and yaw [rad]."""
+    """The target and the belief about it; poses are x, y [m] and yaw [rad]."""
     visible, found = bool(step.observation.target_visible), bool(step.belief.found)
     target = step.problem.target
     return {
@@ -90,7 +90,7 @@ def _target(step: SearchStep) -> dict[str, Any]:
 
 
 def _action(action: Action) -> dict[str, Any]:
-    """The action, as episodes record it."""
+    """The action as recorded in episodes."""
     kind = kind_of(int(action.kind))
     return {
         "kind": kind.name,
@@ -104,7 +104,7 @@ def _action(action: Action) -> dict[str, Any]:
 
 
 def _hand(action: Action) -> dict[str, Any]:
-    """Where the Panda's hand frame goes: its origin lies behind the gripper's, along their common z."""
+    """First and last pose of the Panda's hand frame, whose origin lies behind the gripper's along their common z."""
     back = np.eye(4)
     back[2, 3] = -FINGER_TIPS
     first, last = (np.asarray(T, float) @ back for T in (action.T_world_gripper, action.T_world_place))

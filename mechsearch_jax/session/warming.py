@@ -1,4 +1,4 @@
-"""Images and scenes that stand for those that are yet to come, so that what they need can be compiled beforehand."""
+"""Stand-in images and scenes with which a search is compiled before the first real image."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from mechsearch_jax.session.images import Images
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
-# The size of what stands for an object, as half-extents [m]; and a depth that is measured everywhere else [m].
+# Half-extents of the stand-in object [m], and the depth beyond the board [m].
 BOX = (0.03, 0.03, 0.06)
 FAR = 3.0
-# Nothing that is recognised is too doubtful.
+# Bounds that no recognition exceeds.
 TRUSTING = DoubtConfig(missing=1.0, unexplained=1.0, passed=1.0)
 
 
@@ -37,11 +37,11 @@ def images(camera: Camera, shelf: Shelf, colour: bool, mask: bool, target_id: bo
     """Images of an empty shelf.
 
     Args:
-      camera, shelf: what sees what.
-      colour, mask, target_id: which of them there are.
+      camera, shelf: of the search.
+      colour, mask, target_id: whether to make them.
 
     Raises:
-      InputError: there is a target's number without a mask.
+      InputError: target_id without a mask.
     """
     if target_id and not mask:
         raise InputError("warm_up: target_id names a number of a mask; say mask=True, too")
@@ -55,7 +55,7 @@ def images(camera: Camera, shelf: Shelf, colour: bool, mask: bool, target_id: bo
 
 
 def board_depth(camera: Camera, shelf: Shelf) -> Float[np.ndarray, "h w"]:
-    """The depth image of a board without end [m], float32; `FAR` where it is not, or farther away."""
+    """The depth image of an infinite board [m], float32; at most `FAR`."""
     rows, columns = np.meshgrid(np.arange(camera.height), np.arange(camera.width), indexing="ij")
     x, y = (columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy
     up = np.array(camera.rotation)[2]
@@ -68,14 +68,14 @@ def hidden(problem: Problem, seen: Observation) -> Observation:
     """One object on the shelf, and no target."""
     x, y, _ = np.asarray(problem.poses)[len(problem.poses) // 2].tolist()
     slots = seen.objects.capacity
-    one = np.arange(slots) == 0
-    place = np.where(one[:, None], [x, y, problem.shelf.board + BOX[2]], 0.0)
+    is_first = np.arange(slots) == 0
+    position = np.where(is_first[:, None], [x, y, problem.shelf.board + BOX[2]], 0.0)
     objects = seen.objects.replace(
         size=jnp.asarray(np.broadcast_to(BOX, (slots, 3)), jnp.float32),
         exponents=jnp.full((slots, 2), 0.2, jnp.float32),
-        position=jnp.asarray(place, jnp.float32),
+        position=jnp.asarray(position, jnp.float32),
         rotation=jnp.asarray(np.broadcast_to(np.eye(3), (slots, 3, 3)), jnp.float32),
-        valid=jnp.asarray(one),
+        valid=jnp.asarray(is_first),
     )
     return seen.replace(objects=objects, target_visible=jnp.array(False))
 
@@ -92,8 +92,8 @@ def in_the_open(problem: Problem, seen: Observation) -> Observation:
     )
 
 
-class _Saying(Recogniser):
-    """Another recogniser in all but what it recognises, which is always the same."""
+class _FixedRecogniser(Recogniser):
+    """A copy of a recogniser that returns the same observation for all images."""
 
     def __init__(self, like: Recogniser, observation: Observation):
         for field in dataclasses.fields(like):
@@ -104,22 +104,24 @@ class _Saying(Recogniser):
         return self.__dict__["_observation"]
 
 
-def saying(recogniser: Any, observation: Observation) -> Callable[..., Observation]:
-    """What recognises the same in all images, and is otherwise like a recogniser."""
-    return _Saying(recogniser, observation) if isinstance(recogniser, Recogniser) else lambda *images: observation
+def fixed_recogniser(recogniser: Any, observation: Observation) -> Callable[..., Observation]:
+    """A recogniser that returns `observation` for all images, and else is like `recogniser`."""
+    if isinstance(recogniser, Recogniser):
+        return _FixedRecogniser(recogniser, observation)
+    return lambda *images: observation
 
 
 def motions(problem: Problem, action: Action, config: MotionConfig | None) -> None:
-    """Compile the motions of all kinds of action."""
+    """Compile the reference motions of all kinds of action."""
     for kind in KINDS.values():
         reference_motion(kind, action, config or MotionConfig(gripper=problem.gripper))
 
 
 def trials(tries: Trials, problem: Problem, belief: Belief, observation: Observation, action: Action) -> None:
-    """Have one action of each kind that is planned tried out; where it is none that the arm can make, that fails."""
+    """Compile the trials by trying one action of each planned kind, also those that the arm cannot execute."""
     count = len(PLANNED)
-    many: Action = jax.tree.map(lambda a: np.broadcast_to(a, (1, count, *a.shape)), jax.device_get(action))
+    actions: Action = jax.tree.map(lambda a: np.broadcast_to(a, (1, count, *a.shape)), jax.device_get(action))
     kinds = np.array([[int(kind) for kind in PLANNED]], np.int32)
-    many = many.replace(kind=kinds, object=np.zeros((1, count), np.int32))
+    actions = actions.replace(kind=kinds, object=np.zeros((1, count), np.int32))
     scene = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get(scenes_of(belief, observation)))
-    tries(problem, scene, many, np.ones((1, count), bool))
+    tries(problem, scene, actions, np.ones((1, count), bool))

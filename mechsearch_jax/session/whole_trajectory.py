@@ -1,4 +1,4 @@
-"""A decision as a robot executes it: from where the arm is, through the action, and home."""
+"""The trajectory of a decision: from the present joints through the action and home."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from mechsearch_jax.robot.robot_trajectory import (
 )
 from mechsearch_jax.runtime.errors import InputError
 
-# How fast the fingers open and close on the ways through free space: how fast the distance between them changes [m/s].
+# How fast the distance between the fingers changes on the ways through free space [m/s].
 FINGER_SPEED = 0.1
-# A gripper this much nearer to the shelf than the nearest place outside still is outside [m].
+# Tolerance within which a gripper counts as at `Gripper.nearest_outside` [m].
 OUTSIDE = 2e-3
 
 
 class Setting(recogniser.Setting, Protocol):
-    """What a trajectory has to know of a problem; a planner's `Problem` is one."""
+    """What a trajectory needs of a problem; `Problem` fulfils it."""
 
     @property
     def gripper(self) -> Gripper: ...
@@ -53,7 +53,7 @@ class TrajectoryConfig:
 
     Attributes:
       motion: lengths and durations of the action; with the problem's gripper if None.
-      free: how ways through free space are found.
+      free: how ways through free space are planned.
       bounds: where a controller should stop, and how it grips.
       doubt: when recognition is too doubtful to move.
     """
@@ -66,7 +66,10 @@ class TrajectoryConfig:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Stage:
-    """Rows of one part: joint angles, distance between the fingers and force of the grip, without the row before."""
+    """Rows of one part: joint angles [rad], distance between the fingers [m] and grip force [N].
+
+    The first row comes one timestep after the last row of the part before.
+    """
 
     part: Part
     position: np.ndarray
@@ -88,22 +91,22 @@ def whole_trajectory(
 ) -> RobotTrajectory:
     """The trajectory from the present joints through a decision's action and home; not to be called inside `jit`.
 
-    The ways through free space are straight in the joints, or planned where something is in the way: the whole arm,
-    what it holds included, keeps clear of the shelf, of the objects as they were seen (and as they are predicted to be
-    afterwards, on the way home) and of itself. After a retrieval the hand brings the target home, or stops outside the
-    shelf where home is not free with it. For the action that does nothing it is the way home alone.
+    The ways through free space are straight in joint space, or planned if something is in the way: the whole arm with
+    what it holds keeps clear of the shelf, of the observed objects, of itself and, on the way home, of the predicted
+    objects. After a retrieval the hand brings the target home, or stops outside the shelf if the target would hit
+    something at home. The trajectory of no action is the way home.
 
     Args:
-      problem: what does not change.
-      observation: what was seen before the action; without batch axes.
-      decision: a `Decision`, or its `Action`, whose outcome is then not known beforehand.
-      joints: where the arm is, seven angles [rad]; `home` if left out.
-      home: where it is to go afterwards [rad]; `kinematics.HOME` if left out.
-      width: distance between the fingers at the beginning [m]; ignored on the way home of a closed grip.
-      speed: share of the joints' limits that velocities may reach, above 0 and at most 1; accelerations reach its
-        square, and jerks its cube.
-      depth: the depth image that `observation` comes from; with it the trajectory is refused where what was recognised
-        does not explain the image, see `perception.doubt`.
+      problem: the constants.
+      observation: before the action, without batch axes.
+      decision: a `Decision`, or an `Action` without a prediction.
+      joints: present joint angles, shape (7,) [rad]; `home` if left out.
+      home: final joint angles, shape (7,) [rad]; `kinematics.HOME` if left out.
+      width: present distance between the fingers [m].
+      speed: share of the joints' velocity limits, above 0 and at most 1; accelerations reach the share's square of
+        their limits, and jerks its cube.
+      depth: the depth image that `observation` comes from; with it, recognition that does not explain the image is
+        refused, see `perception.doubt`.
       config: how it is made; the default if None.
 
     Raises:
@@ -127,7 +130,7 @@ def whole_trajectory(
 
 
 class _Assembly:
-    """What making one trajectory shares."""
+    """The making of one trajectory."""
 
     def __init__(
         self,
@@ -146,16 +149,16 @@ class _Assembly:
     def run(self, joints: np.ndarray, home: np.ndarray, width: float) -> RobotTrajectory:
         reference = self._reference()
         if reference is None:
-            there = self._free("the way home", joints, home, ArmBody.of(width), self._obstacles(), abs(width))
-            return self._joined(joints, width, [self._travel(Part.WAY_HOME, there, width, 0.0)], [there], True)
+            back = self._free("the way home", joints, home, ArmBody.of(width), self._obstacles(), abs(width))
+            return self._joined(joints, width, [self._travel(Part.WAY_HOME, back, width, 0.0)], [back], True)
 
         begin = np.asarray(reference.start, float)
         opened = 2.0 * max(begin[7], 0.0)
         body = ArmBody.of(max(width, opened))
-        there = self._free(
+        approach = self._free(
             f"the way to the {self.kind.name}", joints, begin[:7], body, self._obstacles(), opened - width
         )
-        stages, ways = [self._travel(Part.WAY_THERE, there, width, opened)], [there]
+        stages, ways = [self._travel(Part.WAY_THERE, approach, width, opened)], [approach]
 
         acting = self._acting(reference)
         stages.append(acting)
@@ -173,34 +176,34 @@ class _Assembly:
         return self._joined(joints, width, stages, ways, at_home, between)
 
     def _reference(self) -> Reference | None:
-        found = reference_motion(self.kind, self.action, self.motion)
-        if found is None:
+        motion = reference_motion(self.kind, self.action, self.motion)
+        if motion is None:
             return None
-        reference, reachable = found
+        reference, reachable = motion
         if not reachable:
             raise InputError(f"{self.kind.name}: the arm does not reach all of this motion; decide anew")
         return jax.device_get(reference)
 
     def _obstacles(self, afterwards: bool = False, without: int | None = None) -> Obstacles:
-        """The shelf and what is on it: where it was seen, or also where it is expected after the action."""
+        """The shelf and the objects: as observed, and if `afterwards`, also as predicted after the action."""
         seen = self.observation.objects
         if without is not None and without < seen.capacity:
             seen = seen.replace(valid=np.asarray(seen.valid) & (np.arange(seen.capacity) != without))
         scenes = [seen]
         if afterwards and self.after is not None:
             scenes.append(self.after)
-        # A target that is taken out, or pushed or carried somewhere else, is not where it was.
+        # A target that the action takes out, pushes or carries leaves its place.
         moved = self.kind.takes_target or (self.kind.moves_object and int(self.action.object) >= seen.capacity)
         if bool(self.observation.target_visible) and not ((afterwards or without is not None) and moved):
-            scenes.append(self._target_there())
+            scenes.append(self._target_scene())
         return Obstacles.of(self.problem.shelf, tuple(scenes), self.config.free.floor)
 
     def _target_pose(self) -> np.ndarray:
         pose = jnp.asarray(self.observation.target_pose, jnp.float32)
         return np.asarray(upright_pose(pose, self.problem.target.height(self.problem.shelf)), float)
 
-    def _target_there(self) -> Superquadrics:
-        """The target where it was seen, as a scene of its own."""
+    def _target_scene(self) -> Superquadrics:
+        """The target as observed, as a scene of one object."""
         T, target = self._target_pose()[None], self.problem.target
         return Superquadrics(
             size=np.array([target.half_size]),  # pyright: ignore[reportArgumentType]
@@ -211,7 +214,7 @@ class _Assembly:
         )
 
     def _held(self) -> Held:
-        """What is in the closed hand; a target that was not seen is taken to stand between the fingers."""
+        """What the closed hand holds; a target that is not visible is assumed between the fingers."""
         T_world_gripper = np.asarray(self.action.T_world_gripper, float)
         scene, i = self.observation.objects, int(self.action.object)
         if self.kind.holds_object and i < scene.capacity:
@@ -234,7 +237,7 @@ class _Assembly:
         opens: float,
         pace: float = 1.0,
     ) -> FreeMotion:
-        # The fingers start and stop smoothly, which takes half as long again.
+        # The fingers start and stop smoothly, which takes 1.5 times as long.
         least = 1.5 * abs(opens) / (FINGER_SPEED * self.speed)
         try:
             return free_motion(
@@ -256,7 +259,7 @@ class _Assembly:
         return _Stage(part, way.position, width, np.full(len(width), force))
 
     def _acting(self, reference: Reference) -> _Stage:
-        """The rows of the action, slowed down until they keep the limits."""
+        """The rows of the action, slowed down until they respect the joints' limits."""
         steps, timestep = int(reference.length), self.motion.timestep
         start = np.asarray(reference.start, float)
         position = np.concatenate([start[None, :7], np.asarray(reference.q[:steps], float)])
@@ -278,7 +281,7 @@ class _Assembly:
         )
 
     def _between(self, acting: _Stage) -> float:
-        """Clearance where a pick-and-place carries its object from one place outside the shelf to another [m].
+        """Clearance while a pick-and-place carries its object from one pose outside the shelf to another [m].
 
         Raises:
           InputError: the arm touches something there.
@@ -325,5 +328,5 @@ class _Assembly:
 
 
 def _is_free(body: ArmBody, obstacles: Obstacles, q: np.ndarray) -> bool:
-    found = clearance(body, obstacles, q[None])
-    return bool(found.free[0] > 0.0 and found.inside[0] <= 0.0)
+    distances = clearance(body, obstacles, q[None])
+    return bool(distances.free[0] > 0.0 and distances.inside[0] <= 0.0)
