@@ -1,9 +1,9 @@
-"""How far the whole arm is from the shelf, from objects and from itself, at any joint angles, for free motions.
+"""Distance of the whole arm from the shelf, objects and itself at any joint angles, for free motions.
 
-Every primitive of links 1 to 7, the hand, the fingers and what is held is covered by spheres, which reach at most
-`CELL` / 2 beyond it; objects are taken as the boxes that hold them. So a distance that is found is never too large,
-and up to about a centimetre too small. Unlike the tests of the planner, which look at straight approaches of a fixed
-wrist inside the shelf, any joint may turn here, and NumPy suffices: some milliseconds for a path.
+Every primitive of links 1 to 7, the hand, the fingers and the held object is covered by spheres, which reach at most
+`CELL` / 2 beyond it; objects are represented by their bounding boxes. So distances are never too large, and up to about
+1 cm too small. The planner's tests only cover straight approaches with a fixed wrist inside the shelf; here any joint
+may turn. NumPy suffices: a few milliseconds for a path.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import HAND, LINKS, Primitive, fingers
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Edge of the cells of which boxes are made up [m]: each has a sphere around it. Coarse ones serve against the arm
-# itself, from which the hand is far as a rule.
+# Edge of the cells into which boxes are divided, with a sphere around each [m]. Coarse cells are for self-collisions,
+# since the hand is usually far from the arm.
 CELL, COARSE_CELL = 0.03, 0.06
-# Distances are told up to this [m].
+# Larger distances are clipped to this [m].
 FARTHEST = 0.2
-# Joint angles that are looked at together: one compiled function serves all paths.
+# Joint angles that are evaluated together, so that one compiled function serves all paths.
 BLOCK = 64
-# The foot of the robot, which has no primitive of its own: a capsule about the axis of joint 1 [m].
+# The foot of the robot, which no primitive covers: a capsule about the axis of joint 1 [m].
 FOOT = ((0.0, 0.0, 0.06), (0.0, 0.0, 0.333), 0.08)
 HAND_FRAME = 7
 
 
 class Spheres(NamedTuple):
-    """Spheres that are rigid in frames of `forward_kinematics`.
+    """Spheres fixed in frames of `forward_kinematics`.
 
     Attributes:
       frame: of each, ascending, shape (n,).
@@ -49,7 +49,7 @@ class Spheres(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Held:
-    """What is in the closed hand, as a box.
+    """The object in the closed hand, as a box.
 
     Attributes:
       T_gripper_held: its pose in the gripper frame, shape (4, 4).
@@ -62,11 +62,11 @@ class Held:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ArmBody:
-    """The arm with its fingers at some distance and perhaps something in the hand.
+    """The arm with a certain opening of its fingers, and the held object, if any.
 
     Attributes:
       fine: spheres around all of it.
-      coarse: fewer and larger ones around links 6 and 7, the hand, the fingers and what is held.
+      coarse: fewer and larger spheres around links 6 and 7, the hand, the fingers and the held object.
     """
 
     fine: Spheres
@@ -85,10 +85,10 @@ class Obstacles:
     """What the arm must not touch.
 
     Attributes:
-      shelf: with the planner's margins; all beyond its front plane and outside its free space counts as solid.
-      half_size: of the boxes that hold the objects [m], shape (n, 3).
-      T_box_world: their poses, inverted, shape (n, 4, 4).
-      floor: what the robot stands on, as a height [m].
+      shelf: with the planner's margins; everything beyond its front plane and outside its free space is solid.
+      half_size: of the objects' bounding boxes [m], shape (n, 3).
+      T_box_world: inverse poses of the boxes, shape (n, 4, 4).
+      floor: height of the floor [m].
     """
 
     shelf: Shelf
@@ -98,7 +98,7 @@ class Obstacles:
 
     @classmethod
     def of(cls, shelf: Shelf, scenes: tuple[Superquadrics, ...] = (), floor: float = 0.0) -> Obstacles:
-        """The shelf and the valid objects of some scenes, fields (N, ...)."""
+        """The shelf and the valid objects of scenes with fields (N, ...)."""
         sizes: list[np.ndarray] = [np.zeros((0, 3))]
         poses: list[np.ndarray] = [np.zeros((0, 4, 4))]
         for scene in scenes:
@@ -112,7 +112,7 @@ class Obstacles:
 
 
 class Clearance(NamedTuple):
-    """Of several joint angles.
+    """Clearance of m configurations of the arm.
 
     Attributes:
       free: distance to the nearest obstacle, or of the hand from the arm's foot and upper arm, at most `FARTHEST`;
@@ -125,13 +125,13 @@ class Clearance(NamedTuple):
 
 
 def clearance(body: ArmBody, obstacles: Obstacles, q: Float[np.ndarray, "m 7"]) -> Clearance:
-    """How far the arm is from everything at joint angles `q` [rad]."""
+    """The clearance of the arm at joint angles `q` [rad]."""
     parts = [_block_clearance(body, obstacles, q[i : i + BLOCK]) for i in range(0, len(q), BLOCK)]
     return Clearance(np.concatenate([p.free for p in parts]), np.concatenate([p.inside for p in parts]))
 
 
 def link_poses(q: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "m 8 4 4"]:
-    """`kinematics.forward_kinematics` by blocks, so that nothing is compiled for another number of rows."""
+    """`kinematics.forward_kinematics` by blocks of `BLOCK` rows, so that it is compiled only once."""
     parts = []
     for i in range(0, len(q), BLOCK):
         rows = q[i : i + BLOCK]
@@ -141,7 +141,7 @@ def link_poses(q: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "m 8 4 4"]:
 
 
 def tip_positions(q: Float[np.ndarray, "m 7"]) -> Float[np.ndarray, "m 3"]:
-    """Where the point between the finger tips is [m]."""
+    """Position of the point between the finger tips [m]."""
     hand = link_poses(q)[:, HAND_FRAME]
     return hand[:, :3, 3] + kinematics.FINGER_TIPS * hand[:, :3, 2]
 
@@ -154,7 +154,7 @@ def _block_clearance(body: ArmBody, obstacles: Obstacles, q: np.ndarray) -> Clea
     free = np.minimum(to_floor.min(axis=1), FARTHEST)
     free = np.minimum(free, _shelf_clearance(obstacles.shelf, centres, radius))
     free = np.minimum(free, _objects_clearance(obstacles, centres, radius))
-    free = np.minimum(free, _own_distance(body.coarse, frames))
+    free = np.minimum(free, _self_distance(body.coarse, frames))
     inside = np.max(centres[..., 0] + radius, axis=1) - obstacles.shelf.front
     return Clearance(free.astype(float), inside.astype(float))
 
@@ -169,7 +169,7 @@ def _placed(spheres: Spheres, frames: np.ndarray) -> np.ndarray:
 
 
 def _shelf_clearance(shelf: Shelf, centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Distance of the spheres to what is solid of the shelf, at most `FARTHEST`, for each of the joint angles."""
+    """Distance of the spheres to the shelf's solid parts, at most `FARTHEST`, shape (m,)."""
     least = np.full(len(centres), FARTHEST)
     row, column = np.nonzero(centres[..., 0] + radius > shelf.front - FARTHEST)
     np.minimum.at(least, row, _shelf_distance(shelf, centres[row, column]) - radius[column])
@@ -177,7 +177,7 @@ def _shelf_clearance(shelf: Shelf, centres: np.ndarray, radius: np.ndarray) -> n
 
 
 def _shelf_distance(shelf: Shelf, points: np.ndarray) -> np.ndarray:
-    """Distance to what is solid of the shelf, negative in it; beside the free space that of its front plane."""
+    """Distance to the shelf's solid parts, negative inside; beside its free space, to the front plane."""
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     to_wall = np.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
     to_board = np.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
@@ -187,7 +187,7 @@ def _shelf_distance(shelf: Shelf, points: np.ndarray) -> np.ndarray:
 
 
 def _objects_clearance(obstacles: Obstacles, centres: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Distance to the nearest box, at most `FARTHEST`, for each of the joint angles."""
+    """Distance to the nearest box, at most `FARTHEST`, shape (m,)."""
     least = np.full(len(centres), FARTHEST)
     for half_size, T in zip(obstacles.half_size, obstacles.T_box_world, strict=True):
         middle, reach = -T[:3, :3].T @ T[:3, 3], float(np.linalg.norm(half_size)) + FARTHEST
@@ -199,23 +199,23 @@ def _objects_clearance(obstacles: Obstacles, centres: np.ndarray, radius: np.nda
     return least
 
 
-def _own_distance(coarse: Spheres, frames: np.ndarray) -> np.ndarray:
-    """Distance of the wrist, the hand and what it holds from the foot and links 1 and 2."""
+def _self_distance(coarse: Spheres, frames: np.ndarray) -> np.ndarray:
+    """Distance of the wrist, the hand and the held object from the foot and links 1 and 2."""
     points = _placed(coarse, frames)
     least = np.full(len(frames), np.inf)
-    for frame, start, end, radius in _own_capsules():
+    for frame, start, end, radius in _base_capsules():
         T = frames[:, frame] if frame >= 0 else np.broadcast_to(np.eye(4, dtype=np.float32), (len(frames), 4, 4))
         a = (T[:, :3, :3] @ start + T[:, :3, 3])[:, None]
         along = (T[:, :3, :3] @ (end - start))[:, None]
         share = np.sum((points - a) * along, axis=-1) / np.sum(along**2, axis=-1)
         nearest = a + np.clip(share, 0.0, 1.0)[..., None] * along
-        apart = np.linalg.norm(points - nearest, axis=-1) - coarse.radius - radius
-        least = np.minimum(least, apart.min(axis=1))
+        gap = np.linalg.norm(points - nearest, axis=-1) - coarse.radius - radius
+        least = np.minimum(least, gap.min(axis=1))
     return least
 
 
 @functools.cache
-def _own_capsules() -> tuple[tuple[int, np.ndarray, np.ndarray, float], ...]:
+def _base_capsules() -> tuple[tuple[int, np.ndarray, np.ndarray, float], ...]:
     """Capsules of the foot (frame -1) and of links 1 and 2: frame, ends of the axis, radius."""
     start, end, radius = FOOT
     capsules = [(-1, np.array(start, np.float32), np.array(end, np.float32), radius)]
@@ -228,7 +228,7 @@ def _own_capsules() -> tuple[tuple[int, np.ndarray, np.ndarray, float], ...]:
 
 
 def _in_hand(held: Held) -> tuple[Primitive, ...]:
-    """What is held, in the hand frame."""
+    """The held object, in the hand frame."""
     pose = np.array(held.T_gripper_held, float)
     pose[2, 3] += kinematics.FINGER_TIPS
     return (Primitive("box", tuple(held.half_size), pose),)

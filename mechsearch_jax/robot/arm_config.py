@@ -1,4 +1,4 @@
-"""How the arm is used: where it waits, and how fast it goes."""
+"""How the arm is used: its home position and speed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mechsearch_jax.runtime.errors import InputError
 
 @dataclasses.dataclass(frozen=True)
 class ArmConfig:
-    """How the arm is used; hashable. Nothing that is decided depends on it.
+    """How the arm is used; hashable. Decisions do not depend on it.
 
     Attributes:
       home: joint angles where it waits between motions, out of the camera's sight [rad].

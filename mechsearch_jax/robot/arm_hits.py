@@ -1,5 +1,5 @@
-"""Links 2 to 5 of the arm against objects. What is beyond them, links 6 and 7 and the hand, is rigid in the gripper's
-frame and tested as a point cloud."""
+"""Collisions of links 2 to 5 with objects. Links 6 and 7 and the hand are rigid in the gripper's frame, and are tested
+as point clouds."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from jaxtyping import Array, Bool, Float
 from mechsearch_jax.geometry.superquadric import Superquadrics, gauge, to_object_frame
 from mechsearch_jax.robot.gripper import arm_points
 
-# Exponent that the surface of a superquadric grown by a sphere tends to; a little below that of an ellipsoid, so that
-# what is grown holds the Minkowski sum up to millimetres (see the tests).
+# Exponent that a superquadric grown by a sphere tends to; a little below an ellipsoid's, so that the grown superquadric
+# contains the Minkowski sum up to millimetres (see the tests).
 ROUND = 0.7
 
 
 def grown(
     size: Float[Array, "*batch 3"], exponents: Float[Array, "*batch 2"], radius: Float[Array, "*batch"]
 ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch 2"]]:
-    """About the Minkowski sum of superquadrics and spheres, as superquadrics: larger, and rounder at their edges [m].
+    """Approximate Minkowski sum of superquadrics and spheres as superquadrics, larger and with rounder edges [m].
 
     Returns:
       size and exponents.
@@ -29,20 +29,20 @@ def grown(
 
 
 def arm_hits(q: Float[Array, "w 7"], scene: Superquadrics, count: int = 5) -> Bool[Array, "w n"]:
-    """Which objects links 2 to 5 touch in each of several poses of the arm.
+    """Which objects links 2 to 5 touch in each of w configurations.
 
     Args:
-      q: joint angles [rad]; poses close enough to each other that no link passes an object between them.
+      q: joint angles [rad], so close to each other that no link passes an object between them.
       scene: the objects, fields (N, ...).
       count: spheres for each capsule, see `arm_points`.
     """
     points, radius = arm_points(q, count)
     n = scene.capacity
-    each = jnp.broadcast_to(radius[:, None], (radius.shape[0], n))
+    radii = jnp.broadcast_to(radius[:, None], (radius.shape[0], n))
     size, exponents = grown(
-        jnp.broadcast_to(scene.size[None], (*each.shape, 3)),
-        jnp.broadcast_to(scene.exponents[None], (*each.shape, 2)),
-        each,
+        jnp.broadcast_to(scene.size[None], (*radii.shape, 3)),
+        jnp.broadcast_to(scene.exponents[None], (*radii.shape, 2)),
+        radii,
     )
     near = gauge(size[None], exponents[None], to_object_frame(scene, points)) < 1.0
     return jnp.any(near, axis=1) & scene.valid[None]

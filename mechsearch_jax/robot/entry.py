@@ -1,10 +1,9 @@
-"""The one way in and out of the shelf: from outside along +x, then straight along the gripper's z; and back.
+"""The way into the shelf: from outside along +x to the pre-grasp, then along the gripper's z. The way out reverses it.
 
-Where a straight approach begins, the pre-grasp, may lie inside the shelf: it is `Gripper.approach` behind the pose.
-From outside the gripper gets there straight along x, without turning. This stretch is called the crossing; where the
-pre-grasp is outside already, its length is 0.
+The pre-grasp, `Gripper.approach` behind the pose, may lie inside the shelf. The gripper reaches it from outside along
+x, without turning. This stretch is called the crossing; its length is 0 if the pre-grasp is outside.
 
-Hand, fingers, links 6 and 7 cannot touch the shelf on a crossing unless they do at its end: they are rigid in the
+Hand, fingers and links 6 and 7 cannot touch the shelf on a crossing unless they do at its end: they are rigid in the
 gripper's frame, and the free space of the shelf is a prism along x. Links 2 to 5 can.
 """
 
@@ -22,19 +21,19 @@ from mechsearch_jax.robot.kinematics import path_joints, path_kinematics, still_
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf
 
-# How far in front of the shelf the gripper has to be to count as outside [m]: a target in the hand is outside then,
-# and so are the hand and its open fingers, of which one is up to 4 cm ahead where the hand is turned by 45 degrees.
+# How far in front of the shelf the gripper must be to count as outside [m]: then a held target is outside, and so are
+# the open fingers, of which one is up to 4 cm ahead if the hand is turned by 45 degrees.
 MARGIN = 0.04
-# Poses of a crossing at which the arm is tested for all proposals, and for the few actions that are drawn. The longest
-# are 17 cm to the nearest place outside, which leaves 6 and 3 cm between them.
+# Poses of a crossing at which the arm is tested: for all proposals, and for the few actions that are drawn. The longest
+# crossing to the nearest place outside is 17 cm, which makes the poses 6 and 3 cm apart.
 FEW_CROSSINGS, CLOSE_CROSSINGS = 3, 6
 
 
 def check_outside(gripper: Gripper, shelf: Shelf) -> None:
-    """Check that the places outside are outside of this shelf.
+    """Check that the gripper's places outside are in front of this shelf.
 
     Raises:
-      InputError: one is not.
+      InputError: they are not.
     """
     farthest = shelf.front - MARGIN
     if gripper.nearest_outside > farthest + 1e-6:
@@ -46,7 +45,7 @@ def check_outside(gripper: Gripper, shelf: Shelf) -> None:
 def crossing_length(
     T_world_gripper: Float[Array, "*batch 4 4"], outside: float | Float[Array, "*#batch"], gripper: Gripper
 ) -> Float[Array, "*batch"]:
-    """How far the gripper travels along x from a place outside to where the approach to a pose begins [m]."""
+    """Length of the crossing from a place outside to the pre-grasp of a pose [m]."""
     T = jnp.asarray(T_world_gripper)
     return jnp.maximum(T[..., 0, 3] - gripper.approach * T[..., 0, 2] - outside, 0.0)
 
@@ -57,13 +56,13 @@ def crossing_poses(
     gripper: Gripper,
     count: int,
 ) -> Float[Array, "*batch {count} 4 4"]:
-    """Evenly spaced poses on the crossing to a pose's pre-grasp, which is left out; the first is outside."""
+    """Evenly spaced poses on the crossing, from outside to before the pre-grasp."""
     T = jnp.asarray(T_world_gripper)
     return _before(T, crossing_length(T, outside, gripper), np.full(count, gripper.approach), _to_cross(count))
 
 
 def _to_cross(count: int) -> Float[np.ndarray, " {count}"]:
-    """How much of the crossing is still ahead at each pose on it."""
+    """Remaining share of the crossing at each pose on it."""
     return np.arange(count, 0, -1) / count
 
 
@@ -75,7 +74,7 @@ def _before(
 ) -> Float[Array, "*batch w 4 4"]:
     """Poses on a way in: moved back along the gripper's z [m], and along x by a share of the crossing [m].
 
-    They differ in their positions only, and come from one formula: what is joined of parts is written to memory.
+    One formula gives all positions, since concatenated parts would be written to memory.
     """
     T = T_world_gripper[..., None, :, :]
     across = crossing[..., None] * jnp.asarray(to_cross, T.dtype).reshape(*[1] * crossing.ndim, -1)
@@ -95,9 +94,9 @@ def way_in(
 
     Args:
       T_world_gripper: where the way ends.
-      outside: x of the gripper where it begins, unless the approach begins further out [m].
-      gripper: how long the approach is.
-      crossings: number of poses on the crossing, the pre-grasp not among them.
+      outside: x of the gripper where it begins, unless the pre-grasp is further out [m].
+      gripper: gives the length of the approach.
+      crossings: number of poses on the crossing, without the pre-grasp.
       waypoints: number of poses on the approach, both ends included; the first is row `crossings`.
     """
     T = jnp.asarray(T_world_gripper)
@@ -109,25 +108,24 @@ def way_in(
 def ways_in(
     T_world_gripper: Float[Array, "4 4"], q7: Float[Array, ""], gripper: Gripper, crossings: int, waypoints: int
 ) -> tuple[Float[Array, "{crossings}+{waypoints} 7"], Bool[Array, ""], Float[Array, ""]]:
-    """Joint angles on the way in from the first place outside that is in reach: the farthest, for a hand that is full.
+    """Joint angles on the way in from the reachable place outside that is farthest from the shelf, for a full hand.
 
     Args:
       T_world_gripper: where the way ends.
       q7: angle of joint 7 [rad].
-      gripper: says which places there are.
+      gripper: gives the places outside.
       crossings, waypoints: as in `way_in`.
 
     Returns:
       q: joint angles, in one configuration of the arm [rad].
       reachable: whether the arm follows the way from any of the places.
-      outside: the place [m].
+      outside: the place's x [m].
     """
     places = jnp.float32(gripper.outside)
     T = jnp.broadcast_to(T_world_gripper[None], (len(places), 4, 4))
     paths = way_in(T, places, gripper, crossings, waypoints)
     q, reachable = path_kinematics(paths, q7)
-    # The first that is reachable, or the first of all. Chosen one by one: an index would make the arm write all of them
-    # to memory.
+    # The first reachable place, or the first one. Selects instead of an index, which would write all paths to memory.
     best, outside = q[0], jnp.float32(gripper.outside[0])
     for i, place in reversed(list(enumerate(gripper.outside))):
         best = jax.lax.select(reachable[i], q[i], best)
@@ -138,23 +136,23 @@ def ways_in(
 def arm_path(
     path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf
 ) -> tuple[Float[Array, "w 7"], Bool[Array, ""]]:
-    """Joint angles along a path of gripper poses [rad], and whether the arm follows it.
+    """Joint angles along a path of gripper poses [rad], and whether the arm can follow it.
 
-    It does if it stays in one configuration, and links 2 to 5 do not touch the shelf.
+    It can if it stays in one configuration and links 2 to 5 do not touch the shelf.
     """
     q, follows = _followed(path, q7, shelf)
     return jnp.stack(q, axis=-1), follows
 
 
 def arm_follows(path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf) -> Bool[Array, ""]:
-    """Whether the arm follows a path of gripper poses; see `arm_path`."""
+    """Whether the arm can follow a path of gripper poses; see `arm_path`."""
     return _followed(path, q7, shelf)[1]
 
 
 def _followed(
     path: Float[Array, "w 4 4"], q7: Float[Array, ""], shelf: Shelf
 ) -> tuple[list[Float[Array, " w"]], Bool[Array, ""]]:
-    """`arm_path`, with the angles of each joint in an array of their own."""
+    """`arm_path`, with one array of angles for each joint."""
     q, reachable = path_joints(path, q7)
     return q, reachable & ~jnp.any(joints_hit_shelf(q, shelf))
 
@@ -169,19 +167,19 @@ def gripper_enters(
     q7: Float[Array, " c"],
     mask: Bool[Array, " c"],
 ) -> Bool[Array, " c"]:
-    """Whether the arm follows the way in to each pose, and neither it nor what the gripper sweeps touches the shelf.
+    """Whether the arm can follow the way in to each pose, and neither it nor the gripper's sweep touches the shelf.
 
-    The nearest place outside will do: what reaches a farther one passes it.
+    Only the nearest place outside is tested, for ways from farther places pass it.
 
     Args:
       shelf: the shelf.
       gripper: static.
       waypoints: poses on the approach; there are `FEW_CROSSINGS` on the crossing.
-      clouds: what grippers sweep, in their own frames as rows of coordinates [m].
-      cloud: which of them is swept on each way.
+      clouds: swept clouds of grippers in their frames, as rows of coordinates [m].
+      cloud: index of the cloud of each way.
       T_world_gripper: where the ways end.
       q7: angles of joint 7 [rad].
-      mask: which are looked at; false for the others.
+      mask: which ways to test; the result is False for the others.
     """
 
     def enters(shared, _, row):

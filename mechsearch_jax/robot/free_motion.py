@@ -1,11 +1,10 @@
-"""Ways of the arm through free space, from rest to rest: straight in the joints where nothing is there, else around it.
+"""Motions of the arm through free space, from rest to rest: straight in joint space, or around obstacles.
 
-Around obstacles an RRT-Connect searches (Kuffner and LaValle, ICRA 2000) that looks at whole straight pieces at once,
-shortens what it finds, draws from a fixed seed and gives up after a fixed number of attempts. Planning libraries such
-as OMPL were tried and left: its bindings offer no seed, and ask for one pose of the arm at a time.
+Around obstacles, RRT-Connect (Kuffner and LaValle, ICRA 2000) plans a path that is then shortened; it tests whole
+straight pieces at once, draws from a fixed seed and gives up after a fixed number of attempts. OMPL was tried and
+dropped: its bindings offer no seed, and test one configuration at a time.
 
-Nothing passes the plane of the shelf's front between actions, not even where the shelf is open: what the camera did
-not see may be there.
+Between actions nothing passes the plane of the shelf's front, even where it is open: unseen objects may be there.
 """
 
 from __future__ import annotations
@@ -28,9 +27,9 @@ from mechsearch_jax.runtime.errors import InputError
 REACH = np.array([1.15, 1.15, 0.85, 0.8, 0.4, 0.4, 0.2])
 # Waypoints that are timed together.
 WAYPOINTS = 31
-# Places of a line that are looked at together, and the strides in which a line is looked at that is free or of no use.
+# Samples of a line that are tested together, and the stride of the first samples, which soon find an obstacle.
 LOOK, STRIDES = 16, 8
-# Share of the limits that is left free, for what peaks between the places that `timing` looks at.
+# Share of the limits that is left free for peaks between the samples of `timing`.
 SPARE = 0.01
 
 _smooth_curve, _timing = jax.jit(smooth_curve), jax.jit(timing)
@@ -38,19 +37,19 @@ _smooth_curve, _timing = jax.jit(smooth_curve), jax.jit(timing)
 
 @dataclasses.dataclass(frozen=True)
 class FreeMotionConfig:
-    """How ways through free space are found.
+    """How motions through free space are planned.
 
     Attributes:
-      clearance: how far the arm keeps from everything [m]; where an end is closer, half of what it has.
-      step: the arm is looked at so closely that no point of it moves farther between two looks [m]; at most twice
-        `clearance`, so that nothing is touched between them either.
-      slack: the arm may reach so much farther into the shelf's opening than at either end [m].
-      deepest: an arm that reaches farther beyond the shelf's front than this to begin with is not moved [m].
-      extension: how far a tree grows towards a random place [rad].
+      clearance: least distance of the arm from everything [m]; half of an end's distance if that is less.
+      step: largest distance that a point of the arm moves between two tested configurations [m]; at most twice
+        `clearance`, so that the arm touches nothing between them.
+      slack: how much farther than at either end the arm may reach into the shelf's opening [m].
+      deepest: largest distance beyond the shelf's front from which the arm is moved [m].
+      extension: how far a tree grows towards a random configuration [rad].
       attempts: of growing a tree before the search is given up.
-      shortcuts: attempts to shorten what was found.
-      seed: of the random numbers; the same always finds the same.
-      floor: height of what the robot stands on [m].
+      shortcuts: attempts to shorten the path.
+      seed: of the random numbers; equal seeds give equal paths.
+      floor: height of the floor [m].
     """
 
     clearance: float = 0.01
@@ -82,9 +81,9 @@ class FreeMotion:
     """A motion through free space; it begins and ends at rest.
 
     Attributes:
-      position: joint angles after each time step [rad], shape (steps, 7); without rows where nothing moves.
+      position: joint angles after each time step [rad], shape (steps, 7); no rows if nothing moves.
       clearance: least distance from everything on the way [m], at most `arm_clearance.FARTHEST`.
-      straight: whether it is the straight line in the joints.
+      straight: whether it is the straight line in joint space.
     """
 
     position: Float[np.ndarray, "steps 7"]
@@ -94,7 +93,7 @@ class FreeMotion:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Space:
-    """Where the arm may be: at least `least` from everything, and no farther beyond the front than `deepest` [m]."""
+    """Allowed configurations: at least `least` from everything, and at most `deepest` beyond the shelf's front [m]."""
 
     body: ArmBody
     obstacles: Obstacles
@@ -103,11 +102,11 @@ class _Space:
     step: float
 
     def allowed(self, q: np.ndarray) -> Bool[np.ndarray, " m"]:
-        found = clearance(self.body, self.obstacles, q)
-        return (found.free >= self.least) & (found.inside <= self.deepest)
+        distances = clearance(self.body, self.obstacles, q)
+        return (distances.free >= self.least) & (distances.inside <= self.deepest)
 
     def travel(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """How far towards the end the arm gets on the straight line, looked at closely; the start itself if nowhere."""
+        """The last allowed configuration on the straight line to the end; the start itself if blocked at once."""
         line = _line(start, end, self.step)
         for first in range(0, len(line), LOOK):
             stopped = np.flatnonzero(~self.allowed(line[first : first + LOOK]))
@@ -116,7 +115,7 @@ class _Space:
         return end
 
     def passes(self, start: np.ndarray, end: np.ndarray) -> bool:
-        """Whether the straight line is free; looked at in strides, which soon find what is in the way."""
+        """Whether the straight line is free; tested in strides, which soon find an obstacle."""
         line = _line(start, end, self.step)
         order = np.concatenate([np.arange(i, len(line), STRIDES) for i in range(STRIDES)])
         return all(self.allowed(line[order[i : i + LOOK]]).all() for i in range(0, len(line), LOOK))
@@ -148,19 +147,19 @@ def free_motion(
     least: float = 0.0,
     config: FreeMotionConfig | None = None,
 ) -> FreeMotion:
-    """A motion between two joint angles [rad], through free space and within the joints' limits.
+    """A motion between two configurations [rad], through free space and within the joints' limits.
 
     Args:
-      start, end: within the limits.
-      body: the arm, the opening of its fingers and what it holds.
+      start, end: joint angles within the limits [rad].
+      body: the arm, the opening of its fingers and the held object.
       obstacles: what it must not touch.
       timestep: time between rows [s].
       pace: share of the limits that velocities may reach; accelerations reach its square, and jerks its cube.
-      least: it takes no less than this [s], also where nothing moves.
-      config: how it is found; the default if None.
+      least: shortest duration, also if nothing moves [s].
+      config: how it is planned; the default if None.
 
     Raises:
-      InputError: an end is not free, or no way was found.
+      InputError: an end is not free, or no path was found.
     """
     config = config or FreeMotionConfig()
     path = free_path(start, end, body, obstacles, config)
@@ -171,7 +170,7 @@ def free_motion(
     space = _space(path, body, obstacles, config)
     rows = _timed(_respaced(path, WAYPOINTS), timestep, pace, least)
     if not straight and not space.allowed(_thinned(rows, config.step)).all():
-        # The smooth curve cuts a corner where there is no room: stop at each.
+        # The smooth curve cuts a corner and touches something: stop at each corner.
         pieces = [
             _timed(_respaced(np.array(pair), WAYPOINTS), timestep, pace, 0.0) for pair in itertools.pairwise(path)
         ]
@@ -187,14 +186,14 @@ def free_path(
     obstacles: Obstacles,
     config: FreeMotionConfig,
 ) -> Float[np.ndarray, "corners 7"]:
-    """Corners of a path of straight lines in the joints [rad], the ends included, on which the arm touches nothing.
+    """Corners, ends included, of a path of straight lines in joint space on which the arm touches nothing [rad].
 
     Raises:
-      InputError: an end is not free, or no way was found.
+      InputError: an end is not free, or no path was found.
     """
     ends = np.array([start, end], float)
-    found = clearance(body, obstacles, ends)
-    for name, free, inside in zip(("where it begins", "where it ends"), found.free, found.inside, strict=True):
+    at_ends = clearance(body, obstacles, ends)
+    for name, free, inside in zip(("where it begins", "where it ends"), at_ends.free, at_ends.inside, strict=True):
         if inside > config.deepest:
             raise InputError(
                 f"free motion: {name} the arm is {100 * inside:.0f} cm inside the shelf; take it out along its way in"
@@ -207,25 +206,25 @@ def free_path(
     rng = np.random.default_rng(config.seed)
     path = _connected(ends, space, config, rng)
     if path is None:
-        raise InputError(f"free motion: no way around what is there was found in {config.attempts} attempts")
+        raise InputError(f"free motion: no way around the obstacles was found in {config.attempts} attempts")
     return _shortened(path, space, config, rng)
 
 
 def _space(path: np.ndarray, body: ArmBody, obstacles: Obstacles, config: FreeMotionConfig) -> _Space:
-    found = clearance(body, obstacles, path[[0, -1]])
-    least = min(config.clearance, 0.5 * float(found.free.min()))
-    deepest = max(-config.clearance, float(found.inside.max())) + config.slack
+    at_ends = clearance(body, obstacles, path[[0, -1]])
+    least = min(config.clearance, 0.5 * float(at_ends.free.min()))
+    deepest = max(-config.clearance, float(at_ends.inside.max())) + config.slack
     return _Space(body, obstacles, least, deepest, config.step)
 
 
 def _line(start: np.ndarray, end: np.ndarray, step: float) -> np.ndarray:
-    """Places on a straight line in the joints, both ends included, between which no point moves farther than `step`."""
+    """Configurations on a straight line, ends included, between which no point of the arm moves more than `step`."""
     count = max(1, math.ceil(float(np.sum(np.abs(end - start) * REACH)) / step))
     return start + np.linspace(0.0, 1.0, count + 1)[:, None] * (end - start)
 
 
 def _thinned(rows: np.ndarray, step: float) -> np.ndarray:
-    """As few of the rows of a motion as leave no point more than `step` of way between them; the last is kept."""
+    """Few rows of a motion, the last included, between which no point of the arm moves more than `step`."""
     way = np.concatenate([[0.0], np.cumsum(np.sum(np.abs(np.diff(rows, axis=0)) * REACH, axis=1))])
     kept, last = [], -math.inf
     for i in range(len(rows)):
@@ -238,11 +237,11 @@ def _thinned(rows: np.ndarray, step: float) -> np.ndarray:
 def _connected(
     ends: np.ndarray, space: _Space, config: FreeMotionConfig, rng: np.random.Generator
 ) -> np.ndarray | None:
-    """A path between the ends by two trees that grow towards each other; None if they do not meet."""
+    """A path between the ends from two trees that grow towards each other; None if they do not meet."""
     trees = [([end], [-1]) for end in ends]
     low, high = ends.min(axis=0) - 1.0, ends.max(axis=0) + 1.0
     for attempt in range(config.attempts):
-        # The way round is rarely far from both ends; where it is, later attempts look everywhere.
+        # A path around obstacles is rarely far from both ends; if it is, later attempts draw from everywhere.
         near = attempt < config.attempts // 2
         lower, upper = (
             (np.maximum(low, JOINT_LOWER), np.minimum(high, JOINT_UPPER)) if near else (JOINT_LOWER, JOINT_UPPER)
@@ -260,7 +259,7 @@ def _connected(
 
 
 def _grown(tree: tuple[list, list], place: np.ndarray, space: _Space, farthest: float) -> np.ndarray | None:
-    """Grow a tree from its nearest node towards a place; the new node, or None where that is blocked at once."""
+    """Grow a tree from its nearest node towards a configuration; the new node, or None if blocked at once."""
     nodes, parents = tree
     nearest = int(np.argmin(np.sum(((np.array(nodes) - place) * REACH) ** 2, axis=1)))
     way = place - nodes[nearest]
@@ -284,7 +283,7 @@ def _branch(tree: tuple[list, list]) -> np.ndarray:
 
 
 def _shortened(path: np.ndarray, space: _Space, config: FreeMotionConfig, rng: np.random.Generator) -> np.ndarray:
-    """A path without detours: random pieces of it are replaced by straight lines where these are free."""
+    """A shorter path: random pieces are replaced by straight lines if these are free."""
     for _ in range(config.shortcuts):
         if len(path) == 2:
             break
@@ -296,7 +295,7 @@ def _shortened(path: np.ndarray, space: _Space, config: FreeMotionConfig, rng: n
         a, b = (_at(path, lengths, place) for place in (first, last))
         if space.passes(a, b):
             path = np.concatenate([path[:i], [a, b], path[j:]])
-    # What is still a corner between its neighbours goes, where it can.
+    # Remove the corners that can be skipped.
     corner = 1
     while corner < len(path) - 1:
         if space.passes(path[corner - 1], path[corner + 1]):
@@ -307,27 +306,27 @@ def _shortened(path: np.ndarray, space: _Space, config: FreeMotionConfig, rng: n
 
 
 def _at(path: np.ndarray, lengths: np.ndarray, place: float) -> np.ndarray:
-    """The joint angles at a place along a path whose corners are at `lengths`."""
+    """The joint angles at length `place` along a path whose corners are at `lengths`."""
     return np.array([np.interp(place, lengths, path[:, k]) for k in range(path.shape[1])])
 
 
 def _respaced(path: np.ndarray, count: int) -> np.ndarray:
-    """Evenly spaced places of a path, its ends included."""
+    """Evenly spaced configurations on a path, its ends included."""
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0) * REACH, axis=1))])
     return np.array([_at(path, lengths, place) for place in np.linspace(0.0, lengths[-1], count)])
 
 
 def _timed(points: np.ndarray, timestep: float, pace: float, least: float) -> np.ndarray:
-    """Joint angles after each time step of the fastest way along a smooth curve through the points."""
+    """Joint angles after each time step of the fastest motion along a smooth curve through the points."""
     curve = _smooth_curve(points.astype(np.float32))
     seconds, ramp = _timing(curve, np.float32(least), np.float32(pace * (1.0 - SPARE)))
     steps = max(1, math.ceil(float(seconds) / timestep - 1e-6))
     rows = travelled(curve, int(ramp), steps)
-    # Near the corners of a planned path there may be peaks between the places that `timing` looks at.
+    # Near the corners of a planned path there may be peaks between the samples of `timing`.
     velocity, acceleration, jerk = limit_shares(np.concatenate([points[:1], rows]), timestep)
-    over = max(velocity, acceleration ** (1 / 2), jerk ** (1 / 3)) / pace
-    if over > 1.0:
-        rows = travelled(curve, int(ramp), math.ceil(steps * over * (1.0 + SPARE)))
-    # The curve knows its ends in single precision.
+    excess = max(velocity, acceleration ** (1 / 2), jerk ** (1 / 3)) / pace
+    if excess > 1.0:
+        rows = travelled(curve, int(ramp), math.ceil(steps * excess * (1.0 + SPARE)))
+    # The curve is in single precision; make its ends exact.
     share = np.linspace(0.0, 1.0, len(rows) + 1)[1:, None]
     return rows + (1.0 - share) * (points[0] - points[0].astype(np.float32)) + share * (points[-1] - rows[-1])

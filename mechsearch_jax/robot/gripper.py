@@ -1,8 +1,8 @@
-"""The Panda's hand, fingers and arm as few primitives, and the point clouds that collision tests use.
+"""The Panda's hand, fingers and arm as few primitives, and the point clouds of collision tests.
 
-The boxes and capsules are fitted to the convex collision meshes of the maker's description of the robot: for the hand,
-the fingers and links 6 and 7 the real surface lies inside their union and at most 8 mm beneath it; links 1 to 5 are
-wrapped more loosely in capsules. The same primitives are the contact geometry of the simulator.
+The boxes and capsules are fitted to the convex collision meshes of the maker's robot description: for the hand, the
+fingers and links 6 and 7 the real surface lies inside their union and at most 8 mm beneath it; links 1 to 5 are wrapped
+more loosely in capsules. The same primitives are the contact geometry of the simulator.
 
 Frames: as in `kinematics`. The gripper frame has its origin between the finger tips, z along the approach, y along the
 direction in which the fingers open. When joint 7 is at `q7`, links 6 and 7 are rigid with the hand.
@@ -28,8 +28,8 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf, placed_spheres_hit_shelf
 
 FINGER_BASE = 0.0584  # z of the fingers' frames in the hand frame [m]
-LONGEST = 1.0  # that a gripper opens or approaches [m]
-FINE = 0.5  # spacing of a cloud near the front, relative to the rest
+LONGEST = 1.0  # largest opening or approach [m]
+FINE = 0.5  # spacing of a cloud's points near the front, relative to the rest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,10 +40,10 @@ class Gripper:
       max_opening: largest distance between the fingers.
       usable_opening: largest width of an object that may be grasped.
       approach: length of the straight approach and retreat along the gripper's z.
-      outside: places outside the shelf, as x of the gripper in the world, ascending: an empty hand enters from the last
-        and leaves to it, what it holds is taken to the first that is in reach; see `entry`. At the first the longest
-        of the known objects is outside, too.
-      front: the clouds are dense where z in the gripper frame is above this.
+      outside: places outside the shelf, as x of the gripper in the world, ascending: an empty hand enters and leaves at
+        the last; a held object is taken to the first that is reachable, where even the longest object is outside the
+        shelf. See `entry`.
+      front: clouds are dense where z in the gripper frame is above this.
     """
 
     max_opening: float = 0.08
@@ -224,24 +224,24 @@ def gripper_cloud(
 def swept_cloud(
     gripper: Gripper, opening: float, q7: float, count: int, distance: float | None = None, seed: int = 0
 ) -> Float[np.ndarray, "{count} 3"]:
-    """Points spread over the surface of all that the moving gripper passes through on a straight approach.
+    """Points spread over the surface of the volume that the gripper sweeps on a straight approach.
 
-    What a convex primitive sweeps on a line is the convex hull of its start and its end. The cloud covers the boundary
-    of the union of these hulls, twice as densely near the fingers and the front of the hand as behind.
+    A convex primitive sweeps the convex hull of its start and its end. The cloud covers the boundary of the union of
+    these hulls, twice as densely near the fingers and the front of the hand as behind.
 
     Args:
       gripper: the gripper.
       opening: distance between the fingers [m].
       q7: angle of joint 7 [rad].
       count: number of points.
-      distance: length of the approach along z, ending in the frame [m]; the gripper's own by default.
-      seed: the same seed gives the same points.
+      distance: length of the approach along z, which ends at the frame [m]; `gripper.approach` by default.
+      seed: equal seeds give equal points.
 
     Returns:
-      points in the gripper frame [m], float32; ordered so that any first part of them covers everything more coarsely.
+      points in the gripper frame [m], float32; the first n cover the whole surface for every n, more coarsely.
 
     Raises:
-      InputError: the opening is out of range, the distance negative, or fewer than one point asked for.
+      InputError: the opening is out of range, the distance negative, or the count below 1.
     """
     distance = gripper.approach if distance is None else distance
     if distance < 0.0 or count < 1:
@@ -253,7 +253,7 @@ def swept_cloud(
 def _sampled(
     gripper: Gripper, opening: float, q7: float, count: int, distance: float, seed: int
 ) -> Float[np.ndarray, "{count} 3"]:
-    """`swept_cloud` of checked arguments; kept, because several tables of a problem are made of the same clouds."""
+    """`swept_cloud` of checked arguments; cached, because several tables of a problem need the same clouds."""
     hulls = [
         _swept_hull(primitive.kind, primitive.size, primitive.T_frame_primitive.tobytes(), distance)
         for primitive in primitives_in_gripper(gripper, opening, q7)
@@ -278,8 +278,8 @@ def arm_points(q: Float[Numbers, "*batch 7"], count: int) -> tuple[Float[Array, 
       count: number of points on each capsule, its ends included; at least 2.
 
     Returns:
-      points: spheres of the given radii about these points fill the capsules, up to dents between them [m].
-      radii: one for each point [m].
+      points: centres of spheres that fill the capsules, up to dents between the spheres [m].
+      radii: of the spheres [m].
     """
     sums, radii = _spheres(count)
     return jnp.moveaxis(_centres([jnp.asarray(q)[..., joint] for joint in range(5)], sums), 0, -1), jnp.asarray(radii)
@@ -301,7 +301,7 @@ def _spheres(count: int) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, " 
 
 
 def _centres(q: Sequence[Float[Array, "*batch"]], sums: Float[np.ndarray, "k n"]) -> Float[Array, "3 *batch n"]:
-    """Points that are given as sums of `kinematics.turned_axes`, in the base frame."""
+    """Points given as sums of `kinematics.turned_axes`, in the base frame."""
     axes = kinematics.turned_axes(q[: len(sums) // 2])
     rank = axes[0].ndim
     terms = [
@@ -366,9 +366,9 @@ class _Hull(NamedTuple):
 
 @functools.cache
 def _swept_hull(kind: Literal["box", "capsule"], size: tuple[float, ...], pose: bytes, distance: float) -> _Hull:
-    """The convex hull of a primitive and of itself `distance` back along z; the fields of the primitive are hashable.
+    """The convex hull of a primitive, given by hashable fields, and of its copy `distance` back along z.
 
-    Kept, because only link 6 differs between the angles of joint 7.
+    Cached, because only link 6 differs between the angles of joint 7.
     """
     mesh = _mesh(Primitive(kind, size, np.frombuffer(pose).reshape(4, 4)))
     hull = trimesh.convex.convex_hull(np.concatenate([mesh.vertices, mesh.vertices - (0.0, 0.0, distance)]))
@@ -387,14 +387,14 @@ def _outside(points: np.ndarray, hulls: list[_Hull]) -> np.ndarray:
 
 
 def _spread(points: np.ndarray, spacing: np.ndarray, count: int) -> np.ndarray:
-    """Indices of `count` points, each chosen where the distance to those before, over the spacing, is largest."""
+    """Indices of `count` points by farthest-point sampling, with distances relative to the spacing."""
     chosen = np.empty(count, int)
     chosen[0] = np.argmax(points[:, 2])
     gap = np.full(len(points), np.inf)
     x, y, z = np.array(points.T, order="C")
     scale = spacing**2
     distance, square = np.empty_like(gap), np.empty_like(gap)
-    # Column by column and in place: this loop is most of the time that a cloud takes.
+    # Column by column and in place, for this loop takes most of a cloud's time.
     for i in range(1, count):
         last = chosen[i - 1]
         np.subtract(x, x[last], out=distance)

@@ -29,7 +29,7 @@ Numbers = Array | np.ndarray
 
 JOINT_LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973], np.float32)
 JOINT_UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973], np.float32)
-# What the maker allows each joint: velocity [rad/s], acceleration [rad/s2], jerk [rad/s3].
+# The maker's limits for each joint: velocity [rad/s], acceleration [rad/s2], jerk [rad/s3].
 VELOCITY_LIMIT = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61], np.float32)
 ACCELERATION_LIMIT = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0], np.float32)
 JERK_LIMIT = 500.0 * ACCELERATION_LIMIT
@@ -50,7 +50,7 @@ HAND_ANGLE = -math.pi / 4
 FINGER_TIPS = 0.1034
 
 POSITION_TOLERANCE = 1e-4
-# How far a joint may turn between neighbouring waypoints of a path [rad]: at rest, and for each metre and radian moved.
+# How far a joint may turn between neighbouring waypoints of a path [rad]: a constant, and for each metre and radian.
 STEP_FLOOR = 0.1
 STEP_PER_METRE = 6.0
 STEP_PER_RADIAN = 3.0
@@ -86,9 +86,9 @@ def _frames(q: Float[Array, "*batch 7"]) -> list[tuple[Array, Array, Array, Arra
 
 
 def turned_axes(q: Sequence[Float[Array, "*batch"]]) -> list[Float[Array, "3 *batch"]]:
-    """What the frames of the first links are made of: the axes x and y that each joint turns about its z, in order.
+    """The axes x and y that each joint turns about its z, in order: the frames of the links are sums of these.
 
-    `frame_in_turned_axes` says how. With the coordinates in front, all of it is arithmetic of single numbers.
+    `frame_in_turned_axes` gives the sums. With the coordinates as the first axis, all arithmetic is elementwise.
 
     Args:
       q: angles of the first joints [rad].
@@ -132,27 +132,26 @@ def inverse_kinematics(
 ) -> tuple[Float[Array, "*batch 4 7"], Bool[Array, "*batch 4"]]:
     """All joint angles with a bent elbow that reach a pose with joint 7 at a given angle, in closed form.
 
-    The elbow is taken as bent by at least 27 degrees, the outer edge of the reach; the almost straight arm reaches
-    nothing more.
+    The elbow bends by at least 27 degrees, the outer edge of the reach; a straighter arm reaches nothing more.
 
     Args:
       T_base_gripper: pose of the gripper in the base frame.
       q7: angle of joint 7 [rad].
 
     Returns:
-      q: four solutions (two forearms times two shoulders, always in the same order) [rad]. Where there is none, the
-        numbers are finite but mean nothing.
-      valid: which solutions lie within the joint limits and reproduce the pose to 1e-4 m; its rotation they reproduce
-        to rounding errors.
+      q: four solutions (two forearms times two shoulders, always in the same order) [rad]; finite but meaningless
+        where there is none.
+      valid: which solutions lie within the joint limits and reproduce the position to 1e-4 m; the rotation is
+        reproduced to rounding errors.
     """
     T = jnp.asarray(T_base_gripper, jnp.float32)
     q7 = jnp.broadcast_to(jnp.asarray(q7, jnp.float32), T.shape[:-2])
-    found = _solutions(T, q7)
-    rest = [jnp.broadcast_to(found.q4, found.wrist[0].shape), *found.wrist, jnp.broadcast_to(q7, found.wrist[0].shape)]
-    # A stack of joints and shoulders, in front of the forearms.
-    q = jnp.stack([jnp.stack([*shoulder, *rest]) for shoulder in found.shoulders], axis=1)
+    four = _solutions(T, q7)
+    rest = [jnp.broadcast_to(four.q4, four.wrist[0].shape), *four.wrist, jnp.broadcast_to(q7, four.wrist[0].shape)]
+    # Axes: joints, shoulders, forearms.
+    q = jnp.stack([jnp.stack([*shoulder, *rest]) for shoulder in four.shoulders], axis=1)
     q = jnp.moveaxis(q, (2, 1, 0), (-3, -2, -1)).reshape(*T.shape[:-2], 4, 7)
-    valid = jnp.moveaxis(jnp.stack(found.valid, axis=1), (0, 1), (-2, -1))
+    valid = jnp.moveaxis(jnp.stack(four.valid, axis=1), (0, 1), (-2, -1))
     return q, valid.reshape(*T.shape[:-2], 4)
 
 
@@ -175,8 +174,7 @@ class _Solutions(NamedTuple):
 def _solutions(T: Float[Array, "*batch 4 4"], q7: Float[Array, "*#batch"]) -> _Solutions:
     """See `inverse_kinematics`.
 
-    Written in single coordinates: a GPU makes one program of arithmetic that looks the same for every number of an
-    array, and several of what stacks and slices vectors.
+    Written in single coordinates: XLA fuses elementwise arithmetic into one GPU kernel, but not stacks and slices.
     """
     # The axis of the forearms has a length of 1 until they part.
     T, q7 = T[None], q7[None]
@@ -226,8 +224,8 @@ def _solutions(T: Float[Array, "*batch 4 4"], q7: Float[Array, "*#batch"]) -> _S
     q2 = jnp.arctan2(c1 * z3_x + s1 * z3_y, z3_z)
     q3 = jnp.arctan2(_dot(x3, y1), _dot(y3, y1))
 
-    # The rotation is right by construction. What is out of reach shows in the plane of the forearm and the shoulder:
-    # there the line from the wrist to the shoulder is not the one that joint 4 makes.
+    # The rotation is right by construction. A pose out of reach shows in the plane of the forearm and the shoulder:
+    # there the line from the wrist to the shoulder differs from the one that joint 4 gives.
     off = jnp.sqrt(off * off + along_z * along_z) - (_OFFSET - _OFFSET * c4 - _UPPER * s4)
     back = s6 * along_x + c6 * along_y + (_FORE - _OFFSET * s4 + _UPPER * c4)
     reached = (off * off + back * back < POSITION_TOLERANCE**2) & _within(q4, 3) & _within(q7, 6)
@@ -265,10 +263,10 @@ def path_kinematics(
 def path_joints(
     T_base_gripper: Float[Numbers, "*batch waypoints 4 4"], q7: Float[Numbers, "*#batch"]
 ) -> tuple[list[Float[Array, "*batch waypoints"]], Bool[Array, "*batch"]]:
-    """`path_kinematics`, with the angles of each joint in an array of their own."""
+    """`path_kinematics`, with one array of angles for each joint."""
     T = jnp.asarray(T_base_gripper, jnp.float32)
     q7 = jnp.broadcast_to(jnp.asarray(q7, jnp.float32), T.shape[:-3])
-    found = _solutions(T, q7[..., None])
+    four = _solutions(T, q7[..., None])
 
     step = T[..., 1:, :3, :] - T[..., :-1, :3, :]
     step = step * step
@@ -276,11 +274,11 @@ def path_joints(
     turned = jnp.sqrt(jnp.sum(step[..., :3], axis=(-2, -1)) / 2)
     allowed = (STEP_FLOOR + STEP_PER_METRE * moved + STEP_PER_RADIAN * turned)[None]
     # Joint 7 rests, and joint 2 turns as much in one shoulder as in the other.
-    q5, q6 = found.wrist
-    turn = jnp.maximum(jnp.maximum(_turn(found.q4), _turn(found.shoulders[0][1])), jnp.maximum(_turn(q5), _turn(q6)))
-    detour = _detour(found.q4, 3) + _detour(q5, 4) + _detour(q6, 5)
+    q5, q6 = four.wrist
+    turn = jnp.maximum(jnp.maximum(_turn(four.q4), _turn(four.shoulders[0][1])), jnp.maximum(_turn(q5), _turn(q6)))
+    detour = _detour(four.q4, 3) + _detour(q5, 4) + _detour(q6, 5)
     costs = []
-    for (q1, q2, q3), valid in zip(found.shoulders, found.valid, strict=True):
+    for (q1, q2, q3), valid in zip(four.shoulders, four.valid, strict=True):
         smooth = jnp.all(jnp.maximum(jnp.maximum(turn, _turn(q1)), _turn(q3)) < allowed, axis=-1)
         cost = detour + _detour(q1, 0) + _detour(q2, 1) + _detour(q3, 2)
         cost = jnp.sum(_or_never(valid, cost), axis=-1)
@@ -288,11 +286,11 @@ def path_joints(
 
     # The first of the cheapest, in the order of `inverse_kinematics`.
     other = _at_every_waypoint(costs[1] < costs[0], T.shape[-3])
-    q = [jax.lax.select(other, b, a) for a, b in zip(*found.shoulders, strict=True)]
+    q = [jax.lax.select(other, b, a) for a, b in zip(*four.shoulders, strict=True)]
     cost = jnp.minimum(*costs)
     second = _at_every_waypoint(cost[1] < cost[0], T.shape[-3])
     q = [jax.lax.select(second, a[1], a[0]) for a in (*q, q5, q6)]
-    q = [*q[:3], found.q4[0], *q[3:], _at_every_waypoint(q7, T.shape[-3])]
+    q = [*q[:3], four.q4[0], *q[3:], _at_every_waypoint(q7, T.shape[-3])]
     return q, jnp.minimum(cost[0], cost[1]) < jnp.inf
 
 
@@ -312,7 +310,7 @@ def line_poses(
 
 
 def still_ahead(waypoints: int) -> Float[np.ndarray, " {waypoints}"]:
-    """How much of a straight approach is still ahead at each of its evenly spaced poses, both ends included.
+    """Remaining share of a straight approach at its evenly spaced poses, both ends included: from 1 to 0.
 
     Raises:
       InputError: there are fewer than two waypoints.
@@ -354,7 +352,7 @@ def _pose(x: Array, y: Array, z: Array, p: Array) -> Array:
 
 
 def _at_every_waypoint(a: Array, count: int) -> Array:
-    """The same along a last axis."""
+    """The array repeated along a new last axis."""
     return jax.lax.broadcast_in_dim(a, (*a.shape, count), tuple(range(a.ndim)))
 
 
@@ -373,7 +371,7 @@ def _opposite(q: Array) -> Array:
 
 
 def _or_never(possible: Array, cost: Array) -> Array:
-    """What something costs; more than anything where it is not possible."""
+    """The cost where possible, else infinity."""
     return jax.lax.select(possible, cost, jnp.full_like(cost, jnp.inf))
 
 
@@ -387,6 +385,6 @@ def _detour(q: Array, joint: int) -> Array:
 
 
 def _arccos(cosine: Array) -> Array:
-    """`arccos` that clips its argument: what is out of reach is recognised by the pose that it gives."""
+    """`arccos` that clips its argument: poses out of reach are recognised otherwise."""
     cosine = jnp.minimum(jnp.maximum(cosine, -1.0), 1.0)
     return jnp.arctan2(jnp.sqrt((1.0 - cosine) * (1.0 + cosine)), cosine)

@@ -1,9 +1,9 @@
-"""Motion primitives: what arm and fingers do at every time step of a push, a pick-and-place or a retrieval.
+"""Motion primitives: arm and fingers at every time step of a push, a pick-and-place or a retrieval.
 
 Each primitive is a path of gripper poses, solved once by `path_kinematics` so that the arm stays in one configuration,
-and a schedule: which stretches of the path follow each other, and what the fingers do meanwhile. Each stretch takes as
-long as the joints' limits ask for (`time_scaling`), up to a longest duration. Those are fixed by the `MotionConfig`,
-and references are padded to their sum, so that they can be computed, stacked and followed for many worlds at once.
+and a schedule: a sequence of stretches of the path with the motion of the fingers. A stretch takes as long as the
+joints' limits require (`time_scaling`), up to the longest duration in `MotionConfig`. References are padded to the sum
+of the longest durations, so that they can be computed, stacked and followed for many worlds at once.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from mechsearch_jax.robot.kinematics import path_kinematics
 from mechsearch_jax.robot.time_scaling import angles_along, progress, smooth_curve, timing
 from mechsearch_jax.runtime.errors import InputError
 
-# Time steps that a stretch takes at least: where the hand hardly moves, rounding errors must not decide how long it is.
+# Least time steps of a stretch: rounding errors must not decide its duration where the hand hardly moves.
 SHORTEST = 25
-# Durations are multiples of so many time steps: rounding errors, which differ between compiled functions, then seldom
-# change them.
+# Durations are multiples of so many time steps, so that rounding errors, which differ between compiled functions,
+# seldom change them.
 GRAIN = 5
 # A stretch in which no joint turns by more than this is left out [rad].
 STILL = 1e-4
@@ -41,24 +41,24 @@ class MotionConfig:
 
     Attributes:
       timestep: of the simulation and of the references [s].
-      gripper: says how long an approach is and which places are outside the shelf; the planner's.
-      release: how far the gripper backs away from what it has pushed before it retreats, not to drag it along [m].
+      gripper: the planner's; gives the length of an approach and the places outside the shelf.
+      release: how far the gripper backs away from a pushed object before it retreats, in order not to drag it [m].
       clearance: how far above the commanded pose an object is released [m].
-      squeeze: how far beyond closed the fingers are commanded when they hold something [m]; sets the grip's force, here
+      squeeze: how far beyond closed the fingers are commanded when they hold something [m]; sets the grip force, here
         60 to 70 N, which the hand can hold for long. With 40 N long boxes slip.
-      approach_longest: most that an approach or a retreat with free fingers may take [time steps]; an arm that would
-        need longer, here or below, does not reach all of the motion.
-      push_longest: the same of a push.
-      push_least: least that a push takes; what it moves is to stop with the hand.
-      release_longest, release_least: the same of backing away after a push.
+      approach_longest: longest duration of an approach or a retreat with free fingers [time steps]; a motion that needs
+        longer, here or below, counts as out of reach.
+      push_longest: longest duration of a push.
+      push_least: least duration of a push, so slow that pushed objects stop with the hand.
+      release_longest, release_least: of backing away after a push.
       close_steps: duration of closing the fingers.
-      carry_longest: most that an approach or a retreat with an object in the hand may take.
-      leave_longest: the same of the way along x between the outside and where the approach begins.
-      transfer_longest: the same of the way, outside, to in front of where an object is placed.
-      open_steps: duration of opening the fingers; opened at once, they turn a narrow box that they leave one after the
-        other.
-      carry_pace: with an object in the hand, the arm goes at this share of the highest pace that the joints' limits
-        allow: velocities stay below this share of them, accelerations below its square, and jerks below its cube.
+      carry_longest: longest duration of an approach or a retreat with an object in the hand.
+      leave_longest: longest duration of a crossing between the outside and the pre-grasp.
+      transfer_longest: longest duration of the way outside to in front of the place of an object.
+      open_steps: duration of opening the fingers; opened faster, they leave a narrow box one after the other and turn
+        it.
+      carry_pace: pace with an object in the hand: velocities stay below this share of the joints' limits, accelerations
+        below its square, and jerks below its cube.
       waypoints: number of poses on each stretch of a path, where inverse kinematics is solved.
     """
 
@@ -90,16 +90,16 @@ class MotionConfig:
 
 
 class Reference(flax.struct.PyTreeNode):
-    """What the controller follows; one row for each time step. When the motion is over, the last row is repeated.
+    """What the controller follows, one row for each time step. The last row is repeated when the motion is over.
 
     Attributes:
       q: joint angles [rad], shape (..., steps, 7).
       velocity: their rate of change [rad/s], shape (..., steps, 7).
       fingers: commanded distance of each finger from the middle [m], shape (..., steps); below 0 it squeezes.
       start: joint angles and finger distance before the first step, shape (..., 8).
-      length: the time step, counted from 1, after which the motion is over, shape (...).
-      closed: the one after which the fingers have closed; 0 where they are closed from the beginning.
-      opens: the one after which they begin to open; `length` where they stay closed.
+      length: number of time steps of the motion, shape (...).
+      closed: number of time steps until the fingers have closed; 0 if they are closed from the beginning.
+      opens: number of time steps until they begin to open; `length` if they stay closed.
     """
 
     q: jax.Array
@@ -115,8 +115,8 @@ class Reference(flax.struct.PyTreeNode):
 class _Stretch:
     """Part of a schedule: from waypoint `first` to `last`, while the fingers go from one distance to another.
 
-    It takes at least `least` and at most `longest` time steps; within them, as long as the joints' limits ask for,
-    divided by `pace`; none if nothing moves. Where `first` is `last`, the arm waits for `longest`.
+    Its duration is what the joints' limits require, divided by `pace`, but at least `least` and at most `longest` time
+    steps; 0 if nothing moves. If `first` equals `last`, the arm waits for `longest`.
     """
 
     longest: int
@@ -133,7 +133,7 @@ def _ease(u: Array) -> Array:
 
 
 def _points(q: Array, stretch: _Stretch, count: int) -> Array:
-    """The waypoints of a stretch, made `count` of where there are others."""
+    """The waypoints of a stretch, resampled to `count`."""
     if stretch.first == stretch.last:
         return jnp.broadcast_to(q[stretch.first], (count, q.shape[1]))
     direction = 1 if stretch.last > stretch.first else -1
@@ -145,13 +145,13 @@ def _points(q: Array, stretch: _Stretch, count: int) -> Array:
 
 @functools.cache
 def _respaced(given: int, count: int) -> np.ndarray:
-    """What makes `count` evenly spaced points of the natural spline through those given; through two it is a line."""
+    """The matrix that resamples the natural spline through `given` points at `count` evenly spaced points."""
     spline = CubicSpline(np.arange(given), np.eye(given), bc_type="natural")
     return spline(np.linspace(0, given - 1, count)).astype(np.float32)
 
 
 def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float) -> tuple[Reference, Array]:
-    """Travel along the joint angles `q` (waypoints, 7) as the stretches say, one following the other at once.
+    """The motion along joint angles `q` (waypoints, 7) by the stretches, without pauses between them.
 
     Returns:
       The reference, and whether no stretch needs more than its longest time.
@@ -165,14 +165,13 @@ def _schedule(q: Array, stretches: Sequence[_Stretch], timestep: float) -> tuple
     seconds, ramp = jax.vmap(timing)(curves, jnp.asarray(least * timestep, jnp.float32), pace)
 
     needed = jnp.maximum(jnp.ceil(seconds / timestep / GRAIN - 1e-3) * GRAIN, least)
-    # A way of no length, such as that along x to an approach which begins outside, is left out.
+    # Stretches of zero length, such as the crossing to a pre-grasp outside, are left out.
     travels = np.array([s.first != s.last for s in stretches])
     still = jnp.max(jnp.abs(points - points[:, :1]), axis=(1, 2)) < STILL
     needed = jnp.where(still & travels, 0.0, needed)
     in_time = needed <= longest
     steps = jnp.where(in_time, needed, longest).astype(jnp.int32)
     ends = jnp.cumsum(steps)
-    # When the motion is over, the last row is repeated.
     row = jnp.minimum(jnp.arange(int(longest.sum())), ends[-1] - 1)
     now = jnp.sum(row[:, None] >= ends[None], axis=1)
     u = (row + 1 - (ends - steps)[now]) / jnp.maximum(steps[now], 1)
@@ -208,7 +207,7 @@ def push_reference(
       config: lengths and durations.
 
     Returns:
-      The reference, and whether the arm reaches all of it, in time.
+      The reference, and whether the arm reaches all of it in time.
     """
     n, gripper = config.waypoints, config.gripper
     length = jnp.sqrt(jnp.sum(displacement**2))
@@ -296,7 +295,7 @@ def pick_and_place_reference(
 
 
 def _pick_stretches(opening: Array, config: MotionConfig) -> tuple[_Stretch, ...]:
-    """Along a path that begins where the fingers close, passes the start of the approach, and ends outside."""
+    """Stretches of a path that begins where the fingers close, passes the pre-grasp, and ends outside."""
     front, opened, held, pace = config.waypoints - 1, opening / 2, -config.squeeze, config.carry_pace
     return (
         _Stretch(config.leave_longest, 2 * front, front, (opened, opened)),
@@ -308,6 +307,6 @@ def _pick_stretches(opening: Array, config: MotionConfig) -> tuple[_Stretch, ...
 
 
 def _entry(T: Array, q7: Array, config: MotionConfig) -> tuple[Array, Array]:
-    """Joint angles on the way in from the first place outside that is in reach; its corner is row `waypoints - 1`."""
+    """Joint angles on the way in from the first reachable place outside; the pre-grasp is row `waypoints - 1`."""
     q, reachable, _ = ways_in(T, q7, config.gripper, config.waypoints - 1, config.waypoints)
     return q, reachable

@@ -1,4 +1,4 @@
-"""A whole motion as a robot's controller takes it, and how close it comes to the limits."""
+"""A trajectory for a robot's controller, and how close it comes to the limits."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Bounds:
     """Where a controller should stop, and how it grips.
 
     Attributes:
-      tracking: a joint farther than this from its reference is held up [rad]. In the simulator ordinary actions stay
-        below 0.01, a few reach 0.027; a hand that shoves a box against a wall reaches 0.065 and more.
-      effort: of each joint, the torque beyond what gravity and the motion itself ask for [N m].
-      force: that the hand feels beside its grip and the weight of what it holds [N].
-      grip_force: with which the fingers hold [N].
+      tracking: largest error of a joint's angle [rad]. In the simulator ordinary actions stay below 0.01, a few reach
+        0.027; a hand that pushes a box against a wall reaches 0.065 and more.
+      effort: largest torque of each joint beyond what gravity and the motion require [N m].
+      force: largest force on the hand, without its grip and the weight of the held object [N].
+      grip_force: of the fingers [N].
     """
 
     tracking: float = 0.05
@@ -55,15 +55,15 @@ class Bounds:
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What is known of a trajectory before it is executed.
+    """Properties of a trajectory before it is executed.
 
     Attributes:
       duration: [s].
-      position_margin: of the joint that comes closest to its limits, how far it stays away [rad]; negative beyond.
-      velocity, acceleration, jerk: the highest share of the limits that any joint reaches, by differences of the rows.
+      position_margin: least distance of a joint from its limits [rad]; negative beyond them.
+      velocity, acceleration, jerk: largest share of the limits that a joint reaches, by differences of the rows.
       clearance: least distance from everything in free space [m], at most 0.2.
-      straight: whether the ways through free space are straight lines in the joints.
-      ends_at_home: false where the way home is not free and the arm stops outside the shelf.
+      straight: whether the ways through free space are straight lines in joint space.
+      ends_at_home: False if home is not free and the arm stops outside the shelf.
     """
 
     duration: float
@@ -76,7 +76,7 @@ class Report:
     ends_at_home: bool
 
     def within(self, tolerance: float = 1e-3) -> bool:
-        """Whether all joints stay within their limits, their shares up to a tolerance for rounding."""
+        """Whether all joints stay within their limits, up to a tolerance for rounding."""
         return self.position_margin >= -1e-4 and max(self.velocity, self.acceleration, self.jerk) <= 1.0 + tolerance
 
     def __str__(self) -> str:
@@ -91,7 +91,7 @@ class Report:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RobotTrajectory:
-    """The motion of arm and fingers from where the arm is, through an action, and home; one row for each time step.
+    """The motion of arm and fingers from the present joints through an action and home, one row for each time step.
 
     It begins and ends at rest. Positions, velocities and accelerations are those of one smooth curve.
 
@@ -100,14 +100,14 @@ class RobotTrajectory:
       position: joint angles [rad], shape (T, 7).
       velocity: [rad/s], shape (T, 7).
       acceleration: [rad/s2], shape (T, 7).
-      width: distance between the fingers that is commanded [m], shape (T,); 0 where they grip.
-      force: with which they grip [N], shape (T,); 0 where they hold nothing.
+      width: commanded distance between the fingers [m], shape (T,); 0 where they grip.
+      force: grip force [N], shape (T,); 0 where they hold nothing.
       part: a `Part` for each row, shape (T,).
       action: name of the kind of action.
       bounds: where a controller should stop.
       clearance: least distance from everything in free space [m], at most 0.2.
-      straight: whether the ways through free space are straight lines in the joints.
-      ends_at_home: false where the way home is not free and the arm stops outside the shelf.
+      straight: whether the ways through free space are straight lines in joint space.
+      ends_at_home: False if home is not free and the arm stops outside the shelf.
     """
 
     time: Float[np.ndarray, " t"]
@@ -124,7 +124,7 @@ class RobotTrajectory:
     ends_at_home: bool
 
     def report(self) -> Report:
-        """What a dry run tells: duration, shares of the limits, clearance."""
+        """Duration, shares of the limits and clearance."""
         timestep = self.time[1] - self.time[0] if len(self.time) > 1 else 1.0
         shares = limit_shares(self.position, float(timestep))
         margin = np.minimum(self.position - JOINT_LOWER, JOINT_UPPER - self.position).min()
@@ -132,9 +132,8 @@ class RobotTrajectory:
 
 
 def limit_shares(position: Float[np.ndarray, "t 7"], timestep: float) -> tuple[float, float, float]:
-    """The highest shares of the limits of velocity, acceleration and jerk in differences of rows, from rest to rest."""
-    still = (np.repeat(end, 3, axis=0) for end in (position[:1], position[-1:]))
-    first, last = still
+    """Largest shares of the limits of velocity, acceleration and jerk, by differences of rows, from rest to rest."""
+    first, last = (np.repeat(end, 3, axis=0) for end in (position[:1], position[-1:]))
     values, shares = np.concatenate([first, position, last]), []
     for limit in (VELOCITY_LIMIT, ACCELERATION_LIMIT, JERK_LIMIT):
         values = np.diff(values, axis=0) / timestep
@@ -151,11 +150,11 @@ def derivatives(position: Float[np.ndarray, "t 7"], timestep: float) -> tuple[np
 
 
 def slowed(position: Float[np.ndarray, "t 7"], factor: float) -> Float[np.ndarray, "s 7"]:
-    """Rows of a motion from rest to rest that takes about `factor` times as long, at least 1; the ends stay.
+    """Rows of the same motion from rest to rest that takes about `factor` times as long, at least 1.
 
     Args:
-      position: the rows, the one that it starts from included [rad].
-      factor: how much longer.
+      position: the rows, the first configuration included [rad].
+      factor: of the duration.
     """
     if len(position) < 2:
         return position
@@ -164,5 +163,5 @@ def slowed(position: Float[np.ndarray, "t 7"], factor: float) -> Float[np.ndarra
 
 
 def places_when_slowed(rows: int, factor: float) -> Float[np.ndarray, " s"]:
-    """Where, in rows of the faster motion, the rows of one that takes about `factor` times as long lie."""
+    """Positions, in rows of a motion, of the rows of the same motion that takes about `factor` times as long."""
     return np.linspace(0.0, rows - 1, math.ceil((rows - 1) * factor - 1e-9) + 1)

@@ -1,15 +1,15 @@
-"""How fast the arm may travel: smooth curves through waypoints, timed within the joints' limits.
+"""Time scaling: smooth curves through waypoints, timed within the joints' limits.
 
 A stretch of a motion begins and ends at rest. Its waypoints are joined by a natural cubic spline (of class C2, so that
 accelerations do not jump at the waypoints), whose parameter s from 0 to 1 grows by about the least time that the
-velocity limits allow for each part. Places near singularities, where joints turn far for a short way of the hand, are
-so passed slowly. Along it goes a progress profile of unit duration, at rest and without acceleration at both ends: the
-speed rises as a cubic smoothstep, is constant, and falls likewise. The longer the time, the lower are all velocities,
-accelerations and jerks: by its first, second and third power. So the largest of the three ratios to the limits, over
-all joints and places, gives the duration.
+velocity limits allow for each part. So the arm is slow near singularities, where joints turn far for a short way of the
+hand. The progress along the curve has a profile of unit duration, at rest and without acceleration at both ends: the
+speed rises as a cubic smoothstep, is constant, and falls likewise. Velocities, accelerations and jerks fall with the
+first, second and third power of the duration. So the largest of the three ratios to the limits, over all joints and
+places, gives the duration.
 
-Approximation: peaks are looked for at `PLACES` places of the curve. Differences of sampled references are averages of
-the derivatives, so that sampling raises no peak.
+Approximation: peaks are evaluated at `PLACES` places of the curve. Differences of sampled references are averages of
+the derivatives, so sampling raises no peak.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from scipy.interpolate import CubicSpline
 
 from mechsearch_jax.robot.kinematics import ACCELERATION_LIMIT, JERK_LIMIT, VELOCITY_LIMIT
 
-# Shares of a stretch's time in which its speed rises, and falls. Short ones suit long ways, on which velocities are
-# what limits; of those that take equally long, the first is taken, which is closest to 3 u^2 - 2 u^3.
+# Candidate shares of a stretch's time in which its speed rises, and falls. Short ramps suit long stretches, which
+# velocities limit; the first of equally fast ones is chosen, which is closest to 3 u^2 - 2 u^3.
 RAMPS = (1 / 3, 1 / 2, 0.42, 0.26, 0.2, 0.15)
 PLACES = 257
-# Added to the least time for the way between two waypoints [s], so that a still one has a length too; and the share
-# of the mean that each has at least, so that the spline's knots do not lie too unevenly.
+# Added to the least time between two waypoints [s], so that it is positive at rest; and its least share of the mean,
+# so that the spline's knots are not too uneven.
 LEAST_TIME = 1e-4
 LEAST_SHARE = 0.5
 # How often each of those times is averaged with its neighbours, so that the parameter has no kinks.
@@ -51,14 +51,14 @@ class Curve(flax.struct.PyTreeNode):
 
 def smooth_curve(q: Float[Array, "n 7"]) -> Curve:
     """The curve through joint angles [rad] at waypoints, evenly spaced along the hand's way; n is at least 2."""
-    # A norm of high order instead of the largest over the joints, which would make kinks.
+    # A norm of high order instead of the maximum over the joints, which would make kinks.
     fourth = jnp.sum((jnp.diff(q, axis=0) / VELOCITY_LIMIT[None]) ** 4, axis=1)
     least = LEAST_SHARE * jnp.mean((fourth + LEAST_TIME**4) ** 0.25) + LEAST_TIME
-    taken = (fourth + least**4) ** 0.25
+    time = (fourth + least**4) ** 0.25
     for _ in range(SMOOTHINGS):
-        padded = jnp.concatenate([taken[:1], taken, taken[-1:]])
-        taken = (padded[:-2] + 2 * taken + padded[2:]) / 4
-    step = taken / jnp.sum(taken)
+        padded = jnp.concatenate([time[:1], time, time[-1:]])
+        time = (padded[:-2] + 2 * time + padded[2:]) / 4
+    step = time / jnp.sum(time)
     knots = jnp.concatenate([jnp.zeros(1, step.dtype), jnp.cumsum(step)])
     return Curve(knots / knots[-1], q, _bends(step, q))
 
@@ -66,15 +66,15 @@ def smooth_curve(q: Float[Array, "n 7"]) -> Curve:
 def timing(
     curve: Curve, least: Float[Array, ""] | float, pace: Float[Array, ""] | float = 1.0
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """How long the way along a curve takes, and with which profile.
+    """The least duration of the motion along a curve, and its profile.
 
     Args:
       curve: without leading axes.
-      least: it takes no less than this [s].
+      least: lower bound of the duration [s].
       pace: share of the limits that velocities may reach; accelerations reach its square, and jerks its cube.
 
     Returns:
-      The duration [s], and which of `RAMPS` needs the least.
+      The duration [s], and the index of the fastest of `RAMPS`.
     """
     segment = jnp.searchsorted(curve.knots, jnp.asarray(_PLACES), side="right", method="scan_unrolled") - 1
     _, d1, d2, d3 = _derivatives(curve, jnp.clip(segment, 0, curve.knots.shape[0] - 2), jnp.asarray(_PLACES))
@@ -83,7 +83,7 @@ def timing(
     velocity = d1 * rate
     acceleration = d2 * rate**2 + d1 * rate2
     jerk = d3 * rate**3 + 3.0 * d2 * rate * rate2 + d1 * rate3
-    # So little that its roots are far below a time step.
+    # The lower bound is so small that its roots are far below a time step.
     ratios = [
         jnp.maximum(jnp.max(jnp.abs(peak) / limit[None, None], axis=(1, 2)), 1e-12)
         for peak, limit in ((velocity, VELOCITY_LIMIT), (acceleration, ACCELERATION_LIMIT), (jerk, JERK_LIMIT))
@@ -95,7 +95,7 @@ def timing(
 
 
 def progress(u: Float[Array, "*n"], ramp: Int[Array, "*#n"]) -> Float[Array, "*n"]:
-    """How far along a curve a profile is, from 0 to 1, when the share `u` of its time has passed."""
+    """Progress of a profile along its curve, from 0 to 1, at the share `u` of its time."""
     return _profile(u, jnp.asarray(RAMPS, jnp.float32)[ramp])
 
 
@@ -104,14 +104,14 @@ def angles_along(curves: Curve, which: Int[Array, " m"], s: Float[Array, " m"]) 
 
     Args:
       curves: with one leading axis.
-      which: of the curves each place is on.
+      which: index of the curve of each place.
       s: parameters, from 0 to 1.
     """
     count, n = curves.knots.shape
     flat: Curve = jax.tree.map(lambda a: a.reshape(count * n, *a.shape[2:]), curves)
     # One sorted array for all curves, so that a single search serves all places.
-    apart = (curves.knots + 2.0 * jnp.arange(count)[:, None]).reshape(-1)
-    segment = jnp.searchsorted(apart, s + 2.0 * which, side="right", method="scan_unrolled") - 1
+    knots = (curves.knots + 2.0 * jnp.arange(count)[:, None]).reshape(-1)
+    segment = jnp.searchsorted(knots, s + 2.0 * which, side="right", method="scan_unrolled") - 1
     return _derivatives(flat, jnp.clip(segment, which * n, which * n + n - 2), s)[0]
 
 
@@ -120,8 +120,8 @@ def travelled(curve: Curve, ramp: int, steps: int) -> Float[np.ndarray, "{steps}
 
     Args:
       curve: without leading axes.
-      ramp: which of `RAMPS` its profile has.
-      steps: into how many parts the time is divided; the last row is the curve's end.
+      ramp: index of its profile in `RAMPS`.
+      steps: number of parts of the time; the last row is the curve's end.
     """
     share = _profile(np.arange(1, steps + 1) / steps, RAMPS[ramp])
     knots = np.asarray(curve.knots, float)
@@ -148,7 +148,7 @@ def _bends(step: Array, q: Array) -> Array:
     middle = 2 * (before + after)
     shift = 1
     while shift < right.shape[0]:
-        # Each equation less those `shift` above and below, so that it no longer knows their unknowns.
+        # Subtract the equations `shift` above and below, which eliminates their unknowns.
         up = [_shifted(a, shift, fill) for a, fill in ((before, 0.0), (middle, 1.0), (after, 0.0), (right, 0.0))]
         down = [_shifted(a, -shift, fill) for a, fill in ((before, 0.0), (middle, 1.0), (after, 0.0), (right, 0.0))]
         above = jnp.where(jnp.arange(right.shape[0])[:, None] < shift, 0.0, before / up[1])

@@ -27,13 +27,8 @@ def csv_header() -> list[str]:
 def save_csv(trajectory: RobotTrajectory, path: PathLike, overwrite: bool = False) -> None:
     """Write a trajectory as CSV: one line with names and units, then one for each row.
 
-    Args:
-      trajectory: which.
-      path: of the file.
-      overwrite: whether a file that is there may be replaced.
-
     Raises:
-      InputError: the file is there, or cannot be written.
+      InputError: the file exists and `overwrite` is False, or it cannot be written.
     """
     columns = (trajectory.time[:, None], trajectory.position, trajectory.velocity)
     table = np.concatenate([*columns, trajectory.width[:, None], trajectory.force[:, None]], axis=1)
@@ -48,20 +43,15 @@ def ros_messages(
     joint_names: Sequence[str] = JOINT_NAMES,
     gripper_name: str = GRIPPER_NAME,
 ) -> dict[str, Any]:
-    """A trajectory as numbers, texts, lists and dictionaries in the layout of ROS messages.
+    """A trajectory as JSON values in the layout of ROS messages.
 
     `arm` is a `trajectory_msgs/JointTrajectory`: `joint_names` and `points` with `positions` [rad], `velocities`
-    [rad/s], `accelerations` [rad/s2] and `time_from_start` (`secs`, `nsecs`). `gripper` has the same layout: one joint,
-    whose position is the width between the fingers [m] and whose effort is the grip's force [N]; only rows where
+    [rad/s], `accelerations` [rad/s2] and `time_from_start` (`secs`, `nsecs`). `gripper` has the same layout with one
+    joint, whose position is the width between the fingers [m] and whose effort is the grip force [N]; only rows where
     either changes, and the ends. `stop` has the bounds at which a controller should stop.
 
-    Args:
-      trajectory: which.
-      joint_names: of the robot's seven joints, in order.
-      gripper_name: of the gripper's one.
-
     Raises:
-      InputError: there are not seven different names.
+      InputError: `joint_names` are not seven different names.
     """
     names = [str(name) for name in joint_names]
     if len(set(names)) != len(JOINT_NAMES) or len(names) != len(JOINT_NAMES):
@@ -99,16 +89,10 @@ def ros_messages(
 
 
 def save_ros(trajectory: RobotTrajectory, path: PathLike, overwrite: bool = False, **names: Any) -> None:
-    """Write `ros_messages` as JSON.
-
-    Args:
-      trajectory: which.
-      path: of the file.
-      overwrite: whether a file that is there may be replaced.
-      **names: `joint_names` and `gripper_name`.
+    """Write `ros_messages` as JSON; `names` are its `joint_names` and `gripper_name`.
 
     Raises:
-      InputError: the file is there, or cannot be written, or the names are not seven.
+      InputError: as `save_csv` and `ros_messages`.
     """
     _write(json.dumps(ros_messages(trajectory, **names), allow_nan=False) + "\n", path, overwrite)
 
@@ -124,9 +108,9 @@ def _header() -> dict[str, Any]:
 
 def _changes(trajectory: RobotTrajectory) -> list[int]:
     """The first and the last row, and those next to a change of the fingers' width or force."""
-    told = np.stack([trajectory.width, trajectory.force], axis=1)
-    differs = np.any(np.diff(told, axis=0) != 0.0, axis=1)
-    kept = np.zeros(len(told), bool)
+    grip = np.stack([trajectory.width, trajectory.force], axis=1)
+    differs = np.any(np.diff(grip, axis=0) != 0.0, axis=1)
+    kept = np.zeros(len(grip), bool)
     kept[[0, -1]] = True
     kept[1:] |= differs
     kept[:-1] |= differs
