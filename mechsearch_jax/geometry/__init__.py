@@ -1,1 +1,1 @@
-"""Shapes and motions of rigid bodies, with no knowledge of a robot or a shelf."""
+"""Shapes and motions of rigid bodies, independent of robot and shelf."""

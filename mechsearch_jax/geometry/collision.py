@@ -1,9 +1,8 @@
-"""Point clouds against superquadrics: the one place where collisions are looked for.
+"""Collision tests of point clouds with superquadrics.
 
-A cloud collides with an object if one of its points is inside it, where the gauge is below 1 (paper equations 14 to
-17). Powers are by far the most expensive part of that test, and almost never needed: most pairs are told apart by boxes
-around them, and the p-norms of the gauge lie between norms without powers, which decide every cloud except those that
-graze the surface.
+A cloud collides with an object if one of its points is inside, where the gauge is below 1 (paper equations 14 to 17).
+Powers are by far the most expensive part of that test, and rarely needed: bounding boxes separate most pairs, and the
+p-norms of the gauge lie between norms without powers, which decide every cloud that does not graze the surface.
 """
 
 from __future__ import annotations
@@ -26,22 +25,23 @@ from mechsearch_jax.geometry.masked import block_size, entry_of, for_each, merge
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import inverse, make, matmul
 
-# How many pairs a CPU looks at together: at boxes, at whole clouds, and at gauges.
+# Pairs that a CPU tests together: by boxes, by bounds, and by gauges.
 BOXES, CLOUDS, GAUGES = 1024, 128, 32
-# Of so few pairs, those that are near are decided by gauges at once: it would not pay to look at bounds first.
+# With at most so many pairs, bounds do not pay: gauges decide at once.
 FEW = 1024
-# What is known of a pair: it is apart, not decided yet, or it collides.
+# State of a pair: apart, undecided, or colliding.
 APART, OPEN, HIT = jnp.uint8(0), jnp.uint8(1), jnp.uint8(2)
 
 
 class Clouds(flax.struct.PyTreeNode):
-    """Point clouds, each in a frame of its own.
+    """Point clouds, each in its own frame.
 
     Attributes:
       points: as rows of coordinates, shape (C, 3, P) [m].
-      low, high: boxes around them, shape (C, 3) [m].
-      gap: how far a point may be from the nearest one of the first `first` of its cloud [m].
-      first: so many points of a cloud that all of a batch share are looked at first; all where it is 0. Static.
+      low, high: corners of their bounding boxes, shape (C, 3) [m].
+      gap: largest distance of a point from the nearest of the first `first` points of its cloud [m].
+      first: number of points that are tested first, for clouds that a whole batch shares; 0 to test all at once.
+        Static.
     """
 
     points: jax.Array
@@ -67,12 +67,12 @@ def collisions(
     """Which placed clouds collide with which objects.
 
     Args:
-      clouds: what is placed.
-      cloud: which of them each placed cloud is.
-      T_world_cloud: where it is.
+      clouds: C point clouds.
+      cloud: index of each placed cloud.
+      T_world_cloud: pose of each placed cloud.
       scene: the objects, fields (N, ...).
-      mask: pairs that are worth a look; the others are reported as free of collision.
-      own: whether the clouds differ along a batch. If they do not they are not copied; static.
+      mask: pairs to test; the result is False for the others.
+      own: whether the clouds differ along a batch. If not, they are not copied. Static.
 
     Returns:
       True where a masked pair collides.
@@ -86,14 +86,14 @@ def collisions(
 
 
 def _collide(first: int, mask: Bool[Array, "*batch m n"], shared: tuple | None, rows: tuple) -> Array:
-    """See `collisions`; the axes of a batch may be in front."""
+    """`collisions` with leading batch axes."""
     if mask.size == 0:
         return mask
     if uses_kernel():
         lead = mask.ndim - 2
         cloud, T_world_cloud, objects, own = rows
         points, boxes = own if shared is None else (a.reshape(*[1] * lead, *a.shape) for a in shared[:2])
-        # Of clouds that differ along a batch no gaps are known, nor are they needed where `first` is 0.
+        # Clouds that differ along a batch have no gaps, which are not needed where `first` is 0.
         gap = 0.0 if shared is None else shared[2]
         return collide(mask, points, boxes, gap, cloud, T_world_cloud, objects, 0 if shared is None else first)
     m, n = mask.shape[-2:]
@@ -114,8 +114,8 @@ class _Pairs(NamedTuple):
     Attributes:
       relative: the cloud's pose in the object's frame, shape (K, 3, 4).
       size, exponents: of the object.
-      table: a part of what is known of the clouds: points (0), boxes (1), with a leading axis K.
-      gap: of `Clouds`, where all of a batch share them.
+      table: gives the clouds' points (0) or boxes (1), with a leading axis K.
+      gap: of `Clouds` that a whole batch shares.
     """
 
     relative: Float[Array, "k 3 4"]
@@ -125,7 +125,7 @@ class _Pairs(NamedTuple):
     gap: Array | float
 
     def coordinates(self, count: int = 0) -> Float[Array, "3 k p"]:
-        """Magnitudes of the points' coordinates in half-extents; of the first `count` points, if that is not 0."""
+        """Magnitudes of the coordinates, in half-extents, of the first `count` points, or of all if it is 0."""
         points = self.table(0)
         points = points[..., :count] if count else points
         rows = jnp.moveaxis(self.relative / self.size[:, :, None], 1, 0)
@@ -135,12 +135,12 @@ class _Pairs(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _AllPairs:
-    """All pairs of placed clouds and objects, for a CPU, which looks closer and closer at fewer and fewer of them.
+    """All pairs of placed clouds and objects, for a CPU, which tests fewer and fewer pairs more and more closely.
 
     Attributes:
       shape: of the mask.
-      shared: points, boxes and gap of the clouds, where all of a batch share them.
-      clouds, T_world_cloud, objects, own: see `collisions`, with the axes of the batch in front.
+      shared: points, boxes and gap of clouds that a whole batch shares.
+      clouds, T_world_cloud, objects, own: see `collisions`, with leading batch axes.
     """
 
     shape: tuple[int, ...]
@@ -151,7 +151,7 @@ class _AllPairs:
     own: tuple | None
 
     def decided(self, state: UInt8[Array, " all"], test: Callable[[_Pairs], Array], block: int) -> UInt8[Array, " all"]:
-        """What is known of the pairs after a test of those that are open."""
+        """The states of the pairs after a test of the undecided ones."""
         last = jnp.uint32(math.prod(self.shape) - 1)
 
         def body(state, index, active):
@@ -178,7 +178,7 @@ class _AllPairs:
 
 
 def _near(pairs: _Pairs) -> UInt8[Array, " k"]:
-    """Whether the boxes around clouds and objects overlap, along the axes of the clouds'."""
+    """Which bounding boxes of clouds and objects overlap, along the axes of the clouds."""
     box, rotation = pairs.table(1), pairs.relative[:, :, :3]
     reach = jnp.sum(jnp.abs(rotation) * pairs.size[:, :, None], axis=1)
     centre = -jnp.sum(rotation * pairs.relative[:, :, 3:], axis=1)
@@ -186,7 +186,7 @@ def _near(pairs: _Pairs) -> UInt8[Array, " k"]:
 
 
 def _bounded(pairs: _Pairs, count: int = 0) -> UInt8[Array, " k"]:
-    """What bounds on the gauge tell, of all points or of the first `count`."""
+    """The states by bounds on the gauge of all points, or of the first `count`."""
     least, most = _bounds(pairs.coordinates(count), pairs.exponents)
     if count:
         # The gauge is a norm, at most the length over the least half-extent, or twice that below 2-norms.
@@ -196,13 +196,13 @@ def _bounded(pairs: _Pairs, count: int = 0) -> UInt8[Array, " k"]:
 
 
 def _gauged(pairs: _Pairs) -> UInt8[Array, " k"]:
-    """What the gauge of all points tells."""
+    """The states by the gauge of all points."""
     least = jnp.min(superquadric.unit_gauge(pairs.coordinates(), pairs.exponents.T[:, :, None]), axis=1)
     return jnp.where(least < 1.0, HIT, APART)
 
 
 def _bounds(scaled: Float[Array, "3 k p"], exponents: Float[Array, "k 2"]) -> tuple[Float[Array, " k"], ...]:
-    """Bounds on the least gauge of points, with no power evaluated per point.
+    """Bounds on the least gauge of points, without a power for each point.
 
     Args:
       scaled: magnitudes of their coordinates in half-extents.

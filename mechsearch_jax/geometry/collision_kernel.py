@@ -1,18 +1,18 @@
-"""Point clouds against superquadrics on an NVIDIA GPU: one kernel for all pairs, of which most are left out.
+"""Collision tests of point clouds with superquadrics on an NVIDIA GPU: one kernel for all pairs.
 
-A program of the kernel has a few placed clouds. For each it looks at the wanted objects one after the other: at boxes,
-where these overlap at the first points of the cloud, and at the others only where the first ones are neither inside nor
-so far outside that no other can be. Which objects are wanted, and which collide, are
-the bits of one word for each placed cloud: hardly any of the millions of clouds of a batch has a wanted pair, and to
-pass by the others has to cost next to nothing.
+A program of the kernel has a few placed clouds. For each it tests the masked objects one after the other: first the
+bounding boxes; if these overlap the first points of the cloud; and the other points only if the first ones are neither
+inside nor so far outside that no other can be inside. The masked objects and the colliding ones are the bits of a word
+for each placed cloud: few of the millions of clouds of a batch have a masked pair, and skipping the others must cost
+little.
 
 The gauge is computed with logarithms, where a power is a product and a p-norm of two numbers is
 
     log ||(a, b)||_p = max(log a, log b) + log(1 + exp(-p |log a - log b|)) / p,
 
-so that nothing overflows, whatever the exponents and however far away a point. The base is 2, because a GPU's
-special-function units know that one (`lg2.approx`, `ex2.approx`: 22 bits); they are taken as they are. The gauge is
-within a relative 1e-5 of the exact one, beside the rounding of a point's coordinates in an object's frame.
+so that nothing overflows, whatever the exponents and however far away a point. The base is 2, that of a GPU's
+special-function units (`lg2.approx`, `ex2.approx`: 22 bits). The gauge is within a relative 1e-5 of the exact one,
+without the rounding of a point's coordinates in an object's frame.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from mechsearch_jax.geometry.masked import on_cpu
 Function = Callable[[Array], Array]
 
 TINY = 1e-30
-# By how much the gauge of a point has to be above what is possible before it counts as above.
+# Tolerance for rounding in comparisons of the gauge.
 ROUNDING = 1e-4
 # Points of a cloud in one step, a power of 2, and warps of 32 threads that share it.
 POINTS, WARPS = 256, 2
-# Placed clouds of a program, as many as leave so many programs, a power of 2 at most. A GPU begins a program in about a
-# nanosecond, and one with fewer placed clouds is done sooner.
+# Largest number of placed clouds of a program, a power of 2, and the number of programs below which it is smaller. A
+# GPU begins a program in about a nanosecond, and one with fewer placed clouds is done sooner.
 PLACED, PROGRAMS = 16, 2**17
 # Objects whose bits share a word.
 BITS = 32
@@ -59,7 +59,7 @@ def log_gauge(point: Sequence[Array], powers: Sequence[Array] | Array, log: Func
 
 
 def special(name: str) -> Function:
-    """A special-function unit's own result: XLA and Triton otherwise add what rounds it better."""
+    """The plain result of a special-function unit, without the corrections that XLA and Triton add."""
     from jax.experimental.pallas import triton
 
     def function(x: Array) -> Array:
@@ -70,7 +70,7 @@ def special(name: str) -> Function:
 
 
 def kernel_available() -> bool:
-    """Whether this version of JAX has what the kernel is written in. (JAX 0.11 announces that it will go.)"""
+    """Whether this version of JAX has Pallas's Triton backend, which JAX 0.11 announces to remove."""
     try:
         from jax.experimental.pallas import triton
     except ImportError:
@@ -79,20 +79,20 @@ def kernel_available() -> bool:
 
 
 def uses_kernel() -> bool:
-    """Whether what is being traced is meant for an NVIDIA GPU, and the kernel can be had."""
+    """Whether JAX is tracing for an NVIDIA GPU and the kernel is available."""
     if on_cpu() or jax.default_backend() != "gpu" or not kernel_available():
         return False
     return "rocm" not in jax.extend.backend.get_backend().platform_version.lower()
 
 
 def _relative(o: Sequence[Array], T: Sequence[Sequence[Array]]) -> list[list[Array]]:
-    """A cloud's pose in an object's frame, 3 x 4 numbers, from what is known of both."""
+    """A cloud's pose in an object's frame, 3 x 4 numbers, from `T_object_world` and `T_world_cloud`."""
     rotated = [[jnp.asarray(sum(o[4 * row + k] * T[k][j] for k in range(3))) for j in range(4)] for row in range(3)]
     return [[*numbers[:3], numbers[3] + o[4 * row + 3]] for row, numbers in enumerate(rotated)]
 
 
 def _boxes_overlap(relative: Sequence[Sequence[Array]], size: Sequence[Array], box: Sequence[Array]) -> Array:
-    """Whether the boxes around a cloud and an object overlap, along the axes of the cloud's."""
+    """Whether the bounding boxes of a cloud and an object overlap, along the axes of the cloud."""
     overlap = jnp.bool_(True)
     for k in range(3):
         reach = sum(jnp.abs(relative[row][k]) * size[row] for row in range(3))
@@ -118,14 +118,14 @@ def collide(
       mask: pairs of a placed cloud and an object.
       points: clouds as rows of coordinates in their own frames, shape (*batch, C, 3, P) [m].
       boxes: their least and largest coordinates, shape (*batch, C, 2, 3) [m].
-      gap: how far a point may be from the nearest one of the first `first` of its cloud, shape () [m].
-      cloud: which of them each placed cloud is, shape (*batch, M).
-      T_world_cloud: where it is, shape (*batch, M, 4, 4).
+      gap: largest distance of a point from the nearest of the first `first` points of its cloud, shape () [m].
+      cloud: index of each placed cloud, shape (*batch, M).
+      T_world_cloud: pose of each placed cloud, shape (*batch, M, 4, 4).
       objects: `T_object_world` (12 numbers), half-extents and exponents, shape (*batch, N, 17).
-      first: see `gap`; 0 where nothing is known. Static.
+      first: see `gap`; 0 if there is no `gap`. Static.
       interpret: run it as JAX operations on any device, slowly: for tests.
 
-    What does not vary along an axis of the batch has a length of 1 there.
+    An array that does not vary along a batch axis has a length of 1 there.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
@@ -136,10 +136,10 @@ def collide(
     lead, count = len(batch), math.prod(batch)
     size = min(POINTS, pl.next_power_of_2(points.shape[-1]))
     placed = min(PLACED, pl.next_power_of_2(max(count * m // PROGRAMS, 1)))
-    # A point that is there twice changes no minimum.
+    # Repeated points change no minimum.
     points = jnp.pad(points, [(0, 0)] * (points.ndim - 1) + [(0, -points.shape[-1] % size)], mode="edge")
     wanted = _packed(mask.reshape(count, m, n), m + -m % placed)
-    # What is not known of the gaps makes no point far enough away.
+    # With an infinite gap, the first points never rule out the others.
     gaps = jnp.full((*boxes.shape[:-2], 1), gap if 0 < first <= size else jnp.inf, boxes.dtype)
     boxes = jnp.concatenate([boxes.reshape(*boxes.shape[:-2], 6), gaps], axis=-1)
     T = T_world_cloud.reshape(*T_world_cloud.shape[:-2], 16)
@@ -164,32 +164,32 @@ def collide(
 
 
 def _packed(mask: Bool[Array, "b m n"], rows: int) -> Int32[Array, "b words {rows}"]:
-    """Rows of bits as words of at most `BITS` each; after the last row there are some of zeros."""
+    """Rows of bits as words of at most `BITS` each, padded with zeros to `rows` rows."""
     parts = jnp.split(mask, list(range(BITS, mask.shape[-1], BITS)), axis=-1)
     words = [jnp.sum(jnp.where(bits, _bit_values(bits), 0), axis=-1, dtype=jnp.int32) for bits in parts]
     return jnp.pad(jnp.stack(words, axis=1), ((0, 0), (0, 0), (0, rows - mask.shape[1])))
 
 
 def _unpacked(words: Int32[Array, "b words rows"], m: int, n: int) -> Bool[Array, "b {m} {n}"]:
-    """What `_packed` made words of."""
+    """The inverse of `_packed`."""
     parts = np.split(np.arange(n), list(range(BITS, n, BITS)))
     bits = [words[:, k, :m, None] & _bit_values(part[None, None]) != 0 for k, part in enumerate(parts)]
     return jnp.concatenate(bits, axis=-1)
 
 
 def _bit_values(bits: Array | np.ndarray) -> Int32[np.ndarray, "1 1 n"]:
-    """What each bit of a word counts."""
+    """The values of a word's bits."""
     return (np.uint32(1) << np.arange(bits.shape[-1], dtype=np.uint32)).view(np.int32)[None, None]
 
 
 class _Settings(NamedTuple):
-    """What is static about the kernel.
+    """The static settings of the kernel.
 
     Attributes:
-      batch: sizes of its axes.
+      batch: sizes of the batch axes.
       shapes: the same of each array, 1 where it does not vary along an axis.
-      objects: how many there are.
-      placed: placed clouds of a program.
+      objects: number of objects.
+      placed: number of placed clouds of a program.
       size: points in one step.
       log2, exp2: of base 2.
     """
@@ -215,10 +215,7 @@ class _Settings(NamedTuple):
 
 
 def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, objects, out) -> None:
-    """One program: a few placed clouds of an element of the batch against the objects of a word.
-
-    The arrays are references.
-    """
+    """One program: tests a few placed clouds of an element of the batch with the objects of a word. Arrays are refs."""
     from jax.experimental import pallas as pl
 
     b, w, first = pl.program_id(1), pl.program_id(2), pl.program_id(0) * settings.placed
@@ -226,7 +223,7 @@ def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, ob
     rows = pl.ds(first, settings.placed)
     out[b, w, rows] = jnp.zeros(settings.placed, jnp.int32)
 
-    def look(k, _):
+    def at_cloud(k, _):
         i = first + k
         word = wanted[b, w, i]
 
@@ -246,17 +243,17 @@ def _kernel(settings: _Settings, wanted, points, boxes, cloud, T_world_cloud, ob
 
                 return jax.lax.cond(_boxes_overlap(relative, numbers[12:15], box), at_points, lambda hits: hits, hits)
 
-            def each(bit, hits):
+            def at_object(bit, hits):
                 is_wanted = jax.lax.shift_right_logical(word, bit) & 1 != 0
                 return jax.lax.cond(is_wanted, functools.partial(at_boxes, bit), lambda hits: hits, hits)
 
-            out[b, w, i] = jax.lax.fori_loop(0, min(settings.objects, BITS), each, jnp.int32(0))
+            out[b, w, i] = jax.lax.fori_loop(0, min(settings.objects, BITS), at_object, jnp.int32(0))
 
         return 0
 
     @pl.when(jnp.max(jnp.abs(wanted[b, w, rows])) > 0)
     def _():
-        jax.lax.fori_loop(0, settings.placed, look, 0)
+        jax.lax.fori_loop(0, settings.placed, at_cloud, 0)
 
 
 def _inside(
@@ -273,7 +270,7 @@ def _inside(
         scaled = [r[0] * x + (r[1] * y + (r[2] * z + r[3])) for r in rows]
         return log_gauge(scaled, powers, settings.log2, settings.exp2)
 
-    def others(_):
+    def other_points(_):
         least = jax.lax.fori_loop(
             1,
             points.shape[-1] // settings.size,
@@ -288,4 +285,4 @@ def _inside(
     beyond = reach / jnp.minimum(jnp.minimum(shape[0], shape[1]), shape[2])
     inside = least < 0.0
     settled = inside | (jnp.exp2(least) > 1.0 + ROUNDING + beyond)
-    return jax.lax.cond(settled, lambda hit: hit, others, inside.astype(jnp.int32)) > 0
+    return jax.lax.cond(settled, lambda hit: hit, other_points, inside.astype(jnp.int32)) > 0

@@ -18,7 +18,7 @@ QUARTER_TURN = math.pi / 2
 
 Numbers = Array | np.ndarray
 
-# What comes this close together touches together [m].
+# Gap below which things count as touching [m].
 TOUCH = 0.004
 
 
@@ -35,7 +35,7 @@ class Footprints(flax.struct.PyTreeNode):
 
 
 def footprints(scene: Superquadrics) -> Footprints:
-    """Footprints of objects; of one that lies tilted, those of its bounding box's projection.
+    """Footprints of objects; for a tilted object, that of its bounding box.
 
     An approximation: exponents e2 above 0.6 about a vertical axis count as round, everything else as a rectangle.
     """
@@ -44,19 +44,19 @@ def footprints(scene: Superquadrics) -> Footprints:
     # Along its yaw, across it, and upwards.
     rows = [jnp.stack(row, axis=-1) for row in ((c, -s, zero), (s, c, zero), (zero, zero, zero + 1.0))]
     reach = extents(scene, jnp.stack(rows, axis=-2))
-    own = jnp.sum(scene.size[:, None] * heading.level, axis=-1)
-    half = jnp.where(heading.upright[:, None], own, reach[:, :2])
+    half_upright = jnp.sum(scene.size[:, None] * heading.level, axis=-1)
+    half = jnp.where(heading.upright[:, None], half_upright, reach[:, :2])
     z, height = scene.position[:, 2], reach[:, 2]
     return Footprints(half, heading.round, scene.position[:, :2], heading.yaw, z - height, z + height, scene.valid)
 
 
 class Headings(NamedTuple):
-    """How objects stand; see `footprints`.
+    """Orientations of objects as seen from above; see `footprints`.
 
     Attributes:
-      yaw: of the first axis that is level [rad].
-      level: which of their own axes are the first and the second level one, as 0 and 1, shape (..., 2, 3).
-      upright: whether the third axis is vertical.
+      yaw: of the first level axis [rad].
+      level: one-hot indices of the first and the second level axis, shape (..., 2, 3).
+      upright: whether one axis is vertical.
       round: whether they are round seen from above.
     """
 
@@ -67,7 +67,7 @@ class Headings(NamedTuple):
 
 
 def headings(rotation: Float[Numbers, "*batch 3 3"], exponents: Float[Numbers, "*batch 2"]) -> Headings:
-    """How objects with some `R_world_object` and exponents stand."""
+    """The orientations of objects from `R_world_object` and exponents."""
     up = jnp.abs(rotation[..., 2, :])
     vertical = jnp.argmax(up, axis=-1)
     order = (vertical[..., None] + jnp.arange(1, 3).reshape(*[1] * vertical.ndim, 2)) % 3
@@ -79,25 +79,25 @@ def headings(rotation: Float[Numbers, "*batch 3 3"], exponents: Float[Numbers, "
 
 
 def turned(yaw: Float[Array, "..."], v: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
-    """Planar vectors turned by angles that belong to their first axes [rad]."""
+    """Planar vectors turned by angles [rad] that correspond to their first axes."""
     c, s = (a.reshape(a.shape + (1,) * (v.ndim - 1 - a.ndim)) for a in (jnp.cos(yaw), jnp.sin(yaw)))
     return jnp.stack([c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]], axis=-1)
 
 
 def dot(a, b):
-    """Product of planar vectors, written out: a sum over an axis would be a kernel of its own on a GPU."""
+    """Dot product of planar vectors, written out: a sum over an axis would be a separate kernel on a GPU."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1]
 
 
 def extents(scene: Superquadrics, directions: Float[Array, "*#n 3 d"]) -> Float[Array, "n d"]:
     """How far objects reach from their centres along directions [m].
 
-    An approximation: the objects are taken as elliptic cylinders if their exponent e2 is above 0.6, else as boxes; both
-    hold the superquadric, however it is turned.
+    An approximation: an object is an elliptic cylinder if its exponent e2 is above 0.6, else a box; both contain the
+    superquadric.
 
     Args:
       scene: the objects, fields (N, ...).
-      directions: unit vectors in the world, as columns; of all objects, or of each.
+      directions: unit vectors in the world, as columns; the same for all objects, or for each object its own.
     """
     directions = directions[None] if directions.ndim == 2 else directions
     local = jnp.sum(scene.rotation[:, :, :, None] * directions[:, :, None, :], axis=1)

@@ -1,9 +1,9 @@
 """Evaluate a function only where a mask is true, at fixed shapes.
 
-Most (pose, grasp, object) triples of a scene are far apart, and most objects do not move in an action. What is here
-compacts the entries that matter and runs over them in blocks, so the work follows their number while every shape stays
-static: there is no capacity to overflow. Under `vmap` the rows of the batch are merged before they are compacted, so
-that one full scene among a thousand empty ones costs no more than its own entries.
+Most (pose, grasp, object) triples of a scene are far apart, and most objects do not move in an action. These functions
+compact the entries whose mask is true and run over them in blocks, so the work is proportional to their number while
+every shape stays static, without a capacity that could overflow. Under `vmap` the rows of the batch are merged before
+they are compacted, so that one full scene among a thousand empty ones costs no more than its own entries.
 """
 
 from __future__ import annotations
@@ -17,37 +17,37 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Integer
 
-# A GPU needs that many times as large blocks to be busy. With eight times as many, so that a single decision has no
-# block but the first, it takes a third longer: what is masked then costs more than looking for what is not.
+# Blocks on a GPU are larger by this factor, to keep it busy. With eight times as much, a single decision fits one block
+# and takes a third longer: evaluating masked entries then costs more than skipping them.
 GPU_BLOCKS = 64
-# Where there are so many entries, as in a batch, up to so many times as many again: what is masked costs little then,
-# beside the hundreds of rounds that smaller blocks take.
+# With more than `MANY` entries, as in a batch, blocks are up to `LARGER` times as large again: masked entries cost
+# little then, compared with the hundreds of rounds of smaller blocks.
 MANY, LARGER = 2**22, 4
 # Indices are 32 bits wide.
 LARGEST_INDEX = 2**31 - 1
-# How many entries of a mask are counted together before those that are true are looked for among them.
+# Entries of a mask that are counted together, before the true ones among them are located.
 WIDTH = 64
 
 Carry = TypeVar("Carry")
 
 
 class Entry(NamedTuple):
-    """Places in what has the axes of a batch in front, each given by one number.
+    """Indices into arrays with leading batch axes.
 
     Attributes:
       batch: sizes of the axes.
-      axes: where along each of them.
+      axes: the index along each of them.
     """
 
     batch: tuple[int, ...]
     axes: tuple[Array, ...]
 
     def of(self, array: Array, *within: tuple[Array, int]) -> Array:
-        """The parts of an array that belong to the entries; one that does not vary along an axis has a length of 1.
+        """The parts of an array at these indices; an array that does not vary along an axis has a length of 1 there.
 
         Args:
-          array: with the axes of the batch in front, and after them those of `within`.
-          within: where along further axes, and their sizes.
+          array: its leading axes are those of the batch, then those of `within`.
+          within: indices along further axes, and their sizes.
         """
         lead = len(self.batch)
         axes = [*((i, n) for i, n in zip(self.axes, array.shape[:lead], strict=True) if n > 1), *within]
@@ -61,21 +61,21 @@ class Entry(NamedTuple):
 
 
 def taken(array: Array, index: Integer[Array, " k"]) -> Array:
-    """Rows of an array; `array[index]` for indices that are known to be in range, which needs many operations less."""
+    """`array[index]` for indices that must be in range, which saves the operations that handle others."""
     numbers = jax.lax.GatherDimensionNumbers(tuple(range(1, array.ndim)), (0,), (0,))
     sizes = (1, *array.shape[1:])
     return jax.lax.gather(array, index[:, None], numbers, sizes, mode=jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS)
 
 
 def put(array: Array, index: Integer[Array, " k"], values: Array) -> Array:
-    """The array with other rows; those beyond its end are left out."""
+    """The array with rows replaced; indices beyond its end are ignored."""
     numbers = jax.lax.ScatterDimensionNumbers(tuple(range(1, array.ndim)), (0,), (0,))
     mode = jax.lax.GatherScatterMode.FILL_OR_DROP
     return jax.lax.scatter(array, index[:, None], values, numbers, mode=mode)
 
 
 def entry_of(index: Integer[Array, " k"], batch: tuple[int, ...], inner: int) -> Entry:
-    """The batch's part of indices into all entries, of which each element of the batch has `inner`."""
+    """The batch indices of flat indices, where each element of the batch has `inner` entries."""
     axes: list[Array] = []
     rest = jax.lax.div(index, jnp.uint32(inner)) if batch else index
     for place, size in reversed(list(enumerate(batch))):
@@ -85,38 +85,38 @@ def entry_of(index: Integer[Array, " k"], batch: tuple[int, ...], inner: int) ->
 
 
 def on_cpu() -> bool:
-    """Whether what is being traced is meant for a CPU, going by the default device, which a program may set."""
+    """Whether JAX is tracing for a CPU, by its default device, which a program may set."""
     device = jax.default_device.value
     return (device if isinstance(device, str) else device.platform if device else jax.default_backend()) == "cpu"
 
 
 def block_size(entries: int, total: int = 0) -> int:
-    """How many of `total` entries to evaluate at once where a CPU would be given `entries`."""
+    """How many of `total` entries to evaluate at once: `entries` on a CPU, more on a GPU."""
     return entries if on_cpu() else entries * GPU_BLOCKS * min(max(total // MANY, 1), LARGER)
 
 
 def for_each(mask: Bool[Array, " n"], body: Callable[[Carry, Array, Array], Carry], carry: Carry, block: int) -> Carry:
-    """Run over the indices where a mask is true, a block at a time; their order is kept.
+    """Loop over the indices where a mask is true, in order and a block at a time.
 
     Args:
-      mask: which of the `n` indices are meant.
-      body: `body(carry, index, active) -> carry`, with `block` indices of which only the `active` are meant; the
-        others are `n`. On a GPU it may be called with none that is active.
-      carry: what the first block begins with.
-      block: how many indices at once.
+      mask: which of the `n` indices to visit.
+      body: `body(carry, index, active) -> carry`, with `block` indices; those that are not `active` are `n`. On a GPU
+        it may be called with no active index.
+      carry: the initial carry.
+      block: number of indices at once.
     """
     n = mask.shape[0]
     if n == 0:
         return carry
     if n <= block and not on_cpu():
-        # A GPU evaluates the idle entries of a single block faster than it finds out whether there is anything to do.
+        # A GPU evaluates the idle entries of a single block faster than it skips them.
         return body(carry, jnp.where(mask, jnp.arange(n, dtype=jnp.uint32), jnp.uint32(n)), mask)
     size, rows = min(block, n), math.ceil(n / WIDTH)
     bits = jax.lax.pad(mask.astype(jnp.uint8), jnp.uint8(0), ((0, rows * WIDTH - n, 0),)).reshape(rows, WIDTH)
     ends = jax.lax.cumsum(jnp.sum(bits, axis=1, dtype=jnp.uint32))
     starts = jax.lax.pad(ends, jnp.uint32(0), ((1, -1, 0),))
     total = ends[-1]
-    # How often a range of rows is halved until one is left.
+    # Steps of a bisection over the rows.
     halvings = max(rows - 1, 1).bit_length()
 
     def step(i, carry):
@@ -142,17 +142,16 @@ def for_each(mask: Bool[Array, " n"], body: Callable[[Carry, Array, Array], Carr
 
 
 def merged(run: Callable[[Array, Any, Any], Any], indices: int = 1) -> Callable[[Array, Any, Any], Any]:
-    """A function of a mask (n,), of what is shared and of rows, which sees a whole batch at once under `vmap`.
+    """A function of a mask (n,), a shared pytree and rows, which is called for a whole batch at once under `vmap`.
 
     Args:
-      run: `run(mask, shared, rows)`, where the mask has the axes of the batch in front, if any, and so have the leaves
-        of `rows`, with a length of 1 along those where they do not vary. Its results have the same axes in front. It
-        must not close over traced values.
-      indices: how many indices `run` needs for each entry of the mask.
+      run: `run(mask, shared, rows)`, where the mask and the leaves of `rows` may have leading batch axes, with a length
+        of 1 where the rows do not vary. Its results have the same leading axes. It must not close over traced values.
+      indices: number of indices that `run` needs for each entry of the mask.
 
     Returns:
-      The function. Under `vmap`, what is shared may be batched too, but then the batch runs one by one. A batch with
-      more indices than there can be runs in pieces.
+      The function. Under `vmap`, if the shared pytree is batched, the elements of the batch run one by one. A batch
+      that needs more than 32-bit indices runs in pieces.
     """
 
     @custom_vmap
@@ -174,10 +173,10 @@ def merged(run: Callable[[Array, Any, Any], Any], indices: int = 1) -> Callable[
                 jax.tree.map(spread, tree, batched)
                 for tree, batched in ((shared, shared_batched), (rows, rows_batched))
             )
-            result = jax.lax.map(lambda one: apply(*one), (mask, shared, rows))
+            result = jax.lax.map(lambda element: apply(*element), (mask, shared, rows))
         elif piece < axis_size:
             rows = jax.tree.map(spread, rows, rows_batched)
-            result = jax.lax.map(lambda one: apply(one[0], shared, one[1]), (mask, rows), batch_size=piece)
+            result = jax.lax.map(lambda pair: apply(pair[0], shared, pair[1]), (mask, rows), batch_size=piece)
         else:
             rows = jax.tree.map(lambda a, batched: a if batched else a[None], rows, rows_batched)
             result = merged(run, indices)(mask, shared, rows)
@@ -190,19 +189,19 @@ def masked_vmap(
     function: Callable[[Any, Any, Any], Any],
     mask: Bool[Array, " n"],
     shared: Any,
-    own: Any,
+    per_element: Any,
     rows: Any,
     block: int = 256,
 ) -> Any:
-    """`function(shared, own, row)` for every row whose mask is true, zeros (or False) for the others.
+    """`function(shared, per_element, row)` for every row whose mask is true, zeros (or False) for the others.
 
     Args:
       function: maps three pytrees to a pytree of arrays. It must not close over traced values.
       mask: which of the `n` rows to evaluate.
-      shared: pytree that stays the same under `vmap`. (It may be batched too, but then the batch runs one by one.)
-      own: pytree of what all rows share, but the elements of a batch do not.
+      shared: pytree that is not batched under `vmap`; if it is, the elements of the batch run one by one.
+      per_element: pytree that all rows share, but that may differ between the elements of a batch.
       rows: pytree whose leaves have a leading axis `n`.
-      block: how many rows are evaluated at once on a CPU; changes the speed, never a result.
+      block: number of rows evaluated at once on a CPU; changes the speed, never a result.
 
     Returns:
       The function's results with a leading axis `n`.
@@ -210,41 +209,43 @@ def masked_vmap(
 
     def run(mask, shared, both):
         batch, n, total = mask.shape[:-1], mask.shape[-1], mask.size
-        own, rows = both
+        per_element, rows = both
         size = block_size(block, total)
         if total <= size and not on_cpu():
-            return _everywhere(function, mask, shared, own, rows)
+            return _everywhere(function, mask, shared, per_element, rows)
         width = jnp.uint32(n)
 
-        def evaluate(shared, own, rows, index):
+        def evaluate(shared, per_element, rows, index):
             entry = entry_of(index, batch, n)
             row = jax.tree.map(lambda a: entry.of(a, (jax.lax.rem(index, width), n)), rows)
-            apart = jax.tree.map(entry.of, own)
-            varies = jax.tree.map(lambda a: 0 if any(k > 1 for k in a.shape[: len(batch)]) else None, own)
-            return jax.vmap(function, (None, varies, 0), axis_size=len(index))(shared, apart, row)
+            element = jax.tree.map(entry.of, per_element)
+            varies = jax.tree.map(lambda a: 0 if any(k > 1 for k in a.shape[: len(batch)]) else None, per_element)
+            return jax.vmap(function, (None, varies, 0), axis_size=len(index))(shared, element, row)
 
         def body(result, index, active):
-            values = evaluate(shared, own, rows, jax.lax.min(index, jnp.uint32(total - 1)))
+            values = evaluate(shared, per_element, rows, jax.lax.min(index, jnp.uint32(total - 1)))
             return jax.tree.map(lambda r, v: put(r, index, v), result, values)
 
-        shape = jax.eval_shape(evaluate, shared, own, rows, jax.ShapeDtypeStruct((1,), jnp.uint32))
+        shape = jax.eval_shape(evaluate, shared, per_element, rows, jax.ShapeDtypeStruct((1,), jnp.uint32))
         result = jax.tree.map(lambda s: jnp.zeros((total, *s.shape[1:]), s.dtype), shape)
         result = for_each(mask.reshape(-1), body, result, size)
         return jax.tree.map(lambda r: r.reshape(*mask.shape, *r.shape[1:]), result)
 
-    return merged(run)(mask, shared, (own, rows))
+    return merged(run)(mask, shared, (per_element, rows))
 
 
-def _everywhere(function, mask, shared, own, rows):
-    """`masked_vmap` without looking for what is masked."""
+def _everywhere(function, mask, shared, per_element, rows):
+    """`masked_vmap` that evaluates every row."""
     batch = mask.shape[:-1]
     evaluate = jax.vmap(function, (None, None, 0), axis_size=mask.shape[-1])
     for k in reversed(range(len(batch))):
-        own_axes, row_axes = (jax.tree.map(lambda a, k=k: 0 if a.shape[k] > 1 else None, tree) for tree in (own, rows))
-        evaluate = jax.vmap(evaluate, (None, own_axes, row_axes), axis_size=batch[k])
+        element_axes, row_axes = (
+            jax.tree.map(lambda a, k=k: 0 if a.shape[k] > 1 else None, tree) for tree in (per_element, rows)
+        )
+        evaluate = jax.vmap(evaluate, (None, element_axes, row_axes), axis_size=batch[k])
     squeezed = (
         jax.tree.map(lambda a: a.reshape([k for k in a.shape[: len(batch)] if k > 1] + [*a.shape[len(batch) :]]), tree)
-        for tree in (own, rows)
+        for tree in (per_element, rows)
     )
     values = evaluate(shared, *squeezed)
 

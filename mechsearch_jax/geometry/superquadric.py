@@ -26,10 +26,10 @@ EDGE_EXPONENT = 0.2
 
 
 class Superquadrics(flax.struct.PyTreeNode):
-    """A fixed number of superquadrics, some of which may be absent; every field has the leading axes `(..., N)`.
+    """N superquadrics, of which any may be absent; every field has the leading axes `(..., N)`.
 
     Attributes:
-      size: half-extents along the object's own axes [m], shape (..., N, 3).
+      size: half-extents along the object's axes [m], shape (..., N, 3).
       exponents: (e1, e2), shape (..., N, 2); (0.2, 0.2) is a box, (0.2, 1.0) a cylinder.
       position: `t_world_object` [m], shape (..., N, 3).
       rotation: `R_world_object`, shape (..., N, 3, 3).
@@ -73,8 +73,8 @@ def pad(superquadrics: Superquadrics, capacity: int) -> Superquadrics:
 def standard_edges(superquadrics: Superquadrics) -> Superquadrics:
     """The same superquadrics with edges no sharper than `EDGE_EXPONENT`.
 
-    What fits an image best has nearly the sharp edges of a real box. It hides more and is hit more than the rounded box
-    of the same size that stands for it in plans: with it, f and g would depend on how an object came to be known.
+    The best fit to an image has nearly the sharp edges of a real box. It hides more and is hit more than the rounded
+    box of the same size in plans, so that f and g would depend on how an object was recognised.
     """
     return superquadrics.replace(exponents=jnp.maximum(superquadrics.exponents, EDGE_EXPONENT))
 
@@ -112,7 +112,7 @@ def gauge(
 def unit_gauge(
     scaled: Float[Array, "3 ..."] | Sequence[Array], exponents: Float[Array, "2 ..."]
 ) -> Float[Array, "..."]:
-    """`gauge` of points whose coordinates are given as magnitudes in half-extents, along the first axis, as e1, e2."""
+    """`gauge` of points given as magnitudes in half-extents; coordinates, and (e1, e2), are along the first axis."""
     x, y, z = scaled
     e1, e2 = exponents
     return _norm2(_norm2(x, y, 2.0 / e2), z, 2.0 / e1)
@@ -123,7 +123,7 @@ def radial_distance(
 ) -> Float[Array, "..."]:
     """Distance from a point to the surface along the ray from the centre (equation 6) [m]. Arguments as in `gauge`.
 
-    At the centre itself, where every ray is as good as another, it is the smallest half-extent.
+    At the centre it is the smallest half-extent.
     """
     size, exponents, points = align((size, 1), (exponents, 1), (points, 1))
     scale = gauge(size, exponents, points)
@@ -140,7 +140,7 @@ def to_object_frame(superquadrics: Superquadrics, points: Float[Array, "... 3"])
 
 
 def bounding_radius(size: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
-    """Radius of a sphere about the centre that holds a superquadric of any exponents up to 2 [m]: its box's."""
+    """Radius of a sphere about the centre that contains a superquadric of any exponents up to 2 [m]."""
     return jnp.sqrt(jnp.sum(size**2, axis=-1))
 
 

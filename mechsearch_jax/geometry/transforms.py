@@ -1,7 +1,7 @@
 """Rigid transforms as (..., 4, 4) matrices named `T_a_b`: the pose of frame b in frame a.
 
-Leading axes broadcast against each other, whatever their number. Products are written as explicit sums: they fuse with
-what surrounds them, and no GPU rounds their factors to TF32, which would move points by millimetres.
+Leading axes broadcast against each other, whatever their number. Products are written as explicit sums: XLA fuses them,
+and no GPU rounds their factors to TF32, which would move points by millimetres.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 
 def align(*arrays_and_ranks: tuple[Array, int]) -> list[Array]:
-    """Arrays of as many leading axes each, from pairs of an array and the number of its own trailing axes."""
+    """Arrays with equal numbers of leading axes, from pairs of an array and the number of its trailing axes."""
     leading = max(a.ndim - rank for a, rank in arrays_and_ranks)
     return [a.reshape((1,) * (leading - (a.ndim - rank)) + a.shape) for a, rank in arrays_and_ranks]
 
@@ -36,10 +36,9 @@ def transform(T_a_b: Float[Array, "... 4 4"], points: Float[Array, "... 3"]) -> 
 def transform_rows(
     T_a_b: Float[Array, "*batch 4 4"], cloud: Float[Array, "*#batch 3 p"]
 ) -> list[Float[Array, "*batch p"]]:
-    """x, y and z in frame a of a cloud that is given as rows of coordinates in frame b.
+    """x, y and z in frame a of a cloud given as rows of coordinates in frame b.
 
-    Every coordinate is an expression of its own, so that nothing of the size of the cloud is kept where only a sum or a
-    minimum over its points is wanted.
+    Separate expressions for the coordinates fuse into a sum or a minimum over the points, without a cloud in memory.
     """
     x, y, z = (cloud[..., k, :] for k in range(3))
     rows = (T_a_b[..., row, :, None] for row in range(3))
@@ -82,7 +81,7 @@ def back_off(T_a_b: Float[Array, "*#batch 4 4"], distance: Float[Array, "*#batch
 
 
 def _moved(T_a_b: Float[Array, "... 4 4"], offset: Float[Array, "... 3 1"]) -> Float[Array, "... 4 4"]:
-    """A sum of two arrays, which becomes part of what reads it; an array that is written into is copied."""
+    """The frame moved by an offset: a sum, which fuses with what reads it, unlike an update in place."""
     T_a_b, offset = align((T_a_b, 2), (offset, 2))
     width = [(0, 0, 0)] * (offset.ndim - 2) + [(0, 1, 0), (3, 0, 0)]
     return T_a_b + jax.lax.pad(offset, jnp.zeros((), offset.dtype), width)
@@ -90,8 +89,8 @@ def _moved(T_a_b: Float[Array, "... 4 4"], offset: Float[Array, "... 3 1"]) -> F
 
 def yaw_rotation(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
     """Rotation about the vertical by an angle [rad]."""
-    c, s, zero, one = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw), jnp.ones_like(yaw)
-    rows = [[c, -s, zero], [s, c, zero], [zero, zero, one]]
+    c, s, zero, unit = jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw), jnp.ones_like(yaw)
+    rows = [[c, -s, zero], [s, c, zero], [zero, zero, unit]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 

@@ -1,4 +1,4 @@
-"""What bodies can be: one file for each shape, and their registry. It does without JAX."""
+"""Shapes of bodies, one file for each, and their registry; without JAX."""
 
 from mechsearch_jax.shapes.registry import SHAPES, by_shape, in_order, shape_of
 from mechsearch_jax.shapes.shape import Shape

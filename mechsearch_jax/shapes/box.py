@@ -56,8 +56,8 @@ class Box:
 
     def cut(self, origin, direction, half_size, library):
         cuts = [slab(o, d, half_size[i], library) for i, (o, d) in enumerate(zip(origin, direction, strict=True))]
-        (near, far), *others = cuts
-        for a, b in others:
+        (near, far), *rest = cuts
+        for a, b in rest:
             near, far = library.maximum(near, a), library.minimum(far, b)
         return first(near, far, library)
 
@@ -73,7 +73,7 @@ class Box:
         return library.sum(before * after, axis=-1)
 
     def areas(self, half_size, library):
-        """Of the faces across each axis."""
+        """Areas of the faces across each axis."""
         a, b, c = half_size
         return library.stack([b * c, a * c, a * b])
 
@@ -91,5 +91,5 @@ class Box:
         return trimesh.creation.box(extents=(2 * a, 2 * b, 2 * c))
 
     def grasps(self, half_size, count, max_yaw):
-        """Square to each of its sides."""
+        """Perpendicular to each side."""
         return np.arange(4) * np.pi / 2, 2 * np.array(half_size)[[1, 0, 1, 0]]

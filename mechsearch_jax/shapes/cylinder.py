@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     import trimesh
 
 CODE = 1
-# Corners of the polygon around a cylinder, and of the one inside it that its mesh is made of.
+# Corners of the circumscribed polygon of a cylinder, and of the inscribed polygon of its mesh.
 RIM, SECTIONS = 24, 32
 
 
 @dataclasses.dataclass(frozen=True)
 class Cylinder:
-    """A `shape.Shape`; its half-extents are its radius, twice, and half its height."""
+    """A `shape.Shape` with half-extents (radius, radius, half its height)."""
 
     code: int = CODE
     name: str = "cylinder"
@@ -37,7 +37,7 @@ class Cylinder:
         return None if half_size[0] == half_size[1] else "a cylinder's first two are its radius and must be equal"
 
     def nearest(self, size, library):
-        """With the same cross-section and height."""
+        """The cylinder of the same cross-section and height."""
         radius = library.sqrt(size[..., :1] * size[..., 1:2])
         return library.concatenate([radius, radius, size[..., 2:]], axis=-1)
 
@@ -62,7 +62,7 @@ class Cylinder:
         return library.abs(direction[..., 2]) * half_size[..., 2] + across * half_size[..., 0]
 
     def cut(self, origin, direction, half_size, library):
-        """The side is cut at half a chord before and after the point nearest to the axis."""
+        """The ray crosses the side half a chord before and after its point nearest to the axis."""
         (x, y, z), (u, v, w) = origin, direction
         square = library.maximum(u * u + v * v, 1e-20)
         middle = -(x * u + y * v) / square
@@ -81,17 +81,17 @@ class Cylinder:
 
     def distance(self, level, height, half_size, library):
         square = library.sum(level**2, axis=-1)
-        apart = square > 0
-        side = library.where(apart, library.sqrt(library.where(apart, square, 1.0)), 0.0) - half_size[0]
+        off_axis = square > 0
+        side = library.where(off_axis, library.sqrt(library.where(off_axis, square, 1.0)), 0.0) - half_size[0]
         return gap(library.stack([side, library.abs(height) - half_size[2]], axis=-1), library)
 
     def fall(self, before, after, library):
-        """That of the difference of its axis' two inclinations."""
+        """The cosine of the difference between the inclinations of its axis."""
         a, b = (library.clip(library.abs(up[..., 2]), 0.0, 1.0) for up in (before, after))
         return a * b + library.sqrt((1.0 - a**2) * (1.0 - b**2))
 
     def areas(self, half_size, library):
-        """Of the side, of nothing, and of the ends."""
+        """Areas of the side, of nothing, and of the ends."""
         a, _, c = half_size
         return library.stack([2.0 * a * c, 0.0 * a, a * a])
 
@@ -111,6 +111,6 @@ class Cylinder:
         return trimesh.creation.cylinder(radius=half_size[0], height=2 * half_size[2], sections=SECTIONS)
 
     def grasps(self, half_size, count, max_yaw):
-        """From all sides that the arm can come from."""
+        """From all directions of approach."""
         yaws = np.linspace(-max_yaw, max_yaw, count) if count > 1 else np.zeros(1)
         return yaws, np.full(len(yaws), 2 * half_size[0])

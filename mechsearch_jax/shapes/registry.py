@@ -1,4 +1,4 @@
-"""All shapes. A new shape is a file of its own, beside the others, and its entry here."""
+"""The registry of shapes. A new shape is a new file in this folder and an entry here."""
 
 from __future__ import annotations
 
@@ -14,11 +14,7 @@ SHAPES: Mapping[str, Shape] = {shape.name: shape for shape in (Box(), Cylinder()
 
 
 def shape_of(name: Any, where: str = "shape") -> Shape:
-    """The shape with a name.
-
-    Args:
-      name: of the shape.
-      where: what to call it in the message.
+    """The shape with a name; error messages begin with `where`.
 
     Raises:
       InputError: there is none.
@@ -26,25 +22,25 @@ def shape_of(name: Any, where: str = "shape") -> Shape:
     for shape in SHAPES.values():
         if shape.name == name:
             return shape
-    *others, last = (f'"{known}"' for known in SHAPES)
-    raise InputError(f"{where}: {shown(name)} is unknown; use {', '.join(others)} or {last}")
+    *names, last = (f'"{valid}"' for valid in SHAPES)
+    raise InputError(f"{where}: {shown(name)} is unknown; use {', '.join(names)} or {last}")
 
 
 def in_order() -> tuple[Shape, ...]:
-    """All shapes, each at the place of its code."""
+    """All shapes in the order of their codes."""
     return tuple(sorted(SHAPES.values(), key=lambda shape: shape.code))
 
 
 def by_shape(kind: Any, value: Callable[[Shape], Any], library: Any) -> Any:
-    """For each body what `value` gives for its shape.
+    """For each body the `value` of its shape.
 
     Args:
-      kind: codes of the bodies' shapes. They have to be known ones: where they are traced, none can be refused.
+      kind: codes of the bodies' shapes; not checked, since they may be traced.
       value: called for every shape; its results broadcast against `kind`.
-      library: NumPy or `jax.numpy`, whichever the arrays are of.
+      library: of the arrays, NumPy or `jax.numpy`.
     """
-    first, *others = in_order()
+    first, *rest = in_order()
     chosen = value(first)
-    for shape in others:
+    for shape in rest:
         chosen = library.where(kind == shape.code, value(shape), chosen)
     return chosen

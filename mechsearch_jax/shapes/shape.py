@@ -1,4 +1,4 @@
-"""What a shape of bodies has to offer: one file for each shape, named in `registry`."""
+"""The protocol of a shape of bodies; implementations are listed in `registry`."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ if TYPE_CHECKING:
 
 
 class Shape(Protocol):
-    """A shape: solids that are told apart by three half-extents along their own axes, about which they are symmetric.
+    """A family of solids with three half-extents along their axes of symmetry.
 
-    Of what takes a `library`, arrays are of that one: NumPy or `jax.numpy`. Nothing here imports JAX, so that the names
-    of the shapes are known at once. Leading axes broadcast; directions and points are in the solid's own frame.
+    Methods with a `library`, NumPy or `jax.numpy`, take and return its arrays; this folder does not import JAX, so that
+    the command line starts fast. Leading axes broadcast; directions and points are in the solid's frame.
 
     Attributes:
-      code: its value in `World.kind`; all shapes are numbered from 0.
-      name: what files and the command line call it.
-      exponents: (e1, e2) of the superquadric that the planner takes it for.
+      code: its value in `World.kind`, counted from 0.
+      name: in files and on the command line.
+      exponents: (e1, e2) of the superquadric that represents it in plans.
       density: [kg/m3].
-      friction: of sliding, against anything that is not rougher.
+      friction: coefficient of sliding friction against anything that is not rougher.
       geometry: type of its geometry in MuJoCo.
-      round: whether it is a solid of revolution about its third axis, its first two half-extents being the radius.
+      round: whether it is a solid of revolution about its third axis; the first two half-extents are then its radius.
       yaws: number of candidate yaw angles of a target, over half a turn.
       target_half_size: half-extents of the usual target [m].
     """
@@ -49,14 +49,14 @@ class Shape(Protocol):
     @property
     def target_half_size(self) -> tuple[float, float, float]: ...
 
-    # What it is.
+    # Size and mass.
 
     def fault(self, half_size: Sequence[float]) -> str | None:
-        """Why three positive lengths are no half-extents of this shape; None if they are."""
+        """Why this shape cannot have three positive half-extents; None if it can."""
         ...
 
     def nearest(self, size: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch 3"]:
-        """Half-extents of the solid of this shape that comes nearest to a superquadric with others [m]."""
+        """Half-extents of the solid of this shape nearest to a superquadric's half-extents [m]."""
         ...
 
     def volume(self, half_size: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch"]:
@@ -64,7 +64,7 @@ class Shape(Protocol):
         ...
 
     def moments(self, half_size: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch 3"]:
-        """Principal moments of inertia of a homogeneous solid of 1 kg, about its own axes [m2]."""
+        """Principal moments of inertia of a homogeneous solid of 1 kg [m2]."""
         ...
 
     def geometry_size(self, half_size: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch 3"]:
@@ -72,15 +72,15 @@ class Shape(Protocol):
         ...
 
     def bounding_radius(self, half_size: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch"]:
-        """Radius of the smallest sphere about the centre that holds it [m]."""
+        """Radius of the smallest sphere about the centre that contains it [m]."""
         ...
 
-    # Where its surface is.
+    # Surface.
 
     def reach(
         self, direction: Float[Any, "*batch 3"], half_size: Float[Any, "*other 3"], library: Any
     ) -> Float[Any, "..."]:
-        """How far it reaches from its centre along unit vectors [m]; differentiable also along its axes."""
+        """Its support function, from its centre along unit vectors [m]; differentiable also along its axes."""
         ...
 
     def cut(
@@ -90,23 +90,23 @@ class Shape(Protocol):
         half_size: Float[Any, " 3"],
         library: Any,
     ) -> Float[Any, "*rays"]:
-        """Where rays from outside enter it; infinite where they miss, or it is behind them.
+        """Where rays from outside enter it; infinite for misses, also if it is behind them.
 
         Args:
-          origin: where they begin, by component [m].
+          origin: of the rays, by component [m].
           direction: of any length, by component.
           half_size: [m].
           library: of the arrays.
 
         Returns:
-          By how many times `direction` the surface is from `origin`.
+          Distance from `origin` in lengths of `direction`.
         """
         ...
 
     def normal(
         self, point: Float[Any, "*batch 3"], half_size: Float[Any, "*batch 3"], library: Any
     ) -> Float[Any, "*batch 3"]:
-        """Outward normals, of any length, at points on its surface [m]; of others, the normal of a point nearby."""
+        """Outward normals, of any length, at points on its surface, or at surface points near others [m]."""
         ...
 
     def distance(
@@ -123,7 +123,7 @@ class Shape(Protocol):
         ...
 
     def fall(self, before: Float[Any, "*batch 3"], after: Float[Any, "*batch 3"], library: Any) -> Float[Any, "*batch"]:
-        """Cosine of the angle by which it has fallen over; to roll is not to fall.
+        """Cosine of the angle by which it has fallen over; rolling does not count.
 
         Args:
           before, after: the world's vertical, as unit vectors.
@@ -131,7 +131,7 @@ class Shape(Protocol):
         """
         ...
 
-    # Points spread evenly over its surface, from the same random numbers whatever the shape.
+    # Points spread evenly over its surface, from the same random numbers for all shapes.
 
     def areas(self, half_size: Float[Any, " 3"], library: Any) -> Float[Any, " 3"]:
         """Areas of three parts of its surface, relative to each other."""
@@ -140,34 +140,34 @@ class Shape(Protocol):
     def spread(
         self, part: Int[Any, " n"], even: Float[Any, "n 3"], sign: Float[Any, " n"], library: Any
     ) -> Float[Any, "n 3"]:
-        """Points that lie evenly on parts of its surface, in half-extents.
+        """Uniform points on parts of its surface, in half-extents.
 
         Args:
-          part: which of the three.
-          even: numbers that lie evenly between -1 and 1.
-          sign: 1 or -1, evenly.
+          part: index of the part of each point.
+          even: uniform numbers from -1 to 1.
+          sign: 1 or -1 with equal probability.
           library: of the arrays.
         """
         ...
 
-    # What is asked of a few bodies on the host.
+    # On the host, for single bodies.
 
     def rim(self, half_size: Sequence[float]) -> Float[np.ndarray, "corners 2"]:
         """A convex polygon around its level cross-section, counter-clockwise [m]."""
         ...
 
     def mesh(self, half_size: Sequence[float]) -> trimesh.Trimesh:
-        """Its surface, of triangles [m]."""
+        """Its surface as a triangle mesh [m]."""
         ...
 
     def grasps(
         self, half_size: Sequence[float], count: int, max_yaw: float
     ) -> tuple[Float[np.ndarray, " g"], Float[np.ndarray, " g"]]:
-        """How it is grasped from the side: directions of the approach seen from above [rad], and its widths there [m].
+        """Grasps from the side: yaw angles of the approach [rad], and its widths there [m].
 
         Args:
           half_size: [m].
-          count: number of approach directions, where all are as good.
-          max_yaw: largest angle between those and its first axis [rad].
+          count: number of approach directions of a round solid.
+          max_yaw: their largest angle to its first axis [rad].
         """
         ...

@@ -1,1 +1,1 @@
-"""Where the search takes place: camera, shelf, target, scenario files."""
+"""The workspace of the search: camera, shelf, target, scenario files."""

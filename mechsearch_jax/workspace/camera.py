@@ -14,10 +14,10 @@ from mechsearch_jax.geometry.transforms import rotate
 from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.workspace.leaves import are_given
 
-# More pixels along a side, or metres from the robot, no camera here has.
+# Largest number of pixels along a side, and largest coordinate of the position [m].
 LARGEST = 16384
 FARTHEST = 10.0
-# What of a camera is data under `jit`.
+# The fields that are dynamic under `jit`.
 _DATA = ("fx", "fy", "cx", "cy", "rotation", "position")
 
 
@@ -31,8 +31,8 @@ class Camera:
     """A fixed pinhole camera; its frame has x right, y down, z forward. Defaults: docs/method.md,
     "Facts of the scene".
 
-    A pytree: where a jitted function takes it as an argument that is not static, a camera that was calibrated again
-    compiles nothing. Outside of tracing it holds plain numbers, and is hashable.
+    A pytree, so that a recalibrated camera recompiles nothing where a jitted function takes it as a dynamic argument.
+    Outside of tracing it holds plain numbers and is hashable.
 
     Attributes:
       width, height: image size in pixels; static.
@@ -58,7 +58,7 @@ class Camera:
     def __post_init__(self):
         for name in ("width", "height"):
             check_range(f"Camera: {name}", getattr(self, name), 1, LARGEST, "pixels")
-        # Rebuilt by JAX, the fields that are data hold whatever stands for their leaves, which is not checked.
+        # In a pytree rebuilt by JAX, dynamic fields may hold tracers or other stand-ins, which are not checked.
         if not are_given(*(getattr(self, name) for name in _DATA), arrays=True):
             return
         for name in ("fx", "fy"):
@@ -72,7 +72,7 @@ class Camera:
             raise InputError("Camera: rotation mirrors; its columns are the camera's x, y and z, a right-handed frame")
         for axis, value in zip("xyz", self.position, strict=True):
             check_range(f"Camera: position {axis}", value, -FARTHEST, FARTHEST, "m")
-        # Of one type, whatever number they were given as: another type compiles anew.
+        # Convert to one type, for other types would be compiled for anew.
         for name in ("fx", "fy", "cx", "cy"):
             object.__setattr__(self, name, float(getattr(self, name)))
         object.__setattr__(self, "rotation", tuple(tuple(map(float, row)) for row in self.rotation))
@@ -103,7 +103,7 @@ def pixel_rays(
 
     Args:
       camera: the camera.
-      rows, columns: pixel indices; need not be whole numbers, nor inside the image.
+      rows, columns: pixel indices, also fractional or outside the image.
 
     Returns:
       `d` such that `camera.position + depth * d` lies at that depth [m per m of depth].
@@ -126,7 +126,7 @@ def project(
 ) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
     """World points as (row, column) pixel coordinates and depth [m]; the inverse of `pixel_rays`.
 
-    Points at or behind the camera's plane have no image: theirs is computed at a depth of 1 micrometre.
+    Points at or behind the camera's plane have no image; they are projected as at a depth of 1 micrometre.
     """
     inverse = jnp.array(camera.rotation).T
     origin = jnp.array(camera.position).reshape([1] * (points.ndim - 1) + [3])
@@ -138,7 +138,7 @@ def project(
 
 
 def back_project(camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
-    """The point in the world that every pixel of a depth image sees [m]; NaN where the depth is not finite."""
+    """The world point of every pixel of a depth image [m]; NaN where the depth is not finite."""
     seen = jnp.isfinite(depth)
     points = jnp.array(camera.position).reshape(1, 1, 3) + jnp.where(seen, depth, 0.0)[..., None] * rays(camera)
     return jnp.where(seen[..., None], points, jnp.nan)

@@ -1,7 +1,6 @@
-"""The detector, which finds the target in an image that shows enough of it: how few pixels are too few.
+"""The detection threshold: how many pixels of the target an image must show for the detector to find it.
 
-Whoever has to know asks `found_pixels`: recognition, the simulated camera, and f, which must not rule out a target
-where the detector cannot see it.
+Recognition, the simulated camera and f use it; f must not rule out a target that the detector could not see.
 """
 
 from __future__ import annotations
@@ -10,23 +9,23 @@ import math
 
 from mechsearch_jax.workspace.camera import Camera
 
-# More pixels of an image of this size make the target visible, as in the paper.
+# The target is visible with more pixels than this in an image of this size, as in the paper.
 FOUND_PIXELS = 100
 IMAGE_SIZE = (1280, 720)
 
 
 def found_pixels(camera: Camera, pixels: int | float = FOUND_PIXELS) -> float:
-    """The most pixels of the target that a camera's image may show without the detector finding it.
+    """The largest number of the target's pixels in a camera's image with which the detector does not find it.
 
-    The same share of every image: of one that is half as wide and half as high a quarter as many.
+    It is the same share of images of all sizes.
 
     Args:
-      camera: whose images are looked at; only their size matters.
-      pixels: as many in an image of 1280 x 720.
+      camera: only its image's size matters.
+      pixels: the number in an image of 1280 x 720.
     """
     return pixels * camera.width * camera.height / math.prod(IMAGE_SIZE)
 
 
 def longer(camera: Camera) -> float:
-    """How many times as long, in pixels, what an image of 1280 x 720 shows is in a camera's image of the same view."""
+    """Factor of lengths in pixels from an image of 1280 x 720 to a camera's image of the same view."""
     return math.sqrt(found_pixels(camera) / FOUND_PIXELS)

@@ -1,4 +1,4 @@
-"""Numbers of a camera or a shelf that are data under `jit`: what somebody gave, or what JAX puts in its place."""
+"""Fields of a camera or a shelf that are dynamic under `jit`: a user's values, or JAX's stand-ins for them."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 
 
 def are_given(*fields: Any, arrays: bool = False) -> bool:
-    """Whether all leaves of some fields are what somebody gave, right or wrong, and not what stands for them in JAX.
+    """Whether all leaves of dataclass fields are a user's values, valid or not, and should be checked.
 
-    A dataclass that is a pytree is rebuilt with tracers, shapes or axes in its fields: there is nothing to check then.
+    JAX rebuilds a dataclass that is a pytree with tracers, shapes or axes in its fields, which cannot be checked.
 
     Args:
       fields: of the dataclass.
-      arrays: whether somebody may give arrays of the host. JAX rebuilds with such, too.
+      arrays: whether NumPy arrays count as a user's values, although JAX rebuilds with them, too.
     """
     kinds = (int, float, np.number, str, *([np.ndarray] if arrays else []))
     leaves = jax.tree.leaves(fields, is_leaf=lambda part: part is None)

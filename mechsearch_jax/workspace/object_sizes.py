@@ -1,4 +1,4 @@
-"""How large the objects are that scenes are generated with."""
+"""Sizes of the objects of generated scenes."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import dataclasses
 
 from mechsearch_jax.runtime.errors import InputError
 
-# Objects are no larger, nor smaller [m].
+# Bounds of an object's lengths [m].
 LEAST, LARGEST = 0.001, 1.0
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectSizes:
-    """Sizes of the objects that generated scenes draw from [m]; the paper's eleven by default.
+    """Sizes from which the objects of generated scenes are drawn [m]; by default the paper's eleven objects.
 
     Attributes:
       boxes: full sizes in x, y and z; x and y may be swapped.
@@ -45,7 +45,7 @@ class ObjectSizes:
 
     @property
     def catalogue(self) -> tuple[tuple[str, tuple[float, float, float]], ...]:
-        """Every object as its shape and its half-extents [m]."""
+        """Shape and half-extents of every object [m]."""
         return (
             *(("box", (x / 2, y / 2, z / 2)) for x, y, z in self.boxes),
             *(("cylinder", (radius, radius, height / 2)) for radius, height in self.cylinders),

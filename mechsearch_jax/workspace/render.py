@@ -39,7 +39,7 @@ def cast(
     enter, leave = _slab_chord(size, origin, direction)
 
     def gauge(t):
-        # One coordinate after the other: a vector would be kept for every pixel in every step.
+        # Coordinate by coordinate: vectors would be kept in memory for every pixel and step.
         return superquadric.unit_gauge([jnp.abs((origin[k] + t * direction[k]) / size[k]) for k in range(3)], exponents)
 
     def value_and_slope(t):
@@ -53,7 +53,7 @@ def cast(
     t = jax.lax.stop_gradient(jax.lax.fori_loop(0, NEWTON_STEPS, newton, jnp.maximum(enter, 0.0)))
     value, slope = value_and_slope(t)
     hit = (enter <= leave) & (leave > 0.0) & (value <= 1.0 + GRAZING)
-    # One more step that is differentiated: by the implicit function theorem its gradient is the crossing's.
+    # One more, differentiated step: by the implicit function theorem its gradient is that of the crossing.
     slope = jax.lax.stop_gradient(slope)
     descending = slope < -1e-6
     refined = t + jnp.where(descending, (1.0 - value) / jnp.where(descending, slope, -1.0), 0.0)
@@ -65,7 +65,7 @@ def object_depth(
     origin: Float[Array, "3"],
     directions: Float[Array, "*batch 3"],
 ) -> Float[Array, "*batch"]:
-    """Depth of one object (a `Superquadrics` without its object axis) along world rays; infinite where it is not."""
+    """Depth of one object (a `Superquadrics` without its object axis) along world rays [m]; infinite for misses."""
     inverse = scene_object.rotation.T
     local_origin = rotate(inverse, origin - scene_object.position)
     local = rotate(inverse, directions)
@@ -85,17 +85,17 @@ def render_depth(camera: Camera, scene: Superquadrics) -> Float[Array, "h w"]:
       Depth along the optical axis [m], shape (height, width); infinite where no object is seen.
     """
     origin, directions = jnp.array(camera.position), rays(camera)
-    each = jax.lax.map(lambda one: object_depth(one, origin, directions), scene)
-    return jnp.min(each, axis=0)
+    depths = jax.lax.map(lambda scene_object: object_depth(scene_object, origin, directions), scene)
+    return jnp.min(depths, axis=0)
 
 
 class Window(flax.struct.PyTreeNode):
     """One object's image: the depth at every `stride`-th pixel of a part of the camera's image.
 
     Attributes:
-      depth: infinite where the object is not, shape (h, w) [m].
+      depth: infinite beside the object, shape (h, w) [m].
       corner: row and column of the first pixel, int32, shape (2,).
-      stride: how many rows and columns of pixels each row and column stands for, int32.
+      stride: number of the image's rows and columns for each row and column of the window, int32.
     """
 
     depth: jax.Array
@@ -106,15 +106,15 @@ class Window(flax.struct.PyTreeNode):
 def window_place(
     camera: Camera, scene_object: Superquadrics, window: tuple[int, int]
 ) -> tuple[Int[Array, "2"], Int[Array, ""]]:
-    """First row and column, and stride, of a window that holds what the camera sees of an object.
+    """First row and column, and stride, of a window that contains the image of an object.
 
-    The stride is 1 where the window is large enough for the image of the object's bounding box, as far as that lies in
-    the camera's image, and as small as possible elsewhere.
+    The stride is the smallest with which the window contains the image of the object's bounding box, as far as it lies
+    in the camera's image.
     """
     corners = jnp.stack(jnp.meshgrid(*[jnp.array([-1.0, 1.0])] * 3, indexing="ij"), axis=-1).reshape(8, 3)
     T_world_object = make(scene_object.rotation, scene_object.position)
     pixels, _ = project(camera, transform(T_world_object, corners * scene_object.size[None]))
-    # One pixel beyond the image, so that what is outside of it stays outside.
+    # Clip one pixel beyond the image, so that an object outside of it stays outside.
     limit = jnp.array([camera.height, camera.width], jnp.float32)
     low, high = (jnp.clip(bound, -1.0, limit) for bound in (jnp.min(pixels, axis=0), jnp.max(pixels, axis=0)))
     extent = jnp.array(window, jnp.float32)
@@ -125,7 +125,7 @@ def window_place(
 
 @functools.partial(jax.jit, static_argnames=("window",))
 def object_window(camera: Camera, scene_object: Superquadrics, window: tuple[int, int]) -> Window:
-    """Depth of one object in a window of fixed size around its image; more coarsely where it is larger than that."""
+    """Depth of one object in a window of fixed size around its image, with a stride if the image is larger."""
     corner, stride = window_place(camera, scene_object, window)
     rows, columns = jnp.meshgrid(jnp.arange(window[0]), jnp.arange(window[1]), indexing="ij")
     middle = (stride - 1) / 2.0
@@ -137,7 +137,7 @@ def object_window(camera: Camera, scene_object: Superquadrics, window: tuple[int
 def _window_pixels(
     corner: Int[Array, " n"], stride: Int[Array, " n"], size: int, count: int
 ) -> tuple[Int[Array, "n {count}"], Bool[Array, "n {count}"]]:
-    """Along one axis, the pixel of each window that shows each pixel of an image, and whether any does."""
+    """Along one axis, the index in each window of each pixel of an image, and whether it is in the window."""
     index = (jnp.arange(count)[None] - corner[:, None]) // stride[:, None]
     return jnp.clip(index, 0, size - 1), (index >= 0) & (index < size)
 

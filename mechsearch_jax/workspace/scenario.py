@@ -1,4 +1,4 @@
-"""Scenarios: which objects stand where on the shelf at the start of an episode, and the file they are kept in."""
+"""Scenarios: the objects on the shelf at the start of an episode, and their files."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ VERSION = 1
 MAX_OBJECTS = 8
 # Enough for thousands of scenes: 48 bits.
 HASH_DIGITS = 12
-# Names are used as names of files.
+# Names are also file names.
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
-# Half-extents below this are none that can be computed with, let alone seen [m].
+# Smallest half-extent; smaller ones lead to numerical problems [m].
 LEAST_HALF_SIZE = 5e-4
 
 _BODY_KEYS = {"shape": str, "half_size": 3, "position": 3, "quaternion": 4}
@@ -44,7 +44,7 @@ class Body:
 
     Attributes:
       shape: name of its shape, such as "box" or "cylinder".
-      half_size: half-extents along its own axes [m]; for a cylinder (radius, radius, half its height).
+      half_size: half-extents along its axes [m]; for a cylinder (radius, radius, half its height).
       position: of its centre in the world [m].
       quaternion: (w, x, y, z) of its rotation in the world, a unit quaternion.
     """
@@ -60,9 +60,9 @@ class Scenario:
     """The start of an episode.
 
     Attributes:
-      name: what results call it.
+      name: in results.
       objects: the surrounding objects, which the robot may move.
-      target: what it searches.
+      target: the body that the robot searches.
     """
 
     name: str
@@ -71,10 +71,10 @@ class Scenario:
 
     @property
     def content_hash(self) -> str:
-        """Twelve hexadecimal digits that tell contents apart: every shape, size and pose, in the objects' order.
+        """Twelve hexadecimal digits of a hash of every shape, size and pose, in the objects' order.
 
-        The name does not count, nor how a file writes its numbers. The order of the objects does: random numbers go
-        by it.
+        The name and the format of numbers in the file do not count. The order of the objects does, since random numbers
+        depend on it.
         """
         # Adding 0 makes -0 the 0 that it equals.
         bodies = [
@@ -90,10 +90,10 @@ def rotation_matrix(quaternion: Sequence[float] | Float[np.ndarray, "*batch 4"])
 
 
 def check_name(value: Any, where: str) -> None:
-    """Refuse what cannot be a scenario's name, which is a name of files.
+    """Check a scenario's name, which is also a file name.
 
     Raises:
-      InputError: it cannot.
+      InputError: it is not a valid name.
     """
     if not isinstance(value, str) or not NAME.fullmatch(value):
         raise InputError(
@@ -157,14 +157,13 @@ def parse_scenario(value: Any, where: str, shelf: Shelf | None = None) -> Scenar
     """A scenario from parsed JSON.
 
     Args:
-      value: what a JSON parser made of the file.
-      where: how to name the file in messages.
+      value: the parsed file.
+      where: how messages name the file.
       shelf: the shelf that the bodies must stand on; the default shelf if None.
 
     Raises:
-      InputError: the format or version is another one; a key is unknown or missing; the name cannot be one of a file; a
-        number is not finite; a size is that of nothing on the shelf; a quaternion is not of unit length; a body is off
-        the board.
+      InputError: the format or version is another one; a key is unknown or missing; the name is invalid; a number is
+        not finite; a size is out of range; a quaternion is not of unit length; a body is off the board.
     """
     shelf = shelf or Shelf()
     _check_keys(value, ("format", "version", "name", "objects", "target"), where, None)
@@ -191,9 +190,9 @@ def load_scenario(path: str | os.PathLike[str], shelf: Shelf | None = None) -> S
 
 
 def is_another_format(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is a JSON object that does not even look like a scenario: it has neither `format` nor `target`.
+    """Whether a file is a JSON object with neither `format` nor `target`, and so not a scenario.
 
-    What cannot be read or parsed may be a broken scenario, and is left to `load_scenario` to complain about.
+    False if it cannot be read or parsed, so that `load_scenario` raises an error about a damaged scenario.
     """
     try:
         value = read_json(path)
@@ -209,7 +208,7 @@ def format_scenario(scenario: Scenario) -> str:
 
 
 def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
-    """Write a scenario file; a file that is already there is replaced as a whole or left as it is.
+    """Write a scenario file; an existing file is replaced.
 
     Raises:
       InputError: the file cannot be written.
@@ -220,27 +219,23 @@ def save_scenario(scenario: Scenario, path: str | os.PathLike[str]) -> None:
 
 
 def superquadrics(bodies: Sequence[Body], capacity: int = MAX_OBJECTS) -> Superquadrics:
-    """Bodies as the planner sees them when it knows them exactly.
-
-    Args:
-      bodies: at most `capacity` of them.
-      capacity: number of slots; the ones left over are masked out.
+    """Bodies as superquadrics with the planner's exponents, at their exact poses, in `capacity` slots.
 
     Raises:
       InputError: there are more bodies than slots.
     """
-    known = Superquadrics(
+    exact = Superquadrics(
         size=jnp.array([b.half_size for b in bodies], jnp.float32).reshape(-1, 3),
         exponents=jnp.array([shape_of(b.shape).exponents for b in bodies], jnp.float32).reshape(-1, 2),
         position=jnp.array([b.position for b in bodies], jnp.float32).reshape(-1, 3),
         rotation=jnp.array([rotation_matrix(b.quaternion) for b in bodies], jnp.float32).reshape(-1, 3, 3),
         valid=jnp.ones(len(bodies), bool),
     )
-    return superquadric.pad(known, capacity)
+    return superquadric.pad(exact, capacity)
 
 
 def example_scenarios() -> dict[str, Path]:
-    """The scenarios that ship with the package: their names and the files they are in."""
+    """The files of the scenarios that ship with the package, by name."""
     folder = importlib.resources.files("mechsearch_jax") / "data"
     files = [Path(str(file)) for file in folder.iterdir() if file.name.endswith(".json")]
     return {file.stem: file for file in sorted(files)}

@@ -1,4 +1,4 @@
-"""The shelf as the planner and the simulator know it: a box of free space, open at the front (-x)."""
+"""The shelf of planner and simulator: a box of free space, open at the front (-x)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from mechsearch_jax.geometry.transforms import transform_rows
 from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.workspace.leaves import are_given
 
-# Nothing is farther from the robot, and no board thicker [m].
+# Largest coordinate, and largest thickness of a board [m].
 FARTHEST, THICKEST = 10.0, 0.5
-# The numbers of a shelf, and the pairs of them; all are data under `jit`.
+# The fields that are numbers, and those that are ranges; all are dynamic under `jit`.
 _NUMBERS = ("front", "back", "right", "left", "board", "ceiling", "thickness", "side_margin", "ceiling_margin")
 _RANGES = ("spawn_x", "spawn_y")
 
@@ -27,8 +27,8 @@ class Shelf:
     """Inner faces of the shelf in the robot's base frame [m]; +x points into the shelf, z up (docs/method.md,
     "Facts of the scene").
 
-    A pytree: where a jitted function takes it as an argument that is not static, a shelf that was measured again
-    compiles nothing. Outside of tracing it holds plain numbers, and is hashable.
+    A pytree, so that a shelf with other measures recompiles nothing where a jitted function takes it as a dynamic
+    argument. Outside of tracing it holds plain numbers and is hashable.
 
     Attributes:
       front: x of the board's front edge.
@@ -38,8 +38,8 @@ class Shelf:
       board: z of the board's top, on which objects stand.
       ceiling: z of the upper board's underside.
       thickness: thickness of the boards.
-      side_margin: how much closer than they are the planner takes the side walls to be.
-      ceiling_margin: the same for the upper board.
+      side_margin: the planner's distance from the side walls.
+      ceiling_margin: the planner's distance from the upper board.
       spawn_x: range of x in which the generator drops object centres.
       spawn_y: the same for y.
     """
@@ -57,7 +57,7 @@ class Shelf:
     spawn_y: tuple[float, float] = (-0.18, 0.38)
 
     def __post_init__(self):
-        # Rebuilt by JAX, it holds whatever stands for its leaves, which is not checked.
+        # In a pytree rebuilt by JAX, fields may hold tracers or other stand-ins, which are not checked.
         if not are_given(*(getattr(self, name) for name in (*_NUMBERS, *_RANGES))):
             return
         for name in ("front", "back", "right", "left", "board", "ceiling"):
@@ -71,7 +71,7 @@ class Shelf:
             low, high = getattr(self, name)
             if not -FARTHEST <= low < high <= FARTHEST:
                 raise InputError(f"Shelf: {name} ({low}, {high}) must be two places in metres, the smaller first")
-        # Of one type, whatever number they were given as: another type compiles anew.
+        # Convert to one type, for other types would be compiled for anew.
         for name in _NUMBERS:
             object.__setattr__(self, name, float(getattr(self, name)))
         for name in _RANGES:
@@ -94,20 +94,19 @@ class Shelf:
 
 
 def on_host(shelf: Shelf, *row: int) -> Shelf:
-    """The shelf whose numbers a jitted function handed out, as it was given: with the shortest decimals that come to
-    them.
+    """The original shelf from one that a jitted function returned: with the shortest decimals that round to float32.
 
     Args:
-      shelf: its leaves are arrays of the host, float32.
-      row: of several shelves, whose leaves have leading axes, which one is meant.
+      shelf: its leaves are NumPy arrays, float32.
+      row: index along the leading axes of the leaves, if there are several shelves.
     """
     return jax.tree.map(lambda numbers: float(str(np.float32(numbers[row]))), shelf)
 
 
 def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
-    """Whether world points are in the shelf, whose sides and ceiling are taken closer by their margins.
+    """Whether world points are in the shelf's solid parts, which include the margins at sides and ceiling.
 
-    Everything beyond the front edge has to be inside the free box, or counts as in the shelf.
+    Everything beyond the front edge and outside the free box counts as solid.
     """
     return _in_shelf(shelf, points[..., 0], points[..., 1], points[..., 2])
 
@@ -115,7 +114,7 @@ def hits_shelf(shelf: Shelf, points: Float[Array, "*batch 3"]) -> Bool[Array, "*
 def cloud_hits_shelf(
     shelf: Shelf, T_world_cloud: Float[Array, "*batch 4 4"], cloud: Float[Array, "*#batch 3 p"]
 ) -> Bool[Array, "*batch"]:
-    """Whether a point of a placed cloud, given as rows of coordinates in its own frame, is in the shelf."""
+    """Whether a point of a placed cloud, given as rows of coordinates in its frame, is in the shelf's solid parts."""
     return jnp.any(_in_shelf(shelf, *transform_rows(T_world_cloud, cloud)), axis=-1)
 
 
@@ -135,7 +134,7 @@ def _in_shelf(
 def spheres_hit_shelf(
     shelf: Shelf, centres: Float[Array, "*batch n 3"], radii: Float[Array, " n"]
 ) -> Bool[Array, "*batch n"]:
-    """Whether spheres touch what `hits_shelf` is true for; one in front of the shelf may bulge past its front edges.
+    """Whether spheres touch the shelf's solid parts (`hits_shelf`); at the front, the edges count, not their plane.
 
     Args:
       shelf: the shelf.
@@ -153,7 +152,7 @@ def placed_spheres_hit_shelf(
     z: Float[Array, "*batch n"],
     radii: Float[Array, " n"],
 ) -> Bool[Array, "*batch n"]:
-    """`spheres_hit_shelf` with each coordinate of the centres in an array of its own."""
+    """`spheres_hit_shelf` with one array for each coordinate of the centres."""
     to_wall = jnp.minimum(y - shelf.right, shelf.left - y) - shelf.side_margin
     to_board = jnp.minimum(z - shelf.board, shelf.ceiling - z - shelf.ceiling_margin)
     beside = jnp.maximum(jnp.minimum(to_wall, to_board), 0.0)

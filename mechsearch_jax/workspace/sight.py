@@ -1,6 +1,6 @@
-"""Whether a camera sees the shelf at all, and what is probably wrong with its pose where it does not.
+"""Check whether a camera sees the shelf, and guess the mistake in its pose if it does not.
 
-Pure geometry of a pose, on the host: it is looked at before anything is computed from it.
+Pure geometry of the pose, on the host, before anything else is computed with it.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Shares of the board that the image must show: with less nothing can be searched, or it is worth a warning.
+# Shares of the board below which a camera is refused, and below which there is a warning.
 LEAST_USABLE = 0.2
 LEAST_SEEN = 0.5
-# The rows of an image run upwards in the world where its y axis points up by more than this.
+# A camera counts as upside down if the z component of its y axis in the world is above this.
 UPSIDE_DOWN = 0.5
-# How far a line of sight may pass into a wall, whose place is not known better [m].
+# Uncertainty of the walls: how far a line of sight may pass into a wall [m].
 SLACK = 0.02
 # Axes of a camera's frame in a frame with x forward, y left and z up, and in OpenGL's, as columns.
 BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -31,15 +31,15 @@ Pose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 
 
 def check_camera(camera: Camera, shelf: Shelf) -> None:
-    """Refuse a camera that does not see the shelf.
+    """Check that a camera sees the shelf.
 
     Args:
       camera: with x right, y down and z forward.
-      shelf: what it is to see.
+      shelf: that it should see.
 
     Raises:
-      InputError: the shelf is behind it, nearly all of the board outside of its image, or it looks through a wall and
-        would not without a usual mistake; the line names the likely mistake.
+      InputError: the shelf is behind it, nearly all of the board is outside of its image, or it looks through a wall
+        because of a common mistake. The message names the likely mistake.
     """
     fault = blindness(camera, shelf)
     if fault is not None:
@@ -47,7 +47,7 @@ def check_camera(camera: Camera, shelf: Shelf) -> None:
 
 
 def blindness(camera: Camera, shelf: Shelf) -> str | None:
-    """Why nothing can be searched with a camera, in one line; None where it sees enough of the shelf."""
+    """Why a camera cannot be used, in one line; None if it sees enough of the shelf."""
     sight = _sight(camera, _pose(camera), shelf)
     if sight.ahead and sight.seen >= LEAST_USABLE:
         return None
@@ -60,11 +60,11 @@ def blindness(camera: Camera, shelf: Shelf) -> str | None:
 
 
 def camera_faults(camera: Camera, shelf: Shelf) -> tuple[str, ...]:
-    """What is wrong with a camera's pose, as seen from the shelf; empty if nothing is.
+    """Warnings about a camera's pose relative to the shelf.
 
     Args:
       camera: with x right, y down and z forward.
-      shelf: what it is to see.
+      shelf: that it should see.
     """
     fault = blindness(camera, shelf)
     if fault is not None:
@@ -84,12 +84,12 @@ def share_seen(camera: Camera, shelf: Shelf) -> float:
 
 
 class Sight(NamedTuple):
-    """What a camera sees of the board, without the objects on it.
+    """How much a camera sees of the board, without the objects on it.
 
     Attributes:
-      central: cosine of the angle between its axis and the way to the middle of the shelf's space.
-      framed: share of the board within its image, whatever stands between.
-      seen: share of the board within its image that walls, ceiling and back leave in sight.
+      central: cosine of the angle between its axis and the direction to the middle of the shelf's space.
+      framed: share of the board within its image, hidden or not.
+      seen: share of the board within its image that walls, ceiling and back do not hide.
     """
 
     central: float
@@ -98,12 +98,12 @@ class Sight(NamedTuple):
 
     @property
     def ahead(self) -> bool:
-        """Whether the middle of the shelf's space is before it."""
+        """Whether the middle of the shelf's space is in front of it."""
         return self.central > 0.0
 
 
 def _sight(camera: Camera, pose: Pose, shelf: Shelf) -> Sight:
-    """What a camera would see from a pose."""
+    """The sight of a camera from a pose."""
     rotation, position = pose
     x, y = np.linspace(shelf.front, shelf.back, 21), np.linspace(shelf.right, shelf.left, 21)
     board = np.stack(np.meshgrid(x, y, [shelf.board], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -112,7 +112,7 @@ def _sight(camera: Camera, pose: Pose, shelf: Shelf) -> Sight:
     safe = np.maximum(depth, 1e-6)
     row, column = camera.fy * down / safe + camera.cy, camera.fx * right / safe + camera.cx
     framed = (row >= 0.0) & (row < camera.height) & (column >= 0.0) & (column < camera.width) & (depth > 0)
-    # Where the line of sight passes the plane of the front, it has to pass the opening.
+    # The line of sight must pass the plane of the front within the opening.
     way = board - position
     share = (shelf.front - position[0]) / np.where(way[:, 0] > 1e-9, way[:, 0], np.inf)
     crossing = position + share[:, None] * way
@@ -120,13 +120,13 @@ def _sight(camera: Camera, pose: Pose, shelf: Shelf) -> Sight:
     opening &= (crossing[:, 2] > shelf.board - SLACK) & (crossing[:, 2] < shelf.ceiling + SLACK)
     inside = _in_space(position, shelf)
     seen = framed & (inside | (opening & (position[0] <= shelf.front)))
-    away = middle - position
-    central = away @ rotation[:, 2] / max(float(np.linalg.norm(away)), 1e-9)
+    towards = middle - position
+    central = towards @ rotation[:, 2] / max(float(np.linalg.norm(towards)), 1e-9)
     return Sight(float(central), float(framed.mean()), float(seen.mean()))
 
 
 def _in_space(position: Float[np.ndarray, "3"], shelf: Shelf) -> bool:
-    """Whether a place is in the shelf's own space."""
+    """Whether a position is in the shelf's space."""
     x, y, z = position
     high, wide = shelf.board <= z <= shelf.ceiling, shelf.right <= y <= shelf.left
     return bool(shelf.front <= x <= shelf.back and wide and high)
@@ -142,9 +142,9 @@ def _little(sight: Sight) -> str:
 
 
 def _mistake(camera: Camera, shelf: Shelf) -> str | None:
-    """The mistake with which a camera that sees the shelf would have this pose; None if no known one explains it."""
+    """The common mistake that would explain the pose, as a message; None if none does."""
     sights = {line: (pose, _sight(camera, pose, shelf)) for line, pose in _mended(_pose(camera)).items()}
-    # The right way up, not in the shelf, and of several one whose images are level and show the shelf in their middle.
+    # Corrected poses that are upright and outside the shelf; the best is level and has the shelf in the middle.
     doubts = {
         line: (round(abs(pose[0][2, 0]), 2), -sight.central)
         for line, (pose, sight) in sights.items()
@@ -154,7 +154,7 @@ def _mistake(camera: Camera, shelf: Shelf) -> str | None:
 
 
 def _mended(pose: Pose) -> Mapping[str, Pose]:
-    """What a pose would be without each of the usual mistakes, by what is said of it; the usual ones first."""
+    """The pose corrected for each common mistake, by the message about it; the most common first."""
     rotation, position = pose
     back = rotation.T, -rotation.T @ position
     inverted = "camera: T_world_camera looks inverted: its inverse sees the shelf"

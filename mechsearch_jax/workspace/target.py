@@ -1,4 +1,4 @@
-"""The known target object and the finite set of poses it may have (paper section 3)."""
+"""The target, whose shape is known, and the finite set of its candidate poses (paper section 3)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mechsearch_jax.runtime.errors import InputError, check_range
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Half-extents and margins are no longer [m], and f and g are no finer.
+# Largest half-extent and inset [m], and largest number of candidate poses.
 LARGEST = 1.0
 MOST_POSES = 100_000
 
@@ -25,7 +25,7 @@ class Target:
       half_size: half-extents [m].
       grid: number of candidate positions in x and y.
       inset: distance between the outermost candidate positions and the board's edges [m].
-      yaws: number of candidate yaw angles over half a turn; 1 for what looks the same from all sides.
+      yaws: number of candidate yaw angles over half a turn; 1 for a round target.
     """
 
     shape: str = "cylinder"
@@ -52,24 +52,22 @@ class Target:
 
     @classmethod
     def of(cls, shape: str, half_size: tuple[float, float, float] | None = None) -> Target:
-        """The target of a shape, with as many candidate yaw angles as that needs.
+        """The target of a shape, with the shape's number of yaw angles.
 
         Args:
           shape: its name.
-          half_size: half-extents [m]; the usual ones if left out.
+          half_size: half-extents [m]; the shape's usual ones if left out.
 
         Raises:
-          InputError: there is no such shape, or the half-extents are none of it.
+          InputError: there is no such shape, or it cannot have these half-extents.
         """
-        known = shape_of(shape)
-        return cls(known.name, half_size or known.target_half_size, yaws=known.yaws)
+        kind = shape_of(shape)
+        return cls(kind.name, half_size or kind.target_half_size, yaws=kind.yaws)
 
     def resized(self, shape: str, half_size: tuple[float, float, float]) -> Target:
-        """The target of a shape and a size, searched for as finely as this one.
+        """A target of a shape and half-extents [m] with this one's grid and inset.
 
-        Args:
-          shape: its name; of another shape than this one's, it has that shape's usual yaw angles.
-          half_size: half-extents [m].
+        It has this target's yaw angles if the shape is the same, else the other shape's usual ones.
 
         Raises:
           InputError: as `of`.
@@ -97,8 +95,7 @@ class Target:
     def candidate_poses(self, shelf: Shelf) -> Float[np.ndarray, "x 3"]:
         """The candidate poses X as rows of x, y [m] and yaw [rad], yaw varying fastest and x slowest.
 
-        The outermost positions are `inset` from the board's edges, so that the spacing is 15 to 16 mm for the default
-        shelf.
+        The outermost positions are `inset` from the board's edges; the default spacing is 15 to 16 mm.
         """
         x = np.linspace(shelf.front + self.inset, shelf.back - self.inset, self.grid[0])
         y = np.linspace(shelf.right + self.inset, shelf.left - self.inset, self.grid[1])
@@ -108,12 +105,12 @@ class Target:
     def places(self, shelf: Shelf, shares: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, "x s 3"]:
         """Places in the grid cell of each candidate pose: x, y [m] and yaw [rad].
 
-        The corners of the outermost cells lie where a target touches the back or a side wall: pushes take it there, and
-        no other pose would stand for it. At the front nothing holds it, and little hides it.
+        The outermost cells reach to where a target touches the back or a side wall, for pushes take it there, and no
+        other pose represents it. They are not extended at the front, where little hides the target.
 
         Args:
           shelf: as in `candidate_poses`.
-          shares: where in a cell, as shares of half of it; those of 1 are its corners.
+          shares: positions in a cell, relative to half of its size; 1 is at a corner.
         """
         poses = self.candidate_poses(shelf)
         offsets = np.tile(shares * np.array(self.cell(shelf), np.float32) / 2, (len(poses), 1, 1))
