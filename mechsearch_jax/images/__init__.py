@@ -1,1 +1,1 @@
-"""Images of a camera and the points and pixels in them, before anything is recognised."""
+"""Camera images, their points and pixels, before recognition."""

@@ -1,11 +1,11 @@
-"""The camera's pose from what it sees of the robot, whose shape and joint angles are known (appendix C.1).
+"""Correct the camera's pose on the visible robot, whose shape and joint angles are known (appendix C.1).
 
-Iterative closest point, point to plane: every observed point that may be the robot's is matched with the nearest point
-of the robot's surface, in closed form, because the robot is made of boxes and capsules. Only observed points look for a
-partner, so the sides of the robot that the camera cannot see need not be left out.
+Point-to-plane iterative closest point: every observed point near the robot is matched with the nearest point of the
+robot's surface, in closed form, since the robot is made of boxes and capsules. Only observed points are matched, so the
+hidden sides of the robot do not matter.
 
-The primitives lie up to 8 mm outside the real hand, fingers and links 6 and 7, and farther from links 1 to 5; on a real
-robot that limits the accuracy. Give `robot_distance` a closer shape of your own where it matters.
+The primitives lie up to 8 mm outside the real hand, fingers and links 6 and 7, and farther from links 1 to 5, which
+limits the accuracy on a real robot. `robot_distance` accepts a more accurate shape.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 
 HAND_FRAME = 7
-# Keeps steps small in directions in which the robot's shape says nothing: as much as one point, at this distance [m].
+# Damping of directions that the robot's shape does not determine: as much as one point at this distance [m].
 LEVER = 0.1
 
 # Signed distances of points (P, 3) in the base frame to the robot's surface, and outward unit normals (P, 3), for joint
@@ -38,7 +38,7 @@ RobotDistance = Callable[[Array, Array, Array], tuple[Array, Array]]
 
 
 class _Solids(NamedTuple):
-    """All primitives as boxes with rounded edges: a capsule is a box of no thickness with a large rounding."""
+    """All primitives as boxes with rounded edges: a capsule is a line with a large rounding."""
 
     frame: np.ndarray
     T_frame_solid: np.ndarray
@@ -75,7 +75,7 @@ def panda_distance(
 ) -> tuple[Float[Array, " p"], Float[Array, "p 3"]]:
     """Signed distances to links 1 to 7, the hand and the fingers, and outward normals of the nearest surface.
 
-    Outside exact for the union of the primitives; inside it is the depth in the primitive that is entered deepest.
+    Outside, the distance is exact for the union of the primitives; inside, it is the depth in the deepest primitive.
 
     Args:
       points: in the base frame [m].
@@ -115,8 +115,8 @@ class PoseConfig:
     """How the camera's pose is refined.
 
     Attributes:
-      stages: numbers of Gauss-Newton steps, each with the distance within which a point is taken to be the robot's
-        [m]; the first must hold the largest error of the given pose, at the robot.
+      stages: numbers of Gauss-Newton steps, each with the distance within which a point counts as the robot's [m]; the
+        first distance must be at least the error of the given pose at the robot.
       robot_distance: the robot's shape.
       minimum_points: the pose stays as given if fewer points are within the last stage's distance.
     """
@@ -136,10 +136,10 @@ class PoseEstimate(flax.struct.PyTreeNode):
     """A corrected camera pose.
 
     Attributes:
-      T_world_camera: the corrected pose, shape (4, 4); the given one where `points` are too few.
-      points: number of observed points that lie on the robot in the end, int32.
+      T_world_camera: the corrected pose, shape (4, 4); the given one if `points` are too few.
+      points: number of observed points on the robot at the end, int32.
       error: root mean square of their distances to its surface [m].
-      corrected: whether the points were enough.
+      corrected: whether there were enough points.
     """
 
     T_world_camera: jax.Array
@@ -148,12 +148,12 @@ class PoseEstimate(flax.struct.PyTreeNode):
     corrected: jax.Array
 
     def camera(self, camera: Camera) -> Camera:
-        """The same camera at the corrected pose; not for use under `jit`, since it is one of plain numbers."""
+        """The camera at the corrected pose, with plain numbers; not for use under `jit`."""
         return with_pose(camera, np.asarray(self.T_world_camera))
 
 
 def with_pose(camera: Camera, T_world_camera: Float[np.ndarray, "4 4"]) -> Camera:
-    """The same camera elsewhere."""
+    """The camera at another pose."""
     turn = Rotation.from_matrix(np.asarray(T_world_camera[:3, :3], float)).as_matrix()
     return dataclasses.replace(
         camera,
@@ -171,17 +171,16 @@ def estimate_pose(
     opening: Float[Array, ""],
     config: PoseConfig | None = None,
 ) -> PoseEstimate:
-    """Correct a camera's pose so that what it sees of the robot lies on the robot (appendix C.1).
+    """Correct a camera's pose so that the observed points of the robot lie on the robot (appendix C.1).
 
-    Point-to-plane iterative closest point (Y. Chen and G. Medioni, 1992) with a robust weight, Tukey's, of every point.
-    From 2 cm and 2 degrees away it finds the true pose to 1.5 mm and 0.15 degrees where hand and forearm are in view
-    (tested on images of the primitives, with 1 mm of noise), to 3 mm and 0.6 degrees where a corner of the hand is.
+    Point-to-plane iterative closest point (Y. Chen and G. Medioni, 1992) with Tukey's robust weights. From 2 cm and 2
+    degrees away it finds the true pose to 1.5 mm and 0.15 degrees if hand and forearm are in view (tested on images of
+    the primitives, with 1 mm of noise), and to 3 mm and 0.6 degrees if only a corner of the hand is.
 
     Args:
       T_world_camera: the given pose; the world is the robot's base.
-      points: observed points in the camera's frame [m]: of the robot, and of anything else, which is left out as far as
-        it is farther from the robot than `config.stages` say.
-      valid: which points count; leave out the shelf and what stands on it.
+      points: observed points in the camera's frame [m]; those farther from the robot than `config.stages` are ignored.
+      valid: which points count; exclude the shelf and the objects.
       joints: the robot's joint angles when the image was taken [rad].
       opening: the distance between its fingers [m].
       config: static; the default if None.
@@ -199,7 +198,7 @@ def estimate_pose(
 
     def step(_, T, reach):
         world, distance, normal, weight = weights(T, reach)
-        # Turned about the points' centre, the rotation and the translation hardly depend on each other.
+        # With a rotation about the points' centre, rotation and translation are nearly independent.
         centre = jnp.sum(world * weight[:, None], axis=0) / jnp.maximum(jnp.sum(weight), 1e-6)
         jacobian = jnp.concatenate([jnp.cross(world - centre[None], normal), normal], axis=-1)
         weighted = jacobian * weight[:, None]

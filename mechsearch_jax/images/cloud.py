@@ -1,8 +1,8 @@
-"""Point clouds of what stands on the shelf: the part of the image that shows it, its points, without the shelf.
+"""Point clouds of the objects on the shelf, from the part of the image that shows them, without the shelf.
 
-An image has one row and column for each ray. Of a camera's full image only a `View` is used: the rows and columns that
-the space above the board can appear in, every `stride`-th of them. Training renders exactly these rays, so that what
-a network is shown later, `view.of(depth)`, is spread over objects in the same way.
+Of a camera's full image only a `View` is used: the rows and columns in which the space above the board can appear,
+every `stride`-th of them. Training renders exactly these rays, so that points have the same density on objects in
+training and in `view.of(depth)`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,12 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 POINTS = 2048
 STRIDE = 2
-# How near to the shelf's known faces a point still counts as the shelf [m].
+# Points within this distance of the shelf's faces count as the shelf [m].
 MARGIN = 0.004
 # How far objects may stick out over the board's front edge [m].
 OVERHANG = 0.06
-# Views that a network is shown have a multiple of so many rows and columns of rays, if the image has them. To a camera
-# that was calibrated again the shelf is a few pixels larger or smaller: for the least view its program would be
-# compiled anew each time.
+# Views for networks have a multiple of so many rows and columns, if the image has them. Otherwise a recalibrated
+# camera, whose view is a few pixels larger or smaller, would recompile everything.
 BLOCK = 8
 # Pixels in a block of `draw`.
 _BLOCK = 64
@@ -86,12 +85,12 @@ def view(camera: Camera, rows: tuple[int, int], columns: tuple[int, int], stride
 def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride: int = STRIDE, block: int = 1) -> View:
     """The part of the image in which things on the board can appear, up to 0.25 m above it.
 
-    Not for a traced camera or shelf: they decide about shapes.
+    Camera and shelf must not be traced, for they decide the view's shape.
 
     Args:
       camera, shelf: the defaults if None.
       stride: distance of neighbouring rays, in pixels.
-      block: the view has as many rows and columns of rays as are a multiple of this, if the image has them.
+      block: the view's numbers of rows and columns are multiples of this, if the image is large enough.
 
     Raises:
       InputError: the camera does not see the shelf.
@@ -100,7 +99,7 @@ def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride:
     tops = (shelf.board, min(shelf.board + 0.25, shelf.ceiling))
     sides = ((shelf.front - OVERHANG, shelf.back), (shelf.right, shelf.left), tops)
     corners = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(8, 3)
-    # Nothing here is traced, also where the caller is.
+    # Not traced even if the caller is.
     with jax.ensure_compile_time_eval():
         pixels, depth = (np.asarray(a) for a in project(camera, jnp.array(corners, jnp.float32)))
     low = np.maximum(np.floor(pixels.min(axis=0)), 0).astype(int)
@@ -113,7 +112,7 @@ def shelf_view(camera: Camera | None = None, shelf: Shelf | None = None, stride:
 
 
 def _in_blocks(first: int, end: int, size: int, stride: int, block: int) -> tuple[int, int]:
-    """A range of pixels that holds the given one, with a multiple of `block` rays if an image so long has them."""
+    """A range of pixels that contains the given one, with a multiple of `block` rays if the image is long enough."""
     count = -(-(end - first) // stride)
     count = min(-(-count // block) * block, -(-size // stride))
     span = (count - 1) * stride + 1
@@ -122,24 +121,24 @@ def _in_blocks(first: int, end: int, size: int, stride: int, block: int) -> tupl
 
 
 def middle(shelf: Shelf) -> tuple[Any, Any, Any]:
-    """The middle of the board's top [m]: numbers, or arrays where the shelf is traced."""
+    """The middle of the board's top [m]: numbers, or arrays if the shelf is traced."""
     return (shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board
 
 
 def distance(camera: Camera, shelf: Shelf) -> float:
-    """From the camera to the middle of the board's top [m]; at least a nanometre."""
+    """Distance of the camera from the middle of the board's top [m]; at least 1 nm."""
     return max(float(np.linalg.norm(np.subtract(camera.position, middle(shelf)))), 1e-9)
 
 
 def density(camera: Camera, shelf: Shelf) -> float:
-    """How many of a camera's pixels there are to a metre across its view at the middle of the board."""
+    """A camera's pixels per metre across its view, at the middle of the board."""
     return camera.fx / distance(camera, shelf)
 
 
 def thinned_view(camera: Camera, shelf: Shelf) -> View:
-    """The shelf's part of a camera's image as networks are shown it: thinned to about the density of their training.
+    """The shelf's part of a camera's image for networks, thinned to about the density of their training.
 
-    Not for a traced camera or shelf: which rays they are decides about shapes.
+    Camera and shelf must not be traced, for they decide the view's shape.
 
     Raises:
       InputError: the camera does not see the shelf.
@@ -149,12 +148,12 @@ def thinned_view(camera: Camera, shelf: Shelf) -> View:
 
 
 class PointCloud(flax.struct.PyTreeNode):
-    """Points in the world, a fixed number of them, some of which may be absent.
+    """P points in the world, of which any may be absent.
 
     Attributes:
       points: [m], shape (P, 3); finite even where absent.
       valid: whether the slot holds a point, shape (P,).
-      pixel: row * width + column of the pixel that each point was seen at, int32, shape (P,).
+      pixel: row * width + column of each point's pixel, int32, shape (P,).
     """
 
     points: jax.Array
@@ -163,7 +162,7 @@ class PointCloud(flax.struct.PyTreeNode):
 
 
 def cloud_of(points: Float[Array, "h w 3"]) -> PointCloud:
-    """The cloud of an image of points [m], such as `camera.back_project` gives; those that are NaN are absent."""
+    """The cloud of an image of points [m], such as that of `camera.back_project`; NaN points are absent."""
     flat = points.reshape(-1, 3)
     valid = jnp.isfinite(flat).all(axis=-1)
     return PointCloud(jnp.where(valid[:, None], flat, 0.0), valid, jnp.arange(flat.shape[0], dtype=jnp.int32))
@@ -178,9 +177,9 @@ def above_board(shelf: Shelf, points: Float[Array, "*batch 3"], margin: float = 
 
 
 def draw(key: Key[Array, ""], chosen: Bool[Array, " p"], count: int) -> tuple[Int[Array, " count"], Int[Array, ""]]:
-    """Random indices of true elements, in rising order and spread evenly: each of `count` equal shares gives one.
+    """Random indices of true elements in ascending order, one from each of `count` equal shares of them.
 
-    Neighbouring shares may give the same element, and do where there are few; where none is true, all indices are 0.
+    Neighbouring shares may give the same element, and do if there are few; if none is true, all indices are 0.
 
     Returns:
       The indices, and how many elements are true.

@@ -1,4 +1,4 @@
-"""What colour tells: whether the target is among the segments, and segments where nobody else makes them."""
+"""Detection of the target by its colour, and segmentation by colour."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ ColourDifference = Callable[[Array, Array], Array]
 
 # The target's colour, if none is given: the paper's red.
 RED = (0.7282, 0.1558, 0.2099)
-# How far apart two hues may be that count as one [rad]: a fourth of the way from red to yellow.
+# Largest difference of equal hues [rad]: a fourth of the way from red to yellow.
 HUE = math.radians(15.0)
-# A colour of the same hue counts as the target's if it has this share of the target's saturation, or more.
+# A colour of the target's hue counts as the target's with at least this share of its saturation.
 SATURATION = 0.7
-# Least difference between the largest and the smallest of red, green and blue of a pixel: below it the hue is noise.
+# Least chroma of a pixel; below it the hue is noise.
 LEAST_CHROMA = 0.08
-# The same of a target's colour, and its least saturation: white, grey, black and what is nearly so have no hue.
+# Least chroma and saturation of a target's colour: white, grey, black and similar colours have no hue.
 LEAST_TARGET_CHROMA = 0.15
 LEAST_TARGET_SATURATION = 0.3
 
 
 def mean_square(colours: Float[Array, "*batch 3"], reference: Float[Array, "3"]) -> Float[Array, "*batch"]:
-    """Mean squared difference of red, green and blue, as in appendix C.3. Depends on how brightly a thing is lit."""
+    """Mean squared difference of red, green and blue, as in appendix C.3; depends on the lighting."""
     return jnp.mean((colours - reference.reshape([1] * (colours.ndim - 1) + [3])) ** 2, axis=-1)
 
 
 def chromaticity(colours: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
-    """Colours divided by their sum, which a light's strength leaves alone; grey for black."""
+    """Colours divided by their sum, which does not depend on brightness; grey for black."""
     total = jnp.sum(colours, axis=-1, keepdims=True)
     dark = total < 1e-3
     return jnp.where(dark, 1.0 / 3.0, colours / jnp.where(dark, 1.0, total))
@@ -52,48 +52,50 @@ def chromatic(colours: Float[Array, "*batch 3"], reference: Float[Array, "3"]) -
 
 
 def chroma(colours: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
-    """The largest less the smallest of red, green and blue: 0 for grey."""
+    """Maximum minus minimum of red, green and blue: 0 for grey."""
     return jnp.max(colours, axis=-1) - jnp.min(colours, axis=-1)
 
 
 def saturation(colours: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
-    """Chroma over the largest of red, green and blue, which a light's strength leaves alone; 0 for black."""
+    """Chroma over the maximum of red, green and blue, which does not depend on brightness; 0 for black."""
     return chroma(colours) / jnp.maximum(jnp.max(colours, axis=-1), 1e-6)
 
 
 def _opponents(colours: Float[Array, "*batch 3"]) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """Coordinates in the plane across the axis of greys, whose angle is the hue: 0 for red, pi/3 for yellow."""
+    """Coordinates in the plane perpendicular to the axis of greys, where the angle is the hue: 0 for red, pi/3 for
+    yellow."""
     red, green, blue = (colours[..., i] for i in range(3))
     return red - 0.5 * (green + blue), (0.5 * math.sqrt(3.0)) * (green - blue)
 
 
 def hue_difference(colours: Float[Array, "*batch 3"], reference: Float[Array, "3"]) -> Float[Array, "*batch"]:
-    """How far a hue is from the reference's, or a saturation below it; 1 where either is as far as it may be.
+    """Difference from a reference in hue or saturation, whichever is larger; 1 at the tolerance of either.
 
-    The hue is the angle between the two in the plane across the axis of greys, as a share of `HUE`. A saturation above
-    the reference's is no difference; one below it is, by its lack as a share of the largest. Neither depends on how
-    brightly a thing is lit. What has hardly any chroma is infinitely different.
+    The difference in hue is the angle between the two in the plane perpendicular to the axis of greys, over `HUE`. A
+    saturation below the reference's counts relative to its tolerance; one above does not count. Neither depends on
+    brightness. Colours below `LEAST_CHROMA` are infinitely different.
     """
     a, b = _opponents(colours)
     x, y = _opponents(reference.reshape([1] * (colours.ndim - 1) + [3]))
     turn = jnp.abs(jnp.arctan2(a * y - b * x, a * x + b * y))
-    own = saturation(reference)
-    lack = (own - saturation(colours)) / ((1.0 - SATURATION) * own)
+    full = saturation(reference)
+    lack = (full - saturation(colours)) / ((1.0 - SATURATION) * full)
     return jnp.where(chroma(colours) < LEAST_CHROMA, jnp.inf, jnp.maximum(jnp.maximum(turn / HUE, lack), 0.0))
 
 
 @dataclasses.dataclass(frozen=True)
 class TargetColour:
-    """How the target is told from other things by its colour.
+    """How the target is recognised by its colour.
 
-    The paper's threshold of 0.1 on the mean square also takes in brown and dark red things, and "exactly one" segment
-    then means none. `TargetColour.lit` compares hues and saturations, which tell a red target from them in any light.
+    The paper's threshold of 0.1 on the mean square also accepts brown and dark red things, so that more than one
+    segment has the target's colour. `TargetColour.lit` compares hues and saturations, which separate a red target from
+    these in any light.
 
     Attributes:
       rgb: the target's colour, each in 0 to 1.
-      threshold: largest difference at which a segment is the target's.
+      threshold: largest difference of the target's colour.
       difference: how colours are compared.
-      minimum_pixels: a segment with fewer is not looked at.
+      minimum_pixels: smaller segments are ignored.
     """
 
     rgb: tuple[float, float, float] = RED
@@ -112,11 +114,11 @@ class TargetColour:
 
     @classmethod
     def lit(cls, rgb: tuple[float, float, float] = RED) -> TargetColour:
-        """A measure that does not depend on the light: the target has the hue of `rgb`, to 15 degrees, and at least 0.7
-        of its saturation; the shade may be purer, brighter or darker.
+        """A detector that does not depend on lighting: the target has the hue of `rgb`, to 15 degrees, and at least 0.7
+        of its saturation; it may be purer, brighter or darker.
 
         Args:
-          rgb: the target's colour as a camera shows it, each in 0 to 1.
+          rgb: the target's colour in a camera's image, each in 0 to 1.
 
         Raises:
           InputError: a number is outside 0 to 1, or the colour has no hue.
@@ -135,7 +137,7 @@ class TargetColour:
         return cls(rgb, threshold=1.0, difference=hue_difference)
 
     def __call__(self, colours: Float[Array, "*batch 3"]) -> Bool[Array, "*batch"]:
-        """Which colours, of single pixels for example, are the target's; a `recogniser.TargetDetector`."""
+        """Which colours are the target's; a `recogniser.TargetDetector`."""
         return self.difference(colours, jnp.array(self.rgb)) < self.threshold
 
 
@@ -144,8 +146,8 @@ class Detection(flax.struct.PyTreeNode):
 
     Attributes:
       found: whether exactly one segment has the target's colour.
-      segment: that segment, int32; the most similar one where none or several have it.
-      difference: of every segment's mean colour from the target's, infinite for those too small, shape (N,).
+      segment: that segment, int32; the most similar one if none or several have it.
+      difference: of every segment's mean colour from the target's, infinite for too small segments, shape (N,).
     """
 
     found: jax.Array
@@ -157,11 +159,11 @@ class Detection(flax.struct.PyTreeNode):
 def detect_target(
     colours: Float[Array, "p 3"], labels: Int[Array, " p"], segments: int, target: TargetColour | None = None
 ) -> Detection:
-    """Look for the target among segments by their mean colours (appendix C.3).
+    """Find the target among segments by their mean colours (appendix C.3).
 
     Args:
       colours: of points or pixels, red, green and blue in 0 to 1.
-      labels: the segment of each, 0 to `segments - 1`; others belong to none.
+      labels: the segment of each, 0 to `segments - 1`; other numbers for none.
       segments: number of segments; static.
       target: its colour; static; the paper's if None.
     """
@@ -171,20 +173,20 @@ def detect_target(
     mean = jax.ops.segment_sum(colours, slot, segments + 1)[:-1] / jnp.maximum(count, 1.0)[:, None]
     difference = target.difference(mean, jnp.array(target.rgb))
     difference = jnp.where(count >= target.minimum_pixels, difference, jnp.inf)
-    alike = difference < target.threshold
-    return Detection(jnp.sum(alike) == 1, jnp.argmin(difference).astype(jnp.int32), difference)
+    is_like_target = difference < target.threshold
+    return Detection(jnp.sum(is_like_target) == 1, jnp.argmin(difference).astype(jnp.int32), difference)
 
 
 @dataclasses.dataclass(frozen=True)
 class ClusterConfig:
-    """When neighbouring pixels show the same thing.
+    """When neighbouring pixels belong to the same segment.
 
     Attributes:
       colour: largest distance between the chromaticities of neighbours.
       depth: largest difference between the depths of neighbours [m].
-      rejoin: parts whose mean chromaticities are within `colour` and that come this close to each other are one thing,
-        split by what stands in front of it [m].
-      minimum: a thing with fewer pixels is dropped.
+      rejoin: parts with mean chromaticities within `colour` and a gap of at most this are one segment, which something
+        in front splits [m].
+      minimum: segments with fewer pixels are dropped.
     """
 
     colour: float = 0.05
@@ -209,31 +211,31 @@ def cluster_by_colour(
     foreground: Bool[np.ndarray, "h w"],
     config: ClusterConfig | None = None,
 ) -> Int[np.ndarray, "h w"]:
-    """Segments of like colour that hang together, for images that come without a mask.
+    """Connected segments of similar colour, for images without a mask.
 
-    Things of one colour that touch in the image are one segment: give neighbouring objects different colours, as the
-    paper does, or use a segmentation network. Runs on the host, by SciPy's connected components.
+    Objects of equal colour that touch in the image become one segment: give neighbouring objects different colours, as
+    the paper does, or use a segmentation network. Runs on the host, by SciPy's connected components.
 
     Args:
       colour: red, green and blue in 0 to 1.
       depth: along the camera's axis [m].
-      points: what the pixels see, in the world [m].
+      points: of the pixels, in the world [m].
       foreground: pixels to be clustered.
       config: the default if None.
 
     Returns:
-      segment of every pixel, the one with the most pixels first; `labels.OTHER` for none, also off the foreground.
+      segment of every pixel, numbered by decreasing size; `labels.OTHER` for none.
     """
     config = config or ClusterConfig()
     tint = np.array(chromaticity(jnp.asarray(colour, jnp.float32)))
     index = np.arange(foreground.size).reshape(foreground.shape)
     pairs = []
-    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])):
+    for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])):
         with np.errstate(invalid="ignore"):
-            near = np.abs(depth[here] - depth[there]) <= config.depth
-        alike = np.linalg.norm(tint[here] - tint[there], axis=-1) <= config.colour
-        linked = foreground[here] & foreground[there] & near & alike
-        pairs.append((index[here][linked], index[there][linked]))
+            near = np.abs(depth[first] - depth[second]) <= config.depth
+        alike = np.linalg.norm(tint[first] - tint[second], axis=-1) <= config.colour
+        linked = foreground[first] & foreground[second] & near & alike
+        pairs.append((index[first][linked], index[second][linked]))
     part = _components(foreground.size, *(np.concatenate(ends) for ends in zip(*pairs, strict=True)))
     part = np.where(foreground.ravel(), part, -1)
     names, part = np.unique(part, return_inverse=True)

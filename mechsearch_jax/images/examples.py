@@ -1,4 +1,4 @@
-"""Example images that ship with the package: what a robot's camera would deliver."""
+"""Example images that ship with the package."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mechsearch_jax.workspace.camera import Camera
 
 # The shipped file, in the folder `data` of the package.
 FILE = "example-images.npz"
-# Depths are kept as whole multiples of this [m], as depth cameras deliver them.
+# Depths are stored as multiples of this [m], as depth cameras deliver them.
 STEP = 0.001
 # The images in a file: their types, and the channels of a pixel.
 IMAGES = {"depth": (np.uint16, ()), "colour": (np.uint8, (3,)), "mask": (np.int8, ())}
@@ -29,13 +29,13 @@ REST = "rest"
 
 @dataclasses.dataclass(frozen=True)
 class Images:
-    """Images of one moment, registered to each other: pixel (row, column) shows the same point in each.
+    """Images taken at the same time and registered to each other.
 
     Attributes:
       depth: float32 (H, W), metres along the camera's z; 0 where nothing was measured.
       colour: uint8 (H, W, 3), red, green and blue.
       mask: int8 (H, W), the number of the object that a pixel shows, or what `images.labels` has.
-      target_id: the number in the mask that is the target's; None where it is not visible.
+      target_id: the target's number in the mask; None if it is not visible.
       camera: intrinsics and pose in the world, the robot's base.
     """
 
@@ -56,7 +56,7 @@ def example_images() -> Images:
 
 
 def load_images(path: PathLike) -> Images:
-    """Read what `save_images` wrote.
+    """Read a file of `save_images`.
 
     Raises:
       InputError: the file cannot be read or is damaged, an image has another size than the camera's or another type,
@@ -80,7 +80,7 @@ def load_images(path: PathLike) -> Images:
 
 
 def _rest(array: np.ndarray, path: PathLike) -> tuple[int | None, Camera]:
-    """What an archive says of the target and the camera, which is text."""
+    """The target's number and the camera, from an archive's text."""
     try:
         value = json.loads(str(array)) if array.dtype.kind == "U" and array.ndim == 0 else None
     except (ValueError, RecursionError):
@@ -95,7 +95,7 @@ def _rest(array: np.ndarray, path: PathLike) -> tuple[int | None, Camera]:
 
 
 def save_images(images: Images, path: PathLike) -> None:
-    """Write images as the shipped ones are kept; depths are rounded to millimetres.
+    """Write images in the format of the shipped ones; depths are rounded to millimetres.
 
     Raises:
       InputError: the file cannot be written.

@@ -1,10 +1,10 @@
-"""Images and cameras in files, as cameras' drivers write them.
+"""Images and cameras in files, in the formats of camera drivers.
 
 | what | files |
 |---|---|
 | depth | PNG or TIFF of 16 bits in millimetres; TIFF or `.npy` of floats in metres; 0 or NaN for not measured |
 | colour | PNG or JPEG, 8 bits a channel |
-| mask | PNG or `.npy` of whole numbers, one for each object, and one that stands for none |
+| mask | PNG or `.npy` of whole numbers, one for each object, and one for the background |
 | camera | JSON with the fields of a ROS `sensor_msgs/CameraInfo` and `T_world_camera` |
 """
 
@@ -25,24 +25,24 @@ from mechsearch_jax.runtime.errors import InputError, nearest, shown
 from mechsearch_jax.runtime.files import PathLike, read_bytes, read_json, replacing, save_json
 from mechsearch_jax.workspace.camera import Camera
 
-# What is larger is no image of a depth camera [bytes, pixels].
+# Largest size of an image [bytes, pixels].
 IMAGE_LIMIT = 256 * 2**20
 PIXEL_LIMIT = 64 * 10**6
 MILLIMETRE = 0.001
-# No intrinsics and no pose hold a larger number.
+# Bound of the numbers in intrinsics and poses.
 LARGEST_NUMBER = 1e7
-# An object that covers more of a mask is none: its number stands for no object [share].
+# A number that covers a larger share of a mask must be the background.
 LARGEST = 0.5
-# What in a camera's file is not looked at, since it says nothing of an image that is rectified.
+# Keys of a camera's file that do not matter for rectified images.
 _UNUSED = ("header", "distortion_model", "R", "r", "P", "p", "binning_x", "binning_y", "roi", "frame_id")
 _CAMERA_KEYS = ("width", "height", "K", "D", "T_world_camera")
 
 
 def load_depth(path: PathLike) -> Float[np.ndarray, "h w"]:
-    """A depth image in metres along the camera's z, 0 or NaN where nothing was measured.
+    """Read a depth image in metres along the camera's z, 0 or NaN where nothing was measured.
 
     Raises:
-      InputError: the file cannot be read, or holds no depth image.
+      InputError: the file cannot be read, or is not a depth image.
     """
     image = _pixels(path)
     if image.ndim != 2:
@@ -57,10 +57,10 @@ def load_depth(path: PathLike) -> Float[np.ndarray, "h w"]:
 
 
 def load_colour(path: PathLike) -> UInt8[np.ndarray, "h w 3"]:
-    """A colour image: red, green and blue.
+    """Read a colour image: red, green and blue.
 
     Raises:
-      InputError: the file cannot be read, or holds no colour image.
+      InputError: the file cannot be read, or is not a colour image.
     """
     image = _pixels(path)
     if image.ndim != 3 or image.shape[-1] not in (3, 4) or image.dtype != np.uint8:
@@ -71,14 +71,17 @@ def load_colour(path: PathLike) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def load_mask(path: PathLike, background: int) -> tuple[Int[np.ndarray, "h w"], dict[int, int]]:
-    """A mask with the numbers that a `Recogniser` takes, and which number in the file each of them was.
+    """Read a mask and renumber its objects for a `Recogniser`.
 
     Args:
       path: of the file; its objects may have any numbers.
-      background: the number that stands for no object, as negative ones do.
+      background: the number of the background, as are negative ones.
+
+    Returns:
+      The mask, and the new number for each number in the file.
 
     Raises:
-      InputError: the file cannot be read, holds no mask, or more objects than there can be.
+      InputError: the file cannot be read, is not a mask, or has too many objects.
     """
     image = _pixels(path)
     if image.ndim != 2 or image.dtype.kind not in "iu":
@@ -101,10 +104,10 @@ def load_mask(path: PathLike, background: int) -> tuple[Int[np.ndarray, "h w"], 
 
 
 def load_camera(path: PathLike) -> Camera:
-    """A camera: the fields `width`, `height` and `K` of a ROS `CameraInfo`, and `T_world_camera`.
+    """Read a camera: the fields `width`, `height` and `K` of a ROS `CameraInfo`, and `T_world_camera`.
 
-    `K` is for pixels whose first has its centre at 0, as in ROS. `T_world_camera` is 4 x 4, the camera's pose in the
-    frame of the robot's base; the camera's own frame has x right, y down, z forward (ROS: the optical frame).
+    In `K` the centre of the first pixel is at 0, as in ROS. `T_world_camera` is 4 x 4, the camera's pose in the frame
+    of the robot's base; the camera's frame has x right, y down, z forward (ROS: the optical frame).
 
     Raises:
       InputError: the file cannot be read, or a field is missing, unknown or impossible, or the lens distorts.
@@ -150,8 +153,8 @@ def save_depth(depth: Float[np.ndarray, "h w"], path: PathLike) -> None:
     Raises:
       InputError: the file cannot be written.
     """
-    known = np.where(np.isfinite(depth), depth, 0.0)
-    _save_png(np.round(np.clip(known / MILLIMETRE, 0, 65535)).astype(np.uint16), path)
+    finite = np.where(np.isfinite(depth), depth, 0.0)
+    _save_png(np.round(np.clip(finite / MILLIMETRE, 0, 65535)).astype(np.uint16), path)
 
 
 def save_colour(colour: UInt8[np.ndarray, "h w 3"], path: PathLike) -> None:
@@ -173,7 +176,7 @@ def save_mask(mask: Int[np.ndarray, "h w"], path: PathLike, background: int = 25
 
 
 def save_camera(camera: Camera, path: PathLike) -> None:
-    """Write what `load_camera` reads.
+    """Write a camera's file for `load_camera`.
 
     Raises:
       InputError: the file cannot be written.
@@ -197,7 +200,7 @@ def _save_png(image: np.ndarray, path: PathLike) -> None:
 
 
 def _pixels(path: PathLike) -> np.ndarray:
-    """The pixels of an image file, in whatever type it has them."""
+    """The pixels of an image file, in its type."""
     data = read_bytes(path, IMAGE_LIMIT)
     try:
         with warnings.catch_warnings():
@@ -205,7 +208,7 @@ def _pixels(path: PathLike) -> np.ndarray:
             image = _array(data) if Path(path).suffix.lower() == ".npy" else _picture(data)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    # To damage the decoders beneath answer with a dozen kinds of exception.
+    # The decoders raise a dozen kinds of exception on damaged files.
     except Exception as error:
         raise InputError(f"{path}: is no whole image ({type(error).__name__})") from error
     if image.ndim not in (2, 3) or image.size == 0:

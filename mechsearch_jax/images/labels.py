@@ -1,12 +1,12 @@
-"""What the pixels of a labelled image show: one convention, for masks that come in and for labels that are made here.
+"""Labels of pixels, for users' masks and for our own labels.
 
 A pixel of an instance holds the instance's number, 0 to `INSTANCES - 1`; every other pixel one of the numbers below.
 """
 
 OTHER = -1
-"""Something that is not to be recognised: the target, the robot, or a point of unknown belonging."""
+"""Something that is not to be recognised: the target, the robot, or an unassigned point."""
 FREE = -2
-"""The shelf itself: there is nothing between it and the camera."""
+"""The shelf, with nothing between it and the camera."""
 MISSING = -3
 """Nothing was measured."""
 

@@ -1,4 +1,4 @@
-"""Sensor noise: what a depth camera makes of the true depth. Interchangeable: any `NoiseModel` will do."""
+"""Noise models of depth cameras."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mechsearch_jax.workspace.camera import Camera, back_project, project
 
 
 class NoiseModel(Protocol):
-    """Makes a sensor's image of points from the true depth."""
+    """Simulates a sensor's image of points from the true depth."""
 
     def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
-        """World points [m] as measured, NaN where nothing was.
+        """Measured world points [m], NaN where nothing was measured.
 
         Args:
           key: PRNG key.
@@ -33,24 +33,20 @@ def no_noise(key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) ->
 
 
 def depth_of(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
-    """The depth of measured points [m]; NaN where nothing was measured.
-
-    Args:
-      camera: whose image it is.
-      points: what a `NoiseModel` made.
-    """
+    """The depth of the measured points of a `NoiseModel` [m]; NaN where nothing was measured."""
     finite: Bool[Array, "h w"] = jnp.isfinite(points).all(axis=-1)
     _, measured = project(camera, jnp.where(finite[..., None], points, 0.0))
     return jnp.where(finite, measured, jnp.nan)
 
 
 def measured_depth(camera: Camera, depth: Float[Array, "h w"], points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
-    """The depth of measured points [m]; where nothing was measured infinite if nothing is there, else NaN.
+    """The depth of the measured points of a `NoiseModel` [m]; without a measurement infinite if nothing is there, else
+    NaN.
 
     Args:
-      camera: whose image it is.
+      camera: of the image.
       depth: the true one [m]; infinite where nothing is.
-      points: what a `NoiseModel` made of it.
+      points: measured for it.
     """
     measured = depth_of(camera, points)
     return jnp.where(jnp.isnan(measured) & ~jnp.isfinite(depth), jnp.inf, measured)
@@ -82,18 +78,18 @@ class RandomDirection:
 class TimeOfFlight:
     """Noise like that of a time-of-flight camera.
 
-    Depth is noisier the farther and the more slanting a surface is; surfaces seen at a grazing angle may return
-    nothing; a pixel across an edge may measure a mixture of what is before and behind it. The model is
-    phenomenological: it has these three effects in the size that such cameras show, and stands for none in particular.
+    Depth is noisier the farther and the more slanted a surface is; surfaces at a grazing angle may return nothing; a
+    pixel across an edge may measure a mixture of both depths. The model is phenomenological: it has these three effects
+    at the size that such cameras show, but does not describe a particular one.
 
     Attributes:
       deviation: standard deviation of the depth at 1 m of a surface seen face on [m]; it grows with the square of the
-        depth and with the inverse of the cosine of the angle of incidence, of which at least 0.2 is taken.
-      grazing: cosine of the angle of incidence below which a return is missing half of the time.
-      softness: how gradually that sets in, in units of that cosine.
-      missing: share of returns that are missing anywhere.
+        depth and with the inverse of the cosine of the angle of incidence, which is at least 0.2 here.
+      grazing: cosine of the angle of incidence at which half of the returns are missing.
+      softness: width of the transition, in units of that cosine.
+      missing: share of missing returns everywhere.
       mixed: share of the pixels at an edge that measure a mixture.
-      edge: jump in depth between neighbouring pixels that makes an edge [m].
+      edge: difference in depth between neighbouring pixels that makes an edge [m].
     """
 
     deviation: float = 0.0015
@@ -127,12 +123,12 @@ class TimeOfFlight:
 
 
 def _incidence(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h w"]:
-    """Cosine of the angle between each pixel's ray and the normal of the surface that its neighbours span.
+    """Cosine of the angle between each pixel's ray and the normal of the surface through its neighbours.
 
-    The neighbours to the right and below span one, those to the left and above another; the one that is met more
-    squarely counts, because at an edge the other leads across it. 1 where there is neither.
+    The neighbours to the right and below give one normal, those to the left and above another; the larger cosine
+    counts, because the other pair may lie across an edge. 1 if neither pair is measured.
     """
-    # Else a GPU's compiler makes the points anew at each neighbour, within one very large kernel.
+    # Otherwise XLA recomputes the points for each neighbour, in one very large GPU kernel.
     points = jax.lax.optimization_barrier(points)
     ray = points - jnp.array(camera.position).reshape(1, 1, 3)
 
@@ -140,8 +136,8 @@ def _incidence(camera: Camera, points: Float[Array, "h w 3"]) -> Float[Array, "h
         across, down = (jnp.roll(points, side, axis=axis) - points for axis in (1, 0))
         normal = jnp.cross(across, down)
         lengths = jnp.linalg.norm(normal, axis=-1) * jnp.linalg.norm(ray, axis=-1)
-        known = jnp.isfinite(lengths) & (lengths > 0)
-        return jnp.where(known, jnp.abs(jnp.sum(normal * ray, axis=-1)) / jnp.where(known, lengths, 1.0), -1.0)
+        defined = jnp.isfinite(lengths) & (lengths > 0)
+        return jnp.where(defined, jnp.abs(jnp.sum(normal * ray, axis=-1)) / jnp.where(defined, lengths, 1.0), -1.0)
 
     best = jnp.maximum(cosine(-1), cosine(1))
     return jnp.where(best < 0, 1.0, best)

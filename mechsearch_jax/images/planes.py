@@ -1,4 +1,4 @@
-"""The plane that most points lie on, by random sample consensus: the shelf's floor in a real image."""
+"""The plane with most points, by random sample consensus, such as the shelf's floor in a real image."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class PlaneConfig:
     """How a plane is searched.
 
     Attributes:
-      hypotheses: number of planes through three random points that are tried.
-      tolerance: a point at most so far from a plane lies on it [m].
+      hypotheses: number of tried planes through three random points.
+      tolerance: largest distance from a plane of a point on it [m].
       within: largest angle between the plane's normal and the expected one [rad].
       fits: how often the best plane is then fitted to the points on it.
     """
@@ -49,7 +49,7 @@ class Plane(flax.struct.PyTreeNode):
     Attributes:
       normal: unit vector, on the side of the expected one, shape (3,).
       offset: of the plane from the origin along the normal [m].
-      support: number of points on it, int32; 0 if no plane was found, which is then the expected normal's through 0.
+      support: number of points on it, int32; 0 if there is none: then it has the expected normal and offset 0.
     """
 
     normal: jax.Array
@@ -57,12 +57,12 @@ class Plane(flax.struct.PyTreeNode):
     support: jax.Array
 
     def height(self, points: Float[Array, "*batch 3"]) -> Float[Array, "*batch"]:
-        """Distance of points from the plane, positive on the side that the normal points to [m]."""
+        """Signed distance of points from the plane, positive on the side of the normal [m]."""
         return sum(points[..., k] * self.normal[k] for k in range(3)) - self.offset
 
 
 def _fitted(plane: Plane, points: Array, valid: Array, config: PlaneConfig) -> Plane:
-    """The least-squares plane of the points on a plane, by the direction in which they spread least."""
+    """The least-squares plane of the points on a plane; its normal is the direction of their least spread."""
     on = (valid & (jnp.abs(plane.height(points)) <= config.tolerance)).astype(points.dtype)
     count = jnp.sum(on)
     centre = jnp.sum(points * on[:, None], axis=0) / jnp.maximum(count, 1.0)
@@ -82,13 +82,13 @@ def find_plane(
     expected: tuple[float, float, float] = UP,
     config: PlaneConfig | None = None,
 ) -> Plane:
-    """The plane with most points on it, of those that are nearly perpendicular to a direction.
+    """The plane with most points on it, of those with a normal near a direction.
 
     A fixed number of planes through three valid points each are compared by their support, and the best is fitted to
     the points that lie on it (M. Fischler and R. Bolles, "Random sample consensus", 1981).
 
     Args:
-      key: the same key finds the same plane.
+      key: PRNG key.
       points: in the world [m].
       valid: which points count.
       expected: unit vector near the normal; static.
@@ -114,10 +114,10 @@ def find_plane(
 
     planes = jax.lax.map(lambda pair: hypothesis(*pair), (normals, triples[:, 0]), batch_size=16)
     best = jnp.argmax(jnp.where(plausible, planes.support, -1))
-    found = plausible[best] & (planes.support[best] >= 3)
+    has_plane = plausible[best] & (planes.support[best] >= 3)
     nothing = Plane(direction, jnp.float32(0.0), jnp.int32(0))
-    plane = jax.tree.map(lambda a, b: jnp.where(found, a[best].astype(b.dtype), b), planes, nothing)
+    plane = jax.tree.map(lambda a, b: jnp.where(has_plane, a[best].astype(b.dtype), b), planes, nothing)
     for _ in range(config.fits):
         fitted = _fitted(plane, points, valid, config)
-        plane = jax.tree.map(lambda a, b: jnp.where(found, a, b), fitted, plane)
+        plane = jax.tree.map(lambda a, b: jnp.where(has_plane, a, b), fitted, plane)
     return plane

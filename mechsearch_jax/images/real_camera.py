@@ -1,8 +1,8 @@
-"""From the images of a real depth camera to a mask that the `Recogniser` takes (appendices B.1, C.1 and C.3).
+"""Prepare the images of a real depth camera for the `Recogniser` (appendices B.1, C.1 and C.3).
 
-The camera's pose is corrected on the robot that it sees; the shelf is removed by its known shape, and its floor, which
-touches every object, by the plane that is measured there; what is left is segmented by a given mask or by colour. All
-this happens once an image and on the host, so that images of any size are fine; what comes out has fixed shapes:
+The camera's pose is corrected on the visible robot. The shelf is removed by its known shape, and its floor, which
+touches every object, by the measured plane. The remaining points are segmented by a given mask or by colour. All this
+runs once per image on the host:
 
     prepared = real_camera.prepare(key, problem.camera, problem.shelf, depth, colour, joints=joints)
     perceive = Recogniser(problem, camera=prepared.camera)
@@ -30,25 +30,25 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 _evened = jax.jit(evened)
 
-# The plane of the floor and the camera's pose are found from at most so many points.
+# Largest number of points for the plane of the floor and for the camera's pose.
 FLOOR_POINTS = ROBOT_POINTS = 4096
 
 
 @dataclasses.dataclass(frozen=True)
 class RealCameraConfig:
-    """How images become a cloud; lengths in metres.
+    """How images are prepared; lengths in metres.
 
     Attributes:
-      segments: number of segments that are kept, the largest first: eight objects and the target.
-      overhang: how far before the shelf's front edge things on it are looked for.
-      wall_clearance: points that are closer to the walls and the upper board than this are the shelf's.
-      floor_search: points whose height over the board is at most this may be its floor.
+      segments: largest number of segments: eight objects and the target.
+      overhang: how far objects may stick out in front of the shelf.
+      wall_clearance: points closer than this to the walls or the upper board are the shelf's.
+      floor_search: largest distance from the board of points that may be the floor's.
       floor_clearance: points less than this above the floor's plane are the floor's.
-      floor_support: points that the plane must have to be believed; the known board is taken otherwise.
+      floor_support: least number of points on the floor's plane; with fewer, the shelf's board is used.
       robot_clearance: points this close to the robot are the robot's, if its joint angles are given.
-      robot_margin: the robot is looked for at least this far before the shelf's front edge.
+      robot_margin: least distance in front of the shelf of points that are matched with the robot.
       pose: how the camera's pose is corrected.
-      plane: how the floor is found.
+      plane: how the floor's plane is fitted.
       clusters: how pixels are clustered by colour.
       target: the target's colour.
     """
@@ -76,17 +76,17 @@ class RealCameraConfig:
 
 
 class PreparedImage(flax.struct.PyTreeNode):
-    """What was made of a depth and a colour image.
+    """A prepared depth and colour image.
 
     Attributes:
-      segmentation: what every pixel shows, as `images.labels` has it, int32, shape (h, w): a segment's number, the
-        one with the most pixels first where they were clustered; FREE for the shelf and what is seen beside it; OTHER
-        for the robot, whatever else is before the shelf, and what is on it but in no segment; MISSING where nothing
-        was measured. It is a `mask` of the `Recogniser`.
-      depth: the depth image with NaN where nothing was measured, as the `Recogniser` takes it.
+      segmentation: label of every pixel as in `images.labels`, int32, shape (h, w): a segment's number, by decreasing
+        size if clustered by colour; FREE for the shelf and its surroundings; OTHER for the robot, other things in front
+        of the shelf, and things on it without a segment; MISSING where nothing was measured. It is a `mask` of the
+        `Recogniser`.
+      depth: the depth image for the `Recogniser`, with NaN where nothing was measured.
       detection: whether one of the segments is the target, by its colour.
-      floor: the plane of the shelf's floor, in the world; its `support` is 0 where the known board was taken.
-      pose: how the camera's pose was corrected; None where no joint angles were given.
+      floor: the plane of the shelf's floor, in the world; its `support` is 0 if it is the given shelf's board.
+      pose: how the camera's pose was corrected; None without joint angles.
       camera: the camera at its corrected pose.
     """
 
@@ -99,7 +99,7 @@ class PreparedImage(flax.struct.PyTreeNode):
 
     @property
     def target_id(self) -> jax.Array:
-        """The target's number in the segmentation, int32; OTHER where it was not detected."""
+        """The target's number in the segmentation, int32; OTHER if it was not detected."""
         return jnp.where(self.detection.found, self.detection.segment, OTHER)
 
 
@@ -126,7 +126,7 @@ def _checked(camera: Camera, depth: np.ndarray, colour: np.ndarray, mask: np.nda
 
 
 def _fixed(rng: np.random.Generator, points: np.ndarray, count: int) -> tuple[Array, Array]:
-    """At most `count` of the points, drawn at random and padded to that number, and which of them count."""
+    """At most `count` random points, padded to `count`, and which of them are valid."""
     chosen = points[rng.permutation(len(points))[:count]]
     padded = np.zeros((count, 3), np.float32)
     padded[: len(chosen)] = chosen
@@ -134,12 +134,12 @@ def _fixed(rng: np.random.Generator, points: np.ndarray, count: int) -> tuple[Ar
 
 
 def _correct_pose(rng, camera, shelf, points, joints, opening, config) -> PoseEstimate:
-    """The camera's pose from the points in front of the shelf, where there is nothing but the robot."""
+    """The camera's pose from the points in front of the shelf, where there is only the robot."""
     rotation, position = np.array(camera.rotation), np.array(camera.position)
-    before = points[:, 0] < shelf.front - config.robot_margin
+    in_front = points[:, 0] < shelf.front - config.robot_margin
     within = max(reach for _, reach in config.pose.stages)
-    distance, _ = config.pose.robot_distance(jnp.asarray(points[before]), joints, opening)
-    near = points[before][np.asarray(distance) < within]
+    distance, _ = config.pose.robot_distance(jnp.asarray(points[in_front]), joints, opening)
+    near = points[in_front][np.asarray(distance) < within]
     local, valid = _fixed(rng, (near - position) @ rotation, ROBOT_POINTS)
     T_world_camera = np.eye(4, dtype=np.float32)
     T_world_camera[:3, :3], T_world_camera[:3, 3] = rotation, position
@@ -163,7 +163,7 @@ def _segment(colour, depth, points, foreground, mask, config) -> Int[np.ndarray,
 
 
 def _inside(shelf: Shelf, points: np.ndarray, config: RealCameraConfig) -> Bool[np.ndarray, "h w"]:
-    """Which points lie in the shelf's free space, off its walls; its floor is not looked at."""
+    """Which points lie between the shelf's walls and below its upper board; its floor is ignored."""
     x, y, z = np.moveaxis(points, -1, 0)
     c = config.wall_clearance
     with np.errstate(invalid="ignore"):
@@ -187,27 +187,27 @@ def prepare(
     opening: float = 0.0,
     config: RealCameraConfig | None = None,
 ) -> PreparedImage:
-    """The objects' segments in a depth and a colour image of the shelf.
+    """Segment the objects in a depth and a colour image of the shelf.
 
     Args:
-      key: which points the floor and the camera's pose are found from.
-      camera: intrinsics, and the pose as far as it is known: to 2 cm and 2 degrees if joint angles are given.
-      shelf: the shelf's shape.
+      key: PRNG key of the points for the floor and the camera's pose.
+      camera: intrinsics and pose; with joint angles, a pose within 2 cm and 2 degrees suffices.
+      shelf: the shelf.
       depth: along the camera's axis [m]; 0, infinite or NaN where nothing was measured.
       colour: red, green and blue in 0 to 1, registered to the depth image, float, shape (h, w, 3).
-      mask: whole numbers, the segment of every pixel, 0 to `config.segments - 1`, others for none; clusters of like
-        colour if None. The shelf and the robot need not be told apart in it.
-      joints: the robot's joint angles when the images were taken [rad]; without them the pose is taken as given, and
-        the robot must be out of the way.
+      mask: whole numbers, the segment of every pixel, 0 to `config.segments - 1`, others for none; it need not separate
+        shelf and robot. If None, pixels are clustered by colour.
+      joints: the robot's joint angles when the images were taken [rad]; without them the pose is used as given, and the
+        robot must be out of sight.
       opening: distance between its fingers [m].
       config: the default if None.
 
     Raises:
-      InputError: an image's size, type or unit is not as said.
+      InputError: an image has the wrong size, type or unit.
     """
     config = config or RealCameraConfig()
     depth = _checked(camera, depth, colour, mask)
-    # The key's own bits seed the draws on the host, whose number of points differs from image to image.
+    # The host draws the points, whose number differs between images; the key's bits are the seed.
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     pose = None
     if joints is not None:
@@ -215,13 +215,13 @@ def prepare(
         seen = np.asarray(back_project(camera, jnp.asarray(depth)))[np.isfinite(depth)]
         pose = _correct_pose(rng, camera, shelf, seen, angles, fingers, config)
         camera = pose.camera(camera)
-    # Noise would split a thing into several, or leave out of the target what would then be an object in it.
+    # With noise, an object would be split, and pixels of the target would be missed and taken for an object in it.
     colour = np.asarray(_evened(jnp.asarray(colour, jnp.float32), jnp.asarray(depth)))
     points = np.asarray(back_project(camera, jnp.asarray(depth)))
     inside = _inside(shelf, points, config)
     floor = _find_floor(key, rng, shelf, points, inside, config)
     foreground = inside & (np.asarray(floor.height(jnp.asarray(points))) > config.floor_clearance)
-    # What is before the shelf hides what is in it.
+    # Things in front of the shelf hide what is in it.
     other = (points[..., 0] <= shelf.front - config.overhang) & (points[..., 2] > shelf.board)
     if joints is not None:
         distance, _ = config.pose.robot_distance(jnp.asarray(points[foreground]), angles, fingers)

@@ -1,4 +1,4 @@
-"""What the recogniser is shown of each segment: its points and what surrounds them, in the segment's own frame."""
+"""Input of the recognition network for each segment: its points and their surroundings, in the segment's frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
-# The fourth channel of a segment's cloud. CONTEXT is the paper's 0, the others but CLEAR divide its 1.
+# Values of the fourth channel of a segment's cloud. CONTEXT is the paper's 0; INNER, OUTLINE and HIDDEN_EDGE divide its
+# 1; CLEAR is ours.
 CONTEXT, INNER, OUTLINE, HIDDEN_EDGE, CLEAR = range(5)
 MARKS = 5
 
@@ -27,13 +28,13 @@ class SegmentConfig:
     """How a segment's cloud is drawn.
 
     Attributes:
-      inner: points drawn from the whole segment.
-      edge: points drawn from its edge, where it ends or something hides the rest.
-      context: points drawn from what surrounds it.
-      border: how far around the segment's bounding box that reaches, in pixels ...
+      inner: number of points drawn from the whole segment.
+      edge: number of points drawn from its edge, where it ends or something hides the rest.
+      context: number of points drawn from its surroundings.
+      border: how far the surroundings reach beyond the segment's bounding box, in pixels ...
       growth: ... and in shares of the box's sides.
-      step: something nearer than an edge by this much hides what is behind it [m].
-      minimum: segments of fewer pixels are none.
+      step: something nearer than an edge by this much hides the object behind it [m].
+      minimum: segments of fewer pixels are ignored.
     """
 
     inner: int = 128
@@ -61,12 +62,12 @@ class Segments(flax.struct.PyTreeNode):
 
     Attributes:
       points: in the segment's frame [m], shape (..., S, P, 3).
-      mark: the fourth channel, int8, shape (..., S, P): CONTEXT another thing; of the segment itself OUTLINE where it
-        ends before something farther, HIDDEN_EDGE where something nearer cuts it off, INNER elsewhere; CLEAR the shelf
-        seen past it, so that the ray up to there is free.
+      mark: the fourth channel, int8, shape (..., S, P): CONTEXT for another thing; of the segment OUTLINE where it ends
+        in front of something farther, HIDDEN_EDGE where something nearer hides the rest, INNER elsewhere; CLEAR for the
+        shelf beside it, so that the ray up to there is free.
       camera: the camera's position in the segment's frame [m], shape (..., S, 3).
       T_world_segment: the frame, shape (..., S, 4, 4).
-      pixels: how many pixels of the image are the segment's, shape (..., S).
+      pixels: the segment's number of pixels, shape (..., S).
       valid: whether the slot holds a segment, shape (..., S).
     """
 
@@ -81,11 +82,11 @@ class Segments(flax.struct.PyTreeNode):
 def edge_marks(
     distance: Float[Array, "h w"], labels: Int[Array, "h w"], step: float = SegmentConfig.step
 ) -> Int[Array, "h w"]:
-    """INNER, OUTLINE or HIDDEN_EDGE for every pixel, as its four neighbours tell.
+    """INNER, OUTLINE or HIDDEN_EDGE for every pixel, by its four neighbours.
 
     Args:
       distance: of each pixel's point from the camera [m].
-      labels: what each pixel shows; a pixel without a measurement or at the image's rim tells nothing of its neighbour.
+      labels: of the pixels; MISSING neighbours and those beyond the image make no edge.
       step: see `SegmentConfig`.
     """
 
@@ -134,11 +135,11 @@ def segment_clouds(
     rows, columns = jnp.arange(height), jnp.arange(width)
     flat = points.reshape(-1, 3)
 
-    def one(key, number):
-        own = labels == number
+    def segment_cloud(key, number):
+        is_segment = labels == number
         inner, edge, around = jax.random.split(key, 3)
-        chosen, pixels = draw(inner, own.reshape(-1), config.inner)
-        rim, rims = draw(edge, (own & (edges != INNER)).reshape(-1), config.edge)
+        chosen, pixels = draw(inner, is_segment.reshape(-1), config.inner)
+        rim, rims = draw(edge, (is_segment & (edges != INNER)).reshape(-1), config.edge)
         rim = jnp.where(rims > 0, rim, jnp.resize(chosen, rim.shape))
 
         def reach(used, index):
@@ -147,9 +148,9 @@ def segment_clouds(
             margin = config.border + config.growth * (high - low)
             return (index >= low - margin) & (index <= high + margin)
 
-        near = reach(own.any(axis=1), rows)[:, None] & reach(own.any(axis=0), columns)[None, :]
-        others = near & ~own & (labels != MISSING)
-        context, contexts = draw(around, others.reshape(-1), config.context)
+        near = reach(is_segment.any(axis=1), rows)[:, None] & reach(is_segment.any(axis=0), columns)[None, :]
+        surroundings = near & ~is_segment & (labels != MISSING)
+        context, contexts = draw(around, surroundings.reshape(-1), config.context)
         context = jnp.where(contexts > 0, context, jnp.resize(chosen, context.shape))
         index = jnp.concatenate([chosen, rim, context])
 
@@ -167,11 +168,11 @@ def segment_clouds(
             valid=pixels >= config.minimum,
         )
 
-    return jax.vmap(one)(jax.random.split(key, count), jnp.arange(count, dtype=labels.dtype))
+    return jax.vmap(segment_cloud)(jax.random.split(key, count), jnp.arange(count, dtype=labels.dtype))
 
 
 def _frame(origin: Float[Array, "3"], eye: Float[Array, "3"]) -> Float[Array, "4 4"]:
-    """z up, x along the horizontal part of the way from `eye` to `origin`."""
+    """The frame with z up and x along the horizontal part of the direction from `eye` to `origin`."""
     ahead = (origin - eye).at[2].set(0.0)
     length = jnp.sqrt(jnp.sum(ahead**2))
     ahead = jnp.where(length > 1e-6, ahead / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0, 0.0]))

@@ -1,8 +1,8 @@
-"""Which pixels are the target's: what its colour says, made whole by what lies around it and by its known shape.
+"""The target's pixels: by colour, completed by their neighbours and by the target's known shape.
 
-A detector judges one pixel at a time. In a sensor's noise it misses pixels of the target, and what it misses would be
-taken for an obstacle inside the target. So colours are evened out within surfaces before they are judged, neighbours
-then vote, and what lies on the surface of the target as it is fitted to those pixels is the target's, too.
+A detector judges single pixels. In a sensor's noise it misses pixels of the target, which would be taken for an
+obstacle inside the target. So colours are averaged within surfaces before detection, neighbours then vote, and pixels
+on the surface of the fitted target are the target's, too.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Points of the target that its pose is fitted to.
+# Number of points for fitting the target's pose.
 TARGET_POINTS = 256
-# Neighbours are the pixels of a square of so many ...
+# Neighbours are pixels within a square of this width whose depth differs by at most `LIKE_DEPTH` [m] and, where colours
+# are averaged, whose colour differs by at most `LIKE_COLOUR`, as the length of the difference of red, green and blue:
+# with noise of 8/255 in each channel, one in a thousand differs more.
 WINDOW = 5
-# ... whose depth differs by no more than this [m], and, where colours are evened out, whose colour does not either: the
-# length of the difference of red, green and blue; in noise of 8/255 a channel one in a thousand differs so much.
 LIKE_DEPTH = 0.01
 LIKE_COLOUR = 0.25
-# What is so near to the surface of the fitted target is on it [m]: four standard deviations of a sensor of 1 mm.
+# Points within this distance of the fitted target's surface are on it [m]: four standard deviations of 1 mm noise.
 SURFACE = 0.004
 
 
 def _neighbours(image: Array, fill: float | bool) -> list[Array]:
-    """An image of (h, w, ...) moved so that each pixel holds one of its neighbours, itself among them."""
+    """Shifted copies of an image (h, w, ...), in which each pixel holds one of its neighbours or itself."""
     reach, (height, width) = WINDOW // 2, image.shape[:2]
     edges = [(reach, reach), (reach, reach), *[(0, 0)] * (image.ndim - 2)]
     padded = jnp.pad(image, edges, constant_values=fill)
@@ -41,11 +41,11 @@ def _neighbours(image: Array, fill: float | bool) -> list[Array]:
 
 
 def evened(colour: Float[Array, "h w 3"], depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
-    """Each pixel's colour as the mean of its neighbours' of like depth and colour: less noise, and the same edges.
+    """Mean colour of each pixel's neighbours of similar depth and colour: less noise, and the same edges.
 
     Args:
       colour: red, green and blue in 0 to 1.
-      depth: [m]; a pixel without a finite one keeps its colour.
+      depth: [m]; a pixel without a finite depth keeps its colour.
     """
     total, count = jnp.zeros(colour.shape, colour.dtype), jnp.zeros(depth.shape, colour.dtype)
     for near, other in zip(_neighbours(depth, math.nan), _neighbours(colour, 0.0), strict=True):
@@ -56,12 +56,7 @@ def evened(colour: Float[Array, "h w 3"], depth: Float[Array, "h w"]) -> Float[A
 
 
 def elected(chosen: Bool[Array, "h w"], depth: Float[Array, "h w"]) -> Bool[Array, "h w"]:
-    """What most of a pixel's neighbours of like depth are; a tie, or a pixel without a finite depth, stays.
-
-    Args:
-      chosen: what each pixel is.
-      depth: [m].
-    """
+    """Majority vote among each pixel's neighbours of similar depth; at a tie or without a finite depth [m] it stays."""
     votes = jnp.zeros(depth.shape, jnp.int32)
     for near, other in zip(_neighbours(depth, math.nan), _neighbours(chosen, False), strict=True):
         votes = votes + jnp.where(jnp.abs(near - depth) < LIKE_DEPTH, jnp.where(other, 1, -1), 0)
@@ -71,10 +66,10 @@ def elected(chosen: Bool[Array, "h w"], depth: Float[Array, "h w"]) -> Bool[Arra
 def coloured_pixels(
     detector: Callable[[Array], Array], colour: Float[Array, "h w 3"], depth: Float[Array, "h w"]
 ) -> Bool[Array, "h w"]:
-    """Where a detector sees the target, whatever the noise of single pixels.
+    """The pixels in which a detector sees the target, robust to the noise of single pixels.
 
     Args:
-      detector: which pixels of an image are the target's.
+      detector: gives the target's pixels of a colour image.
       colour: red, green and blue in 0 to 1.
       depth: [m]; NaN where nothing was measured.
     """
@@ -89,14 +84,14 @@ def fitted_pose(
     points: Float[Array, "h w 3"],
     of_target: Bool[Array, "h w"],
 ) -> tuple[Float[Array, " 3"], Bool[Array, ""]]:
-    """The pose of the target whose pixels are known: x, y [m] and yaw [rad], and whether there are any pixels.
+    """The pose of the target from its pixels: x, y [m] and yaw [rad]; and whether it has any pixels.
 
     Args:
-      key: of the points that are drawn.
+      key: PRNG key of the drawn points.
       target: static.
-      shelf, camera: what it stands on, and what sees it.
+      shelf, camera: of the image.
       points: in the world [m].
-      of_target: which are the target's; without any the pose means nothing, but is finite.
+      of_target: the target's pixels; if there are none, the pose is meaningless, but finite.
     """
     index, count = draw(key, of_target.reshape(-1), TARGET_POINTS)
     seen = jnp.broadcast_to(count > 0, TARGET_POINTS)
@@ -107,14 +102,9 @@ def fitted_pose(
 def near_target(
     target: Target, shelf: Shelf, pose: Float[Array, " 3"], points: Float[Array, "*batch 3"]
 ) -> Bool[Array, "*batch"]:
-    """Which points are on the surface of a target that stands at a pose; False for NaN, and for points deep inside it:
-    where something is seen there, the target is not.
+    """Which world points [m] are on the surface of a target at a pose x, y [m] and yaw [rad].
 
-    Args:
-      target: static.
-      shelf: what it stands on.
-      pose: x, y [m] and yaw [rad].
-      points: in the world [m].
+    False for NaN, and for points deep inside the target, since something seen there is not the target.
     """
     return (jnp.abs(distance(target, shelf, pose, points.reshape(-1, 3))) < SURFACE).reshape(points.shape[:-1])
 
@@ -122,18 +112,18 @@ def near_target(
 def without_phantoms(
     labels: Int[Array, "h w"], on_it: Bool[Array, "h w"], of_target: Bool[Array, "h w"]
 ) -> Int[Array, "h w"]:
-    """Labels in which a segment that lies mostly on the found target is OTHER: its points are the target's.
+    """Labels in which a segment that lies mostly on the fitted target is OTHER, for its points are the target's.
 
-    Only a segment of which no more is seen than of the target: a narrow part of the target does not say where the rest
-    of it is, and a pose that is fitted to one may reach into what stands beside it.
+    A segment that is larger than the visible part of the target stays: the pose fitted to a narrow part is uncertain,
+    and may reach into a neighbour.
 
     Args:
-      labels: as `images.labels` has them.
-      on_it: which pixels are on the found target; none where it is not found.
-      of_target: which are known to be its.
+      labels: as in `images.labels`.
+      on_it: pixels on the fitted target; none if it is not visible.
+      of_target: the target's pixels.
     """
-    own = labels[..., None] == jnp.arange(INSTANCES, dtype=labels.dtype).reshape(1, 1, -1)
-    shown, within = jnp.sum(own, axis=(0, 1)), jnp.sum(own & on_it[..., None], axis=(0, 1))
-    is_phantom = (2 * within > shown) & (shown <= jnp.sum(of_target))
-    phantom = jnp.any(own & is_phantom.reshape(1, 1, -1), axis=-1)
+    member = labels[..., None] == jnp.arange(INSTANCES, dtype=labels.dtype).reshape(1, 1, -1)
+    size, within = jnp.sum(member, axis=(0, 1)), jnp.sum(member & on_it[..., None], axis=(0, 1))
+    is_phantom = (2 * within > size) & (size <= jnp.sum(of_target))
+    phantom = jnp.any(member & is_phantom.reshape(1, 1, -1), axis=-1)
     return jnp.where(phantom, OTHER, labels).astype(labels.dtype)

@@ -1,4 +1,4 @@
-"""Where a target of known shape stands, from the points of it that the camera sees."""
+"""The pose of a target of known shape from its visible points."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 ITERATIONS = 12
-# Residuals beyond this count only in proportion: mixed pixels at edges, and points of others [m].
+# Residuals beyond this have linear cost (Huber): mixed pixels at edges, and points of other objects [m].
 OUTLIER = 0.003
-# Damping of a step, relative to the normal equations' diagonal, and how far one step may go [m, m, rad].
+# Damping of a step, relative to the normal equations' diagonal, and the longest step [m, m, rad].
 DAMPING = 1e-3
 LONGEST_STEP = (0.01, 0.01, 0.3)
 
 
 def distance(target: Target, shelf: Shelf, pose: Float[Array, " 3"], points: Float[Array, "p 3"]) -> Float[Array, " p"]:
-    """Signed distance of world points to the surface of a target that stands at x, y [m] and yaw [rad]; [m]."""
+    """Signed distance [m] of world points to the surface of a target at a pose x, y [m] and yaw [rad]."""
     shape = shape_of(target.shape)
     level = points[:, :2] - pose[None, :2]
     if not shape.round:
@@ -38,7 +38,7 @@ def _cost(residual, weight):
 
 
 def _descend(residuals, weight, start):
-    """Damped Gauss-Newton steps from a start; each is kept only if it lowers the cost."""
+    """Damped Gauss-Newton from a start; a step is kept only if it lowers the cost."""
 
     def step(state, _):
         pose, cost, damping = state
@@ -47,7 +47,7 @@ def _descend(residuals, weight, start):
         JtJ = jnp.sum(w[:, None, None] * J[:, :, None] * J[:, None, :], axis=0)
         gradient = jnp.sum((w * r)[:, None] * J, axis=0)
         scale = jnp.diag(JtJ)
-        # A direction of which the points say nothing, like the yaw of what is round, is left alone.
+        # Directions that the points do not determine, such as the yaw of a round target, do not change.
         H = JtJ + jnp.diag(damping * scale + jnp.where(scale > 0, 1e-9, 1.0))
         move = jnp.clip(-jnp.linalg.solve(H, gradient), -jnp.array(LONGEST_STEP), jnp.array(LONGEST_STEP))
         trial = pose + move
@@ -75,11 +75,11 @@ def target_pose(
     the target is round; its pose is free by half a turn.
 
     Args:
-      target: its known shape; static.
-      shelf: what it stands on.
+      target: static.
+      shelf: on which it stands.
       camera_position: in the world [m].
       points: in the world [m], shape (P, 3).
-      valid: which of them are the target's, shape (P,). If none are, the result means nothing, but is finite.
+      valid: which of them are the target's, shape (P,). If none are, the result is meaningless, but finite.
 
     Returns:
       x, y [m] and yaw [rad] within half a turn; the yaw of a round target is 0.

@@ -1,7 +1,7 @@
-"""What networks saw of a shelf while they were trained, as their cards tell it, and what lies far outside of that.
+"""The views of a shelf on which networks were trained, as their cards record, and warnings about views far from these.
 
-A network is shown points, not images, and a segment's points in a frame of its own: what it can be used to are how far
-away and from where a shelf is looked at, how densely, and how large the shelf is. Each is one number of a `View`.
+Networks take points, not images, and a segment's points in its own frame. So they depend on the distance and direction
+of the view, its density, and the size of the shelf. Each is a number of `TrainedView.numbers`.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 @dataclasses.dataclass(frozen=True)
 class TrainedView:
-    """A shelf, and the rays that look at it; hashable.
+    """A shelf and the rays of a view of it; hashable.
 
     Attributes:
-      camera: whose image consists of exactly the rays that a network is shown, a `cloud.View`'s.
-      shelf: what it looks at.
+      camera: of a `cloud.View`, whose image consists of exactly the rays of a network's input.
+      shelf: in the view.
     """
 
     camera: Camera = dataclasses.field(default_factory=lambda: shelf_view(Camera(), Shelf()).camera)
     shelf: Shelf = dataclasses.field(default_factory=Shelf)
 
     def numbers(self) -> dict[str, float]:
-        """What `TOLERANCES` compares; lengths in metres, angles in degrees, pixels per metre."""
+        """The numbers that `TOLERANCES` compares; lengths in metres, angles in degrees, pixels per metre."""
         x, y, z = np.subtract(self.camera.position, middle(self.shelf)).tolist()
-        away = distance(self.camera, self.shelf)
+        to_board = distance(self.camera, self.shelf)
         shelf = self.shelf
         return {
-            "distance": away,
+            "distance": to_board,
             "azimuth": float(np.degrees(np.arctan2(y, -x))),
-            "elevation": float(np.degrees(np.arcsin(z / away))),
+            "elevation": float(np.degrees(np.arcsin(z / to_board))),
             "density": density(self.camera, shelf),
             "depth": shelf.back - shelf.front,
             "width": shelf.left - shelf.right,
@@ -48,19 +48,19 @@ class TrainedView:
         }
 
     def entry(self) -> dict[str, Any]:
-        """It as a card's `view` holds it."""
+        """The entry `view` of a card."""
         return dataclasses.asdict(self)
 
 
 @dataclasses.dataclass(frozen=True)
 class Tolerance:
-    """How far a number may be from what it was in training.
+    """How far a number may be from its value in training without a warning.
 
     Attributes:
-      what: the number, as a sentence that ends in its value.
-      form: how the value is written, with its unit.
-      low, high: multiplied with the trained value, or added to it: the ends of what is not warned of.
-      times: whether they are multiplied.
+      what: beginning of a sentence that ends in the value.
+      form: format of the value, with its unit.
+      low, high: factors of, or differences from, the value in training.
+      times: whether they are factors.
     """
 
     what: str
@@ -74,7 +74,7 @@ class Tolerance:
         return (trained * self.low, trained * self.high) if self.times else (trained + self.low, trained + self.high)
 
 
-# Set by what was measured in the places of `benchmarks/parts/views` (docs/method.md, "Other cameras and shelves").
+# From measurements with `benchmarks/parts/views` (docs/method.md, "Other cameras and shelves").
 TOLERANCES: Mapping[str, Tolerance] = {
     "distance": Tolerance("camera: its distance from the middle of the board is", "{:.2f} m", 0.8, 1.4),
     "azimuth": Tolerance(
@@ -89,12 +89,12 @@ TOLERANCES: Mapping[str, Tolerance] = {
 
 
 def view_faults(camera: Camera, shelf: Shelf, trained: Mapping[str, TrainedView]) -> tuple[str, ...]:
-    """What of a camera and a shelf is far outside of what networks were trained on; empty if nothing is.
+    """Warnings about a camera and a shelf that differ much from those that networks were trained on.
 
     Args:
-      camera: whose full images are given.
-      shelf: what it sees.
-      trained: what they were trained on, by the networks' names.
+      camera: of the full images.
+      shelf: in its view.
+      trained: the views in training, by the networks' names.
 
     Raises:
       InputError: the camera does not see the shelf.
@@ -113,14 +113,10 @@ def view_faults(camera: Camera, shelf: Shelf, trained: Mapping[str, TrainedView]
 
 
 def read_view(card: Mapping[str, Any], where: str) -> TrainedView | None:
-    """What a card says a network was trained on; None if it does not say.
-
-    Args:
-      card: of a network's weights.
-      where: how a complaint begins, such as the card's path.
+    """The view in training that a network's card records, if any; error messages begin with `where`.
 
     Raises:
-      InputError: the entry is none of `TrainedView.entry`.
+      InputError: the entry was not made by `TrainedView.entry`.
     """
     if "view" not in card:
         return None
