@@ -1,4 +1,4 @@
-"""What was seen of the shelf at one moment: the interface between perception and planning."""
+"""The observation of the shelf: the interface between perception and planning."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 
 
 class Observation(flax.struct.PyTreeNode):
-    """What was seen at one moment; every field may carry leading batch axes.
+    """The recognised scene at one moment; every field may have leading batch axes.
 
     Attributes:
       objects: the recognised objects, without the target, fields (..., N, ...).
-      target_visible: whether the target is seen, bool, shape (...).
-      target_pose: where, as x, y [m] and yaw [rad] in the world, shape (..., 3); anything where it is not visible.
+      target_visible: whether the target is visible, bool, shape (...).
+      target_pose: x, y [m] and yaw [rad] in the world, shape (..., 3); arbitrary if it is not visible.
     """
 
     objects: Superquadrics

@@ -1,7 +1,7 @@
-"""From images to what the planner plans with.
+"""Perception: from images to observations.
 
-The way of a depth image: `recogniser` (the front door) -> `cloud` (the shelf's part of it, as points) -> `segmentation`
-(labels, as `labels` has them) -> `segments` -> `recognition` -> `refinement` -> `target_pose` -> `Observation`. Images
-of a real camera, with the robot in view, first pass through `real_camera`. `noise` and `scores` serve training and
-measurements.
+A depth image passes `recogniser` (the entry point) -> `cloud` (points of the shelf's part of the image) ->
+`segmentation` (labels as in `labels`) -> `segments` -> `recognition` -> `refinement` -> `target_pose` -> `Observation`.
+Images of a real camera, with the robot in view, are first prepared by `real_camera`. `noise` and `scores` are for
+training and benchmarks.
 """

@@ -1,10 +1,10 @@
 """The assignment problem, exactly and without a data-dependent loop.
 
-The Hungarian method (H. W. Kuhn, 1955) needs fewest operations, but its nested loops end when the data say so: over a
-batch on a GPU they are thousands of launches that wait for each other. For a few rows there are few enough subsets of
-columns to go through them all, as R. Bellman and M. Held and R. Karp did for the travelling salesman (both 1962): the
-cheapest way to give the first k rows the k columns of a subset follows from those of k - 1 rows. That takes n steps,
-each the same for every problem of a batch.
+The Hungarian method (H. W. Kuhn, 1955) needs fewest operations, but the number of its iterations depends on the data:
+for a batch on a GPU it takes thousands of sequential kernel launches. For a few rows, dynamic programming over all
+subsets of columns is feasible, as by R. Bellman and by M. Held and R. Karp for the travelling salesman (both 1962): the
+cheapest assignment of the first k rows to a subset of k columns follows from those of k - 1 rows. It takes n steps, the
+same for every problem of a batch.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _MOST = 10
 
 
 def assign(cost: Float[Array, "n n"]) -> Int[Array, " n"]:
-    """Which column each row gets, each column once, so that the sum of the costs is smallest.
+    """The column of each row, each column once, with the least sum of costs in float32.
 
-    Among equal sums it is the same one each time, but which is not specified. Sums are those of float32.
+    Of equal sums it deterministically chooses an unspecified one.
 
     Args:
       cost: of each row (first axis) with each column; finite.
@@ -38,7 +38,7 @@ def assign(cost: Float[Array, "n n"]) -> Int[Array, " n"]:
     subsets, columns = np.arange(2**size)[:, None], np.arange(size)[None]
     within = (subsets >> columns & 1).astype(bool)
     without = subsets ^ (1 << columns)
-    # What a row costs whatever it gets is left out: the digits of the sums are kept for what differs.
+    # Subtract each row's constant part, for precision.
     cost = cost - jnp.min(cost, axis=1, keepdims=True)
 
     def give(total, row):
@@ -48,6 +48,6 @@ def assign(cost: Float[Array, "n n"]) -> Int[Array, " n"]:
     def take(subset, last):
         return subset ^ (1 << last[subset]), last[subset]
 
-    # Only subsets of as many columns as there are rows so far mean anything, and only they are reached from the whole.
+    # After k rows, only subsets of k columns are meaningful, and only these are reached backwards from the full set.
     _, last = jax.lax.scan(give, jnp.zeros(2**size, cost.dtype), cost)
     return jax.lax.scan(take, jnp.int32(2**size - 1), last, reverse=True)[1]

@@ -1,7 +1,7 @@
-"""Whether what was recognised explains the depth image that it was recognised in: if not, the robot must not move.
+"""Check whether an observation explains its depth image: if not, the robot must not move.
 
-An `Observation` holds shapes without a word of how sure they are. The image itself tells: what stands on the board must
-lie on a recognised surface, and no ray may pass through a recognised object.
+An `Observation` has no measure of confidence. But points above the board must lie on recognised surfaces, and no ray
+may pass through a recognised object.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Of the shelf's part of the image at most about so many pixels are looked at, spread evenly over it.
+# At most about so many pixels of the shelf's part of the image are used, spread evenly over it.
 PIXELS = 20_000
-# A share of fewer points than this says nothing.
+# Shares of fewer points than this are ignored.
 FEWEST_POINTS = 50
-# How near to the shelf's faces a point counts as the shelf [m].
+# Points within this distance of the shelf's faces count as the shelf [m].
 FACES = 0.012
-# An object is looked at if so many rays pass through it.
+# Objects that fewer rays reach are ignored.
 FEWEST_RAYS = 20
-# The part of a round object's box that is inside it, across.
+# Width of the square inside a round object, relative to its diameter.
 INSCRIBED = 0.7
 
 
@@ -37,14 +37,14 @@ INSCRIBED = 0.7
 class DoubtConfig:
     """When recognition is too doubtful to move.
 
-    The defaults come from 24 published scenes, recognised with 1 mm and time-of-flight noise, with masks and without:
-    there the shares were at most 0.04, but for one object that was recognised wrongly.
+    The defaults come from 24 published scenes, recognised with 1 mm and time-of-flight noise, with and without masks:
+    there the shares were at most 0.04, except for one wrongly recognised object.
 
     Attributes:
       tolerance: how far a point may be from a recognised surface, and how deep a ray may pass through an object [m].
-      missing: share of the shelf's part of the image without a measured depth.
-      unexplained: share of the points on the board that are on no recognised surface.
-      passed: share of the rays towards an object that pass through it, of the worst object.
+      missing: largest share of the shelf's part of the image without a measured depth.
+      unexplained: largest share of the points above the board that are on no recognised surface.
+      passed: largest share of the rays towards an object that pass through it.
     """
 
     tolerance: float = 0.012
@@ -61,13 +61,13 @@ class DoubtConfig:
 
 
 class Doubt(NamedTuple):
-    """How badly a depth image is explained; all shares from 0 to 1.
+    """How badly an observation explains its depth image; shares from 0 to 1.
 
     Attributes:
-      missing: of the shelf's part of the image: without a measured depth.
-      unexplained: of the points on the board: on no recognised surface.
-      passed: of the rays that reach the worst object: pass through it.
-      worst: what that object is called; empty where no ray reaches any.
+      missing: share of the shelf's part of the image without a measured depth.
+      unexplained: share of the points above the board that are on no recognised surface.
+      passed: share of the rays that reach the worst object and pass through it.
+      worst: name of that object; empty if no ray reaches any object.
     """
 
     missing: float
@@ -76,7 +76,7 @@ class Doubt(NamedTuple):
     worst: str
 
     def reason(self, config: DoubtConfig) -> str | None:
-        """Why recognition is too doubtful, in one line; None where it is not."""
+        """Why recognition is too doubtful, in one line; None if it is not."""
         checks = (
             (self.missing, config.missing, "of the shelf's part of the depth image are not measured"),
             (self.unexplained, config.unexplained, "of what stands on the board is on no recognised object"),
@@ -89,7 +89,7 @@ class Doubt(NamedTuple):
 
 
 class Thing(NamedTuple):
-    """What was recognised: its name, half-extents [m], whether it is round about z, and the world in its frame."""
+    """A recognised object or target: name, half-extents [m], whether it is round about z, and its pose in the world."""
 
     name: str
     size: Float[np.ndarray, "3"]
@@ -98,7 +98,7 @@ class Thing(NamedTuple):
     position: Float[np.ndarray, "3"]
 
     def local(self, vectors: np.ndarray) -> np.ndarray:
-        """Directions in the world, in its own frame."""
+        """World directions in its frame."""
         return vectors @ self.rotation
 
 
@@ -108,11 +108,11 @@ def recognition_doubt(
     depth: Float[np.ndarray, "height width"],
     tolerance: float = DoubtConfig.tolerance,
 ) -> Doubt:
-    """How badly what was recognised explains the depth image; some milliseconds, not for `jit`.
+    """How badly an observation explains its depth image. Takes milliseconds; not for `jit`.
 
     Args:
-      setting: whose camera, shelf and target are meant; a problem or a `Recogniser` is one.
-      observation: what was recognised; without batch axes.
+      setting: gives camera, shelf and target, such as a problem or a `Recogniser`.
+      observation: without batch axes.
       depth: as `Recogniser` takes it [m].
       tolerance: as in `DoubtConfig` [m].
 
@@ -132,24 +132,20 @@ def recognition_doubt(
     points = points[_on_the_board(shelf, points)]
     things = things_of(shelf, setting.target, observation)
 
-    apart = np.full(len(points), np.inf)
+    gap = np.full(len(points), np.inf)
     for thing in things:
-        apart = np.minimum(apart, _surface_distance(thing, thing.local(points - thing.position)))
+        gap = np.minimum(gap, _surface_distance(thing, thing.local(points - thing.position)))
     enough = len(points) >= FEWEST_POINTS
-    unexplained = float((apart > tolerance).mean()) if enough else 0.0
+    unexplained = float((gap > tolerance).mean()) if enough else 0.0
     passed = [(_passed(thing, origin, rays, depths, tolerance), thing.name) for thing in things]
     return Doubt(missing, unexplained, *max(passed, default=(0.0, "")))
 
 
 def check_recognition(setting: Setting, observation: Observation, depth: Any, config: DoubtConfig) -> None:
-    """Refuse what was recognised where it does not explain the image.
-
-    Args:
-      setting, observation, depth: as in `recognition_doubt`.
-      config: what is too much.
+    """Check that an observation explains its depth image; arguments as in `recognition_doubt`.
 
     Raises:
-      InputError: it is too doubtful; the line says why.
+      InputError: it is too doubtful; the message gives the reason.
     """
     doubt = recognition_doubt(setting, observation, np.asarray(depth), config.tolerance)
     if reason := doubt.reason(config):
@@ -157,7 +153,7 @@ def check_recognition(setting: Setting, observation: Observation, depth: Any, co
 
 
 def _seen(camera: Camera, shelf: Shelf, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rays through the shelf's opening, scaled to unit depth, and their depths [m]; 0 where none was measured."""
+    """Rays through the shelf's opening, scaled to unit depth, and their depths [m]; 0 where nothing was measured."""
     whole = shelf_view(camera, shelf, 1)
     stride = max(1, math.ceil(math.sqrt(whole.camera.width * whole.camera.height / PIXELS)))
     rows = whole.row + np.arange(0, whole.camera.height, stride)
@@ -181,7 +177,7 @@ def _on_the_board(shelf: Shelf, points: np.ndarray) -> np.ndarray:
 
 
 def things_of(shelf: Shelf, target: Target, observation: Observation) -> list[Thing]:
-    """What was recognised, without batch axes: the objects, and the target where it is seen."""
+    """The recognised objects, and the target if it is visible; `observation` has no batch axes."""
     objects = observation.objects
     sizes, exponents, positions, rotations, valid = (
         np.asarray(a, float)
@@ -200,7 +196,7 @@ def things_of(shelf: Shelf, target: Target, observation: Observation) -> list[Th
 
 
 def _surface_distance(thing: Thing, points: np.ndarray) -> np.ndarray:
-    """About how far points in its own frame are from its surface [m], inside or outside."""
+    """Approximate distance of points in its frame from its surface, inside or outside [m]."""
     past = np.abs(points) - thing.size
     if thing.is_round:
         across = np.hypot(points[:, 0] / thing.size[0], points[:, 1] / thing.size[1]) - 1.0
@@ -209,7 +205,7 @@ def _surface_distance(thing: Thing, points: np.ndarray) -> np.ndarray:
 
 
 def _passed(thing: Thing, origin: np.ndarray, rays: np.ndarray, depths: np.ndarray, tolerance: float) -> float:
-    """Share of the rays that reach the inner part of an object and are measured beyond it."""
+    """Share of the rays through the inner part of an object whose measured depth is beyond it."""
     inner = np.maximum(thing.size - tolerance, 0.3 * thing.size)
     if thing.is_round:
         inner[:2] *= INSCRIBED

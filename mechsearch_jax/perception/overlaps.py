@@ -1,4 +1,4 @@
-"""Recognised things that are where others are: two solid things are not in one place, so at least one is wrong."""
+"""Warnings about recognised things that overlap: at least one of them is wrong."""
 
 from __future__ import annotations
 
@@ -11,42 +11,41 @@ from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import Thing, things_of
 from mechsearch_jax.perception.recogniser import Setting
 
-# Deeper in each other than this things are not by recognition's error alone [m]: what hides behind others is recognised
-# to about a centimetre.
+# Deeper overlaps are not explained by recognition's error alone [m]: hidden things are recognised to about 1 cm.
 DEEPEST = 0.015
-# Directions that two things are looked at along, beside their own axes.
+# Level directions that are tested as separating axes, beside the things' axes.
 _SPREAD = 64
 
 
 def overlap_faults(setting: Setting, observation: Observation) -> tuple[str, ...]:
-    """Which recognised things interpenetrate by more than recognition's error, or have no finite shape; a line each.
+    """Warnings about recognised things that overlap by more than recognition's error, or have no finite shape.
 
     Args:
-      setting: whose shelf and target are meant; a problem is one.
-      observation: what was recognised; without batch axes.
+      setting: gives shelf and target, such as a problem.
+      observation: without batch axes.
     """
     things = things_of(setting.shelf, setting.target, observation)
-    deep = [(one.name, other.name, depth_in_each_other(one, other)) for one, other in itertools.combinations(things, 2)]
-    lost = (thing.name for thing in things if not np.isfinite([thing.size, thing.position]).all())
-    return *(f"recognition: {name} has no finite shape or place; look again" for name in lost), *(
-        f"recognition: {one} and {other} are {100 * depth:.1f} cm deep in each other; at least one of them is wrong"
-        for one, other, depth in deep
+    overlaps = [(a.name, b.name, depth_in_each_other(a, b)) for a, b in itertools.combinations(things, 2)]
+    not_finite = (thing.name for thing in things if not np.isfinite([thing.size, thing.position]).all())
+    return *(f"recognition: {name} has no finite shape or place; look again" for name in not_finite), *(
+        f"recognition: {a} and {b} are {100 * depth:.1f} cm deep in each other; at least one of them is wrong"
+        for a, b, depth in overlaps
         if depth > DEEPEST
     )
 
 
-def depth_in_each_other(one: Thing, other: Thing) -> float:
-    """How far two convex things would have to move to be apart [m], at most; negative where they are.
+def depth_in_each_other(a: Thing, b: Thing) -> float:
+    """Upper bound of the penetration depth of two convex things [m]; negative if they do not overlap.
 
-    The least overlap of their shadows along some directions: exact for boxes whose faces meet, else a little more.
+    The least overlap of their projections on several directions: exact for boxes whose faces meet, else slightly more.
     """
-    way = other.position - one.position
-    if np.linalg.norm(way) > np.linalg.norm(one.size) + np.linalg.norm(other.size):
+    way = b.position - a.position
+    if np.linalg.norm(way) > np.linalg.norm(a.size) + np.linalg.norm(b.size):
         return -float("inf")
     turn = np.pi * np.arange(_SPREAD) / _SPREAD
     level = np.stack([np.cos(turn), np.sin(turn), np.zeros(_SPREAD)], axis=1)
-    directions = np.concatenate([one.rotation.T, other.rotation.T, level])
-    return float(np.min(_reach(one, directions) + _reach(other, directions) - np.abs(directions @ way)))
+    directions = np.concatenate([a.rotation.T, b.rotation.T, level])
+    return float(np.min(_reach(a, directions) + _reach(b, directions) - np.abs(directions @ way)))
 
 
 def _reach(thing: Thing, directions: Float[np.ndarray, "d 3"]) -> Float[np.ndarray, " d"]:

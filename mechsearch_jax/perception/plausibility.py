@@ -1,6 +1,6 @@
-"""Whether images fit what is known of camera and shelf: each fault that a person would see at once, in one line.
+"""Warnings about images that do not fit camera and shelf, one line for each fault that a person would see at once.
 
-Looked at on the host, before anything is recognised: wrong units, poses and masks otherwise end in an empty shelf.
+On the host, before recognition: otherwise wrong units, poses and masks end in an empty shelf.
 """
 
 from __future__ import annotations
@@ -24,30 +24,31 @@ from mechsearch_jax.workspace.camera import Camera, back_project, project
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# The board is looked for so far above and below where it should be [m], among at most so many points, and is believed
-# to be seen where so many lie on one plane.
+# The board is searched within this distance of its height [m], among at most so many points, and counts as seen with so
+# many points on one plane.
 FLOOR_SEARCH = 0.06
 FLOOR_POINTS = 4096
 FLOOR_SUPPORT = 200
-# How far the board that is seen may be from the one that is known [m].
+# Largest distance of the measured board from the given one [m].
 FLOOR_TOLERANCE = 0.01
 # Least share of the pixels that show the shelf with a measured depth.
 LEAST_MEASURED = 0.5
-# Walls are looked for so far before and behind where they should be [m], among at most `FLOOR_POINTS` points that are
-# so far from the other faces [m]. So many of them, and such a share, make a wall of what they lie on.
+# Walls are searched within this distance of their places [m], among at most `FLOOR_POINTS` points with this distance
+# from the other faces [m]. A plane with so many of the points, and such a share, counts as a wall.
 WALL_SEARCH = 0.06
 WALL_MARGIN = 0.035
 WALL_SUPPORT = 150
 WALL_SHARE = 0.05
-# A face that is narrower than this share of its wall may be an object's [m]; the widest objects measure 0.16 m.
+# A plane must cover at least this share of its wall and at least this width [m], or it may be an object's face: the
+# widest objects measure 0.16 m.
 WALL_SPAN = 0.4
 LEAST_WALL_SPAN = 0.2
-# Of how many strips across the board, of how many, its front edge must be seen.
+# Number of strips across the board, and in how many its front edge must be visible.
 EDGE_STRIPS, LEAST_STRIPS = 64, 32
-# So many points above the board are something [pixels of the whole image].
+# So many points above the board count as an object [pixels of an image of 1280 x 720].
 SOMETHING = 100
-# How well a patch must lie on the target for it to be one: share of its points, and how near [m]; and how many pixels
-# it must have, as shares of those of an unhidden target. Other things mostly have more, and few of them on its shape.
+# A patch of pixels may be the target if this share of its points lies within this distance of the fitted target [m],
+# and if its number of pixels is within these shares of an unhidden target's. Other things mostly have more pixels.
 PATCH_SHARE, PATCH_DISTANCE = 0.85, 0.003
 PATCH_PIXELS = (0.4, 1.6)
 
@@ -64,10 +65,10 @@ class Wall:
     """A vertical face of a shelf.
 
     Attributes:
-      name: what it is called.
-      face: name of the number of the shelf that says where it is.
-      axis: of that number: 0 for x, 1 for y.
-      outward: 1 where larger numbers are outside the shelf, -1 where smaller ones are.
+      name: in messages.
+      face: name of the `Shelf`'s field that gives its place.
+      axis: of that field: 0 for x, 1 for y.
+      outward: 1 if larger coordinates are outside the shelf, -1 if smaller ones are.
     """
 
     name: str
@@ -89,13 +90,13 @@ def image_faults(
     depth: Float[np.ndarray, "h w"],
     mask: Int[np.ndarray, "h w"] | None = None,
 ) -> tuple[str, ...]:
-    """What in a depth image and a mask does not fit camera and shelf; empty if everything does.
+    """Warnings about a depth image and a mask that do not fit camera and shelf.
 
     Args:
-      camera: what took them, whose own pose has no fault.
-      shelf: what it sees.
+      camera: of the images, with a pose without faults.
+      shelf: in its view.
       depth: metres along the camera's z; 0 or NaN where nothing was measured.
-      mask: the number of the object that a pixel shows, negative for none.
+      mask: the object's number for each pixel, negative for none.
 
     Raises:
       InputError: the camera does not see the shelf.
@@ -112,7 +113,7 @@ def image_faults(
         )
     points = np.asarray(back_project(view.camera, jnp.asarray(np.where(measured, part, np.nan))))[measured]
     floor = _floor_fault(shelf, points)
-    # Where the board is not where it should be, walls are looked for in the wrong place, too.
+    # If the board is not at its place, the walls are not either.
     walls = [_edge_fault(camera, shelf, points), *(_wall_fault(shelf, wall, points) for wall in WALLS)]
     faults = [floor] if floor else walls
     x, y, z = points.T
@@ -123,7 +124,7 @@ def image_faults(
 
 
 def _floor_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
-    """What is wrong with the board that the points show."""
+    """A warning if the points show no board, or one at another height."""
     x, y, z = points.T
     over = (x > shelf.front) & (x < shelf.back) & (y > shelf.right) & (y < shelf.left)
     low = points[over & (np.abs(z - shelf.board) < FLOOR_SEARCH)]
@@ -150,9 +151,9 @@ def _floor_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
 
 
 def _wall_fault(shelf: Shelf, wall: Wall, points: Float[np.ndarray, "n 3"]) -> str | None:
-    """What is wrong with a wall that the points show; nothing is where they show too little of it.
+    """A warning if the points show a wall at another place; None if they show too little of it.
 
-    The wall is the farthest plane on which many points lie, over a wider range than any object is wide.
+    The wall is the farthest plane with many points that is wider than any object.
     """
     past, sideways = wall.outward * (points[:, wall.axis] - getattr(shelf, wall.face)), points[:, 1 - wall.axis]
     low, high = (shelf.right, shelf.left) if wall.axis == 0 else (shelf.front, shelf.back)
@@ -171,7 +172,7 @@ def _wall_fault(shelf: Shelf, wall: Wall, points: Float[np.ndarray, "n 3"]) -> s
     near = near[np.abs(past[near] - at) < 1.5 * FLOOR_TOLERANCE]
     if abs(np.median(past[near])) < 0.5 * FLOOR_TOLERANCE:
         return None
-    # In a frame in which the wall is a floor, so that both are found by one program.
+    # In a frame in which the wall is a floor, so that one compiled `find_plane` serves both.
     local = np.stack([points[near, 2], sideways[near], -past[near]], axis=1)
     padded = np.zeros((FLOOR_POINTS, 3), np.float32)
     padded[: len(local)] = local
@@ -199,21 +200,21 @@ def _way(wall: Wall, off: float) -> str:
 
 
 def _edge_fault(camera: Camera, shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
-    """What is wrong with the front edge of the board that the points show; nothing where they show too little of it."""
+    """A warning if the points show the board's front edge at another place; None if they show too little of it."""
     x, y, z = points.T
     board = (np.abs(z - shelf.board) < 0.008) & (np.abs(x - shelf.front) < 2 * WALL_SEARCH)
     across = (y > shelf.right + WALL_MARGIN) & (y < shelf.left - WALL_MARGIN)
     strip = ((y - shelf.right) / (shelf.left - shelf.right) * EDGE_STRIPS).astype(int)
     firsts = []
     for i in np.flatnonzero(_edge_in_image(camera, shelf)):
-        own = x[board & across & (strip == i)]
-        if len(own) >= 10:
-            # Not the very first: at an edge a sensor may measure a mixture of what is before and behind it.
-            firsts.append(np.percentile(own, 2))
+        in_strip = x[board & across & (strip == i)]
+        if len(in_strip) >= 10:
+            # Not the minimum: at an edge a sensor may measure a mixture of both depths.
+            firsts.append(np.percentile(in_strip, 2))
     if len(firsts) < LEAST_STRIPS:
         return None
     off = float(np.median(firsts)) - shelf.front
-    # Things that stand at the edge hide it, and then the board seems to begin behind them.
+    # Objects at the edge hide it, so that the board seems to begin behind them.
     if abs(off) <= FLOOR_TOLERANCE or (off > 0 and np.percentile(firsts, 10) - shelf.front <= FLOOR_TOLERANCE):
         return None
     return (
@@ -223,7 +224,7 @@ def _edge_fault(camera: Camera, shelf: Shelf, points: Float[np.ndarray, "n 3"]) 
 
 
 def _edge_in_image(camera: Camera, shelf: Shelf) -> Bool[np.ndarray, " strips"]:
-    """In which strips across the board an image shows its front edge, and a little of what is before that."""
+    """In which strips across the board the image contains its front edge and a little in front of it."""
     y = shelf.right + (np.arange(EDGE_STRIPS) + 0.5) / EDGE_STRIPS * (shelf.left - shelf.right)
     before = np.stack([np.full_like(y, shelf.front - 2 * FLOOR_TOLERANCE), y, np.full_like(y, shelf.board)], axis=1)
     pixels, depth = (np.asarray(a) for a in project(camera, jnp.asarray(before, jnp.float32)))
@@ -234,12 +235,12 @@ def _edge_in_image(camera: Camera, shelf: Shelf) -> Bool[np.ndarray, " strips"]:
 def identity_faults(
     colour: np.ndarray | None, mask: Int[np.ndarray, "h w"] | None, target_id: int | None
 ) -> tuple[str, ...]:
-    """What keeps images from saying which thing is the target; empty if nothing does.
+    """Warnings about images in which the target cannot be identified.
 
     Args:
       colour: the colour image, if there is one.
-      mask: the number of the object that a pixel shows, if there is one.
-      target_id: the target's number in the mask, if it is given; negative where the mask does not show it.
+      mask: the object's number for each pixel, if there is one.
+      target_id: the target's number in the mask, if given; negative if the mask does not show it.
     """
     if colour is None and target_id is None:
         return (
@@ -262,11 +263,11 @@ def colour_faults(
     depth: Float[np.ndarray, "h w"],
     colour: np.ndarray,
 ) -> tuple[str, ...]:
-    """What in a colour image does not fit the target; empty if everything does.
+    """A warning if a colour image seems to have red and blue exchanged.
 
     Args:
-      camera, shelf, target: what took the image, what it sees and what is searched.
-      detector: which pixels of an image are the target's.
+      camera, shelf, target: of the image.
+      detector: gives the target's pixels of a colour image.
       depth: as in `image_faults`.
       colour: (h, w, 3), floats in 0 to 1 or uint8.
 
@@ -282,21 +283,21 @@ def colour_faults(
     inside = above_board(shelf, points)
     least = SOMETHING * camera.width * camera.height / (1280 * 720 * view.stride**2)
 
-    def alike(image: np.ndarray) -> Bool[np.ndarray, "h w"]:
+    def detected(image: np.ndarray) -> Bool[np.ndarray, "h w"]:
         return np.asarray(detector(jnp.asarray(image)) & inside)
 
     exchanged = image[..., ::-1]
-    if alike(image).sum() > least or alike(exchanged).sum() <= least:
+    if detected(image).sum() > least or detected(exchanged).sum() <= least:
         return ()
     swapped = np.asarray(coloured_pixels(detector, jnp.asarray(exchanged), seen) & inside)
     if swapped.sum() <= least:
         return ()
     pose, _ = fitted_pose(jax.random.key(0), target, shelf, view.camera, points, jnp.asarray(swapped))
-    away = np.abs(np.asarray(distance(target, shelf, pose, points[swapped])))
+    from_target = np.abs(np.asarray(distance(target, shelf, pose, points[swapped])))
     across, _, height = target.half_size
     whole = 4 * across * height * (view.camera.fx / float(np.median(np.asarray(seen)[swapped]))) ** 2
     as_large = PATCH_PIXELS[0] * whole < swapped.sum() < PATCH_PIXELS[1] * whole
-    if not as_large or (away < PATCH_DISTANCE).mean() < PATCH_SHARE:
+    if not as_large or (from_target < PATCH_DISTANCE).mean() < PATCH_SHARE:
         return ()
     return (
         "colour image: looks like blue, green, red: nothing has the target's colour, but with red and blue exchanged "
@@ -305,10 +306,7 @@ def colour_faults(
 
 
 def check_measured(camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> None:
-    """Refuse a depth image in which nothing was measured where it shows the shelf.
-
-    Args:
-      camera, shelf, depth: as in `image_faults`.
+    """Check that a depth image has measurements where it shows the shelf; arguments as in `image_faults`.
 
     Raises:
       InputError: nothing was measured, or the camera does not see the shelf.
@@ -326,11 +324,11 @@ def shows_nothing(observation: Observation) -> bool:
 def sight_faults(
     camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"], observation: Observation
 ) -> tuple[str, ...]:
-    """What is to be said of an observation of nothing; empty where anything was recognised.
+    """Why an observation is empty, in one line; nothing if anything was recognised.
 
     Args:
       camera, shelf, depth: as in `image_faults`.
-      observation: what was recognised; without batch axes.
+      observation: without batch axes.
     """
     if not shows_nothing(observation):
         return ()

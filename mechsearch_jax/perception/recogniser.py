@@ -1,4 +1,4 @@
-"""From a camera's images to what the planner plans with: the front door of perception.
+"""From a camera's images to an observation: the entry point of perception.
 
 Depth image -> points of the shelf's part of it -> labels (a given mask, or the segmentation network) -> superquadrics
 (recognition network, refinement on the depth image) and the target's pose -> `Observation`.
@@ -34,12 +34,12 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.sight import check_camera
 from mechsearch_jax.workspace.target import Target
 
-# Which pixels are the target's, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
+# Gives the target's pixels, bool (h, w), of an image of red, green and blue in 0 to 1, shape (h, w, 3).
 TargetDetector = Callable[[Array], Array]
 
 
 class Setting(Protocol):
-    """What a recogniser has to know of a problem; a planner's `Problem` is one."""
+    """What a recogniser needs of a problem; `Problem` fulfils it."""
 
     @property
     def camera(self) -> Camera: ...
@@ -54,21 +54,21 @@ class Setting(Protocol):
 @jax.tree_util.register_pytree_node_class
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
 class Recogniser:
-    """What a camera's images show: the objects' shapes and poses, and the target where it is seen.
+    """Recognises the objects' shapes and poses in a camera's images, and the target if it is visible.
 
     A callable `(key, depth, colour=None, mask=None, target_id=None) -> Observation` for `jit` and `vmap`, and a pytree,
-    so that it can be an argument of either. Networks' weights are its leaves, and where camera and shelf stand; all
-    else is static. Not to be made inside of either: camera and shelf decide about shapes.
+    so that it can be an argument of either. Its leaves are the networks' weights and the poses of camera and shelf; all
+    else is static. Construct it outside of both, since camera and shelf decide the shapes of arrays.
 
-    The image is looked at about as densely as in the networks' training, with 400 pixels to a metre at the middle of
-    the board: of a finer one every second pixel, or third, and so on, of the part in which the shelf's space appears.
+    The image is thinned to about the density of the networks' training, 400 pixels per metre at the middle of the
+    board, and cut to the part in which the shelf's space appears.
 
     Attributes:
-      camera: what took the images; depth and colour are registered to it.
-      view: the part of the images that is looked at.
-      shelf: whose space is looked at.
+      camera: of the images; depth and colour are registered to it.
+      view: the part of the images that is used.
+      shelf: in the view.
       target: whose pose is fitted.
-      segmenter: labels images that come without a mask.
+      segmenter: labels images without a mask.
       shapes: the recognition network.
       detector: finds the target's pixels in a colour image.
       refinement: how the network's shapes are fitted to the depth image.
@@ -93,14 +93,14 @@ class Recogniser:
         detector: TargetDetector | None = None,
         refinement: RefinementConfig | None = None,
     ):
-        """Set up recognition for a problem; every slot has a default.
+        """Set up recognition for a problem.
 
         Args:
-          problem: whose camera, shelf and target are meant.
-          camera: another one than the problem's, such as one whose pose `real_camera.prepare` corrected.
-          segmenter: by default the `NetworkSegmenter` with the shipped weights.
-          weights: of the recognition network; by default those that ship with the package.
-          detector: by default the target is what is red in any light, `TargetColour.lit()`.
+          problem: gives camera, shelf and target.
+          camera: instead of the problem's, such as one whose pose `real_camera.prepare` corrected.
+          segmenter: by default the `NetworkSegmenter` with the package's weights.
+          weights: of the recognition network; by default the package's.
+          detector: by default for a red target in any light, `TargetColour.lit()`.
           refinement: the default if None.
 
         Raises:
@@ -123,7 +123,7 @@ class Recogniser:
 
     @property
     def trained(self) -> dict[str, TrainedView]:
-        """Which camera and shelf the networks were trained on, by their names, where that is known."""
+        """Camera and shelf in the training of the networks, by the networks' names, if their cards record them."""
         views = {"recognition": self.shapes.view}
         if isinstance(self.segmenter, NetworkSegmenter):
             views["segmentation"] = self.segmenter.view
@@ -149,42 +149,42 @@ class Recogniser:
         mask: Any = None,
         target_id: Any = None,
     ) -> Observation:
-        """Recognise what the images show.
+        """Recognise the objects and the target in images.
 
-        The target is seen by its colour, or named by `target_id` in the mask; from depth alone it cannot be told from
-        the objects, and `target_visible` is False. It is visible if it shows more than 100 pixels at 1280 x 720, and
-        the same share of a larger or smaller image, in the shelf's space and with a measured depth.
+        The target is identified by its colour, or by `target_id` in the mask; with depth alone `target_visible` is
+        False. It is visible with more than 100 pixels at 1280 x 720, or the same share of other images, in the shelf's
+        space and with a measured depth.
 
-        With a mask, slot i of the objects is instance i; where the target is one of the instances, instance 8 takes
-        its slot. Without one, the order of the slots means nothing.
+        With a mask, slot i of the objects is instance i; if the target is one of the instances, instance 8 takes its
+        slot. Without a mask, the order of the slots is arbitrary.
 
         Args:
-          key: PRNG key of the points that are drawn; the same key recognises the same.
-          depth: float (H, W), metres along the camera's z; 0 or NaN where nothing was measured, infinite where it is
-            known that nothing is there, for at least 3 m.
+          key: PRNG key of the drawn points.
+          depth: float (H, W), metres along the camera's z; 0 or NaN where nothing was measured, infinite where there is
+            nothing for at least 3 m.
           colour: (H, W, 3), floats in 0 to 1 or uint8, registered to the depth image.
           mask: integers (H, W), registered to the depth image: for each pixel the number of its object, 0 to 8, or
-            what `images.labels` has: OTHER (-1), FREE (-2), MISSING (-3). What was measured on the shelf's faces
-            counts as FREE, whatever the mask says.
-          target_id: the number in the mask that is the target's, an integer; negative where the mask does not show it.
+            OTHER (-1), FREE (-2) or MISSING (-3) of `images.labels`. Points on the shelf's faces always count as FREE.
+          target_id: the target's number in the mask; negative if the mask does not show it.
 
         Returns:
-          Objects with eight slots; whether the target is visible; and its pose.
+          The observation, with eight slots for objects.
 
         Raises:
-          InputError: an image's shape, type or unit is not as said. Values are looked at outside `jit` only.
+          InputError: an image has the wrong shape, type or unit. Values are checked outside `jit` only.
         """
         _check(self.camera, depth, colour, mask, target_id)
         keys = jax.random.split(key, 3)
         image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
-        # Compiled on its own, whatever the images that the labels come from.
-        seen_by = self.view.camera
-        found = recognise_image(keys[1:], image, self.shapes, seen_by, self.shelf, self.target, self.refinement)
-        return Observation(found[0], visible, found[1])
+        # Compiled separately, since it does not depend on where the labels come from.
+        objects, target_pose = recognise_image(
+            keys[1:], image, self.shapes, self.view.camera, self.shelf, self.target, self.refinement
+        )
+        return Observation(objects, visible, target_pose)
 
 
 def _as_pytree(slot: Any) -> Any:
-    """A callable that may hold arrays as it is, any other, such as a function, as one without leaves."""
+    """A callable as a pytree: unchanged if it is one, else, such as a function, without leaves."""
     return jax.tree_util.Partial(slot) if jax.tree_util.all_leaves([slot]) else slot
 
 
@@ -198,20 +198,20 @@ def _labelled(
     seen = jnp.where(seen > 0.0, seen, jnp.nan)
     points = back_project(view.camera, seen)
 
-    # What touches the board still is the target's.
+    # Points on the board's faces may be the target's.
     near = above_board(shelf, points, -MARGIN)
     coloured = jnp.zeros(seen.shape, bool)
     if colour is not None:
         pixels = view.of(jnp.asarray(colour))
         scale = 255.0 if pixels.dtype == jnp.uint8 else 1.0
         coloured = coloured_pixels(recogniser.detector, pixels.astype(jnp.float32) / scale, seen) & near
-    # With a weak type, all that takes the observation would be compiled once more than for another recogniser's.
+    # Casts avoid weak types, with which functions of the observation would be compiled again.
     enough = found_pixels(camera) / view.stride**2
     visible = (jnp.sum(coloured) > enough).astype(bool)
     if mask is None:
         pose, _ = fitted_pose(jax.random.fold_in(key, 0), recogniser.target, shelf, view.camera, points, coloured)
         on_it = near_target(recogniser.target, shelf, pose, points) & near & visible
-        # Where that would be more than its colour shows, the pose is not to be relied on.
+        # The pose is unreliable if it would add more pixels than the colour shows.
         on_it &= jnp.sum(on_it & ~coloured) <= jnp.sum(coloured)
         of_target = coloured | on_it
         labels = recogniser.segmenter(key, shelf, points, of_target)
@@ -226,42 +226,42 @@ def _labelled(
 
 
 def _instances(mask: Int[Array, "h w"]) -> Int[Array, "h w"]:
-    """A mask whose numbers are those of `images.labels`, int8; what it has beside them is OTHER."""
-    known = (mask >= MISSING) & (mask < INSTANCES)
-    return jnp.where(known, mask, OTHER).astype(jnp.int8)
+    """The mask as labels of `images.labels`, int8; other numbers become OTHER."""
+    is_label = (mask >= MISSING) & (mask < INSTANCES)
+    return jnp.where(is_label, mask, OTHER).astype(jnp.int8)
 
 
 def _target_in(
     instances: Int[Array, "h w"], coloured: Bool[Array, "h w"], target_id: Any
 ) -> tuple[Bool[Array, "h w"], Int[Array, ""]]:
-    """The target's pixels in a mask, and its instance's number; that of the last instance if it is none of them."""
+    """The target's pixels in a mask, and its instance's number, or the last number if it is not an instance."""
     numbers = jnp.arange(INSTANCES)
-    own = instances[..., None] == numbers.reshape(1, 1, -1)
+    member = instances[..., None] == numbers.reshape(1, 1, -1)
     if target_id is not None:
         is_target = numbers == target_id
         rest = jnp.zeros(instances.shape, bool)
     else:
         # An instance is the target if most of it has the target's colour.
-        shown = jnp.sum(own & coloured[..., None], axis=(0, 1))
-        is_target = 2 * shown > jnp.sum(own, axis=(0, 1))
+        in_colour = jnp.sum(member & coloured[..., None], axis=(0, 1))
+        is_target = 2 * in_colour > jnp.sum(member, axis=(0, 1))
         rest = coloured & (instances == OTHER)
-    of_target = jnp.any(own & is_target.reshape(1, 1, -1), axis=-1) | rest
+    of_target = jnp.any(member & is_target.reshape(1, 1, -1), axis=-1) | rest
     return of_target, jnp.where(jnp.any(is_target), jnp.argmax(is_target), INSTANCES - 1).astype(jnp.int8)
 
 
 def _labels(
     instances: Int[Array, "h w"], freed: Int[Array, ""], shelf: Shelf, points: Float[Array, "h w 3"]
 ) -> Int[Array, "h w"]:
-    """The labels of a masked image: the objects' slots, and what the points' places say of the rest.
+    """The labels of an image with a mask: the objects' slots; the rest by the places of the points.
 
     Args:
-      instances: as the mask has them.
+      instances: of the mask.
       freed: the target's number, which the last instance takes.
-      shelf: what they stand on.
+      shelf: in the image.
       points: in the world [m].
     """
     body = jnp.where(instances == freed, OTHER, jnp.where(instances == INSTANCES - 1, freed, instances))
-    # Something between the camera and the shelf, such as the robot, hides what is behind it.
+    # Something in front of the shelf, such as the robot, hides what is behind it.
     before = (points[..., 0] <= shelf.front - OVERHANG) & (points[..., 2] > shelf.board) & (instances != FREE)
     labels = jnp.where(above_board(shelf, points), body, jnp.where(before, OTHER, FREE))
     missing = ~jnp.isfinite(points).all(axis=-1) | (instances == MISSING)
@@ -290,7 +290,7 @@ def _check(camera: Camera, depth: Any, colour: Any, mask: Any, target_id: Any) -
 
 
 def _values(image: Any) -> np.ndarray | None:
-    """Every eighth row and column, to look at the values; None while JAX traces."""
+    """Every eighth row and column, for checks of the values; None while JAX traces."""
     return None if isinstance(image, Tracer) else np.asarray(image[::8, ::8])
 
 

@@ -43,16 +43,16 @@ def best_hypothesis(hypotheses: Hypotheses, segments: Segments) -> Superquadrics
 
 
 def nearness(camera: Camera, shelf: Shelf) -> Float[Array, ""]:
-    """The share of its distance from an object at which a camera is told to the network.
+    """Factor by which a camera's distance from an object is reduced in the network's input.
 
-    The network makes little of a camera farther away than that of its training. It is told of one that is not, on the
-    same line, from which the points look all but the same.
+    The network performs badly with a camera farther away than in its training. So its input is a nearer camera on the
+    same ray, from which the points look nearly the same.
     """
-    return jnp.minimum(1.0, _away(Camera(), Shelf()) / jnp.maximum(_away(camera, shelf), 1e-9))
+    return jnp.minimum(1.0, _distance(Camera(), Shelf()) / jnp.maximum(_distance(camera, shelf), 1e-9))
 
 
-def _away(camera: Camera, shelf: Shelf) -> Float[Array, ""]:
-    """`cloud.distance`, also of a camera and a shelf that are traced."""
+def _distance(camera: Camera, shelf: Shelf) -> Float[Array, ""]:
+    """`cloud.distance` for a traced camera and shelf."""
     return jnp.linalg.norm(jnp.array(camera.position) - jnp.array(middle(shelf)))
 
 
@@ -68,12 +68,12 @@ def recognise(
     count: int = 8,
     config: SegmentConfig | None = None,
 ) -> Superquadrics:
-    """The superquadrics of the segments 0 to `count - 1` of a labelled image of points, as the network predicts them.
+    """The network's superquadrics for the segments 0 to `count - 1` of a labelled image of points.
 
-    Slot i is segment i; it is not valid where the segment has fewer than `config.minimum` pixels.
+    Slot i is segment i; it is not valid if the segment has fewer than `config.minimum` pixels.
 
     Args:
-      key: PRNG key of the points that are drawn.
+      key: PRNG key of the drawn points.
       network, parameters: as `networks.weights` loads them; the network is static.
       camera: the camera of the image, a `View`'s as in training.
       points: in the world [m]; NaN invalidates the pixel, whose label is then MISSING.
@@ -94,7 +94,7 @@ class ShapeNetwork(flax.struct.PyTreeNode):
     Attributes:
       parameters: of the network.
       network: static.
-      view: which camera and shelf it was trained on, if that is known; static.
+      view: camera and shelf in its training, if its card records them; static.
     """
 
     parameters: Any
@@ -103,20 +103,20 @@ class ShapeNetwork(flax.struct.PyTreeNode):
 
     @classmethod
     def of(cls, weights: Weights | None = None) -> ShapeNetwork:
-        """The network with the given weights; with those that ship with the package if None."""
+        """The network with the given weights; the package's if None."""
         weights = weights or shipped_weights("recognition")
         return cls(weights.parameters, cast(RecognitionNetwork, weights.network), weights.view)
 
 
 class LabelledImage(flax.struct.PyTreeNode):
-    """An image of points of which is known what each pixel shows.
+    """An image of points with a label for each pixel.
 
     Attributes:
-      points: in the world [m], shape (h, w, 3); NaN invalidates the pixel: nothing was measured.
+      points: in the world [m], shape (h, w, 3); NaN where nothing was measured.
       depth: of the points along the camera's axis [m], shape (h, w); infinite where nothing is, NaN where nothing was
         measured.
-      labels: as `images.labels` has them, shape (h, w).
-      of_target: which of the points the target's pose is fitted to, bool, shape (h, w).
+      labels: as in `images.labels`, shape (h, w).
+      of_target: points to which the target's pose is fitted, bool, shape (h, w).
     """
 
     points: jax.Array
@@ -137,25 +137,24 @@ def recognise_image(
 ) -> tuple[Superquadrics, Float[Array, " 3"]]:
     """The objects of a labelled image, and the target's pose: network, refinement, `superquadric.standard_edges`.
 
-    Every recogniser of images comes down to this. No object is recognised in the target or on it: a segment most of
-    which is there is none.
+    A segment that lies mostly in or on the target is ignored.
 
     Args:
-      keys: of the points that are drawn from the objects, and from the target.
-      image: its pixels are the camera's.
+      keys: for the points drawn from the objects, and from the target.
+      image: of the camera.
       shapes: the network.
       camera: the camera of the image, a `View`'s as in training.
-      shelf: what the objects are on.
+      shelf: with the objects.
       target, refinement: static.
 
     Returns:
-      Eight slots, of which slot i is instance i; and x, y [m] and yaw [rad] of the target, which mean nothing, but are
-      finite, where no pixel is its.
+      Eight slots, of which slot i is instance i; and x, y [m] and yaw [rad] of the target, meaningless but finite if it
+      has no pixels.
     """
-    drawing, choosing = keys
-    pose, found = fitted_pose(choosing, target, shelf, camera, image.points, image.of_target)
-    on_it = near_target(target, shelf, pose, image.points) & found
+    object_key, target_key = keys
+    pose, has_pixels = fitted_pose(target_key, target, shelf, camera, image.points, image.of_target)
+    on_it = near_target(target, shelf, pose, image.points) & has_pixels
     labels = without_phantoms(image.labels, on_it, image.of_target)
-    scene = recognise(drawing, shapes.network, shapes.parameters, camera, image.points, labels, shelf)
+    scene = recognise(object_key, shapes.network, shapes.parameters, camera, image.points, labels, shelf)
     refined = refine(camera, shelf, scene, image.points.reshape(-1, 3), labels.reshape(-1), image.depth, refinement)
     return standard_edges(refined.scene), pose

@@ -1,15 +1,14 @@
-"""Recognised superquadrics, fitted to what the camera measured: damped Gauss-Newton steps on all objects at once.
+"""Fit recognised superquadrics to the depth image by damped Gauss-Newton steps, for all objects in parallel.
 
-A recogniser sees a few hundred points and guesses well; what it guessed can then be held against every pixel. Two facts
-do most of the work. The object's own points lie on its surface. And what the camera sees, it sees through free space:
-no ray may pass through the object before it ends, whatever it ends on, which bounds the silhouette from outside and the
-depth of the object from above and the sides. Where neither says anything, behind the object and behind what hides it,
-the guess stays as a prior, together with what is known about things on a shelf: most stand upright on the board, and
-none is inside the walls.
+The recognition network uses a few hundred points; refinement compares its result with every pixel. There are two kinds
+of evidence. The object's points lie on its surface. And rays are free up to their ends: no ray may pass through the
+object before its measured depth, which bounds the silhouette from outside and the depth of the object from above and
+the sides. Where there is no evidence, behind the object and behind what hides it, the network's result is a prior,
+together with facts about objects on a shelf: most stand upright on the board, and none is inside the walls.
 
 The distance of a point to the surface is `(gauge - 1) / |gradient of the gauge|`: exact for flat faces, of first order
-elsewhere. The gauge depends on the point only by its coordinates over the half-extents, so its gradient is all that the
-Jacobian is made of.
+elsewhere. The gauge depends on a point only by its coordinates over the half-extents, so the Jacobian follows from the
+gauge's gradient.
 """
 
 from __future__ import annotations
@@ -36,9 +35,9 @@ from mechsearch_jax.workspace.shelf import Shelf
 PARAMETERS = 9
 BISECTIONS = 12
 DAMPING_FACTOR = 4.0
-# How far a ray that ends on nothing is known to be free [m].
+# Length to which a ray that ends on nothing is free [m].
 FAR = 3.0
-# Steps larger than these are cut: relative change of a half-extent, metres, radians.
+# Largest step: relative change of the half-extents, centre [m], rotation [rad].
 LARGEST_STEP = (0.3,) * 3 + (0.03,) * 3 + (0.3,) * 3
 HALF_EXTENTS = (0.004, 0.3)
 
@@ -54,35 +53,34 @@ class Hypothesis(flax.struct.PyTreeNode):
 class RefinementConfig:
     """How recognised shapes are refined; lengths in metres, angles in radians.
 
-    The defaults are for the answers of the recognition network, which are mostly right to half a millimetre: with much
-    looser priors, less noise or a wider loss, stray points at the edges of a time-of-flight image undo what the network
-    knew (`mechsearch bench recognition` measures it). For worse guesses there is `rough`.
+    The defaults are for the recognition network, which is mostly right to half a millimetre: with much looser priors,
+    less noise or a wider loss, stray points at the edges of a time-of-flight image make its results worse (`mechsearch
+    bench recognition` measures it). For worse initial shapes there is `rough`.
 
     Attributes:
-      hypotheses: shapes that are tried side by side for every object, as (e1, e2, turn about the object's own z from
-        the recognised heading); the one that explains the image best is kept. With none, the recognised exponents stay
-        as they are. Rounder edges than those of the true bodies make fitted ones too large: their points near an edge
-        pull the faces outwards.
-      points: at most so many of the object's own points are used.
-      rays: pixels in and around the object's image whose rays are used.
+      hypotheses: shapes that are tried for every object, as (e1, e2, turn about the object's z from the recognised
+        heading); the one that explains the image best is kept. If empty, the recognised exponents stay. With rounder
+        edges than the true ones, objects become too large, since points near an edge pull the faces outwards.
+      points: largest number of an object's points that are used.
+      rays: number of pixels in and around the object's image whose rays are used.
       border: how far those pixels reach beyond the image of the object's bounding box, relative to its size.
       stages: numbers of steps, each with the scale of its robust loss, beyond which a residual loses its weight.
-      damping: at the start of a stage, relative to the diagonal of the normal equations. Sharp edges make the distances
-        kinked, and bold first steps end in poor local minima.
-      noise: standard deviation of a point's distance to the surface; what priors are weighed against. More than that of
-        the sensor, because the errors of neighbouring points are not independent.
-      ray_noise: standard deviation of how deep a ray seems to pass through the object: pixels know silhouettes better
-        than depths.
+      damping: at the start of a stage, relative to the diagonal of the normal equations. Sharp edges make kinks in the
+        distances, and large first steps end in poor local minima.
+      noise: standard deviation of a point's distance to the surface, relative to which priors are weighted. More than
+        the sensor's, because the errors of neighbouring points are not independent.
+      ray_noise: standard deviation of how deep a ray seems to pass through the object: pixels determine silhouettes
+        better than depths.
       tolerance: the last part of a ray that need not be free, for the noise of its end.
       size_prior: standard deviation of the recognised half-extents, relative to them.
-      position_prior: that of the recognised centre.
-      yaw_prior: that of the recognised heading.
-      tilt_prior: that of the angle between the vertical and the axis that is upright.
-      upright_within: an object whose most upright axis is farther from the vertical is not taken to stand.
+      position_prior: standard deviation of the recognised centre.
+      yaw_prior: standard deviation of the recognised heading.
+      tilt_prior: standard deviation of the angle between the vertical and the upright axis.
+      upright_within: largest angle between the vertical and an axis of an upright object.
       contact: standard deviation of the height of the lowest point over the board.
       switch: by how much another exponent than the recognised one must lower the cost, in halves of squared standard
         deviations.
-      minimum_points: an object with fewer points stays as it is.
+      minimum_points: an object with fewer points is not changed.
     """
 
     hypotheses: tuple[tuple[float, float, float], ...] = ((0.03, 0.03, 0.0), (0.03, 1.0, 0.0))
@@ -115,26 +113,21 @@ class RefinementConfig:
 
     @classmethod
     def rough(cls, **changes: Any) -> RefinementConfig:
-        """For guesses that are wrong by a tenth of a size or a centimetre: weak priors, and at first a wide loss, for
-        which no point is too far.
-
-        Args:
-          changes: fields that differ.
-        """
+        """For initial shapes that are wrong by a tenth of a size or by 1 cm: weak priors, and at first a wide loss."""
         weak = {"size_prior": 0.15, "position_prior": 0.015, "yaw_prior": 0.2}
         sure = {"noise": 0.001, "ray_noise": 0.0005, "stages": ((6, 0.01), (10, 0.003))}
         return cls(**{**weak, **sure, **changes})
 
 
 class Refined(flax.struct.PyTreeNode):
-    """Refined superquadrics and how they came about.
+    """Refined superquadrics and diagnostics.
 
     Attributes:
-      scene: the superquadrics, in the slots of those that were given.
+      scene: the superquadrics, in their original slots.
       cost: half the sum of robust squared residuals at the end, in units of the noise, shape (N,).
-      initial_cost: the same for the shapes as they were given, under the chosen hypothesis' exponents, shape (N,).
-      points: how many of the object's own points were used, int32, shape (N,); no change where there were too few.
-      hypothesis: index of the hypothesis that was chosen, int32, shape (N,).
+      initial_cost: the same for the initial shapes with the chosen hypothesis' exponents, shape (N,).
+      points: number of the object's points that were used, int32, shape (N,); with too few, the object is unchanged.
+      hypothesis: index of the chosen hypothesis, int32, shape (N,).
     """
 
     scene: Superquadrics
@@ -145,7 +138,7 @@ class Refined(flax.struct.PyTreeNode):
 
 
 class _Shape(flax.struct.PyTreeNode):
-    """What is fitted: logarithms of the half-extents, centre and rotation; the exponents stay."""
+    """The fitted parameters: logarithms of the half-extents, centre and rotation; the exponents are fixed."""
 
     log_size: jax.Array
     position: jax.Array
@@ -154,7 +147,7 @@ class _Shape(flax.struct.PyTreeNode):
 
 
 class _Evidence(flax.struct.PyTreeNode):
-    """What the image says about one object: its own points, and rays with the depth to which they are free."""
+    """The image's evidence about one object: its points, and rays with the depth to which they are free."""
 
     points: jax.Array
     point_weight: jax.Array
@@ -174,7 +167,7 @@ class _Fit(flax.struct.PyTreeNode):
 
 
 def select(labels: Int[Array, " p"], label: Int[Array, ""], count: int) -> tuple[Int[Array, " c"], Float[Array, " c"]]:
-    """Indices of `count` points with a label, spread evenly over all; and weights, 0 where there are no more."""
+    """Indices of `count` points with a label, spread evenly over all; and weights, 0 for surplus indices."""
     rank = jnp.cumsum(labels == label)
     j = jnp.arange(count)
     total = rank[-1]
@@ -199,7 +192,7 @@ def _window(camera: Camera, scene_object: Superquadrics, config: RefinementConfi
     pixels, _ = project(camera, transform(T_world_object, corners * scene_object.size[None]))
     low, high = jnp.min(pixels, axis=0), jnp.max(pixels, axis=0)
     low, high = low - config.border * (high - low), high + config.border * (high - low)
-    # Outside the image there is nothing to be seen: spend all pixels inside.
+    # All pixels lie inside the image.
     edge = jnp.array([camera.height - 1.0, camera.width - 1.0])
     low, high = jnp.clip(low, 0.0, edge), jnp.clip(high, 0.0, edge)
     pixels = jnp.round(low[None] + jnp.asarray(_plane_points(config.rays)) * (high - low)[None]).astype(jnp.int32)
@@ -208,14 +201,14 @@ def _window(camera: Camera, scene_object: Superquadrics, config: RefinementConfi
 
 def _evidence(camera, scene_object, label, points, labels, depth, config) -> _Evidence:
     index, weight = select(labels, label, config.points)
-    own = points[index]
-    finite = jnp.all(jnp.isfinite(own), axis=-1)
+    object_points = points[index]
+    finite = jnp.all(jnp.isfinite(object_points), axis=-1)
     rows, columns = _window(camera, scene_object, config)
     seen = depth[rows, columns]
     free = jnp.where(seen > FAR, FAR, seen) - config.tolerance
     informative = ~jnp.isnan(seen) & (free > 0.0)
     return _Evidence(
-        points=jnp.where(finite[:, None], own, 0.0),
+        points=jnp.where(finite[:, None], object_points, 0.0),
         point_weight=weight * finite,
         directions=pixel_rays(camera, rows * 1.0, columns * 1.0),
         free=jnp.where(informative, free, 0.0),
@@ -224,7 +217,7 @@ def _evidence(camera, scene_object, label, points, labels, depth, config) -> _Ev
 
 
 def _value_and_gradient(size: Array, exponents: Array, points: Array) -> tuple[Array, Array]:
-    """The gauge and its gradient at points in the object's frame; the gradient is a constant for differentiation."""
+    """The gauge and its gradient at points in the object's frame; the gradient is not differentiated."""
 
     def gauge(point):
         return superquadric.gauge(size, exponents, point)
@@ -238,8 +231,7 @@ def _local(shape: _Shape, vectors: Array) -> Array:
 
 
 def _closest_approach(shape: _Shape, origin: Array, evidence: _Evidence) -> Array:
-    """The point of the free part of every ray at which the gauge is least, by bisection of its convex course, in the
-    world."""
+    """The world point of every ray's free part with the least gauge, which is convex along the ray, by bisection."""
     size = jnp.exp(shape.log_size)
     start, direction = _local(shape, origin - shape.position), _local(shape, evidence.directions)
     square = jnp.sum(direction**2, axis=-1)
@@ -282,7 +274,7 @@ def _moved(shape: _Shape, step: Float[Array, "9"]) -> _Shape:
 
 
 def _support(shape: _Shape, direction: tuple[float, float, float]) -> Array:
-    """How far a shape reaches from its centre in a direction: the dual norm of its gauge."""
+    """Support function of a shape from its centre: the dual norm of its gauge."""
 
     def norm(a, b, p):
         big = jnp.maximum(jnp.maximum(a, b), 1e-9)
@@ -305,7 +297,7 @@ def _upright(rotation: Array, config: RefinementConfig) -> Array:
 
 
 def _priors(step: Array, shape: _Shape, guess: _Shape, shelf: Shelf, config: RefinementConfig) -> Array:
-    """Residuals of all that is known without the image, in units of their standard deviations."""
+    """Residuals of the priors, in units of their standard deviations."""
     shape = _moved(shape, step)
     turned = matmul(shape.rotation, guess.rotation.T)
     angle = 0.5 * jnp.stack([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
@@ -326,7 +318,7 @@ def _priors(step: Array, shape: _Shape, guess: _Shape, shelf: Shelf, config: Ref
             (shape.position - guess.position) / config.position_prior,
             angle / deviation,
             jnp.maximum(walls, 0.0) / config.noise,
-            # Bounded pull: what stands on something else is not dragged down to the board.
+            # Bounded, so that objects on other objects are not pulled down to the board.
             5.0 * jnp.arctan(height / 5.0)[None],
             out_of_round[None],
         ]
@@ -368,7 +360,7 @@ def _evaluate(
 def _fit(
     guess: _Shape, origin: Array, evidence: _Evidence, shelf: Shelf, config: RefinementConfig
 ) -> tuple[_Shape, Array, Array]:
-    """Levenberg and Marquardt's method from a guess: the shape, its cost and the guess's."""
+    """Levenberg and Marquardt's method from an initial shape: the fitted shape, its cost and the initial cost."""
 
     def evaluated(shape, scale, damping):
         cost, gradient, normal = _evaluate(shape, guess, origin, evidence, scale, shelf, config)
@@ -385,8 +377,8 @@ def _fit(
         refused = fit.replace(damping=fit.damping * DAMPING_FACTOR)
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), candidate, refused), candidate.cost
 
-    # One loop for everything, so that the residuals are compiled once: first the guess's cost at the last scale, then
-    # the stages, each of which starts by taking the shape as it is at the new scale.
+    # One loop for everything, so that the residuals are compiled once: first the initial cost at the last scale, then
+    # the stages, each of which begins with the cost at the new scale.
     last = config.stages[-1][1]
     schedule = [(last, True), *((scale, i == 0) for steps, scale in config.stages for i in range(steps + 1))]
     scales, restarts = (jnp.array(column) for column in zip(*schedule, strict=True))
@@ -397,7 +389,7 @@ def _fit(
 
 
 def _supposed(scene_object: Superquadrics, hypothesis: Hypothesis, config: RefinementConfig) -> _Shape:
-    """An object as it would be under a hypothesis: upright if it nearly is, a cylinder with one radius."""
+    """An object's initial shape under a hypothesis: upright if it nearly is, a cylinder with equal radii."""
     round_ = hypothesis.exponents[1] > EDGE
     a, b, c = jnp.log(jnp.clip(scene_object.size, *HALF_EXTENTS))
     mean = (a + b) / 2.0
@@ -422,30 +414,30 @@ def refine(
 ) -> Refined:
     """Fit recognised superquadrics to a depth image.
 
-    `jax.vmap` over scenes, points, labels and images refines a batch. The rays from the camera to what it sees must not
-    pass through an object, whatever it is that they end on, so no segmentation of the image is asked for.
+    `jax.vmap` over scenes, points, labels and images refines a batch. Rays must not pass through an object, whatever
+    they end on, so the rays need no labels.
 
     Args:
       camera: the camera of the depth image.
-      shelf: the shelf that the objects are on.
-      scene: what a recogniser made of the points, fields (N, ...).
-      points: observed points in the world [m]; what is not finite is left out.
-      labels: the slot of `scene` that each point belongs to; others for what belongs to none.
-      depth: along the camera's axis [m]; infinite where nothing is seen, NaN where nothing was measured.
+      shelf: with the objects.
+      scene: the recognised objects, fields (N, ...).
+      points: observed points in the world [m]; those that are not finite are ignored.
+      labels: the slot in `scene` of each point; other numbers for none.
+      depth: along the camera's axis [m]; infinite where nothing is, NaN where nothing was measured.
       config: static; the default if None.
 
     Returns:
-      the refined scene and diagnostics. Absent objects and those with too few points are as they were.
+      the refined scene and diagnostics. Absent objects and those with too few points are unchanged.
     """
     config = config or RefinementConfig()
     origin = jnp.array(camera.position)
 
-    # Stands in for what is not fitted, so that its slot stays finite in value and derivative.
+    # Replaces objects that are not fitted, so that values and derivatives of their slots are finite.
     middle = ((shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board + 0.05)
     edges = jnp.full(2, superquadric.EDGE_EXPONENT)
     stand_in = Superquadrics(jnp.full(3, 0.05), edges, jnp.array(middle), jnp.eye(3), jnp.array(False))
 
-    def one(given, label):
+    def refine_object(given, label):
         finite = jnp.all(jnp.isfinite(points), axis=-1)
         usable = given.valid & (jnp.sum((labels == label) & finite) >= config.minimum_points)
         scene_object = jax.tree.map(lambda a, b: jnp.where(usable, a, b), given, stand_in)
@@ -465,4 +457,4 @@ def refine(
         kept = jax.tree.map(lambda a, b: jnp.where(usable & jnp.isfinite(cost), a, b), refined, given)
         return Refined(kept, cost, initial, count, best.astype(jnp.int32))
 
-    return jax.vmap(one)(scene, jnp.arange(scene.capacity))
+    return jax.vmap(refine_object)(scene, jnp.arange(scene.capacity))

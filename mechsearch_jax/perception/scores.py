@@ -1,4 +1,4 @@
-"""How well recognised superquadrics agree with true ones: volumetric intersection over union, and centre error."""
+"""Scores of recognised superquadrics: volumetric intersection over union with the true ones, and centre error."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from mechsearch_jax.geometry.transforms import rotate
 
 # A superquadric with these exponents differs from a box or a cylinder by less than 1e-4 of its volume.
 SHARP = 0.01
-# Exponents at or below this stand for an edge, above it for a round.
+# Exponents up to this represent an edge, larger ones a round.
 EDGE = 0.5
 SAMPLES = 4096
 
 
 def sharpened(superquadrics: Superquadrics) -> Superquadrics:
-    """The boxes and cylinders that superquadrics with rounded edges stand for.
+    """The boxes and cylinders that superquadrics with rounded edges represent.
 
     A perfect fit with the paper's exponents of 0.2 has an intersection over union of only 0.96 with the true box and
-    0.97 with the true cylinder. Exponents up to 0.5 are replaced by 0.01, which is a sharp edge for all that matters.
+    0.97 with the true cylinder. Exponents up to 0.5 are replaced by 0.01, practically a sharp edge.
     """
     exponents = superquadrics.exponents
     return superquadrics.replace(exponents=jnp.where(exponents <= EDGE, SHARP, exponents))

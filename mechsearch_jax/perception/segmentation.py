@@ -1,4 +1,4 @@
-"""Labels of an image by the segmentation network: drawing a cloud, segmenting it, cleaning up, spreading the labels."""
+"""Label an image with the segmentation network: draw a cloud, segment it, clean up, and spread the labels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 
 class Segmenter(Protocol):
-    """Says which pixels show which object; traceable by JAX, and a pytree where it holds arrays."""
+    """Labels the pixels of objects; traceable by JAX, and a pytree if it holds arrays."""
 
     def __call__(
         self, key: Key[Array, ""], shelf: Shelf, points: Float[Array, "h w 3"], of_target: Bool[Array, "h w"]
@@ -33,11 +33,10 @@ class Segmenter(Protocol):
           key: PRNG key.
           shelf: may be traced.
           points: in the world [m]; NaN invalidates the pixel.
-          of_target: where the detector sees the target.
+          of_target: the target's pixels.
 
         Returns:
-          Labels as `images.labels` has them, with no more than eight segments, 0 to 7; the target's pixels are
-          OTHER.
+          Labels as in `images.labels`, with at most eight segments, 0 to 7; the target's pixels are OTHER.
         """
         ...
 
@@ -47,10 +46,10 @@ class CleanUpConfig:
     """How labels of points are cleaned up.
 
     Attributes:
-      neighbours: points that vote on a point's label, itself among them, as far as they are within reach.
+      neighbours: number of nearest points within `reach` that vote on a point's label, itself included.
       rounds: of voting.
-      minimum: segments of fewer points are dissolved into the segments nearest to their points.
-      reach: points farther apart do not vote, nor take each other's label [m]; what is left over becomes OTHER.
+      minimum: points of smaller segments take the label of the nearest other segment.
+      reach: points farther apart do not vote on or take each other's label [m]; points without a label become OTHER.
     """
 
     neighbours: int = 9
@@ -78,13 +77,13 @@ def labels_of(logits: Float[Array, "p classes"]) -> Int[Array, " p"]:
 def clean_up(
     points: Float[Array, "p 3"], labels: Int[Array, " p"], valid: Bool[Array, " p"], config: CleanUpConfig | None = None
 ) -> Int[Array, " p"]:
-    """Labels after neighbours voted and small segments were dissolved, int8; OTHER where `valid` is false.
+    """Labels after neighbours voted and small segments were merged, int8; OTHER where `valid` is false.
 
     Args:
       points: [m].
       labels: instances' numbers, or OTHER.
-      valid: which points there are.
-      config: how; static.
+      valid: which points exist.
+      config: static.
     """
     config = config or CleanUpConfig()
     instances = jnp.arange(INSTANCES)
@@ -95,7 +94,7 @@ def clean_up(
 
     def vote(_, member):
         votes = jnp.sum(member[nearest] & votes_count, axis=1)
-        # A tie stays as it was.
+        # At a tie the label stays.
         best = jnp.argmax(2 * votes + member, axis=1)
         elected = (best[:, None] == instances[None, :]) & (jnp.max(votes, axis=1) > 0)[:, None]
         return elected & member.any(axis=1)[:, None] & valid[:, None]
@@ -107,8 +106,8 @@ def clean_up(
     distance = jnp.where(stays[None, :], square, jnp.inf)
     source = jnp.argmin(distance, axis=1)
     near = jnp.min(distance, axis=1) < config.reach**2
-    own = jnp.where(stays, jnp.argmax(member & kept[None], axis=1), OTHER)
-    return jnp.where(lost & near, own[source], own).astype(jnp.int8)
+    label = jnp.where(stays, jnp.argmax(member & kept[None], axis=1), OTHER)
+    return jnp.where(lost & near, label[source], label).astype(jnp.int8)
 
 
 @functools.partial(jax.jit, static_argnames="reach")
@@ -119,17 +118,17 @@ def spread_labels(
     labels: Int[Array, " p"],
     reach: float = 0.015,
 ) -> Int[Array, "h w"]:
-    """Labels of an image's pixels from those of a cloud drawn from it: each takes that of the nearest cloud point.
+    """Labels of an image's pixels from those of a cloud: each pixel takes the label of the nearest cloud point.
 
     Args:
       points: of the pixels [m]; NaN invalidates the pixel.
-      candidates: which pixels show something on the shelf, not the shelf itself.
-      cloud: [m].
-      labels: of the cloud's points; OTHER points count as any.
-      reach: a pixel with no cloud point so near becomes OTHER [m]; static.
+      candidates: pixels that show something on the shelf, not the shelf.
+      cloud: points drawn from the image [m].
+      labels: of the cloud's points, also OTHER.
+      reach: a pixel without a cloud point within this distance becomes OTHER [m]; static.
 
     Returns:
-      Labels as `images.labels` has them, int8.
+      Labels as in `images.labels`, int8.
     """
     measured = jnp.isfinite(points).all(axis=-1)
     pixels = jnp.where(measured[..., None], points, 0.0).reshape(-1, 3)
@@ -140,16 +139,16 @@ def spread_labels(
         best = jnp.argmin(square)
         return jnp.where(square[best] < reach**2, labels[best], OTHER).astype(jnp.int8)
 
-    # The shelf itself is most of an image.
+    # Most of an image shows the shelf.
     wanted = (measured & candidates).reshape(-1)
-    found = masked_vmap(nearest, wanted, None, (cloud, labels), pixels).reshape(measured.shape)
-    return jnp.where(~measured, MISSING, jnp.where(candidates, found, FREE)).astype(jnp.int8)
+    nearest_label = masked_vmap(nearest, wanted, None, (cloud, labels), pixels).reshape(measured.shape)
+    return jnp.where(~measured, MISSING, jnp.where(candidates, nearest_label, FREE)).astype(jnp.int8)
 
 
 def leave_out_smallest(labels: Int[Array, "h w"]) -> Int[Array, "h w"]:
-    """Labels with the numbers 0 to `INSTANCES - 2`: of as many segments as `INSTANCES` the smallest becomes OTHER.
+    """Labels with the numbers 0 to `INSTANCES - 2`: the smallest segment becomes OTHER if there are `INSTANCES`.
 
-    The last segment takes the number of the one that is smallest, or absent.
+    The last segment takes the number of the smallest, or of an absent one.
     """
     last = INSTANCES - 1
     pixels = jnp.sum(labels[..., None] == jnp.arange(INSTANCES).reshape(1, 1, -1), axis=(0, 1))
@@ -164,7 +163,7 @@ class NetworkSegmenter(flax.struct.PyTreeNode):
     Attributes:
       parameters: of the network.
       network: static.
-      view: which camera and shelf it was trained on, if that is known; static.
+      view: camera and shelf in its training, if its card records them; static.
     """
 
     parameters: Any
@@ -173,7 +172,7 @@ class NetworkSegmenter(flax.struct.PyTreeNode):
 
     @classmethod
     def of(cls, weights: Weights | None = None) -> NetworkSegmenter:
-        """The segmenter with the given weights; with those that ship with the package if None."""
+        """The segmenter with the given weights; the package's if None."""
         weights = weights or shipped_weights("segmentation")
         return cls(weights.parameters, cast(SegmentationNetwork, weights.network), weights.view)
 
@@ -182,13 +181,13 @@ class NetworkSegmenter(flax.struct.PyTreeNode):
         cloud = resample(key, cloud_of(jnp.where(objects[..., None], points, jnp.nan)))
         output = apply_network(self.network, self.parameters, self._as_trained(shelf, cloud.points)[None])
         labels = clean_up(cloud.points, labels_of(output.logits[-1, 0]), cloud.valid)
-        found = spread_labels(points, objects, cloud.points, labels)
-        return leave_out_smallest(jnp.where(of_target & (found != MISSING), OTHER, found))
+        image_labels = spread_labels(points, objects, cloud.points, labels)
+        return leave_out_smallest(jnp.where(of_target & (image_labels != MISSING), OTHER, image_labels))
 
     def _as_trained(self, shelf: Shelf, points: Float[Array, "p 3"]) -> Float[Array, "p 3"]:
-        """Points where they would be if the shelf stood where it stood in training: the network knows no other."""
+        """The points shifted as if the shelf stood where it stood in training, the only place the network knows."""
         if self.view is None:
             return points
-        # In the same precision both, so that points of that shelf itself stay exactly where they are.
-        known, here = (jnp.stack(middle(jax.tree.map(jnp.float32, one))) for one in (self.view.shelf, shelf))
-        return points + (known - here).reshape(1, 3)
+        # Both in the same precision, so that the shift is exactly 0 for the shelf of the training.
+        trained, present = (jnp.stack(middle(jax.tree.map(jnp.float32, s))) for s in (self.view.shelf, shelf))
+        return points + (trained - present).reshape(1, 3)
