@@ -1,1 +1,1 @@
-"""Networks, and the weights that ship with the package."""
+"""The networks and their weights."""

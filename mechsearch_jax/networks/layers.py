@@ -1,7 +1,7 @@
-"""What the networks are made of: attention, feed-forward layers and an encoding of positions.
+"""Layers of the networks: attention, feed-forward layers and an encoding of positions.
 
-Products are computed in `dtype`, which is bfloat16 in training; sums, norms and what flows from layer to layer stay in
-float32, so that millimetres survive.
+Products are computed in `dtype`, bfloat16 in training; sums, norms and the residual stream are float32, which resolves
+millimetres.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 
 def fourier_features(points: Float[Array, "*batch 3"], octaves: int = 6) -> Float[Array, "*batch features"]:
-    """Positions [m] with their sines and cosines at wavelengths from 0.8 m downwards, each half the one before."""
+    """Positions [m] with their sines and cosines at wavelengths of 0.8 m, 0.4 m, 0.2 m, ..."""
     waves = jnp.asarray(2.0 * np.pi / 0.8 * 2.0 ** np.arange(octaves), jnp.float32)
     angle = points[..., :, None] * waves.reshape(*[1] * points.ndim, -1)
     angle = angle.reshape(*points.shape[:-1], -1)
@@ -25,7 +25,7 @@ def fourier_features(points: Float[Array, "*batch 3"], octaves: int = 6) -> Floa
 
 
 class FeedForward(nn.Module):
-    """Normalise, widen, bend, narrow; to be added to its input. `dense(features, dtype=...)` makes its two layers."""
+    """A residual branch: norm, dense layer, GELU, dense layer. `dense(features, dtype=...)` makes the two layers."""
 
     width: int
     growth: int = 4
@@ -40,19 +40,19 @@ class FeedForward(nn.Module):
 
 
 class Attention(nn.Module):
-    """What tokens (..., n, width) gather from others (..., m, width), normalised first; to be added to the former."""
+    """A residual branch: norm, then attention of tokens (..., n, width) to a context (..., m, width) or themselves."""
 
     width: int
     heads: int
     dtype: Any = jnp.float32
 
     @nn.compact
-    def __call__(self, x: Array, others: Array | None = None) -> Array:
-        own = nn.LayerNorm()(x)
-        source = own if others is None else nn.LayerNorm()(others)
+    def __call__(self, x: Array, context: Array | None = None) -> Array:
+        target = nn.LayerNorm()(x)
+        source = target if context is None else nn.LayerNorm()(context)
         query, keys, values = (
             nn.DenseGeneral((self.heads, self.width // self.heads), dtype=self.dtype, name=name)(tokens)
-            for name, tokens in (("query", own), ("key", source), ("value", source))
+            for name, tokens in (("query", target), ("key", source), ("value", source))
         )
         gathered = jax.nn.dot_product_attention(query, keys, values)
         out = nn.DenseGeneral(self.width, axis=(-2, -1), dtype=self.dtype, name="out")(gathered)

@@ -1,14 +1,14 @@
 """The network that predicts a push: how every object moves in the plane, whether it moves at all, whether it topples.
 
 Like SQPD-Net (S. Kim et al., "SE(2)-equivariant pushing dynamics models for tabletop object manipulations", 2022) it
-sees every object in a planar frame of its own and its neighbours from there. The frame has its origin in the object's
-centre and its first axis along the push, and an object is described by how far it reaches in a few directions: so a box
-turned by half a turn, or a cylinder turned at all, is the same to the network, and turning and moving everything turns
-and moves the answer. A push and its mirror image are looked at together, by layers that treat both alike, so that what
-is symmetric stays symmetric. Walls are seen by how near they are, and not at all beyond `REACH`.
+has the features of every object and its neighbours in the object's planar frame. The frame has its origin in the
+object's centre and its first axis along the push, and an object is described by its extents in a few directions. So the
+features do not change if a box is turned by half a turn or a cylinder by any angle, and the output is equivariant under
+planar motions of everything. Layers act on a push and its mirror image together, so that the network is equivariant
+under reflection, too. Walls enter by their distance, up to `REACH`.
 
 `push_geometry` computes the network's input features from a `PushStart`, and `PushNetwork` maps a `PushStart` to a
-`PushMotion`. As a baseline that is not equivariant, the same network can be given the features in the world's frame.
+`PushMotion`. As a baseline that is not equivariant, the same network can use features in the world's frame.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from mechsearch_jax.runtime.errors import InputError
 # Units of the network's outputs: lengths [m], angles [rad].
 _SHIFT, _TURN = 0.05, 0.3
 _EVEN, _ODD = 5, 2
-# Weaker than any neighbour.
+# Stands for an absent neighbour in a maximum.
 _NOBODY = -1e9
 
 
@@ -46,10 +46,10 @@ class PushConfig:
     """Sizes of the network, and the frame of its input features.
 
     Attributes:
-      width: of what is known of an object.
-      layers: of messages between objects.
-      frame: "push" for each object's own frame along the push; "world" for the baseline without symmetry, which has as
-        many parameters as the other if it is 1.4 times as wide.
+      width: of an object's features.
+      layers: number of message layers.
+      frame: "push" for each object's frame along the push; "world" for the baseline without symmetry, which has the
+        same number of parameters at 1.4 times the width.
     """
 
     width: int = 64
@@ -82,7 +82,7 @@ class PushMotion(flax.struct.PyTreeNode):
 
 
 def _join(halves: Parity) -> Array:
-    """Numbers of a push and of its mirror image, (2, ...), from what is even and what is odd in them (...)."""
+    """Features of a push and of its mirror image, (2, ...), from their even and odd parts (...)."""
     return math.sqrt(0.5) * jnp.stack([halves.even + halves.odd, halves.even - halves.odd])
 
 
@@ -92,11 +92,11 @@ def _split(images: Array) -> Parity:
 
 
 class MirrorDense(nn.Module):
-    """A dense layer on a push and its mirror image, (2, ..., width): if they are exchanged, so is what comes out.
+    """A dense layer on a push and its mirror image, (2, ..., width), equivariant under their exchange.
 
-    Its matrix is one for what is even in them and another for what is odd, which costs no more than one for each image.
-    Without `symmetric` there is one image, (1, ..., width), and the layer is an ordinary one. The features of a push
-    come in as its `Parity`, (..., width).
+    It has one matrix for the even part and one for the odd part, at the cost of one matrix for each image. If not
+    `symmetric`, there is one image, (1, ..., width), and the layer is an ordinary one. The first layer takes the
+    features of a push as a `Parity`, (..., width).
     """
 
     features: int
@@ -115,7 +115,7 @@ class MirrorDense(nn.Module):
 
 
 class Messages(nn.Module):
-    """A message from the strongest neighbour of each object, by what both are and how they stand; to be added."""
+    """A residual branch: a message to each object, by a maximum over its neighbours in each channel."""
 
     width: int
     symmetric: bool
@@ -125,22 +125,19 @@ class Messages(nn.Module):
     def __call__(self, x: Array, pairs: Parity, other: Array) -> Array:
         dense = functools.partial(MirrorDense, self.width, self.symmetric, dtype=self.dtype)
         h = nn.LayerNorm()(x)
-        own = dense(name="own")(h)
-        theirs = dense(use_bias=False, name="theirs")(h)
+        receiver = dense(name="own")(h)
+        sender = dense(use_bias=False, name="theirs")(h)
         pair = dense(use_bias=False, name="pair")(pairs)
-        # What an object is itself does not change which neighbour is the strongest, in each channel by itself. The
-        # inner `where` keeps `gelu` and its gradient from `_NOBODY`.
-        strongest = jnp.max(jnp.where(other[None, ..., None], theirs[:, None] + pair, _NOBODY), axis=-2)
+        # The receiver is added after the maximum, which it does not change. The inner `where` keeps `_NOBODY` out of
+        # `gelu` and its gradient.
+        strongest = jnp.max(jnp.where(other[None, ..., None], sender[:, None] + pair, _NOBODY), axis=-2)
         alone = ~jnp.any(other, axis=-1)[None, :, None]
-        message = jnp.where(alone, 0.0, nn.gelu(own + jnp.where(alone, 0.0, strongest)))
+        message = jnp.where(alone, 0.0, nn.gelu(receiver + jnp.where(alone, 0.0, strongest)))
         return dense(name="out")(message).astype(jnp.float32)
 
 
 class PushTrunk(nn.Module):
-    """From the features of a push to numbers for each object, (N, 5) even and (N, 2) odd ones.
-
-    What is said of absent objects means nothing.
-    """
+    """From the features of a push to outputs for each object, (N, 5) even and (N, 2) odd; arbitrary for absent ones."""
 
     config: PushConfig
     dtype: Any = jnp.float32
@@ -153,7 +150,7 @@ class PushTrunk(nn.Module):
         other = geometry.valid[None] & geometry.valid[:, None] & ~jnp.eye(n, dtype=bool)
         x = dense(width, name="objects")(geometry.objects)
         x = x + dense(width, name="bend")(nn.gelu(dense(2 * width, name="widen")(geometry.objects)))
-        # Nothing is said of a wall out of reach: its bias too fades with the distance.
+        # A wall out of reach has no effect: its bias fades with the distance, too.
         walls = nn.gelu(dense(width // 2, name="walls")(geometry.walls)) * geometry.wall_near[None, ..., None]
         x = x + dense(width, use_bias=False, name="met")(jnp.sum(walls, axis=-2))
         for i in range(self.config.layers):
@@ -169,7 +166,7 @@ class PushTrunk(nn.Module):
 
 
 class PushNetwork(nn.Module):
-    """Permutation-equivariant over objects: reordering them reorders the motions. See the module's text."""
+    """The network, permutation-equivariant over objects. See the module's docstring."""
 
     config: PushConfig = PushConfig()
     dtype: Any = jnp.float32
@@ -179,7 +176,7 @@ class PushNetwork(nn.Module):
         geometry = push_geometry(start, self.config.frame)
         outputs = cast(Parity, PushTrunk(self.config, self.dtype, name="trunk")(geometry))
         x, y = geometry.axis[None], perpendicular(geometry.axis)[None]
-        # In the mirror, what goes to the left goes to the right, and turns are the other way round.
+        # The mirror image negates motions across the push and turns, which are odd.
         along, (across, turn) = outputs.even[:, 0], jnp.moveaxis(outputs.odd, -1, 0)
         planar = _SHIFT * jnp.stack([along, across], axis=-1) + geometry.carry[:, None] * geometry.heading[None]
         return PushMotion(

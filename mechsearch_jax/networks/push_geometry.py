@@ -1,4 +1,4 @@
-"""What the push network is told of a push: objects, contacts and walls, along the push and across it."""
+"""Input features of the push network: objects, contacts and walls, along the push and across it."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Directions, spread over half a turn, in which an object's reach is a feature; an even number.
+# Number of directions over half a turn in which an object's extents are features; even.
 DIRECTIONS = 8
-# Contacts and walls farther away than this are all the same to the network [m]: no push is longer.
+# Distances to contacts and walls are clipped to this [m]: no push is longer.
 REACH = 0.25
-# Over how much lateral overlap a contact comes into being: a graze is no contact [m].
+# Lateral overlap over which a contact grows from a graze, which is no contact, to a full one [m].
 GRAZE = 1e-3
-# Deeper overlaps are all the same to the network, and so are objects passed by at more than this [m].
+# Deeper overlaps are clipped to this, and so are lateral gaps of objects that pass each other [m].
 DEEPEST = 0.02
-# Points of the gripper that are looked at.
+# Number of points of the gripper.
 POINTS = 192
-# How far behind the first point of contact others still count as touching [m], and a stricter notion of that: its
-# weights are a power of the others, which saves an exponential.
+# Decay length of the weights of points behind the first contact [m]; the power of these weights that gives stricter
+# ones without another exponential.
 SOFTNESS, STRICTER = 0.015, 5
-# Two objects meet along a normal if it parts them until they touch and, linearly less, if it does so until at most this
-# much before [m].
+# Two objects meet along a normal that separates them until they touch; normals that separate them until up to this much
+# earlier count linearly less [m].
 SAME_CONTACT = 2e-3
-# A step towards a contact at a cylinder is taken as if it were met at no flatter an angle than one of this sine.
+# Least sine of the angle at which a cylinder is met, in Newton's step towards its contact.
 _FLATTEST = 0.3
-# Objects that push each other on, one after the other, in the estimate of who is reached when.
+# Length of chains of objects that push each other, in the estimate of which object is reached when.
 CHAIN = 4
 # Units of the network's inputs and outputs: lengths [m], angles [rad].
 _LENGTH = 0.1
-# The inward normals of the back, right and left walls, and of the front edge, beyond which is nothing.
+# The inward normals of the back, right and left walls, and of the front edge, which is no wall.
 NORMALS = np.array([[-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 0.0]], np.float32)
 _IS_EDGE = np.array([0.0, 0.0, 0.0, 1.0], np.float32)
 MIRRORED_DIRECTIONS = (-np.arange(DIRECTIONS)) % DIRECTIONS
 
 
 class Parity(flax.struct.PyTreeNode):
-    """Numbers by what a mirror along the frame's first axis makes of them; any leading axes.
+    """Features by their parity under reflection at the frame's first axis; any leading axes.
 
     Attributes:
-      even: what stays as it is: lengths, and vectors along the axis.
-      odd: what changes its sign: vectors across the axis.
+      even: unchanged: lengths, and components along the axis.
+      odd: with changed sign: components across the axis.
     """
 
     even: jax.Array
@@ -57,18 +57,18 @@ class Parity(flax.struct.PyTreeNode):
 
 
 class PushGeometry(flax.struct.PyTreeNode):
-    """Input features of a push, in the frame of `PushConfig`; lengths in units of 10 cm but where [m] is given.
+    """Input features of a push, in the frame of `PushConfig`; lengths in units of 10 cm unless [m] is given.
 
     Attributes:
       objects: of each object, shapes (N, ...).
-      pairs: of object j as seen from object i, shapes (N, N, ...).
-      walls: of each wall as seen from each object, shapes (N, 4, ...).
+      pairs: of object j relative to object i, shapes (N, N, ...).
+      walls: of each wall relative to each object, shapes (N, 4, ...).
       wall_near: 1 at the wall, 0 from `REACH` on, shape (N, 4).
       carry: how far each object would be carried if nothing turned or slid off [m], shape (N,).
       heading: unit vector of the push in the frame, shape (2,).
       axis: first axis of the frame in the world, a planar unit vector, shape (2,).
       round: which objects are round, shape (N,).
-      valid: which objects are there, shape (N,).
+      valid: which slots hold an object, shape (N,).
     """
 
     objects: Parity
@@ -97,7 +97,7 @@ def _norm(v: Array) -> Array:
 
 
 def _fan(axis: Array) -> Array:
-    """Angles of directions over half a turn, from a planar vector on [rad]."""
+    """Angles of directions over half a turn, beginning with that of a planar vector [rad]."""
     return jnp.arctan2(axis[1], axis[0]) + jnp.asarray(np.arange(DIRECTIONS) * np.pi / DIRECTIONS, jnp.float32)
 
 
@@ -112,14 +112,14 @@ def reach(prints: Footprints, direction: Float[Array, "*other n 2"]) -> Float[Ar
 
 
 def _slabs(width: Array, offset: Array, speed: Array) -> tuple[Array, Array]:
-    """When a point that is at `offset` and moves at `speed` enters and leaves all slabs |x| <= width along axis -1."""
+    """When a point at `offset` with velocity `speed` enters and leaves all slabs |x| <= width along axis -1."""
     safe = jnp.where(jnp.abs(speed) < 1e-5, 1e-5, speed)
     middle, half = -offset / safe, width / jnp.abs(safe)
     return jnp.max(middle - half, axis=-1), jnp.min(middle + half, axis=-1)
 
 
 def _grazing(enters: Array, leaves: Array, overlap: Array, longest: float = REACH) -> Array:
-    """A distance to a contact, at most `longest`, and `longest` where one passes by or is past it already."""
+    """A distance to a contact, at most `longest`; `longest` if the two pass each other or are past it already."""
     share = jnp.clip(jnp.minimum(overlap, leaves) / GRAZE, 0.0, 1.0)
     return share * jnp.clip(enters, -DEEPEST, longest) + (1.0 - share) * longest
 
@@ -129,14 +129,14 @@ def pusher_distance(
 ) -> tuple[Float[Array, "n p"], Bool[Array, "n p"]]:
     """How far each point moves along a planar unit vector until it enters each footprint, at most `longest` [m].
 
-    Also whether it is at the height of the object; below 0 it is inside already.
+    A distance below 0 means that it is inside. Also returns whether the point is at the height of the object.
     """
     level = (points[None, :, 2] > prints.low[:, None] - TOUCH) & (points[None, :, 2] < prints.high[:, None] + TOUCH)
     side = perpendicular(heading)
     from_centre = points[None, :, :2] - prints.position[:, None]
     lateral = _dot(from_centre, side[None, None])
     widest = reach(prints, jnp.broadcast_to(side[None], prints.position.shape))[:, None]
-    # What passes by is looked at as if it grazed the side, and then counts for nothing.
+    # Points that pass by are shifted to graze the side, which keeps values finite; their weight is 0.
     inside = jnp.clip(lateral, GRAZE / 4 - widest, widest - GRAZE / 4)
     start = from_centre + (inside - lateral)[..., None] * side[None, None]
     local = turned(-prints.yaw, start)
@@ -151,19 +151,19 @@ def pusher_distance(
 
 
 class Meetings(flax.struct.PyTreeNode):
-    """Where object i would meet object j if it moved along the heading; leading axes (N, N).
+    """Contacts of object i with object j if i moves along the heading; leading axes (N, N).
 
-    Distances are exact for two boxes, and gaps then a lower bound. A cylinder's contact is sought with a polygon around
-    it, up to 2% wider, and then moved onto the circle by one step of Newton's method: too soon by up to 3 mm where it
-    is nearly passed by.
+    Distances are exact for two boxes, whose gaps are lower bounds. A cylinder's contact is computed with a
+    circumscribed polygon, up to 2% wider, and then moved onto the circle by one Newton step: too early by up to 3 mm
+    for near misses.
 
     Attributes:
-      distance: how far i moves until it touches j [m]: at least `-DEEPEST`, and `REACH` where it passes by or is past.
-      gap: between them now; negative where they overlap [m].
-      normal: unit vector along which i meets j, never against the heading, (N, N, 2); of two boxes the mean where there
-        are several. Where i passes by, it is about that of a graze, and where it is past, that of a meeting before.
-      middle: of where they overlap across the heading, or of the room between them, to its left, from i's centre [m].
-      breadth: of that overlap; negative where i passes by [m].
+      distance: how far i moves until it touches j [m]: at least `-DEEPEST`, and `REACH` if it passes by or is past.
+      gap: present gap between them; negative if they overlap [m].
+      normal: unit vector along which i meets j, never against the heading, (N, N, 2); for two boxes the mean if there
+        are several. If i passes by, about that of a graze; if it is past, that of the earlier contact.
+      middle: middle of their overlap across the heading, or of the gap, to the left of i's centre [m].
+      breadth: of that overlap; negative if i passes by [m].
     """
 
     distance: jax.Array
@@ -174,9 +174,9 @@ class Meetings(flax.struct.PyTreeNode):
 
 
 def _round_contacts(prints: Footprints, axis: Array, offset: Array) -> tuple[Array, Array]:
-    """The way from footprints i to footprints j where they are nearest, if one of them is round.
+    """Direction and gap from footprints i to footprints j at their nearest points, if one of them is round.
 
-    An approximation: an ellipse is taken for a circle of its mean half-axis. Of two boxes it says nothing.
+    An approximation: an ellipse is replaced by a circle of its mean half-axis. Meaningless for two boxes.
 
     Args:
       prints: the footprints (N).
@@ -184,10 +184,10 @@ def _round_contacts(prints: Footprints, axis: Array, offset: Array) -> tuple[Arr
       offset: of i from j, (K, N, N, 2) [m].
 
     Returns:
-      Unit vectors (K, N, N, 2), and how far they are apart, (K, N, N) [m]; below 0 they overlap. Where the axis of one
-      is inside the other the vector is 0, and less is told than how deep.
+      Unit vectors (K, N, N, 2), and gaps (K, N, N) [m], negative for overlaps. If the centre of the disc is inside the
+      other footprint, the vector is 0 and the depth is underestimated.
     """
-    # Seen from the one that may be a box, the other one is a disc.
+    # In the frame of the footprint that may be a box, the other one is a disc.
     disc_moves = prints.round[:, None, None]
     axis = jnp.where(disc_moves, axis[None], axis[:, None])[None]
     side = perpendicular(axis)
@@ -208,14 +208,14 @@ def meetings(prints: Footprints, heading: Float[Array, "2"]) -> Meetings:
     n = prints.yaw.shape[0]
     fan = _fan(heading)
     rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
-    # A round object has no sides of its own: in their place, two of the rays are taken once more.
+    # A round object has no sides: two of the rays are repeated instead.
     axis = jnp.stack([jnp.cos(prints.yaw), jnp.sin(prints.yaw)], axis=-1)
     first = jnp.where(prints.round[:, None], heading[None], axis)
     sides = jnp.stack([first, perpendicular(first)], axis=1)
-    # How far all objects reach along the rays, (K, N), and along each other's sides: [k, s, m] is m along those of k.
+    # Extents of all objects along the rays, (K, N), and along each other's sides: [k, s, m] is m along those of k.
     along_rays = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, n, 2)))
     along_sides = reach(prints, jnp.broadcast_to(sides[:, :, None], (n, 2, n, 2)))
-    own = jnp.diagonal(along_sides, axis1=0, axis2=2).T
+    half_sides = jnp.diagonal(along_sides, axis1=0, axis2=2).T
     offset = prints.position[:, None] - prints.position[None]
     side = perpendicular(heading)
     lateral = _dot(offset, side[None, None])
@@ -230,15 +230,15 @@ def meetings(prints: Footprints, heading: Float[Array, "2"]) -> Meetings:
         jnp.broadcast_to(jnp.moveaxis(sides, 1, 0)[:, None], (2, n, n, 2)),
     )
     normals = jnp.concatenate(normals)
-    width = jnp.moveaxis(own[:, :, None] + along_sides, 1, 0)
+    width = jnp.moveaxis(half_sides[:, :, None] + along_sides, 1, 0)
     width = jnp.concatenate([along_rays[:, :, None] + along_rays[:, None], width, jnp.swapaxes(width, 1, 2)])
     speed = _dot(normals, heading[None, None, None])
     safe = jnp.where(jnp.abs(speed) < 1e-5, 1e-5, speed)
     nearest, half = -_dot(normals, start[None]) / safe, width / jnp.abs(safe)
-    each = nearest - half
-    enters, leaves = jnp.max(each, axis=0), jnp.min(nearest + half, axis=0)
+    entries = nearest - half
+    enters, leaves = jnp.max(entries, axis=0), jnp.min(nearest + half, axis=0)
     gap = jnp.max(jnp.abs(_dot(normals, offset[None])) - width, axis=0)
-    share = jnp.maximum(1.0 - (enters[None] - each) / SAME_CONTACT, 0.0) * jnp.sign(speed)
+    share = jnp.maximum(1.0 - (enters[None] - entries) / SAME_CONTACT, 0.0) * jnp.sign(speed)
     normal = jnp.sum(share[..., None] * normals, axis=0)
     length = _norm(normal)[..., None]
     normal = jnp.where(length > 1e-6, normal / jnp.where(length > 1e-6, length, 1.0), 0.0)
@@ -264,7 +264,7 @@ def meetings(prints: Footprints, heading: Float[Array, "2"]) -> Meetings:
 def _soft_contacts(distance: Array, level: Array, points: Array, heading: Array) -> tuple[Array, Array]:
     """Where points (P, 3), moved along the heading by distances (N, P), first touch, strictly and less so; (N, 3)."""
     first = jnp.min(jnp.where(level, distance, REACH), axis=1, keepdims=True)
-    # What is not level may be reached long before; the inner `where` keeps it from overflowing.
+    # Points at other heights may be reached long before; the inner `where` prevents an overflow.
     weight = jnp.where(level, jnp.exp((first - jnp.where(level, distance, first)) / SOFTNESS), 0.0)
 
     def mean(weight):
@@ -281,12 +281,12 @@ class PushStart(flax.struct.PyTreeNode):
 
     Attributes:
       prints: footprints of the objects, fields (N, ...).
-      tilt: 10 (1 - cos) of the angle by which each object leans, 0 if a face of it is level, shape (N,).
+      tilt: 10 (1 - cos) of each object's angle of lean, 0 if a face is level, shape (N,).
       points: surface of the gripper in the world [m], shape (P, 3).
       T_world_gripper: its pose, shape (4, 4).
-      displacement: how the gripper moves in the plane [m], shape (2,).
-      faces: where the inner faces of the back, right and left walls are along their inward normals, and the front edge
-        [m], shape (4,).
+      displacement: of the gripper in the plane [m], shape (2,).
+      faces: positions of the inner faces of the back, right and left walls, and of the front edge, along their inward
+        normals [m], shape (4,).
       board: height of the shelf's board [m].
     """
 
@@ -309,11 +309,11 @@ def push_start(
     """The start of a push; see `push_model.PushModel` for the arguments.
 
     Args:
-      shelf: walls; one of which is farther than `REACH` from an object does not exist for it.
+      shelf: walls; those farther than `REACH` from an object have no effect on it.
       scene: the objects, fields (N, ...).
-      pusher: surface of the closed gripper in its own frame [m]; the first `POINTS` of it have to cover all of it.
-      T_world_gripper: where the push starts.
-      displacement: how the gripper moves [m]; what is vertical in it is neglected.
+      pusher: surface of the closed gripper in its own frame [m]; the first `POINTS` must cover all of it.
+      T_world_gripper: first pose.
+      displacement: of the gripper [m]; the vertical component is neglected.
     """
     return PushStart(
         prints=footprints(scene),
@@ -327,7 +327,7 @@ def push_start(
 
 
 def _framed(axis: Array, vectors: Array) -> Array:
-    """Planar vectors (..., 2) in the frame with this first axis."""
+    """Planar vectors (..., 2) in the frame whose first axis is `axis`."""
     x, y = (a.reshape(*[1] * (vectors.ndim - 1), 2) for a in (axis, perpendicular(axis)))
     return jnp.stack([_dot(vectors, x), _dot(vectors, y)], axis=-1)
 
@@ -341,7 +341,7 @@ def _pairs(prints: Footprints, met: Meetings, carry: Array, heading: Array, axis
     passed = jnp.maximum(carry[:, None] - jnp.maximum(onward, 0.0), 0.0)
     gap, breadth = (jnp.clip(a, -DEEPEST, REACH) for a in (met.gap, met.breadth))
     lengths = [onward, onward.T, passed, passed.T, gap, jnp.clip(overlap, -0.05, 0.2), breadth]
-    # From the centre of i; from that of j it differs by the offset, which is a feature.
+    # Relative to the centre of i; relative to j it differs by the offset, which is a feature.
     side = met.middle[..., None] * perpendicular(heading)[None, None]
     normal = _framed(axis, met.normal)
     offset, side = _framed(axis, offset) / _LENGTH, _framed(axis, side) / _LENGTH
@@ -351,7 +351,7 @@ def _pairs(prints: Footprints, met: Meetings, carry: Array, heading: Array, axis
 
 
 def _walls(prints: Footprints, faces: Array, axis: Array) -> tuple[Parity, Array]:
-    """Features of each wall in each object's frame, (N, 4, ...), and how near it is; see `PushGeometry`."""
+    """`walls` and `wall_near` of `PushGeometry`."""
     n = prints.yaw.shape[0]
     normals = jnp.asarray(NORMALS)
     toward = reach(prints, jnp.broadcast_to(normals[:, None], (4, n, 2))).T
@@ -365,7 +365,7 @@ def _walls(prints: Footprints, faces: Array, axis: Array) -> tuple[Parity, Array
 
 
 def _extents(prints: Footprints, axis: Array) -> Parity:
-    """How far each object reaches in directions that begin with the axis [m], (N, ...)."""
+    """Extents of each object in directions that begin with the axis [m], (N, ...)."""
     fan = _fan(axis)
     rays = jnp.stack([jnp.cos(fan), jnp.sin(fan)], axis=-1)
     extents = reach(prints, jnp.broadcast_to(rays[:, None], (DIRECTIONS, prints.yaw.shape[0], 2))).T
@@ -374,7 +374,7 @@ def _extents(prints: Footprints, axis: Array) -> Parity:
 
 
 def _reached(prints: Footprints, met: Meetings, direct: Array, length: Array) -> tuple[Array, Array]:
-    """After how long a way objects are reached, by the gripper or by others, and how far each is then carried [m]."""
+    """Length of the push until the gripper or other objects reach each object, and how far it is then carried [m]."""
     valid = prints.valid[:, None]
     other = ~jnp.eye(prints.yaw.shape[0], dtype=bool) & valid & valid.T
     onward = jnp.where(other, jnp.maximum(met.distance, 0.0), REACH)
@@ -385,7 +385,7 @@ def _reached(prints: Footprints, met: Meetings, direct: Array, length: Array) ->
 
 
 def _swept_band(start: PushStart, level: Array, heading: Array) -> tuple[Array, Array]:
-    """Middle, across the push, of the band that the gripper sweeps at each object's height, and half its breadth."""
+    """Middle and half breadth, across the push, of the band that the gripper sweeps at each object's height."""
     across = _dot(start.points[None, :, :2] - start.prints.position[:, None], perpendicular(heading)[None, None])
     low = jnp.min(jnp.where(level, across, REACH), axis=1)
     high = jnp.max(jnp.where(level, across, -REACH), axis=1)
@@ -394,21 +394,16 @@ def _swept_band(start: PushStart, level: Array, heading: Array) -> tuple[Array, 
 
 
 def _hand_directions(T_world_gripper: Array, axis: Array) -> tuple[Array, Array]:
-    """The hand's approach seen from above, and twice the angle of its closing direction, along and across the push.
+    """The hand's planar approach direction, and the vector at twice the angle of its closing direction, in the frame.
 
-    The hand is the same after half a turn about its approach.
+    Twice the angle, for the hand is the same after half a turn about its approach.
     """
     approach, closing = (_framed(axis, T_world_gripper[None, :2, i])[0] for i in (2, 1))
     return approach, jnp.stack([closing[0] ** 2 - closing[1] ** 2, 2.0 * closing[0] * closing[1]])
 
 
 def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") -> PushGeometry:
-    """The network's input features of a push.
-
-    Args:
-      start: see there.
-      frame: see `PushConfig`.
-    """
+    """The network's input features of a push, in a `frame` of `PushConfig`."""
     prints, points, T_world_gripper = start.prints, start.points, start.T_world_gripper
     length = _norm(start.displacement)
     heading = jnp.where(length > 1e-6, start.displacement / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0]))

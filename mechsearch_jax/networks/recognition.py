@@ -1,11 +1,11 @@
-"""The network that recognises a segment: from its cloud to size, exponents and pose (paper section 4.1, B.1).
+"""The recognition network: from a segment's cloud to size, exponents and pose (paper section 4.1, B.1).
 
-The output is a mixture of a few hypotheses (classification of a coarse orientation, regression of the residual): a box
-at one of six yaw angles within a quarter turn, a standing cylinder, a lying cylinder at one of six yaw angles within
-half a turn. The network gives a logit for each hypothesis, and its small residual rotation, size, exponents and
-position. So the regression targets are continuous where the paper's parametrisation jumps, as at boxes whose yaw passes
-90 degrees and whose width and depth swap roles. That objects stand on the board is a prior: height is relative to an
-object that rests on it, and tilt relative to one that is level.
+The output is a mixture of hypotheses (classification of a coarse orientation, regression of the residual): a box at one
+of six yaw angles within a quarter turn, a standing cylinder, and a lying cylinder at one of six yaw angles within half
+a turn. For each hypothesis the network gives a logit, a small residual rotation, size, exponents and position. So the
+regression targets are continuous where the paper's parametrisation jumps, as for boxes whose yaw passes 90 degrees and
+whose width and depth swap. A prior is that objects stand on the board: height is relative to resting on it, and tilt
+relative to being level.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ UNCERTAIN = 6
 def _yaws(count: int, period: float) -> np.ndarray:
     """Matrices of evenly spread yaw angles, the middles of `count` parts of `period`."""
     yaw = (np.arange(count) + 0.5) * period / count
-    zero, one = np.zeros(count), np.ones(count)
+    zero, unit = np.zeros(count), np.ones(count)
     c, s = np.cos(yaw), np.sin(yaw)
-    return np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(count, 3, 3)
+    return np.stack([c, -s, zero, s, c, zero, zero, zero, unit], axis=-1).reshape(count, 3, 3)
 
 
 _LAID = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -60,8 +60,8 @@ class RecognitionConfig:
 
     Attributes:
       width: of a token.
-      layers: of attention and feed-forward.
-      heads: of an attention.
+      layers: number of attention and feed-forward layers.
+      heads: of an attention layer.
     """
 
     width: int = 192
@@ -74,7 +74,7 @@ class RecognitionConfig:
 
 
 class Hypotheses(flax.struct.PyTreeNode):
-    """What a segment may be, in the segment's frame; every field has the leading axes (..., 13).
+    """Hypotheses about a segment, in the segment's frame; every field has the leading axes (..., 13).
 
     Attributes:
       logit: of the probability of each.
@@ -82,7 +82,7 @@ class Hypotheses(flax.struct.PyTreeNode):
       exponents: (e1, e2), (..., 13, 2).
       position: `t_segment_object` [m], (..., 13, 3).
       rotation: `R_segment_object`, (..., 13, 3, 3).
-      turn: the small rotation vector that follows the hypothesis' own orientation [rad], (..., 13, 3).
+      turn: residual rotation vector after the hypothesis' coarse orientation [rad], (..., 13, 3).
       log_scale: logarithm of the expected absolute error [m] of size and position, (..., 13, 6).
     """
 
@@ -112,7 +112,7 @@ def rotation_of(turn: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
 def resting_height(
     size: Float[Array, "*batch 3"], rotation: Float[Array, "*batch 3 3"], kind: Int[Array, "..."]
 ) -> Float[Array, "*batch"]:
-    """Height of a body's centre above its own lowest point [m], from the code of its shape."""
+    """Height of a body's centre above its lowest point [m]; `kind` is the code of its shape."""
     return by_shape(kind, lambda shape: shape.reach(rotation[..., 2, :], size, jnp), jnp)
 
 
@@ -123,7 +123,7 @@ def _inverse_sigmoid(exponent: float) -> float:
 
 
 def decode(outputs: Float[Array, "*batch k o"], logit: Float[Array, "*batch k"]) -> Hypotheses:
-    """What the network's outputs mean; zeros are 8 cm cubes and cylinders on the board, at the segment's origin.
+    """Hypotheses from the network's outputs; zeros are 8 cm cubes and cylinders on the board, at the segment's origin.
 
     Args:
       outputs: for each hypothesis, rotation (3), size (3), position (3), exponents (2), logarithms of errors (6).
@@ -132,7 +132,7 @@ def decode(outputs: Float[Array, "*batch k o"], logit: Float[Array, "*batch k"])
     batch = [1] * (outputs.ndim - 2)
     is_round = jnp.asarray(IS_ROUND).reshape(*batch, HYPOTHESES)
     turn = _TURN * outputs[..., :3]
-    # A round object's rotation about its own axis means nothing, and its radius is one number.
+    # A round object has no rotation about its axis, and one radius.
     turn = jnp.where(is_round[..., None] & (jnp.arange(3) == 2).reshape(*batch, 1, 3), 0.0, turn)
     base = jnp.asarray(BASE_ROTATIONS).reshape(*batch, HYPOTHESES, 3, 3)
     rotation = matmul(base, rotation_of(turn))
@@ -150,7 +150,7 @@ def decode(outputs: Float[Array, "*batch k o"], logit: Float[Array, "*batch k"])
 
 
 class RecognitionNetwork(nn.Module):
-    """Self-attention among a segment's points and one summary token; see the module's text.
+    """Self-attention among a segment's points and one summary token; see the module's docstring.
 
     Permutation-invariant over a segment's points, and independent between segments.
     """
@@ -178,8 +178,8 @@ class RecognitionNetwork(nn.Module):
             x = x + Attention(config.width, config.heads, self.dtype)(x)
             x = x + FeedForward(config.width, dtype=self.dtype)(x)
         x = nn.LayerNorm()(x)
-        own = (mark > 0) & (mark < MARKS - 1)
-        share = own / jnp.maximum(jnp.sum(own, axis=-1, keepdims=True), 1)
+        is_segment = (mark > 0) & (mark < MARKS - 1)
+        share = is_segment / jnp.maximum(jnp.sum(is_segment, axis=-1, keepdims=True), 1)
         pooled = jnp.concatenate([x[:, 0], jnp.sum(x[:, 1:] * share[..., None], axis=1)], axis=-1)
         pooled = nn.gelu(nn.Dense(2 * config.width, name="summary")(pooled))
         logit = nn.Dense(HYPOTHESES, name="logit")(pooled)

@@ -1,10 +1,10 @@
-"""The network that tells the objects of a cloud apart (paper section 4.1 and appendix B.1).
+"""The segmentation network, which separates the objects of a cloud (paper section 4.1 and appendix B.1).
 
 Edge convolutions over each point's nearest neighbours (Y. Wang et al., "Dynamic graph CNN for learning on point
-clouds", 2019) see where surfaces end. Between them a few latent tokens gather from all points and give back (A. Jaegle
-et al., "Perceiver", 2021), so that far parts of one object hear of each other. The first of these tokens stand for the
-instances, and a point belongs to the one that its features match best (B. Cheng et al., "MaskFormer", 2021). Unlike
-DGCNN's, the neighbours are those in space in every layer: they are found once.
+clouds", 2019) detect the ends of surfaces. Between them, a few latent tokens attend to all points and the points to the
+tokens (A. Jaegle et al., "Perceiver", 2021), which connects distant parts of an object. The first tokens represent the
+instances, and a point belongs to the one that its features match best (B. Cheng et al., "MaskFormer", 2021). Unlike in
+DGCNN, neighbours are those in space in every layer, so they are computed once.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from mechsearch_jax.images.labels import INSTANCES
 from mechsearch_jax.networks.layers import Attention, FeedForward, fourier_features
 from mechsearch_jax.runtime.errors import InputError
 
-# The middle of the shelf's space [m]: where the network's frame has its origin.
+# Origin of the network's frame, the middle of the shelf's space [m].
 MIDDLE = (0.6, 0.1, 0.5)
-# Neighbours that `strongest_neighbour` goes through in one piece, between which the largest so far is in memory.
+# Unrolled iterations over the neighbours in `strongest_neighbour`.
 _UNROLLED = 5
 
 
@@ -35,10 +35,10 @@ class SegmentationConfig:
 
     Attributes:
       width: of a point's features and of a token.
-      layers: of edge convolution and attention.
-      heads: of an attention.
-      neighbours: k, how many points an edge convolution looks at.
-      latents: tokens that gather from all points; the first nine are the instances.
+      layers: number of layers of edge convolution and attention.
+      heads: of an attention layer.
+      neighbours: k, number of neighbours in an edge convolution.
+      latents: number of latent tokens; the first nine are the instances.
     """
 
     width: int = 128
@@ -60,9 +60,9 @@ class SegmentationOutput(flax.struct.PyTreeNode):
     """The network's output for the points of a cloud.
 
     Attributes:
-      logits: for each layer, of the probability that a point is of each of nine instances, or (last) of none, shape
-        (layers, ..., P, 10); the last layer's are the answer, the others help training.
-      centres: the centre of each point's object in the world, as the point sees it [m], shape (..., P, 3).
+      logits: for each layer, of the probability that a point belongs to each of nine instances, or (last) to none,
+        shape (layers, ..., P, 10); the last layer's are the result, the others are for training.
+      centres: predicted centre of each point's object in the world [m], shape (..., P, 3).
     """
 
     logits: jax.Array
@@ -70,12 +70,12 @@ class SegmentationOutput(flax.struct.PyTreeNode):
 
 
 def nearest_neighbours(points: Float[Array, "p 3"], count: int) -> Int[Array, "p count"]:
-    """Indices of the `count` nearest points of each point, itself among them, by Euclidean distance.
+    """Indices of the `count` nearest points of each point, itself included, in order of distance.
 
-    Nearer ones come first, and of equally near ones that of the lower index, on every platform.
+    Of equally near points, the lower index comes first, on every platform.
     """
     passes, sort = (functools.partial(of, count=count) for of in (_neighbours_by_passes, _neighbours_by_sorting))
-    # Indices have no slope, and a general reduction knows no derivative.
+    # Indices have no gradient, and JAX cannot differentiate a general reduction.
     return jax.lax.platform_dependent(jax.lax.stop_gradient(points), cuda=passes, rocm=passes, default=sort)
 
 
@@ -84,10 +84,10 @@ def _neighbours_by_sorting(points: Array, count: int) -> Array:
 
 
 def _neighbours_by_passes(points: Array, count: int) -> Array:
-    """One pass over all pairs for each neighbour, which finds the next after the last.
+    """One pass over all pairs for each neighbour, which finds the next nearest one.
 
-    On a GPU `top_k` sorts whole rows where `count` is above 16. A pass is a reduction into which the distances are
-    fused: they are never in memory.
+    On a GPU `top_k` sorts whole rows if `count` is above 16. A pass is a reduction that is fused with the computation
+    of the distances, which are never in memory.
     """
     number = jnp.broadcast_to(jnp.arange(len(points), dtype=jnp.int32)[None], (len(points), len(points)))
     beyond = (jnp.float32(jnp.inf), jnp.int32(len(points)))
@@ -96,14 +96,14 @@ def _neighbours_by_passes(points: Array, count: int) -> Array:
         first = (a[0] < b[0]) | ((a[0] == b[0]) & (a[1] < b[1]))
         return jnp.where(first, a[0], b[0]), jnp.where(first, a[1], b[1])
 
-    def following(last, _):
+    def next_nearest(last, _):
         square = _squares(points)
         done = (square < last[0][:, None]) | ((square == last[0][:, None]) & (number <= last[1][:, None]))
-        found = jax.lax.reduce((jnp.where(done, jnp.inf, square), number), beyond, nearer, (1,))
-        return found, found[1]
+        following = jax.lax.reduce((jnp.where(done, jnp.inf, square), number), beyond, nearer, (1,))
+        return following, following[1]
 
     none = (jnp.full(len(points), -1.0), jnp.full(len(points), -1, jnp.int32))
-    return jax.lax.scan(following, none, length=count)[1].T
+    return jax.lax.scan(next_nearest, none, length=count)[1].T
 
 
 def _squares(points: Array) -> Array:
@@ -117,23 +117,23 @@ def strongest_neighbour(
     place: Float[Array, "3 width"],
     neighbours: Int[Array, "p count"],
 ) -> Float[Array, "p width"]:
-    """For each channel the largest, over a point's neighbours, of their features and of where they are.
+    """`max(features[neighbours] + offsets @ place, axis=1)`: for each channel the maximum over a point's neighbours.
 
-    Plainly `max(features[neighbours] + offsets @ place, axis=1)`. But that is `count` times as large as all else in
-    the network, so it is gone through neighbour by neighbour; and the gradient reaches one neighbour for each channel,
-    while differentiation, left to itself, would add a zero to all others too, at random places in memory.
+    The array in the maximum would be `count` times as large as all others in the network, so this iterates over the
+    neighbours. The gradient reaches one neighbour for each channel; automatic differentiation would also add zeros to
+    all others, at random places in memory.
 
     Args:
       features: of the points.
       offsets: of each point's neighbours.
-      place: what an offset counts in each channel.
-      neighbours: of each point, their indices.
+      place: matrix from offsets to channels.
+      neighbours: indices of each point's neighbours.
     """
     return _strongest(features, offsets, place, neighbours)[0]
 
 
 def _strongest(features, offsets, place, neighbours):
-    """The largest in float32, and the number of the neighbour that it is of."""
+    """The maximum in float32, and its index among the neighbours."""
     place = place.astype(jnp.float32)
     count = neighbours.shape[1]
     number = jnp.arange(count, dtype=jnp.uint8 if count <= 256 else jnp.int32)
@@ -141,14 +141,14 @@ def _strongest(features, offsets, place, neighbours):
     def stronger(best, neighbour):
         largest, winner = best
         index, offset, number = neighbour
-        # Products so thin cost less as sums, which are fused with what is around them.
-        where = sum(offset[:, i, None] * place[None, i] for i in range(3))
-        response = features[index].astype(jnp.float32) + where
+        # Explicit sums instead of a thin matrix product, because XLA fuses them.
+        shift = sum(offset[:, i, None] * place[None, i] for i in range(3))
+        response = features[index].astype(jnp.float32) + shift
         return (jnp.maximum(largest, response), jnp.where(response > largest, number, winner)), None
 
     none = (jnp.full(features.shape, -jnp.inf, jnp.float32), jnp.zeros(features.shape, number.dtype))
-    each = (neighbours.T, jnp.moveaxis(offsets, 1, 0).astype(jnp.float32), number)
-    return jax.lax.scan(stronger, none, each, unroll=_UNROLLED)[0]
+    inputs = (neighbours.T, jnp.moveaxis(offsets, 1, 0).astype(jnp.float32), number)
+    return jax.lax.scan(stronger, none, inputs, unroll=_UNROLLED)[0]
 
 
 def _strongest_forward(features, offsets, place, neighbours):
@@ -156,14 +156,14 @@ def _strongest_forward(features, offsets, place, neighbours):
     return best, (features, offsets, place, neighbours, winner)
 
 
-def _strongest_backward(kept, slope):
-    features, offsets, place, neighbours, winner = kept
+def _strongest_backward(residuals, slope):
+    features, offsets, place, neighbours, winner = residuals
     index = winner.astype(jnp.int32)
-    who = jnp.take_along_axis(neighbours, index, axis=1)
-    # Sums of many terms lose what is small in 16 bits, and a GPU adds these in memory far more slowly.
-    to_features = jnp.zeros(features.shape, jnp.float32).at[who, jnp.arange(features.shape[1])[None]].add(slope)
+    source = jnp.take_along_axis(neighbours, index, axis=1)
+    # In 16 bits, sums of many terms lose precision, and a GPU's atomic additions are far slower.
+    to_features = jnp.zeros(features.shape, jnp.float32).at[source, jnp.arange(features.shape[1])[None]].add(slope)
     to_place = [jnp.sum(slope * jnp.take_along_axis(offsets[..., i], index, axis=1), axis=0) for i in range(3)]
-    # Nothing of this is computed where, as in training, nobody asks for the gradient of the offsets.
+    # XLA removes this where the gradient of the offsets is not used, as in training.
     wins = winner[:, None] == jnp.arange(neighbours.shape[1], dtype=winner.dtype)[None, :, None]
     to_offsets = jnp.where(wins, slope[:, None], 0.0) @ place.T
     return (
@@ -178,10 +178,10 @@ strongest_neighbour.defvjp(_strongest_forward, _strongest_backward)
 
 
 class EdgeConvolution(nn.Module):
-    """The strongest response to a point's neighbours, by what they are and where; to be added to its input.
+    """A residual branch: the maximum response over a point's neighbours, by their features and positions.
 
-    The strongest is taken before the activation, unlike DGCNN's: for an activation that never falls it is the same,
-    and nothing has to be kept of the other neighbours.
+    Unlike in DGCNN, the maximum precedes the activation, which gives the same for a monotonic one, and needs no memory
+    for the other neighbours.
     """
 
     width: int
@@ -190,17 +190,17 @@ class EdgeConvolution(nn.Module):
     @nn.compact
     def __call__(self, x: Array, offsets: Array, neighbours: Array) -> Array:
         h = nn.LayerNorm()(x)
-        own = nn.Dense(self.width, dtype=self.dtype, name="own")(h)
-        other = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="other")(h)
-        # What the layer says of the axes is its matrix.
+        receiver = nn.Dense(self.width, dtype=self.dtype, name="own")(h)
+        sender = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="other")(h)
+        # Applied to the axes, the layer gives its matrix.
         place = nn.Dense(self.width, use_bias=False, dtype=self.dtype, name="place")(jnp.eye(3))
-        strongest = jax.vmap(strongest_neighbour, in_axes=(0, 0, None, 0))(other, offsets, place, neighbours)
-        response = nn.gelu(own + strongest.astype(self.dtype))
+        strongest = jax.vmap(strongest_neighbour, in_axes=(0, 0, None, 0))(sender, offsets, place, neighbours)
+        response = nn.gelu(receiver + strongest.astype(self.dtype))
         return nn.Dense(self.width, dtype=self.dtype, name="out")(response).astype(jnp.float32)
 
 
 class SegmentationNetwork(nn.Module):
-    """Permutation-equivariant over the points: reordering them reorders the output. See the module's text."""
+    """The network, permutation-equivariant over the points. See the module's docstring."""
 
     config: SegmentationConfig = SegmentationConfig()
     dtype: Any = jnp.float32
@@ -213,7 +213,7 @@ class SegmentationNetwork(nn.Module):
         config = self.config
         neighbours = jax.vmap(lambda cloud: nearest_neighbours(cloud, config.neighbours))(points)
         around = jax.vmap(lambda cloud, index: cloud[index])(points, neighbours)
-        # Neighbours are millimetres apart: in units of 2 cm, cut off where distance no longer matters.
+        # Offsets of neighbours are millimetres: in units of 2 cm, and saturated beyond.
         offsets = jnp.tanh((around - points[:, :, None, :]) / 0.02)
         features = fourier_features(points - jnp.array(MIDDLE).reshape(1, 1, 3))
         x = nn.Dense(config.width, name="points")(features)

@@ -1,7 +1,7 @@
-"""Weights of networks in files: NumPy archives of half-precision arrays, from which no code can run, and their cards.
+"""Files of weights: NumPy archives of half-precision arrays, which cannot execute code, and their cards.
 
-An archive `NAME.npz` holds one array for each parameter, named by its path in the network. Beside it lies the card
-`NAME.json`: which network with which configuration it is, the archive's SHA-256, and how it was made and scored.
+An archive `NAME.npz` holds one array for each parameter, named by its path in the network. The card `NAME.json` beside
+it holds the network's name and configuration, the archive's SHA-256, and how the weights were trained and scored.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ VERSION = 1
 
 @dataclasses.dataclass(frozen=True)
 class Architecture:
-    """What a kind of network consists of.
+    """A kind of network.
 
     Attributes:
       network: its class.
       config: the class of its configuration.
-      inputs: arrays of the shapes and types that it takes, or pytrees of such.
+      inputs: shapes and types of its inputs, arrays or pytrees.
     """
 
     network: Any
@@ -52,7 +52,7 @@ class Architecture:
     inputs: tuple[Any, ...]
 
     def shapes(self, config: Any) -> Any:
-        """Its parameters' shapes."""
+        """The shapes of its parameters."""
         network = self.network(config)
         return jax.eval_shape(lambda *inputs: network.init(jax.random.key(0), *inputs), *self.inputs)["params"]
 
@@ -85,8 +85,8 @@ class Weights:
     Attributes:
       network: the Flax module; static under jit.
       parameters: its parameters, float32.
-      card: what its card says.
-      view: which camera and shelf it was trained on, if it looks at any and its card says so.
+      card: the content of its card.
+      view: camera and shelf in its training, if its card records them.
     """
 
     network: nn.Module
@@ -102,8 +102,8 @@ def save_weights(path: PathLike, name: str, config: Any, parameters: Any, card: 
       path: of the archive, NAME.npz; the card goes beside it.
       name: of the architecture, one of `ARCHITECTURES`.
       config: of the network.
-      parameters: Flax parameters; kept in half precision.
-      card: how they were made and scored; numbers, texts, lists and dictionaries.
+      parameters: Flax parameters; stored in half precision.
+      card: how they were trained and scored, as JSON values.
 
     Raises:
       InputError: a file cannot be written.
@@ -128,14 +128,14 @@ def save_weights(path: PathLike, name: str, config: Any, parameters: Any, card: 
 
 
 def read_card(archive: PathLike, name: str) -> dict[str, Any]:
-    """What the card beside an archive says.
+    """The content of the card beside an archive NAME.npz.
 
     Args:
-      archive: NAME.npz.
+      archive: path of the archive.
       name: of the architecture.
 
     Raises:
-      InputError: the card is missing, is none, or is of another network.
+      InputError: the card is missing, is not a card, or is of another network.
     """
     path = Path(archive).with_suffix(".json")
     try:
@@ -150,10 +150,10 @@ def read_card(archive: PathLike, name: str) -> dict[str, Any]:
 
 
 def read_archive(path: Path, card: dict[str, Any]) -> bytes:
-    """An archive, as its card describes it.
+    """The bytes of an archive, checked against its card.
 
     Raises:
-      InputError: it is missing, or another than its card describes.
+      InputError: it is missing, or its SHA-256 differs from the card's.
     """
     try:
         data = read_bytes(path, ARRAYS_LIMIT)
@@ -172,16 +172,16 @@ def weight_shapes(name: str, config: Any) -> dict[str, tuple[int, ...]]:
 
 
 def _config(name: str, value: Any, arrays: dict[str, np.ndarray], where: Path) -> Any:
-    """The configuration that a card tells of.
+    """The configuration in a card.
 
     Raises:
-      InputError: it is none of this network, or of one that is larger than anything in its archive.
+      InputError: it is not a configuration of this network, or of a larger one than the archive holds.
     """
     kinds = {field.name: type(field.default) for field in dataclasses.fields(ARCHITECTURES[name].config)}
     if not isinstance(value, dict) or {key: type(part) for key, part in value.items()} != kinds:
-        told = ", ".join(f"{key} ({kind.__name__})" for key, kind in kinds.items())
-        raise InputError(f"{where}: config: {shown(value)} must hold {told}; train or install anew")
-    # A network of millions of layers would be laid out before anybody could find that it is not this one.
+        keys = ", ".join(f"{key} ({kind.__name__})" for key, kind in kinds.items())
+        raise InputError(f"{where}: config: {shown(value)} must hold {keys}; train or install anew")
+    # Otherwise a damaged card could ask for a network of millions of layers, whose shapes take forever to compute.
     largest = max([len(arrays), *(size for array in arrays.values() for size in array.shape)])
     for key, part in value.items():
         if isinstance(part, int) and part > largest:
@@ -193,14 +193,10 @@ def _config(name: str, value: Any, arrays: dict[str, np.ndarray], where: Path) -
 
 
 def load_weights(path: PathLike, name: str) -> Weights:
-    """Read an archive, checked against its card and against the network that it is for.
-
-    Args:
-      path: of the archive.
-      name: of the architecture.
+    """Read an archive, checked against its card and its architecture `name`.
 
     Raises:
-      InputError: a file is missing, corrupt, or of another network.
+      InputError: a file is missing, damaged, or of another network.
     """
     path = Path(path)
     card = read_card(path, name)
@@ -215,10 +211,10 @@ def load_weights(path: PathLike, name: str) -> Weights:
         ) from None
     for key in sorted(shapes.keys() | arrays.keys()):
         expected = shapes.get(key)
-        found = arrays[key].shape if key in arrays else None
-        if expected != found:
+        shape = arrays[key].shape if key in arrays else None
+        if expected != shape:
             raise InputError(
-                f"{path}: {shown(key)} has the shape {found} where the network needs {expected}; train anew"
+                f"{path}: {shown(key)} has the shape {shape} where the network needs {expected}; train anew"
             )
         if arrays[key].dtype.kind != "f":
             raise InputError(f"{path}: {shown(key)} holds {arrays[key].dtype} instead of numbers; train anew")
@@ -226,7 +222,7 @@ def load_weights(path: PathLike, name: str) -> Weights:
             arrays[key] = arrays[key].astype(np.float32)
         if not np.isfinite(arrays[key]).all():
             raise InputError(f"{path}: {shown(key)} holds NaN or infinite numbers; train anew")
-    # Numbers, also where the caller is traced.
+    # Concrete arrays even if the caller is traced.
     with jax.ensure_compile_time_eval():
         parameters = {key: jax.device_put(a) for key, a in arrays.items()}
     return Weights(ARCHITECTURES[name].network(config), unflatten_dict(parameters, sep="/"), card, view)

@@ -1,4 +1,4 @@
-"""What stands in the way of a target: moments of a scene with the objects marked that its best grasps hit."""
+"""A figure of the objects in the way of a target: scenes in which the objects hit by its best grasps are marked."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from mechsearch_jax.workspace.target import Target
 
 MARK = drawing.BLOCKED[2]
 _WIDTH, _GAP, _TITLE, _LINE = 4.6, 0.16, 0.34, 0.2
-# Letters in a line of the text beneath, for each inch of the figure's width.
+# Letters in a line of text, for each inch of the figure's width.
 _LETTERS = 13
 
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
-    """A scene as it is at one moment.
+    """A scene at one moment.
 
     Attributes:
-      title: what moment it is.
+      title: of its picture.
       image: the camera's view.
-      owner: index of the object that each pixel shows; anything else where there is none.
+      owner: index of the object at each pixel; other numbers for none.
       scene: the true objects.
       target_pose: x, y [m] and yaw [rad] of the target.
       blockers: indices of the objects in the way.
@@ -48,13 +48,13 @@ class Moment:
 def blockers_figure(
     moments: Sequence[Moment], camera: Camera, shelf: Shelf, target: Target, heading: str, text: str
 ) -> Figure:
-    """Draw moments side by side, each as the camera sees it and from above, objects in the way in orange.
+    """Draw moments side by side, each in the camera's view and from above, with objects in the way in orange.
 
     Args:
       moments: at least one.
       camera, shelf, target: of the problem.
-      heading: one line above everything.
-      text: why the target cannot be taken out; it is broken into lines below everything.
+      heading: one line at the top.
+      text: why the target cannot be taken out, at the bottom.
     """
     room = drawing.height_of([moment.scene for moment in moments], shelf)
     left, right, top, bottom = drawing.view_window(camera, shelf, room)
@@ -98,5 +98,5 @@ def _draw(view: Axes, above: Axes, moment: Moment, camera: Camera, shelf: Shelf,
 
 
 def _turned(outline: np.ndarray | None) -> np.ndarray | None:
-    """An outline in x and y as the picture from above has it: y across, x upwards."""
+    """An outline in x and y in the axes of the picture from above: y across, x upwards."""
     return None if outline is None else outline[:, ::-1]

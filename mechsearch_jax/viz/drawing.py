@@ -1,6 +1,6 @@
-"""The pieces that pictures are made of: the shelf from above, the camera's view, actions drawn into both.
+"""Parts of figures: the shelf from above, the camera's view, and actions in both.
 
-From above, the picture is oriented as the robot sees the shelf: its open front at the bottom, +y to the left.
+Pictures from above are oriented as for the robot: the shelf's open front at the bottom, +y to the left.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ BLOCKED = ("#f2c14e", "#ee9b3a", "#d9622b", "#9c3d2e")
 NO_GRASP = "#8d7b9c"
 HAND = INK
 
-# In pictures from above: what is shown in front of the shelf, and beside and behind it [m].
+# Margins of pictures from above: in front of the shelf, and beside and behind it [m].
 ROBOT_STRIP, RIM = 0.1, 0.012
-# The camera's view reaches at least so far above the board, and so far above what stands there [m].
+# Least height of the camera's view above the board, and margin above the objects [m].
 LOWEST, ROOM = 0.15, 0.03
-# Size of the type within pictures.
+# Font size within pictures.
 LETTER = 8.5
 
 
 @dataclasses.dataclass(frozen=True)
 class Band:
-    """A colour of the map, what it stands for, and the values of g that it stands for, `low` to `high`."""
+    """A colour of the map, its label, and its values of g, from `low` to `high`."""
 
     colour: str
     label: str
@@ -59,7 +59,7 @@ class Band:
 
 def bands() -> tuple[Band, ...]:
     """The colours of g, from the best to the worst value."""
-    # One object less than `INFEASIBLE` counts, too: so it is in maps and recordings of earlier versions.
+    # Maps and recordings of earlier versions have `INFEASIBLE` minus one object.
     worst = 2 - INFEASIBLE
     return (
         Band(GRASPABLE, "graspable", 1, 1),
@@ -81,7 +81,7 @@ def surfaces(scene: Superquadrics, grid: tuple[int, int] = (33, 97)) -> list[Flo
 
     Args:
       scene: the objects.
-      grid: how many from pole to pole, and how many around, the last the same as the first.
+      grid: number of points from pole to pole, and around, where the last equals the first.
     """
     elevation = np.linspace(-np.pi / 2, np.pi / 2, grid[0])[:, None]
     azimuth = np.linspace(-np.pi, np.pi, grid[1])[None, :]
@@ -111,7 +111,7 @@ def hull(points: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "corners 2"
 
 
 def outlines(scene: Superquadrics) -> list[Float[np.ndarray, "corners 2"] | None]:
-    """Each object's outline seen from above in x and y [m], counter-clockwise; None for absent objects."""
+    """Each object's outline from above in x and y [m], counter-clockwise; None for absent objects."""
     return [None if points is None else hull(points[:, :2]) for points in surfaces(scene)]
 
 
@@ -125,10 +125,10 @@ def map_image(
     graspability: Int[np.ndarray, " x"],
     target: Target,
 ) -> Float[np.ndarray, "rows columns 4"]:
-    """Colours of the candidate positions as an image: rows along x, columns along y, see-through where not `shown`.
+    """Colours of the candidate positions as an image: rows along x, columns along y, transparent where not `shown`.
 
-    Of several yaw angles at a position, the best graspability among those shown counts; the fewer of the angles are
-    shown, the paler the colour.
+    Of several yaw angles at a position, the best graspability among the shown ones counts; the fewer angles are shown,
+    the paler the colour.
     """
     rows, columns = target.grid
     shown, g = (a.reshape(rows, columns, target.yaws) for a in (shown, graspability))
@@ -142,7 +142,7 @@ def map_image(
 
 
 def draw_shelf(axes: Axes, shelf: Shelf) -> None:
-    """The empty shelf from above, and the limits and looks of the axes."""
+    """Draw the empty shelf from above, and set the limits and style of the axes."""
     front, back, right, left = shelf.front, shelf.back, shelf.right, shelf.left
     axes.add_patch(
         patches.Rectangle((right, front), left - right, back - front, facecolor=BOARD, linewidth=0, zorder=0)
@@ -161,7 +161,7 @@ def draw_shelf(axes: Axes, shelf: Shelf) -> None:
 
 
 def draw_map(axes: Axes, image: Float[np.ndarray, "rows columns 4"], shelf: Shelf, target: Target) -> None:
-    """An image of `map_image`, each candidate position as a cell of its grid."""
+    """Draw an image of `map_image`, each candidate position as a cell of its grid."""
     dx, dy, _ = target.cell(shelf)
     poses = target.candidate_poses(shelf)
     low, high = poses[:, :2].min(axis=0), poses[:, :2].max(axis=0)
@@ -174,7 +174,7 @@ def draw_map(axes: Axes, image: Float[np.ndarray, "rows columns 4"], shelf: Shel
 
 
 def draw_objects(axes: Axes, scene: Superquadrics) -> None:
-    """The objects as outlines with their numbers."""
+    """Draw the objects as outlines with their numbers."""
     for i, outline in enumerate(outlines(scene)):
         if outline is None:
             continue
@@ -188,7 +188,7 @@ def draw_objects(axes: Axes, scene: Superquadrics) -> None:
 
 
 def number(axes: Axes, place: tuple[float, float], index: int, animated: bool = False) -> Text:
-    """The number of an object, legible on anything."""
+    """Draw the number of an object, legible on any background."""
     text = axes.text(
         *place, str(index), color=INK, fontsize=LETTER, ha="center", va="center", zorder=10, animated=animated
     )
@@ -197,7 +197,7 @@ def number(axes: Axes, place: tuple[float, float], index: int, animated: bool = 
 
 
 def draw_target(axes: Axes, pose: Float[np.ndarray, " 3"], target: Target, certain: bool) -> None:
-    """The target from above: filled where it has been found, an open outline where only the picture knows it."""
+    """Draw the target from above: filled if `certain`, an open outline if the robot does not know its pose."""
     x, y, yaw = (float(v) for v in pose)
     shape = shape_of(target.shape)
     style = {"edgecolor": TARGET, "linewidth": 1.6, "zorder": 5, "facecolor": TARGET if certain else "none"}
@@ -214,13 +214,7 @@ def draw_target(axes: Axes, pose: Float[np.ndarray, " 3"], target: Target, certa
 
 
 def target_points(pose: Float[np.ndarray, " 3"], target: Target, shelf: Shelf) -> Float[np.ndarray, "points 3"]:
-    """Points whose hull is the target, upright on the board [m].
-
-    Args:
-      pose: x, y [m] and yaw [rad].
-      target: what it looks like.
-      shelf: where it stands.
-    """
+    """Points whose hull is the target, upright on the shelf's board at a pose x, y [m] and yaw [rad]; [m]."""
     x, y, yaw = (float(v) for v in pose)
     c, s = np.cos(yaw), np.sin(yaw)
     level = shape_of(target.shape).rim(target.half_size) @ np.array([[c, s], [-s, c]]) + (x, y)
@@ -231,7 +225,7 @@ def target_points(pose: Float[np.ndarray, " 3"], target: Target, shelf: Shelf) -
 def draw_hidden_target_in_view(
     axes: Axes, pose: Float[np.ndarray, " 3"], target: Target, camera: Camera, shelf: Shelf
 ) -> None:
-    """An open outline where only the picture knows that the target is."""
+    """Draw the target whose pose the robot does not know as an open outline."""
     outline = hull(pixels(camera, target_points(pose, target, shelf)))
     hidden = patches.Polygon(
         outline, closed=True, facecolor="none", edgecolor=TARGET, linewidth=1.3, linestyle=(0, (2, 1.5)), zorder=5
@@ -245,9 +239,9 @@ def halo(width: float) -> list:
 
 
 def pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """(column, row) of world points, as `camera.project` has them; nothing is compiled for another number of points."""
-    away = np.asarray(points, np.float32) - np.array(camera.position, np.float32)
-    x, y, z = np.moveaxis(away @ np.array(camera.rotation, np.float32), -1, 0)
+    """(column, row) of world points, as by `camera.project` but without compilation for each number of points."""
+    offset = np.asarray(points, np.float32) - np.array(camera.position, np.float32)
+    x, y, z = np.moveaxis(offset @ np.array(camera.rotation, np.float32), -1, 0)
     safe = np.maximum(z, np.float32(1e-6))
     column, row = camera.fx * x / safe + camera.cx - 0.5, camera.fy * y / safe + camera.cy - 0.5
     return np.stack([column, row], axis=-1)
@@ -258,7 +252,7 @@ def view_window(camera: Camera, shelf: Shelf, height: float | None = None) -> tu
 
     Args:
       camera, shelf: of the problem.
-      height: how far above its board it is shown [m]; up to the upper board if None.
+      height: of the shown part above its board [m]; up to the upper board if None.
     """
     top = shelf.ceiling if height is None else min(shelf.board + height, shelf.ceiling)
     corners = np.array(
@@ -276,20 +270,20 @@ def view_window(camera: Camera, shelf: Shelf, height: float | None = None) -> tu
 
 
 def height_of(scenes: Iterable[Superquadrics], shelf: Shelf) -> float:
-    """How far above the board everything in some scenes can be shown, with a little room [m]."""
+    """Height above the board that shows all objects of several scenes, with a margin [m]."""
     tops = [points[:, 2].max() for scene in scenes for points in surfaces(scene) if points is not None]
     return max(LOWEST, *(top - shelf.board + ROOM for top in tops)) if tops else LOWEST
 
 
 def map_share(shelf: Shelf) -> float:
-    """Height of the picture from above for each unit of its width."""
+    """Height of the picture from above, relative to its width."""
     return (shelf.back - shelf.front + ROBOT_STRIP + RIM) / (shelf.left - shelf.right + 2 * RIM)
 
 
 def draw_view(
     axes: Axes, image: UInt8[np.ndarray, "h w 3"], camera: Camera, shelf: Shelf, height: float | None = None
 ) -> None:
-    """The camera's image, cut to the shelf: see `view_window`."""
+    """Draw the camera's image, cut to the shelf: see `view_window`."""
     left, right, top, bottom = view_window(camera, shelf, height)
     axes.imshow(image[top:bottom, left:right], extent=(left, right, bottom, top), interpolation="antialiased")
     axes.set_xlim(left, right)
@@ -302,7 +296,7 @@ def draw_view(
 
 
 def _name_front_in_view(axes: Axes, camera: Camera, shelf: Shelf) -> None:
-    """Say which side is the robot's, along the board's front edge where that is in the picture."""
+    """Label the robot's side along the board's front edge, if that is in the picture."""
     y = np.linspace(shelf.left, shelf.right, 201)
     edge = np.column_stack([np.full_like(y, shelf.front), y, np.full_like(y, shelf.board - shelf.thickness)])
     edge = pixels(camera, edge)
@@ -320,11 +314,11 @@ def _name_front_in_view(axes: Axes, camera: Camera, shelf: Shelf) -> None:
 
 
 def draw_numbers_in_view(axes: Axes, owner: Int[np.ndarray, "h w"], count: int) -> None:
-    """The numbers of the objects in the camera's image, each amid the pixels that show it.
+    """Draw the numbers of the objects into the camera's image, each in the middle of its pixels.
 
     Args:
-      axes: where the image is drawn.
-      owner: index of the object that each pixel shows; anything else where there is none.
+      axes: with the image.
+      owner: index of the object at each pixel; other numbers for none.
       count: number of objects.
     """
     for i in range(count):
@@ -334,7 +328,7 @@ def draw_numbers_in_view(axes: Axes, owner: Int[np.ndarray, "h w"], count: int) 
 
 
 def draw_legend(figure: Figure, y: float, size: float = LETTER) -> None:
-    """What the colours of the map mean, in one line at the height `y` of the figure (0 to 1), in type of a size."""
+    """Draw the legend of the map's colours, in one line at the height `y` of the figure (0 to 1), in a font size."""
     marks = [patches.Patch(facecolor=(*rgb(b.colour), 0.95), label=b.label) for b in bands()]
     marks.append(patches.Patch(facecolor=TARGET, label="target, found"))
     marks.append(patches.Patch(facecolor="none", edgecolor=TARGET, linestyle=(0, (2, 1.5)), label="target, hidden"))
@@ -344,7 +338,7 @@ def draw_legend(figure: Figure, y: float, size: float = LETTER) -> None:
 
 
 def draw_action_legend(figure: Figure, y: float) -> None:
-    """How actions are drawn, in one line at the height `y` of the figure (0 to 1)."""
+    """Draw the legend of actions, in one line at the height `y` of the figure (0 to 1)."""
     ghost = {"facecolor": (*rgb(ACTION), 0.14), "edgecolor": ACTION, "linestyle": (0, (3, 1.6))}
     marks = [
         patches.Patch(facecolor=(*rgb(HAND), 0.22), edgecolor=HAND, label="the hand as it begins"),

@@ -1,6 +1,6 @@
-"""A step of an episode while it is played: a bystander's view beside the shelf from above, where everything moves.
+"""Images of an animated step of an episode: a bystander's view beside the shelf from above.
 
-What does not move is drawn once a step, by the functions of the filmstrip; what does is drawn over it.
+The static parts are drawn once per step, by the functions of the filmstrip, and the moving parts over them.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ _GAP, _LEFT, _HEADER, _FOOTER, _BETWEEN = 0.08, 4.8, 0.56, 0.44, 0.05
 
 
 class Moving(NamedTuple):
-    """What moves, at one moment.
+    """The moving parts at one moment.
 
     Attributes:
-      bodies: for each body, the target last, points whose hull it is [m]; None for absent ones.
-      hand: points whose hulls are the fingers and the hand [m].
+      bodies: points of each body, whose hull it is, the target last [m]; None for absent bodies.
+      hand: points of the fingers and the hand, whose hulls they are [m].
       time: since the beginning [s].
     """
 
@@ -44,13 +44,13 @@ class Moving(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where everything is: left, lower side, width and height of each part in pixels, from the lower left corner.
+    """Layout of an image: left, bottom, width and height of each part in pixels, from the lower left corner.
 
     Attributes:
-      size: width and height of the whole picture; both are even.
+      size: width and height of the whole image; both even.
       beside: the bystander's view.
       above: the shelf from above.
-      view: what the camera saw.
+      view: the camera's view.
     """
 
     size: tuple[int, int]
@@ -60,7 +60,7 @@ class Layout:
 
     @classmethod
     def of(cls, width: int, camera: Camera, shelf: Shelf, room: float) -> Layout:
-        """For pictures `width` pixels wide, in which `room` m above the board are shown."""
+        """The layout of images `width` pixels wide that show `room` m above the board."""
         left, right, top, bottom = drawing.view_window(camera, shelf, room)
         column = WIDTH - _LEFT - 3 * _GAP
         view, above = column * (bottom - top) / (right - left), column * drawing.map_share(shelf)
@@ -81,14 +81,14 @@ class Layout:
 
 
 class Page:
-    """The picture of one step, at any moment of it."""
+    """The images of one step."""
 
     def __init__(self, frame: Frame, camera: Camera, shelf: Shelf, target: Target, room: float, layout: Layout):
         """Args:
         frame: the step.
         camera, shelf, target: of the problem.
         room: see `drawing.height_of`.
-        layout: where everything is.
+        layout: of the images.
         """
         width, height = layout.size
         self._layout = layout
@@ -98,7 +98,7 @@ class Page:
             self._figure.add_axes((x / width, y / height, w / width, h / height))
             for x, y, w, h in (layout.view, layout.above)
         )
-        # Where the hand is now, it is drawn as it moves.
+        # The hand is drawn as a moving part.
         frame = dataclasses.replace(frame, sketch=dataclasses.replace(frame.sketch, hands=None))
         draw_seen(view, frame, camera, shelf, target, room)
         draw_believed(self._above, frame, shelf, target)
@@ -113,11 +113,11 @@ class Page:
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
 
     def image(self, beside: UInt8[np.ndarray, "h w 3"], moving: Moving) -> UInt8[np.ndarray, "rows columns 3"]:
-        """The whole picture at one moment.
+        """The whole image at one moment.
 
         Args:
-          beside: the bystander's view, as large as the layout's.
-          moving: what moves.
+          beside: the bystander's view, of the layout's size.
+          moving: the moving parts.
         """
         self._canvas.restore_region(self._background)
         self._clock.set_text(f"{moving.time:.1f} s")
@@ -143,7 +143,7 @@ class Page:
 
 
 class _Movers:
-    """What moves in the picture from above."""
+    """The artists of the moving parts in the picture from above."""
 
     def __init__(self, axes: Axes, frame: Frame):
         self._bodies: list[tuple[patches.Polygon, Artist | None]] = []
@@ -159,7 +159,7 @@ class _Movers:
         return polygon
 
     def at(self, moving: Moving) -> list[Artist]:
-        """The artists of a moment, those in front last."""
+        """The artists of a moment, from back to front."""
         *objects, target = moving.bodies
         while len(self._bodies) < len(objects):
             number = drawing.number(self._axes, (0.0, 0.0), len(self._bodies), animated=True)

@@ -1,4 +1,4 @@
-"""The filmstrip: an episode in one picture, step by step."""
+"""The filmstrip: all steps of an episode in one figure."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Of the figure [inches]: at 100 dots an inch all of its type can be read.
+# Width of the figure [inches]: all text is legible at 100 dots per inch.
 WIDTH = 10.0
 _HEADING, _GAP, _BETWEEN, _LEGEND = 0.42, 0.14, 0.06, 0.8
-# Distance of lines of type, in units of its size.
+# Distance of lines of text, in units of the font size.
 _LEADING = 1.4
-# Width of a letter, in units of the size of its type.
+# Width of a letter, in units of the font size.
 _LETTER, _BOLD_LETTER = 0.54, 0.575
 
 
@@ -37,14 +37,14 @@ class Frame:
       title: what the robot did.
       caption: why, in one short line.
       image: the camera's view.
-      owner: index of the object that each pixel shows; anything else where there is none.
-      scene: the objects as the planner knew them.
+      owner: index of the object at each pixel; other numbers for none.
+      scene: the objects that the planner used.
       existence: f at the candidate poses.
       graspability: g at the candidate poses.
-      target_pose: x, y [m] and yaw [rad] of the true target; None where nobody knows it.
+      target_pose: x, y [m] and yaw [rad] of the true target; None if unknown.
       found: whether the robot knows that pose.
-      after: the objects as the planner expects them after the action.
-      sketch: what there is to show of the action.
+      after: the objects that the planner predicts after the action.
+      sketch: of the action.
     """
 
     title: str
@@ -66,13 +66,13 @@ def filmstrip(
     """Draw an episode: per step the camera's view and the shelf from above, with f and g as colours and the action.
 
     Args:
-      frames: the steps, at least one; a single one has its two pictures side by side.
+      frames: the steps, at least one; a single step has its two pictures side by side.
       camera, shelf, target: of the problem.
-      heading: one line above everything.
-      columns: at most so many steps side by side; lines are filled evenly.
+      heading: one line at the top.
+      columns: largest number of steps side by side; lines are filled evenly.
 
     Returns:
-      The figure, `WIDTH` wide; nothing is kept anywhere else.
+      The figure, `WIDTH` wide, which pyplot does not know.
     """
     lines = math.ceil(len(frames) / columns)
     columns = math.ceil(len(frames) / lines)
@@ -80,7 +80,7 @@ def filmstrip(
     room = drawing.height_of(scenes, shelf)
     width = (WIDTH - (columns + 1) * _GAP) / columns
     lines_of = [_lines(frame, width) for frame in frames]
-    caption = _BETWEEN + max(sum(_LEADING * size / 72 for _, size, *_ in told) for told in lines_of)
+    caption = _BETWEEN + max(sum(_LEADING * size / 72 for _, size, *_ in texts) for texts in lines_of)
     layout = _layout(columns, width, caption, drawing.view_window(camera, shelf, room), drawing.map_share(shelf))
     height = _HEADING + lines * layout.height + _LEGEND
     figure = Figure(figsize=(WIDTH, height), facecolor=drawing.PAPER)
@@ -109,12 +109,12 @@ def filmstrip(
 
 
 class _Layout(NamedTuple):
-    """Where the pictures of a step are [inches].
+    """Layout of the pictures of a step [inches].
 
     Attributes:
-      width, height: of all of it.
-      view, above: of each picture its left side, from the step's left side, its lower side, from the step's upper side
-        downwards, its width and its height.
+      width, height: of the step.
+      view, above: left side of each picture from the step's left side, its lower side downwards from the step's upper
+        side, its width and its height.
     """
 
     width: float
@@ -124,7 +124,7 @@ class _Layout(NamedTuple):
 
 
 def _layout(columns: int, width: float, caption: float, window: tuple[int, int, int, int], map_share: float) -> _Layout:
-    """One above the other, or, of a single step, side by side with the same height."""
+    """The pictures above each other, or, for a single step, side by side with equal heights."""
     left, right, top, bottom = window
     share = (bottom - top) / (right - left)
     if columns > 1:
@@ -137,14 +137,14 @@ def _layout(columns: int, width: float, caption: float, window: tuple[int, int, 
 
 
 def _lines(frame: Frame, width: float) -> list[tuple[str, float, str, str]]:
-    """Title and caption of a step, broken into lines: each with its size, weight and colour."""
-    told = (
+    """Lines of a step's title and caption, each with its font size, weight and colour."""
+    texts = (
         (frame.title, 9.5, "bold", drawing.INK, _BOLD_LETTER),
         (frame.caption, drawing.LETTER, "normal", drawing.MUTED, _LETTER),
     )
     return [
         (line, size, weight, colour)
-        for text, size, weight, colour, letter in told
+        for text, size, weight, colour, letter in texts
         for line in textwrap.wrap(text, int(72 * width / (letter * size)))
     ]
 
@@ -164,13 +164,13 @@ def _draw(view: Axes, above: Axes, frame: Frame, camera: Camera, shelf: Shelf, t
 
 
 def draw_seen(axes: Axes, frame: Frame, camera: Camera, shelf: Shelf, target: Target, room: float) -> None:
-    """What the camera sees at a step, and the action.
+    """Draw the camera's view at a step, and the action.
 
     Args:
-      axes: for nothing else.
+      axes: empty.
       frame: the step.
       camera, shelf, target: of the problem.
-      room: how far above the board it is shown [m].
+      room: height of the shown part above the board [m].
     """
     drawing.draw_view(axes, frame.image, camera, shelf, room)
     drawing.draw_numbers_in_view(axes, frame.owner, frame.scene.capacity)
@@ -180,13 +180,7 @@ def draw_seen(axes: Axes, frame: Frame, camera: Camera, shelf: Shelf, target: Ta
 
 
 def draw_believed(axes: Axes, frame: Frame, shelf: Shelf, target: Target) -> None:
-    """The empty shelf from above with f and g at a step, and the action.
-
-    Args:
-      axes: for nothing else.
-      frame: the step.
-      shelf, target: of the problem.
-    """
+    """Draw the empty shelf from above with f and g at a step, and the action; `axes` must be empty."""
     drawing.draw_shelf(axes, shelf)
     image = drawing.map_image(frame.existence, frame.graspability, target)
     drawing.draw_map(axes, image, shelf, target)

@@ -1,4 +1,4 @@
-"""The picture of f and g for one scene."""
+"""The figure of f and g for one scene."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ def maps_figure(
     target: Target,
     heading: str,
 ) -> Figure:
-    """Draw the camera's view, f, g, and g where f allows the target, each of the last three from above.
+    """Draw the camera's view, and from above f, g, and g where f allows the target.
 
     Args:
       maps: f and g and the objects.
       image: the camera's view.
-      owner: index of the object that each pixel shows; anything else where there is none.
+      owner: index of the object at each pixel; other numbers for none.
       target_pose: x, y [m] and yaw [rad] of the true target, drawn dashed.
       camera, shelf, target: of the problem.
-      heading: one line above everything.
+      heading: one line at the top.
 
     Returns:
-      The figure; nothing is kept anywhere else.
+      The figure, which pyplot does not know.
     """
     left, right, top, bottom = drawing.view_window(camera, shelf)
     map_height = _WIDTH * drawing.map_share(shelf)
@@ -110,7 +110,7 @@ def _draw_counts(axes: Axes, maps: Maps) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Maps:
-    """f and g over all candidate poses, and the objects that they were computed from.
+    """f and g over all candidate poses, and the objects from which they were computed.
 
     Attributes:
       poses: x, y [m] and yaw [rad] of the candidate poses.
@@ -141,7 +141,7 @@ def save_maps(maps: Maps, path: PathLike) -> None:
 
 
 def load_maps(path: PathLike) -> Maps:
-    """Read what `save_maps` wrote.
+    """Read a file of `save_maps`.
 
     Raises:
       InputError: the file cannot be read or holds something else.

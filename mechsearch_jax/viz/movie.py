@@ -1,4 +1,4 @@
-"""Moving pictures as files: MP4 (H.264, which every browser and player shows) and animated WebP (for pages)."""
+"""Write movies: MP4 (H.264, for all browsers and players) and animated WebP (for pages)."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 
 Images = Iterable[UInt8[np.ndarray, "h w 3"]]
-# Of H.264, the smaller the better; and of WebP, the larger the better.
+# Quality of H.264, better if smaller, and of WebP, better if larger.
 CRF, QUALITY = "20", 70
 
 
 def check_movie_path(path: PathLike) -> None:
-    """Fail before the work begins, where a file's ending is none that `save_movie` knows.
+    """Check before the work begins that `save_movie` supports a file's ending.
 
     Raises:
-      InputError: it is not.
+      InputError: it does not.
     """
     if Path(path).suffix.lower() not in WRITERS:
         raise InputError(f"{path}: ends in none of {', '.join(WRITERS)}; name a file that does")
 
 
 def save_movie(images: Images, path: PathLike, fps: int) -> None:
-    """Write images, one after the other, as a moving picture.
+    """Write images as a movie.
 
     Args:
-      images: all of the same even width and height, at least one; they are taken one by one.
-      path: of the file; its ending says what is written, .mp4 or .webp.
-      fps: images in a second.
+      images: at least one, all of the same even width and height; consumed one by one.
+      path: of the file, which ends in .mp4 or .webp.
+      fps: images per second.
 
     Raises:
       InputError: the ending is unknown, or the file cannot be written.
@@ -62,7 +62,7 @@ def _write_webp(images: Images, file: IO[bytes], fps: int) -> None:
 
     pictures = (Image.fromarray(image) for image in images)
     first = next(pictures)
-    # Within 60 s nothing is worth a whole new picture: only what changes is written.
+    # No key frames within 60 s: only changes are written.
     first.save(
         file, format="WEBP", save_all=True, append_images=pictures, duration=round(1000 / fps), loop=0,
         quality=QUALITY, method=4, kmin=1000, kmax=2000,

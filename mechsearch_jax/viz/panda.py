@@ -1,4 +1,4 @@
-"""The Panda to be seen: the boxes and capsules that stand for it everywhere, in the colours of its parts."""
+"""The Panda in pictures: its collision primitives in the colours of its parts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.viz.raycast import Capsule, Colour, Solid
 
 WHITE, GREY, DARK = (0.93, 0.94, 0.95), (0.62, 0.65, 0.69), (0.27, 0.30, 0.34)
-# Of links 1 to 7.
+# Colours of links 1 to 7.
 COLOURS = (WHITE, WHITE, WHITE, WHITE, WHITE, GREY, GREY)
 _BOX, _CAPSULE = shape_of("box"), Capsule()
 
@@ -20,17 +20,24 @@ def panda_solids(poses: Float[np.ndarray, "8 4 4"], opening: float) -> list[Soli
     """The foot, the arm, the hand and its fingers.
 
     Args:
-      poses: of links 1 to 7 and of the hand, as `kinematics.forward_kinematics` gives them.
+      poses: of links 1 to 7 and of the hand, as from `kinematics.forward_kinematics`.
       opening: distance between the fingers [m].
     """
-    parts = ((poses[frame], some, colour) for frame, some, colour in _parts(opening))
-    return [_foot(), *(_solid(T @ part.T_frame_primitive, part, colour) for T, some, colour in parts for part in some)]
+    solids = [
+        _solid(poses[frame] @ primitive.T_frame_primitive, primitive, colour)
+        for frame, primitives, colour in _parts(opening)
+        for primitive in primitives
+    ]
+    return [_foot(), *solids]
 
 
 def panda_pieces() -> list[list[Solid]]:
-    """What is rigid, each in its own frame: links 1 to 7 and the hand, and in the hand's the left and the right finger,
-    where they touch; the foot, in the world, comes last."""
-    pieces = [[_solid(part.T_frame_primitive, part, colour) for part in some] for _, some, colour in _parts(0.0)]
+    """The rigid pieces: links 1 to 7 and the hand in their frames, the left and the right finger in the hand's frame,
+    closed, and the foot in the world."""
+    pieces = [
+        [_solid(primitive.T_frame_primitive, primitive, colour) for primitive in primitives]
+        for _, primitives, colour in _parts(0.0)
+    ]
     return [*pieces, [_foot()]]
 
 
@@ -38,7 +45,7 @@ def _parts(opening: float) -> list[tuple[int, tuple[Primitive, ...], Colour]]:
     """The frame, the primitives and the colour of each link, of the hand and of its fingers."""
     both = fingers(opening)
     half = len(both) // 2
-    links = [(i, tuple(some), colour) for i, (some, colour) in enumerate(zip(LINKS, COLOURS, strict=True))]
+    links = [(i, tuple(link), colour) for i, (link, colour) in enumerate(zip(LINKS, COLOURS, strict=True))]
     return [*links, (7, tuple(HAND), DARK), (7, both[:half], GREY), (7, both[half:], GREY)]
 
 

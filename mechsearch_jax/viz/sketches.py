@@ -1,6 +1,6 @@
-"""Actions in pictures: the hand, an arrow along what moves, and everything that is moved where it is to end.
+"""Actions in pictures: the hand, an arrow along the motion, and the predicted poses of everything that moves.
 
-All kinds of action are drawn alike, from above and into the camera's image.
+All kinds of action are drawn alike, from above and in the camera's image.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# What moves less than this is not shown where it ends [m, and in its rotation matrix].
+# Smaller motions are not shown [m, and in the rotation matrix].
 STAYS = 5e-3
-# An arrow is longer than this, or it is left out [m].
+# Shorter arrows are left out [m].
 SHORTEST = 0.01
 
 Flat = Callable[[Float[np.ndarray, "points 3"]], Float[np.ndarray, "points 2"]]
 
 
 def from_above(points: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 2"]:
-    """World points as the picture from above has them: y across, x upwards."""
+    """World points in the axes of the picture from above: y across, x upwards."""
     return points[:, 1::-1]
 
 
@@ -41,7 +41,7 @@ def in_view(camera: Camera) -> Flat:
 
 
 def moved(before: Superquadrics, after: Superquadrics) -> Superquadrics:
-    """The objects after an action that it moves, the others absent."""
+    """The objects that an action moves, after it; others are absent."""
     fields = [
         (np.asarray(a, float), np.asarray(b, float))
         for a, b in ((before.position, after.position), (before.rotation, after.rotation))
@@ -53,14 +53,14 @@ def moved(before: Superquadrics, after: Superquadrics) -> Superquadrics:
 def draw_action(
     axes: Axes, flat: Flat, sketch: Sketch, before: Superquadrics, after: Superquadrics, shelf: Shelf
 ) -> None:
-    """An action: its hands, where everything that it moves ends, and its arrow.
+    """Draw an action: its hands, everything that it moves at the predicted poses, and its arrow.
 
     Args:
-      axes: where the shelf is drawn.
-      flat: where world points are there.
-      sketch: what there is to show of the action.
-      before, after: the objects before it, and as they are predicted after it.
-      shelf: an arrow ends a little in front of it.
+      axes: with the shelf.
+      flat: maps world points to the axes.
+      sketch: of the action.
+      before, after: the objects before it, and predicted after it.
+      shelf: the arrow ends at most a little in front of it.
     """
     for points in drawing.surfaces(moved(before, after)):
         if points is not None:
@@ -76,14 +76,14 @@ def draw_action(
 def draw_taken_target(
     axes: Axes, flat: Flat, sketch: Sketch, pose: Float[np.ndarray, " 3"], target: Target, shelf: Shelf
 ) -> None:
-    """Where the target ends that an action takes along; nothing for other actions."""
+    """Draw the target at the end of an action that takes it along; nothing for other actions."""
     path = shown_path(sketch, shelf)
     if sketch.takes_target and path is not None:
         _ghost(axes, flat(drawing.target_points(np.array([*path[-1, :2], pose[2]]), target, shelf)), drawing.TARGET)
 
 
 def shown_path(sketch: Sketch, shelf: Shelf) -> Float[np.ndarray, "points 3"] | None:
-    """The part of an action's path that is drawn: up to a little in front of the shelf."""
+    """The part of an action's path that is drawn, at most to a little in front of the shelf."""
     if sketch.path is None:
         return None
     outside = np.flatnonzero(sketch.path[:, 0] < shelf.front - 0.55 * drawing.ROBOT_STRIP)
@@ -110,7 +110,7 @@ def points_of_hand(T: Float[np.ndarray, "4 4"], opening: float) -> list[Float[np
 
 
 def _corners(T: np.ndarray, parts: Sequence[Primitive]) -> np.ndarray:
-    """Corners of boxes that are given in a frame with the pose `T`."""
+    """Corners of boxes given in a frame with the pose `T`."""
     signs = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3, indexing="ij"), axis=-1).reshape(8, 3)
     poses = [T @ part.T_frame_primitive for part in parts]
     return np.concatenate([(signs * part.size) @ P[:3, :3].T + P[:3, 3] for part, P in zip(parts, poses, strict=True)])
@@ -127,7 +127,7 @@ def _ghost(axes: Axes, points: np.ndarray, colour: str) -> None:
 
 
 def _hand(axes: Axes, points: np.ndarray, first: bool) -> None:
-    """Filled where it begins to act, paler elsewhere."""
+    """Draw the hand, paler if it is not the first pose."""
     axes.add_patch(
         patches.Polygon(
             drawing.hull(points), closed=True, facecolor=(*drawing.rgb(drawing.HAND), 0.22 if first else 0.05),

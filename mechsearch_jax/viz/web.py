@@ -1,4 +1,4 @@
-"""The pieces that the page of an episode is made of: meshes of what there is, pictures of what was seen and believed.
+"""Parts of the web page of an episode: meshes of the bodies, pictures of observations and beliefs.
 
 Viser, which sends them to the browser, is an optional dependency.
 """
@@ -25,21 +25,21 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# Points of a recognised shape from pole to pole and around: its edges are round, and few suffice.
+# Number of points of a recognised shape from pole to pole and around; few suffice for its round edges.
 GRID = (17, 33)
 # Radius of the shaft of a sampled action's arrow [m].
 SHAFT = 0.0025
 # Width of the camera's view [pixels].
 VIEW_WIDTH = 720
-# Share of a cell's width that is coloured, and how far above the board it lies [m], which would show through.
+# Share of a cell's width that is coloured, and its height above the board, which would show through [m].
 FILLED, LIFT = 0.88, 1.5e-3
 
 
 def import_viser() -> ModuleType:
-    """The library, which is not always installed.
+    """Import the optional library.
 
     Raises:
-      InputError: it is not.
+      InputError: it is not installed.
     """
     try:
         import viser
@@ -63,7 +63,7 @@ class Mesh(NamedTuple):
 
 
 def mesh_of(solids: Iterable[Solid]) -> Mesh:
-    """Some solids as one surface, in the frame that their poses are in."""
+    """One mesh of several solids, in the frame of their poses."""
     parts = []
     for solid in solids:
         T = np.eye(4)
@@ -88,7 +88,7 @@ def hand_mesh(T: Float[np.ndarray, "4 4"], opening: float) -> Mesh:
 
 
 def arrow_mesh(start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"]) -> Mesh | None:
-    """A straight arrow in the world; None where it is too short to be seen. Unlike a line, it can be clicked."""
+    """A straight arrow in the world; None if it is too short. Unlike a line, it can be clicked."""
     way = np.asarray(end, float) - start
     length = float(np.linalg.norm(way))
     if length <= sketches.SHORTEST:
@@ -104,7 +104,7 @@ def arrow_mesh(start: Float[np.ndarray, " 3"], end: Float[np.ndarray, " 3"]) -> 
 
 
 def seen_picture(frame: Frame, camera: Camera, shelf: Shelf, target: Target, room: float) -> UInt8[np.ndarray, "h w 3"]:
-    """What the camera saw at a step, cut to the shelf, with the objects' numbers and the action.
+    """The camera's view at a step, cut to the shelf, with the objects' numbers and the action.
 
     Args:
       frame: the step.
@@ -159,7 +159,7 @@ def _points(scene: Superquadrics) -> list[Float[np.ndarray, "points 3"] | None]:
 
 @functools.cache
 def _faces() -> UInt32[np.ndarray, "triangles 3"]:
-    """Two triangles for each cell of the grid, seen from outside counter-clockwise."""
+    """Two triangles for each cell of the grid, counter-clockwise from outside."""
     rows, columns = GRID
     index = np.arange(rows * columns).reshape(GRID)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
