@@ -22,9 +22,9 @@ QUICK = (
 # started from here read this as they import NumPy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if "XLA_FLAGS" not in os.environ:
-    asked = {**os.environ, "XLA_FLAGS": QUICK, "JAX_PLATFORMS": "cpu"}
-    known = subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], env=asked, capture_output=True)
-    os.environ["XLA_FLAGS"] = QUICK if known.returncode == 0 else ""
+    environment = {**os.environ, "XLA_FLAGS": QUICK, "JAX_PLATFORMS": "cpu"}
+    tried = subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], env=environment, capture_output=True)
+    os.environ["XLA_FLAGS"] = QUICK if tried.returncode == 0 else ""
 
 import jaxtyping  # noqa: E402
 
@@ -86,8 +86,8 @@ def pytest_addoption(parser):
 def share_of(text):
     """The part and the number of parts that `--slow-share` asks for."""
     part, _, parts = text.partition("/")
-    known = parts.isdigit() and (part == "auto" or part.isdigit())
-    if not known or int(parts) < 1 or not (part == "auto" or 1 <= int(part) <= int(parts)):
+    valid = parts.isdigit() and (part == "auto" or part.isdigit())
+    if not valid or int(parts) < 1 or not (part == "auto" or 1 <= int(part) <= int(parts)):
         raise pytest.UsageError(f'--slow-share "{text}" is neither K/N with K from 1 to N nor auto/N')
     return (int(commit(), 16) % int(parts) + 1 if part == "auto" else int(part)), int(parts)
 
@@ -95,13 +95,13 @@ def share_of(text):
 def commit(folder=Path(__file__).parent):
     """The hexadecimal digits of the commit that is checked out."""
     try:
-        asked = subprocess.run(["git", "rev-parse", "HEAD"], cwd=folder, capture_output=True, text=True, check=True)
+        done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=folder, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError) as error:
         why = "there is no git" if isinstance(error, OSError) else error.stderr.strip().partition("\n")[0]
         raise pytest.UsageError(
             f"--slow-share auto/N: {folder} tells no commit to choose a part by ({why}); give K/N"
         ) from error
-    return asked.stdout.strip()
+    return done.stdout.strip()
 
 
 def part_of(nodeid, parts):

@@ -144,9 +144,9 @@ def test_a_belief_is_compiled_once_for_both_cameras(two):
     # Compiled before, as for an episode, whatever ran before.
     update_belief(two[0], initial_belief(two[0]), SEEN)
     sizes = [cache_size(f) for f in (initial_belief, update_belief)]
-    found = [update_belief(problem, initial_belief(problem), SEEN) for problem in two]
+    beliefs = [update_belief(problem, initial_belief(problem), SEEN) for problem in two]
     assert [cache_size(f) for f in (initial_belief, update_belief)] == sizes
-    counts = [int(jnp.sum(belief.exists)) for belief in found]
+    counts = [int(jnp.sum(belief.exists)) for belief in beliefs]
     assert counts[0] > 0
     assert counts[1] == pytest.approx(counts[0], rel=0.05)
 
@@ -217,10 +217,10 @@ def test_cameras_of_a_batch_may_differ():
 
 def test_of_100_calibrations_a_millimetre_apart_nearly_all_share_a_program():
     rng = np.random.default_rng(0)
-    known = traced_as(thinned_view(Camera(), SHELF))
+    expected = traced_as(thinned_view(Camera(), SHELF))
     cameras = [recalibrated(Camera(), *rng.normal(scale=1e-3, size=2)) for _ in range(100)]
     views = [thinned_view(camera, SHELF) for camera in cameras]
-    assert sum(traced_as(seen) == known for seen in views) >= 90
+    assert sum(traced_as(seen) == expected for seen in views) >= 90
     for seen in views:
         assert seen.camera.height % BLOCK == seen.camera.width % BLOCK == 0
 

@@ -67,8 +67,8 @@ def camera(rng, folder):
 def images(rng, folder):
     """Depth, colour, mask and camera in one archive."""
     depth = np.full((9, 16), 0.7, np.float32)
-    told = Images(depth, np.zeros((9, 16, 3), np.uint8), np.zeros((9, 16), np.int8), 3, SMALL)
-    save_images(told, folder / "file.npz")
+    example = Images(depth, np.zeros((9, 16, 3), np.uint8), np.zeros((9, 16), np.int8), 3, SMALL)
+    save_images(example, folder / "file.npz")
     good = (folder / "file.npz").read_bytes()
     (folder / "file.npz").write_bytes(either(rng, good, lambda rng, data: mutated_archive(rng, data, mutated_json)))
     return lambda: load_images(folder / "file.npz")
@@ -84,8 +84,8 @@ def weights(rng, folder):
         card.write_bytes(either(rng, card.read_bytes(), mutated_json))
     else:
         archive.write_bytes(either(rng, archive.read_bytes(), mutated_archive))
-        told = json.loads(card.read_text()) | {"sha256": hashlib.sha256(archive.read_bytes()).hexdigest()}
-        card.write_text(json.dumps(told))
+        changed = json.loads(card.read_text()) | {"sha256": hashlib.sha256(archive.read_bytes()).hexdigest()}
+        card.write_text(json.dumps(changed))
     return lambda: load_weights(archive, "push")
 
 
@@ -129,10 +129,10 @@ def check(kind, number, folder):
         try:
             load()
         except InputError as error:
-            said = str(error)
-            assert said.startswith(str(inside)), said
-            assert len(said.splitlines()) == 1, said
-            assert len(said) < 600, said
+            message = str(error)
+            assert message.startswith(str(inside)), message
+            assert len(message.splitlines()) == 1, message
+            assert len(message) < 600, message
             taken = False
         else:
             taken = True
@@ -157,13 +157,13 @@ def test_a_thousand_mutated_files_are_taken_or_refused_in_one_line(kind, tmp_pat
 def program(monkeypatch, *arguments):
     """Run the command line in this process; its status and what it wrote to standard error."""
     monkeypatch.setattr("sys.argv", ["mechsearch", *arguments])
-    told = io.StringIO()
-    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(io.StringIO()):
+    stderr = io.StringIO()
+    with contextlib.redirect_stderr(stderr), contextlib.redirect_stdout(io.StringIO()):
         try:
             cli.main()
         except SystemExit as end:
-            return end.code, told.getvalue()
-    return 0, told.getvalue()
+            return end.code, stderr.getvalue()
+    return 0, stderr.getvalue()
 
 
 def check_command(number, folder, monkeypatch):
@@ -173,9 +173,9 @@ def check_command(number, folder, monkeypatch):
     scenario(rng, inside)
     settings = ("--config", str(inside / "file.toml")) if config(rng, inside) and rng.random() < 0.5 else ()
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    status, said = program(monkeypatch, "scenarios", "check", str(inside / "file.json"), *settings)
+    status, message = program(monkeypatch, "scenarios", "check", str(inside / "file.json"), *settings)
     assert status in (0, 2)
-    assert len(said.splitlines()) == (1 if status else 0), said
+    assert len(message.splitlines()) == (1 if status else 0), message
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
     shutil.rmtree(inside)
 
@@ -197,9 +197,9 @@ def test_a_name_is_no_path(tmp_path, monkeypatch):
             check_name(name, "file: name")
     value = json.loads(example_scenarios()["first-light"].read_text())
     (tmp_path / "bad.json").write_text(json.dumps(value | {"name": "../../x"}))
-    status, said = program(monkeypatch, "scenarios", "check", str(tmp_path / "bad.json"))
-    assert (status, len(said.splitlines())) == (2, 1), said
-    assert "name: must be a text" in said
+    status, message = program(monkeypatch, "scenarios", "check", str(tmp_path / "bad.json"))
+    assert (status, len(message.splitlines())) == (2, 1), message
+    assert "name: must be a text" in message
     assert [path.name for path in tmp_path.iterdir()] == ["bad.json"]
 
 
@@ -207,9 +207,9 @@ def test_two_scenarios_of_one_name_do_not_overwrite_each_others_maps(tmp_path, m
     text = example_scenarios()["first-light"].read_text()
     for name in ("a.json", "b.json"):
         (tmp_path / name).write_text(text)
-    status, said = program(monkeypatch, "inspect", str(tmp_path), "--out", str(tmp_path / "out"))
+    status, message = program(monkeypatch, "inspect", str(tmp_path), "--out", str(tmp_path / "out"))
     assert status == 2
-    assert "b.json: another scenario is called first-light" in said
+    assert "b.json: another scenario is called first-light" in message
 
 
 def test_an_archive_that_unpacks_to_too_much_is_refused():
@@ -220,5 +220,5 @@ def test_an_archive_that_unpacks_to_too_much_is_refused():
 
 def test_a_path_that_is_none_is_one_line(tmp_path, monkeypatch):
     for name in ("x" * 5000, "a" * 300 + ".json", "/dev/null/x", str(Path(tmp_path) / ("y" * 256))):
-        status, said = program(monkeypatch, "inspect", name, "--out", str(tmp_path / "out"))
-        assert (status, len(said.splitlines())) == (2, 1), said
+        status, message = program(monkeypatch, "inspect", name, "--out", str(tmp_path / "out"))
+        assert (status, len(message.splitlines())) == (2, 1), message

@@ -90,7 +90,7 @@ def answer(weights, points, scene, T, displacement, shelf, config):
     return push.apply_network(PushNetwork(config), weights, push_start(shelf, scene, points, T, displacement))
 
 
-def told(scene, T, displacement, shelf=OPEN, config=CONFIG, points=None):
+def prediction(scene, T, displacement, shelf=OPEN, config=CONFIG, points=None):
     # All have the same shape, so that they share a program.
     points = pusher()[: geometry.POINTS] if points is None else points
     return answer(parameters(config), points, scene, T, displacement, shelf, config)
@@ -132,7 +132,7 @@ def assert_same(a, b, valid=slice(None), shift=2e-5, other=2e-3):
 @given(st.integers(0, 200), st.floats(-np.pi, np.pi), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
 def test_turning_and_moving_everything_turns_and_moves_the_answer(seed, yaw, x, y):
     case = cluttered(seed)
-    before, after = told(*case), told(*moved(yaw, x, y, *case))
+    before, after = prediction(*case), prediction(*moved(yaw, x, y, *case))
     assert np.abs(before.moves).max() > 0.1
     assert_same(before, after.replace(shift=turned_back(yaw, after.shift)))
 
@@ -141,7 +141,7 @@ def test_turning_and_moving_everything_turns_and_moves_the_answer(seed, yaw, x, 
 def test_the_baseline_is_not_equivariant():
     config = dataclasses.replace(CONFIG, frame="world")
     case = cluttered(1)
-    before, after = told(*case, config=config), told(*moved(0.7, 0.0, 0.0, *case), config=config)
+    before, after = prediction(*case, config=config), prediction(*moved(0.7, 0.0, 0.0, *case), config=config)
     assert np.abs(np.asarray(before.shift) - turned_back(0.7, after.shift)).max() > 5e-3
 
 
@@ -158,8 +158,8 @@ def mirror_image(scene, T, displacement, middle=0.0):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_mirrored_push_has_the_mirrored_outcome(seed):
     case, middle = cluttered(seed), (SHELF.left + SHELF.right) / 2
-    a = told(*case, shelf=SHELF, points=symmetric_points())
-    b = told(*mirror_image(*case, middle), shelf=SHELF, points=symmetric_points())
+    a = prediction(*case, shelf=SHELF, points=symmetric_points())
+    b = prediction(*mirror_image(*case, middle), shelf=SHELF, points=symmetric_points())
     assert_same(a, b.replace(shift=b.shift * jnp.float32([1.0, -1.0])[None], turn=-b.turn))
 
 
@@ -171,11 +171,11 @@ def test_a_symmetric_push_goes_straight_and_turns_nothing():
         ((0.03, 0.03, 0.06), ROUND, 0.68, 0.18, 0.9),
     )
     case = superquadric.pad(scene, 5), gripper_at(0.5, 0.1), jnp.float32([0.1, 0.0, 0.0])
-    found = told(*case, shelf=SHELF, points=symmetric_points())
+    motion = prediction(*case, shelf=SHELF, points=symmetric_points())
     np.testing.assert_allclose(
-        [found.shift[0, 1], found.turn[0], found.shift[1, 1] + found.shift[2, 1]], 0.0, atol=1e-5
+        [motion.shift[0, 1], motion.turn[0], motion.shift[1, 1] + motion.shift[2, 1]], 0.0, atol=1e-5
     )
-    assert abs(float(found.shift[1, 1])) > 1e-4
+    assert abs(float(motion.shift[1, 1])) > 1e-4
 
 
 def test_a_box_after_half_a_turn_and_a_cylinder_after_any_are_the_same():
@@ -185,7 +185,7 @@ def test_a_box_after_half_a_turn_and_a_cylinder_after_any_are_the_same():
     assert not is_round.all()
     yaw = jnp.where(jnp.asarray(is_round), 1.234, np.pi)
     again = scene.replace(rotation=transforms.matmul(scene.rotation, transforms.yaw_rotation(yaw)))
-    assert_same(told(scene, T, displacement), told(again, T, displacement))
+    assert_same(prediction(scene, T, displacement), prediction(again, T, displacement))
 
 
 def test_a_box_described_with_its_axes_swapped_is_the_same():
@@ -196,14 +196,14 @@ def test_a_box_described_with_its_axes_swapped_is_the_same():
         size=jnp.where(boxes[:, None], scene.size[:, jnp.array([1, 0, 2])], scene.size),
         rotation=jnp.where(boxes[:, None, None], quarter, scene.rotation),
     )
-    assert_same(told(scene, T, displacement), told(swapped, T, displacement))
+    assert_same(prediction(scene, T, displacement), prediction(swapped, T, displacement))
 
 
 def test_the_order_of_the_objects_does_not_matter():
     scene, T, displacement = cluttered(4)
     order = np.array([3, 0, 4, 2, 1])
-    shuffled = told(jax.tree.map(lambda a: a[order], scene), T, displacement)
-    assert_same(jax.tree.map(lambda a: a[order], told(scene, T, displacement)), shuffled, shift=1e-6, other=1e-5)
+    shuffled = prediction(jax.tree.map(lambda a: a[order], scene), T, displacement)
+    assert_same(jax.tree.map(lambda a: a[order], prediction(scene, T, displacement)), shuffled, shift=1e-6, other=1e-5)
 
 
 def test_absent_objects_change_nothing():
@@ -213,22 +213,22 @@ def test_absent_objects_change_nothing():
     padded = padded.replace(
         position=padded.position.at[5:].set(scene.position[0] + 0.01), size=padded.size.at[5:].set(0.05)
     )
-    present, absent = told(scene, T, displacement), told(padded, T, displacement)
+    present, absent = prediction(scene, T, displacement), prediction(padded, T, displacement)
     assert_same(present, absent, slice(5), shift=1e-6, other=1e-5)
     assert np.isfinite(absent.shift).all()
 
 
 def test_neighbours_and_walls_matter_where_they_are_near():
     scene, T, displacement = cluttered(6)
-    alone = told(scene.replace(valid=jnp.arange(5) == 0), T, displacement)
-    assert np.abs(alone.shift[0] - told(scene, T, displacement).shift[0]).max() > 1e-4
+    alone = prediction(scene.replace(valid=jnp.arange(5) == 0), T, displacement)
+    assert np.abs(alone.shift[0] - prediction(scene, T, displacement).shift[0]).max() > 1e-4
     wall = dataclasses.replace(OPEN, back=0.8)
     near, nearer, far, farther = (
-        told(*moved(0.0, x, 0.0, scene, T, displacement), shelf=wall).shift for x in (0.0, 0.05, -0.5, -0.6)
+        prediction(*moved(0.0, x, 0.0, scene, T, displacement), shelf=wall).shift for x in (0.0, 0.05, -0.5, -0.6)
     )
     assert np.abs(near - nearer).max() > 1e-4
     np.testing.assert_allclose(far, farther, atol=2e-5)
-    np.testing.assert_allclose(far, told(scene, T, displacement).shift, atol=2e-5)
+    np.testing.assert_allclose(far, prediction(scene, T, displacement).shift, atol=2e-5)
 
 
 # --- what the network is told ----------------------------------------------------------------------------------------
@@ -246,7 +246,7 @@ def test_the_distance_to_contact_is_that_of_small_steps():
     prints = footprints.footprints(scene)
     heading = displacement[:2] / jnp.linalg.norm(displacement[:2])
     points = transforms.transform(T, pusher())
-    found, level = jax.jit(geometry.pusher_distance)(prints, points, heading)
+    distance, level = jax.jit(geometry.pusher_distance)(prints, points, heading)
     half, yaw, centre = (np.asarray(a, float) for a in (prints.half, prints.yaw, prints.position))
     for i in range(5):
         axes = np.array([[np.cos(yaw[i]), np.sin(yaw[i])], [-np.sin(yaw[i]), np.cos(yaw[i])]])
@@ -261,7 +261,7 @@ def test_the_distance_to_contact_is_that_of_small_steps():
         side = jnp.broadcast_to(geometry.perpendicular(heading)[None], (5, 2))
         clear = np.abs(across - float(geometry.reach(prints, side)[i])) > 3e-3
         ahead = expected > 0
-        np.testing.assert_allclose(np.maximum(found[i], 0.0)[clear & ahead], expected[clear & ahead], atol=5e-4)
+        np.testing.assert_allclose(np.maximum(distance[i], 0.0)[clear & ahead], expected[clear & ahead], atol=5e-4)
     assert level.any()
 
 
@@ -279,7 +279,7 @@ def test_the_distance_between_objects_is_that_of_small_steps():
     prints = footprints.footprints(scene)
     heading = np.asarray(displacement[:2], float) / np.linalg.norm(displacement[:2])
     met = jax.jit(geometry.meetings)(prints, jnp.float32(heading))
-    found, gap = met.distance, met.gap
+    distance, gap = met.distance, met.gap
     count = 0
     for i in range(5):
         for j in set(range(5)) - {i}:
@@ -294,11 +294,11 @@ def test_the_distance_between_objects_is_that_of_small_steps():
             # Where they only graze each other it is a matter of fractions of a millimetre.
             if apart > 0 and hits.sum() > 20:
                 count += 1
-                assert found[i, j] == pytest.approx(1e-3 * np.argmax(hits), abs=1.5e-3)
+                assert distance[i, j] == pytest.approx(1e-3 * np.argmax(hits), abs=1.5e-3)
             elif apart > 0 and not hits.any():
                 side = np.array([-heading[1], heading[0]])
                 if max((b @ side).min() - (a @ side).max(), (a @ side).min() - (b @ side).max()) > 1e-3:
-                    assert found[i, j] == pytest.approx(REACH)
+                    assert distance[i, j] == pytest.approx(REACH)
     assert count >= 2
 
 
@@ -373,8 +373,8 @@ def test_an_object_reaches_as_far_as_its_outline():
     for i in range(5):
         outline = outline_of(prints, i, 4000) - np.asarray(prints.position[i])
         for direction in ([1.0, 0.0], [0.6, 0.8]):
-            found = geometry.reach(prints, jnp.broadcast_to(jnp.float32(direction)[None], (5, 2)))[i]
-            assert float(found) == pytest.approx((outline @ direction).max(), abs=2e-4)
+            extent = geometry.reach(prints, jnp.broadcast_to(jnp.float32(direction)[None], (5, 2)))[i]
+            assert float(extent) == pytest.approx((outline @ direction).max(), abs=2e-4)
 
 
 def test_how_two_objects_meet_is_told_from_both():
@@ -409,15 +409,15 @@ def test_jit_and_vmap_agree():
     stacked = jax.tree.map(lambda *a: jnp.stack(a), *cases)
     batch = jax.vmap(functools.partial(answer, parameters(), pusher(), shelf=OPEN, config=CONFIG))(*stacked)
     for i, case in enumerate(cases):
-        assert_same(told(*case), jax.tree.map(lambda a, i=i: a[i], batch), shift=1e-6, other=1e-4)
+        assert_same(prediction(*case), jax.tree.map(lambda a, i=i: a[i], batch), shift=1e-6, other=1e-4)
 
 
 @pytest.mark.slow
 def test_eager_and_jit_agree():
     case = cluttered(0)
     with jax.disable_jit():
-        eager = told(*case)
-    assert_same(told(*case), eager, shift=1e-6, other=1e-4)
+        eager = prediction(*case)
+    assert_same(prediction(*case), eager, shift=1e-6, other=1e-4)
 
 
 @pytest.mark.slow
@@ -434,14 +434,14 @@ def test_gradients_are_finite_also_where_things_touch_or_nothing_moves():
     @functools.partial(jax.grad, argnums=(0, 1, 2, 3))
     def gradient(position, T, displacement, weights):
         start = push_start(SHELF, aligned.replace(position=position), points, T, displacement)
-        found = push.apply_network(PushNetwork(CONFIG), weights, start)
-        return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(found))
+        motion = push.apply_network(PushNetwork(CONFIG), weights, start)
+        return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(motion))
 
     # High above, nothing of the gripper is level with the objects, though it is deep inside their footprints.
     for y, z, length in ((0.0, 0.04, 0.1), (0.1, 0.04, 0.1), (0.0, 0.04, 0.0), (0.1, 0.2, 0.1)):
-        found = gradient(aligned.position, gripper_at(0.6, y, z), jnp.float32([0.0, length, 0.0]), parameters())
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
-    assert any(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(found[3]))
+        gradients = gradient(aligned.position, gripper_at(0.6, y, z), jnp.float32([0.0, length, 0.0]), parameters())
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradients))
+    assert any(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradients[3]))
 
 
 # --- the push model --------------------------------------------------------------------------------------------------
@@ -456,7 +456,7 @@ def weights(tmp_path):
 
 def test_what_does_not_move_stays_exactly_where_it_is(weights):
     scene, T, displacement = cluttered(2)
-    expected = told(scene, T, displacement, shelf=SHELF)
+    expected = prediction(scene, T, displacement, shelf=SHELF)
     probability = np.sort(jax.nn.sigmoid(expected.moves))
     model = LearnedPush(weights, likely=float(probability[1:3].mean()))
     outcome = jax.jit(model, static_argnums=0)(SHELF, scene, pusher(), T, displacement, jnp.zeros(()))
@@ -479,7 +479,7 @@ def everything_moves(limit):
 
 def test_a_pushed_object_that_is_told_to_turn_turns_by_that():
     scene, T, displacement = cluttered(3)
-    expected = told(scene, T, displacement, shelf=SHELF)
+    expected = prediction(scene, T, displacement, shelf=SHELF)
     outcome = everything_moves(0.0)(SHELF, scene, pusher(), T, displacement, jnp.zeros(()))
     change = transforms.matmul(outcome.scene.rotation, jnp.swapaxes(scene.rotation, -1, -2))
     np.testing.assert_allclose(np.arctan2(change[:, 1, 0], change[:, 0, 0]), expected.turn, atol=1e-5)

@@ -32,10 +32,10 @@ def test_the_sum_is_scipys(size):
     drawn[20:30] = 1e6 + rng.integers(0, 3, (10, size, size))
     drawn[30:] *= 10.0 ** rng.uniform(-6, 6, (10, 1, 1))
     costs = drawn.astype(np.float32)
-    found = jax.jit(jax.vmap(assign))(costs)
-    for cost, columns in zip(costs.astype(float), np.asarray(found), strict=True):
+    assigned = jax.jit(jax.vmap(assign))(costs)
+    for cost, columns in zip(costs.astype(float), np.asarray(assigned), strict=True):
         assert given_by(cost, columns) == pytest.approx(least(cost), rel=1e-6, abs=1e-5 * np.abs(cost).max())
-    for cost, columns in zip(costs[10:30].astype(float), np.asarray(found)[10:30], strict=True):
+    for cost, columns in zip(costs[10:30].astype(float), np.asarray(assigned)[10:30], strict=True):
         assert given_by(cost, columns) == least(cost)
 
 

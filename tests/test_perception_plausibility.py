@@ -66,9 +66,9 @@ def test_a_shelf_elsewhere_is_said(by, words):
     x, y, z = by
     faults = image_faults(CAMERA, SHELF.moved((-x, -y, -z)), sensed(SCENE)[0])
     assert len(faults) == len(words)
-    for fault, said in zip(faults, words, strict=True):
+    for fault, text in zip(faults, words, strict=True):
         assert fault.startswith("depth image: ")
-        assert said in fault
+        assert text in fault
 
 
 def test_one_5_mm_off_or_hardly_seen_is_not():

@@ -55,9 +55,9 @@ def wrong(camera, seed, metres=0.02, degrees=2.0):
     return with_pose(camera, T)
 
 
-def pose_error(found, camera):
+def pose_error(T_world_camera, camera):
     """Error of the camera's position [m] and rotation [degrees]."""
-    E = np.linalg.inv(pose_of(camera)) @ np.asarray(found, float)
+    E = np.linalg.inv(pose_of(camera)) @ np.asarray(T_world_camera, float)
     return np.linalg.norm(E[:3, 3]), np.degrees(np.linalg.norm(Rotation.from_matrix(E[:3, :3]).as_rotvec()))
 
 
@@ -176,10 +176,10 @@ def test_a_recogniser_takes_the_segmentation_as_its_mask():
     seen = perceive(key, prepared.depth, mask=prepared.segmentation, target_id=prepared.target_id)
     assert seen.target_visible
     assert np.linalg.norm(np.asarray(seen.target_pose)[:2] - SCENE.target.position[:2]) < 0.005
-    found = np.asarray(seen.objects.position)[np.asarray(seen.objects.valid)]
-    assert len(found) == len(SCENE.objects)
+    positions = np.asarray(seen.objects.position)[np.asarray(seen.objects.valid)]
+    assert len(positions) == len(SCENE.objects)
     for body in SCENE.objects:
-        assert np.linalg.norm(found - body.position, axis=1).min() < 0.01
+        assert np.linalg.norm(positions - body.position, axis=1).min() < 0.01
 
 
 def test_the_same_key_gives_the_same_and_the_given_pose_stays_without_joints(images):

@@ -231,9 +231,9 @@ def test_a_batch_is_what_each_is_alone(see, images, in_sight, masked, named):
     np.testing.assert_array_equal(batch.target_visible, [False, True])
     for i, alone in enumerate((masked, named)):
         np.testing.assert_array_equal(batch.objects.valid[i], alone.objects.valid)
-        some = np.asarray(alone.objects.valid)
-        np.testing.assert_allclose(batch.objects.position[i][some], alone.objects.position[some], atol=1e-3)
-        np.testing.assert_allclose(batch.objects.size[i][some], alone.objects.size[some], atol=1e-3)
+        valid = np.asarray(alone.objects.valid)
+        np.testing.assert_allclose(batch.objects.position[i][valid], alone.objects.position[valid], atol=1e-3)
+        np.testing.assert_allclose(batch.objects.size[i][valid], alone.objects.size[valid], atol=1e-3)
     np.testing.assert_allclose(batch.target_pose[1], named.target_pose, atol=1e-3)
 
 

@@ -298,7 +298,7 @@ def test_support_and_closest_approach_are_those_of_dense_samples(exponents):
     free = jnp.asarray(rng.uniform(0.5, 1.2, len(directions)), jnp.float32)
     evidence = refinement._Evidence(directions, free, directions, free, free)
     origin = jnp.array(CAMERA.position)
-    found = jax.jit(refinement._closest_approach)(shape, origin, evidence)
+    points = jax.jit(refinement._closest_approach)(shape, origin, evidence)
     depth = np.linspace(0, 1, 4000)[:, None] * np.array(free)
     dense = np.array(origin) + depth[..., None] * np.array(directions)
 
@@ -308,7 +308,7 @@ def test_support_and_closest_approach_are_those_of_dense_samples(exponents):
         return refinement._value_and_gradient(jnp.exp(shape.log_size), shape.exponents, local)[0]
 
     least = np.min(np.array(gauge(dense[::8].reshape(-1, 3))).reshape(-1, len(directions)), axis=0)
-    reached = np.array(gauge(found))
+    reached = np.array(gauge(points))
     inside = least < 1.2
     assert inside.sum() > 10
     assert np.all(reached[inside] < least[inside] + 0.01)

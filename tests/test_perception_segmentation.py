@@ -24,17 +24,17 @@ def stripes(sizes):
 
 def test_of_nine_segments_the_smallest_is_left_out_and_the_last_takes_its_number():
     labels = stripes(SIZES)
-    found = np.asarray(leave_out_smallest(jnp.asarray(labels)))
-    np.testing.assert_array_equal(found, np.where(labels == 2, OTHER, np.where(labels == 8, 2, labels)))
+    kept = np.asarray(leave_out_smallest(jnp.asarray(labels)))
+    np.testing.assert_array_equal(kept, np.where(labels == 2, OTHER, np.where(labels == 8, 2, labels)))
     last = stripes([*SIZES[:8], 1])
-    found = np.asarray(leave_out_smallest(jnp.asarray(last)))
-    np.testing.assert_array_equal(found, np.where(last == 8, OTHER, last))
+    kept = np.asarray(leave_out_smallest(jnp.asarray(last)))
+    np.testing.assert_array_equal(kept, np.where(last == 8, OTHER, last))
 
 
 def test_of_fewer_segments_none_is_left_out():
     labels = stripes([*SIZES[:4], 0, *SIZES[5:]])
-    found = np.asarray(leave_out_smallest(jnp.asarray(labels)))
-    np.testing.assert_array_equal(found, np.where(labels == 8, 4, labels))
+    kept = np.asarray(leave_out_smallest(jnp.asarray(labels)))
+    np.testing.assert_array_equal(kept, np.where(labels == 8, 4, labels))
 
 
 SHELF = Shelf()

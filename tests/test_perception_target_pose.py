@@ -55,11 +55,11 @@ def test_distance_is_that_to_the_nearest_of_many_surface_points(shape):
     solid = np.column_stack([own[:, :2] @ R.T + pose[:2], own[:, 2] + target.height(SHELF)])
     points = rng.uniform(-0.05, 0.05, (40, 3)) * (1, 1, 2) + [0.6, 0.1, target.height(SHELF)]
     nearest = np.array([np.linalg.norm(solid - p, axis=1).min() for p in points])
-    found = np.asarray(distance(target, SHELF, jnp.float32(pose), jnp.float32(points)))
+    signed = np.asarray(distance(target, SHELF, jnp.float32(pose), jnp.float32(points)))
     outside = nearest > 0.004
     assert 5 < outside.sum() < 40
-    np.testing.assert_allclose(found[outside], nearest[outside], atol=1.5e-3)
-    assert (found[~outside] < 0.005).all()
+    np.testing.assert_allclose(signed[outside], nearest[outside], atol=1.5e-3)
+    assert (signed[~outside] < 0.005).all()
 
 
 @pytest.mark.parametrize("shape", TARGETS)
@@ -69,9 +69,9 @@ def test_the_pose_is_found_within_millimetres_from_noisy_points(shape, side):
     errors, turns = [], []
     for _ in range(12):
         pose = np.array([rng.uniform(0.47, 0.73), rng.uniform(-0.2, 0.4), rng.uniform(0, np.pi)])
-        found = fit(target, visible_points(target, pose, rng, side=side))
-        errors.append(np.linalg.norm(found[:2] - pose[:2]))
-        turns.append(abs((found[2] - pose[2] + np.pi / 2) % np.pi - np.pi / 2))
+        fitted = fit(target, visible_points(target, pose, rng, side=side))
+        errors.append(np.linalg.norm(fitted[:2] - pose[:2]))
+        turns.append(abs((fitted[2] - pose[2] + np.pi / 2) % np.pi - np.pi / 2))
     assert np.median(errors) < (0.0015 if side == "both" else 0.003)
     if shape == "box" and side == "both":
         assert np.median(turns) < np.radians(6)
@@ -81,8 +81,8 @@ def test_points_of_others_among_them_move_it_little():
     target, rng, pose = TARGETS["cylinder"], np.random.default_rng(2), np.array([0.6, 0.1, 0.0])
     points = visible_points(target, pose, rng)
     stray = points[:15] + np.array([0.03, 0.0, 0.0])
-    found = fit(target, np.concatenate([points, stray]))
-    assert np.linalg.norm(found[:2] - pose[:2]) < 0.004
+    fitted = fit(target, np.concatenate([points, stray]))
+    assert np.linalg.norm(fitted[:2] - pose[:2]) < 0.004
 
 
 def test_without_points_it_is_finite_and_a_batch_gives_what_each_gives_alone():

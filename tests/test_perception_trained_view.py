@@ -74,8 +74,8 @@ def test_a_place_that_was_measured_to_be_recognised_worse_is_warned_of():
     measured = json.loads((HERE / "benchmarks" / "results" / "views-cpu.json").read_text())
     for name, place in PLACES.items():
         stored = measured["settings"]["places"][name]
-        told = {"camera": dataclasses.asdict(place.camera), "shelf": dataclasses.asdict(place.shelf)}
-        assert stored == json.loads(json.dumps(told))
+        view = {"camera": dataclasses.asdict(place.camera), "shelf": dataclasses.asdict(place.shelf)}
+        assert stored == json.loads(json.dumps(view))
     overlap = {
         (line["source"], line["noise"]): line["iou_mean"]
         for line in measured["summary"]
@@ -162,11 +162,11 @@ def test_networks_of_which_nothing_is_known_are_not_warned_of():
 )
 def test_a_training_writes_what_it_saw_and_the_weights_know(task, config, tmp_path):
     shelf = Shelf().moved((0.1, 0.0, -0.1))
-    told = task(network=config, shelf=shelf, view=shelf_view(shelf=shelf, stride=4))
-    shapes = ARCHITECTURES[told.name].shapes(config)
-    told.save(tmp_path / "w.npz", jax.tree.map(lambda a: np.zeros(a.shape), shapes), {"seed": 1})
-    weights = load_weights(tmp_path / "w.npz", told.name)
-    assert weights.view == TrainedView(told.view.camera, shelf)
+    training = task(network=config, shelf=shelf, view=shelf_view(shelf=shelf, stride=4))
+    shapes = ARCHITECTURES[training.name].shapes(config)
+    training.save(tmp_path / "w.npz", jax.tree.map(lambda a: np.zeros(a.shape), shapes), {"seed": 1})
+    weights = load_weights(tmp_path / "w.npz", training.name)
+    assert weights.view == TrainedView(training.view.camera, shelf)
     assert weights.card["seed"] == 1
 
 
@@ -199,7 +199,7 @@ def test_the_searcher_tells_it_before_the_first_image():
         searcher = Searcher(place)
         # Building a problem takes long, and nothing here depends on it.
         grasps = types.SimpleNamespace(pair_pose=np.arange(9))
-        known = {"camera": place.camera, "shelf": place.shelf, "target": place.target}
-        searcher.problem = types.SimpleNamespace(**known, poses=np.zeros((9, 3)), grasps=grasps)
+        setting = {"camera": place.camera, "shelf": place.shelf, "target": place.target}
+        searcher.problem = types.SimpleNamespace(**setting, poses=np.zeros((9, 3)), grasps=grasps)
         assert isinstance(searcher.recogniser, Recogniser)
         assert searcher.check().warnings == faults(place)

@@ -70,12 +70,12 @@ def states(problem, belief, objects):
     changes, _, _ = moving.act(jnp.array(True), root, jax.random.key(0))
 
     @jax.jit
-    def told(problem, belief, after):
+    def evaluated(problem, belief, after):
         rollout = rollout_of(problem, belief)
         after = rollout.update(after, after.scene.valid)
         return after, rollout.cost(after)
 
-    return root, *jax.device_get(told(problem, belief, root.replace(**changes)))
+    return root, *jax.device_get(evaluated(problem, belief, root.replace(**changes)))
 
 
 def test_a_pushed_target_stands_at_the_nearest_candidate(problem, belief, objects, states):

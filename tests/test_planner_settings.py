@@ -34,13 +34,13 @@ def test_the_example_holds_every_key_with_its_default(tmp_path):
     text = settings.example_config()
     assert load(tmp_path, text) == Settings()
     (tmp_path / "all.toml").write_text(re.sub(r"(?m)^#(?=\w|\]|  )", "", text))
-    said = tables.read_document(tmp_path / "all.toml").tables
-    assert {name: list(keys) for name, keys in said.items() if name} == {
+    tables_in_file = tables.read_document(tmp_path / "all.toml").tables
+    assert {name: list(keys) for name, keys in tables_in_file.items() if name} == {
         name: list(keys) for name, keys in settings.tables().items()
     }
-    found = load_settings(tmp_path / "all.toml")
-    assert dataclasses.replace(found, given={}) == Settings()
-    assert found.config == Settings().config == PRESETS["standard"]()
+    loaded = load_settings(tmp_path / "all.toml")
+    assert dataclasses.replace(loaded, given={}) == Settings()
+    assert loaded.config == Settings().config == PRESETS["standard"]()
 
 
 def test_the_example_of_the_guide_is_read(tmp_path):
@@ -55,7 +55,7 @@ def test_every_option_of_the_planner_is_a_key():
 
 
 def test_what_is_given_goes_where_it_belongs(tmp_path):
-    found = load(
+    loaded = load(
         tmp_path,
         """
 [camera]
@@ -78,34 +78,36 @@ gamma = 1
 push_distances = [0.1]
 """,
     )
-    assert found.workcell.camera == dataclasses.replace(Camera(), width=848, height=480, position=(0.0, 0.4, 0.7))
-    assert found.workcell.shelf == dataclasses.replace(Shelf(), front=0.9, back=1.3)
-    assert found.workcell.target == dataclasses.replace(Target.box(), half_size=(0.02, 0.025, 0.06), inset=0.04)
-    assert found.objects.catalogue == (("box", (0.05, 0.05, 0.05)),)
-    assert found.config == PRESETS["paper"](gamma=1.0, push_distances=(0.1,))
-    assert isinstance(found.config.planner.gamma, float)
+    assert loaded.workcell.camera == dataclasses.replace(Camera(), width=848, height=480, position=(0.0, 0.4, 0.7))
+    assert loaded.workcell.shelf == dataclasses.replace(Shelf(), front=0.9, back=1.3)
+    assert loaded.workcell.target == dataclasses.replace(Target.box(), half_size=(0.02, 0.025, 0.06), inset=0.04)
+    assert loaded.objects.catalogue == (("box", (0.05, 0.05, 0.05)),)
+    assert loaded.config == PRESETS["paper"](gamma=1.0, push_distances=(0.1,))
+    assert isinstance(loaded.config.planner.gamma, float)
 
 
 def test_a_robot_that_stands_elsewhere_sees_camera_and_shelf_from_there(tmp_path):
     where = "[base]\nposition = [0.5, -0.25, 0.125]\n[shelf]\nfront = 1.0\nback = 1.5\n"
-    found = load(tmp_path, where).workcell
-    assert (found.shelf.front, found.shelf.back) == (0.5, 1.0)
-    assert found.shelf.board == Shelf().board - 0.125
-    assert (found.shelf.left, found.shelf.spawn_y[1]) == (Shelf().left + 0.25, Shelf().spawn_y[1] + 0.25)
-    np.testing.assert_allclose(np.subtract(found.camera.position, Camera().position), (-0.5, 0.25, -0.125), atol=1e-12)
-    assert found.camera.rotation == Camera().rotation
+    workcell = load(tmp_path, where).workcell
+    assert (workcell.shelf.front, workcell.shelf.back) == (0.5, 1.0)
+    assert workcell.shelf.board == Shelf().board - 0.125
+    assert (workcell.shelf.left, workcell.shelf.spawn_y[1]) == (Shelf().left + 0.25, Shelf().spawn_y[1] + 0.25)
+    np.testing.assert_allclose(
+        np.subtract(workcell.camera.position, Camera().position), (-0.5, 0.25, -0.125), atol=1e-12
+    )
+    assert workcell.camera.rotation == Camera().rotation
     assert load(tmp_path, "[base]\nposition = [0, 0, 0]").workcell == Workcell()
 
 
 def test_the_colour_of_the_target_is_the_recognisers_and_not_the_problems(tmp_path):
-    found = load(tmp_path, '[target]\nshape = "box"\ncolor = [0, 0.2, 1]').workcell
-    assert found == Workcell(target=Target.box(), colour=(0.0, 0.2, 1.0))
-    assert found.detector == TargetColour.lit((0.0, 0.2, 1.0))
+    workcell = load(tmp_path, '[target]\nshape = "box"\ncolor = [0, 0.2, 1]').workcell
+    assert workcell == Workcell(target=Target.box(), colour=(0.0, 0.2, 1.0))
+    assert workcell.detector == TargetColour.lit((0.0, 0.2, 1.0))
     assert load(tmp_path, "[target]\ncolor = [0, 0.2, 1]").workcell.target == Target()
     setting = types.SimpleNamespace(camera=Camera(), shelf=Shelf(), target=Target())
-    searcher = Searcher(found)
+    searcher = Searcher(workcell)
     searcher.problem = setting
-    assert searcher.recogniser.detector.func == found.detector
+    assert searcher.recogniser.detector.func == workcell.detector
 
 
 WRONG = {
@@ -154,10 +156,10 @@ WRONG = {
 def test_what_is_wrong_is_named_by_line_and_key(tmp_path, text):
     with pytest.raises(InputError) as refused:
         load(tmp_path, text)
-    said = str(refused.value)
-    assert said.startswith(f"{tmp_path / 'mine.toml'}{WRONG[text]}")
-    assert "\n" not in said
-    assert len(said) < 500
+    message = str(refused.value)
+    assert message.startswith(f"{tmp_path / 'mine.toml'}{WRONG[text]}")
+    assert "\n" not in message
+    assert len(message) < 500
 
 
 def test_a_missing_file_and_one_that_is_no_text_are_refused(tmp_path):
@@ -170,8 +172,8 @@ def test_a_missing_file_and_one_that_is_no_text_are_refused(tmp_path):
 
 def options_of(tmp_path, text, *arguments):
     (tmp_path / "mine.toml").write_text(text)
-    asked = ["inspect", "first-light", "--out", "out", "--config", str(tmp_path / "mine.toml"), *arguments]
-    return cli.parse(asked).keywords["options"]
+    command = ["inspect", "first-light", "--out", "out", "--config", str(tmp_path / "mine.toml"), *arguments]
+    return cli.parse(command).keywords["options"]
 
 
 def test_the_command_line_goes_before_the_file(tmp_path):

@@ -127,12 +127,12 @@ def test_only_what_is_seen_says_which_object_is_which(problem, opened, noise):
 def test_no_object_is_taken_for_two():
     before, after = boxes((0.6, 0.0), (0.6, 0.06), (0.5, 0.3)), boxes((0.5, 0.3), (0.6, 0.055), (0.6, 0.12))
     meant = before.position.at[0].add(LEFT)
-    same, known = same_objects(before, after, meant)
+    same, matched = same_objects(before, after, meant)
     assert same[:3].tolist() == [2, 1, 0]
-    assert known.tolist() == [True] * 3 + [False] * 5
+    assert matched.tolist() == [True] * 3 + [False] * 5
     # One is not seen any more.
-    same, known = same_objects(before, after.replace(valid=after.valid.at[2].set(False)), meant)
-    assert known.tolist() == [False, True, True] + [False] * 5
+    same, matched = same_objects(before, after.replace(valid=after.valid.at[2].set(False)), meant)
+    assert matched.tolist() == [False, True, True] + [False] * 5
     assert same[1:3].tolist() == [1, 0]
     # Any number of slots will do, and one that is seen from another side is the same.
     many, turned = (superquadric.pad(a, 12) for a in (before, after.replace(size=after.size[:, jnp.array([2, 0, 1])])))
@@ -211,10 +211,10 @@ def world_of_none():
 
 
 def test_an_episode_tells_the_belief_what_it_did(problem, monkeypatch):
-    told = []
+    updates = []
 
     def update(problem, belief, observation, before, action):
-        told.append((int(action.kind), before))
+        updates.append((int(action.kind), before))
         return belief
 
     monkeypatch.setattr(slots, "update_belief", update)
@@ -236,5 +236,5 @@ def test_an_episode_tells_the_belief_what_it_did(problem, monkeypatch):
     slot.look(world, keys, [0])
     slot.forget(np.array([True]))
     slot.look(world, keys, [0])
-    assert [kind for kind, _ in told] == [0, ActionKind.PUSH, 0]
-    assert [before for _, before in told] == [views[0], views[0], views[2]]
+    assert [kind for kind, _ in updates] == [0, ActionKind.PUSH, 0]
+    assert [before for _, before in updates] == [views[0], views[0], views[2]]

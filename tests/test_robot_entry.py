@@ -96,14 +96,14 @@ def test_the_gripper_enters_where_the_arm_follows_and_what_it_sweeps_leaves_the_
     find = jax.jit(
         lambda T, mask: entry.gripper_enters(SHELF, GRIPPER, 4, clouds, cloud, T, jnp.full(len(T), Q7), mask)
     )
-    found = np.asarray(find(T, mask))
+    entered = np.asarray(find(T, mask))
     follows = jax.jit(jax.vmap(lambda path: entry.arm_follows(path, Q7, SHELF)))
     whole = np.asarray(follows(jax.vmap(lambda T: entry.way_in(T, GRIPPER.nearest_outside, GRIPPER, 3, 4))(T)))
     points = np.einsum("kij,kpj->kpi", np.asarray(T)[:, :3, :3], np.asarray(clouds).swapaxes(1, 2)[cloud])
     points += np.asarray(T)[:, None, :3, 3]
     touches = np.asarray(hits_shelf(SHELF, jnp.asarray(points))).any(axis=1)
-    np.testing.assert_array_equal(found, whole & ~touches & np.asarray(mask))
-    assert 5 < found.sum() < len(T)
+    np.testing.assert_array_equal(entered, whole & ~touches & np.asarray(mask))
+    assert 5 < entered.sum() < len(T)
     assert (whole & touches & np.asarray(mask)).any()
 
 

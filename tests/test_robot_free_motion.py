@@ -69,9 +69,9 @@ def test_the_clearance_is_never_more_than_that_of_the_simulators_geometry():
     others = [model.geom(f"{name}_box").id for name in models.shelf_boxes(bare)] + [model.geom("box0").id]
     obstacles = Obstacles.of(bare, (boxes(box.position, half=box.half_size),))
     q = np.clip(HERE + rng.normal(0.0, 0.35, (60, 7)), JOINT_LOWER, JOINT_UPPER)
-    found = clearance(ArmBody.of(0.05), obstacles, q)
+    distances = clearance(ArmBody.of(0.05), obstacles, q)
     short = []
-    for angles, free in zip(q, found.free, strict=True):
+    for angles, free in zip(q, distances.free, strict=True):
         data.qpos[:9] = [*angles, 0.025, 0.025]
         mujoco.mj_kinematics(model, data)
         exact = min(mujoco.mj_geomDistance(model, data, a, b, FARTHEST, None) for a in links for b in others)
@@ -129,10 +129,10 @@ def test_a_blocked_way_is_planned_around_and_stays_clear():
     obstacles, way = around()
     assert not way.straight
     rows = np.concatenate([HERE[None], way.position])
-    found = clearance(BODY, obstacles, rows)
-    assert found.free.min() >= 0.005
-    assert way.clearance == pytest.approx(found.free.min(), abs=5e-3)
-    assert found.inside.max() < 0.0
+    distances = clearance(BODY, obstacles, rows)
+    assert distances.free.min() >= 0.005
+    assert way.clearance == pytest.approx(distances.free.min(), abs=5e-3)
+    assert distances.inside.max() < 0.0
     np.testing.assert_allclose(way.position[-1], ASIDE, atol=1e-12)
     assert max(limit_shares(rows, DT)) <= 1.0
 
@@ -223,8 +223,8 @@ def test_random_ends_are_joined_without_touching_anything():
     scene = boxes((0.5, 0.1, 0.45), (0.42, -0.1, 0.46))
     obstacles = Obstacles.of(SHELF, (scene,))
     q = np.clip(HERE + rng.normal(0.0, 0.5, (60, 7)), JOINT_LOWER + 0.01, JOINT_UPPER - 0.01)
-    found = clearance(BODY, obstacles, q)
-    free = q[(found.free > 0.01) & (found.inside < -0.01)][:8]
+    distances = clearance(BODY, obstacles, q)
+    free = q[(distances.free > 0.01) & (distances.inside < -0.01)][:8]
     assert len(free) == 8
     for end in free:
         way = free_motion(HERE, end, BODY, obstacles, timestep=DT)

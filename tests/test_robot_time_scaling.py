@@ -200,8 +200,8 @@ def test_the_curve_is_a_natural_spline_through_the_waypoints():
     expected = CubicSpline(knots, np.asarray(q, float), bc_type="natural")
     both = jax.tree.map(lambda a: jnp.stack([a[::-1] if a.ndim > 1 else 1 - a[::-1], a]), curve)
     along = jax.jit(angles_along)
-    found = along(both, jnp.ones(200, jnp.int32), jnp.asarray(places, jnp.float32))
-    np.testing.assert_allclose(found, expected(places), atol=1e-5)
+    angles = along(both, jnp.ones(200, jnp.int32), jnp.asarray(places, jnp.float32))
+    np.testing.assert_allclose(angles, expected(places), atol=1e-5)
     np.testing.assert_allclose(curve.bend, expected(knots, 2), atol=2e-2 * np.abs(expected(knots, 2)).max())
     back = along(both, jnp.zeros(200, jnp.int32), jnp.asarray(1 - places, jnp.float32))
     np.testing.assert_allclose(back, expected(places), atol=1e-5)
@@ -249,13 +249,13 @@ def test_a_stretch_takes_no_less_than_the_time_optimal_one():
 def test_a_still_stretch_takes_no_time_and_has_gradients():
     q = jnp.tile(jnp.asarray(HOME)[None], (31, 1))
 
-    def told(q):
+    def timed_angles(q):
         curve = smooth_curve(q)
         both = jax.tree.map(lambda a: a[None], curve)
         places = jnp.linspace(0.0, 1.0, 50)
         return timing(curve, 0.0)[0], angles_along(both, jnp.zeros(50, jnp.int32), places)
 
-    (seconds, angles), pullback = jax.vjp(jax.jit(told), q)
+    (seconds, angles), pullback = jax.vjp(jax.jit(timed_angles), q)
     assert float(seconds) < 2 * PLAN.timestep
     np.testing.assert_allclose(angles, np.tile(HOME, (50, 1)), atol=1e-6)
     assert np.isfinite(pullback((jnp.float32(1.0), jnp.ones((50, 7))))[0]).all()

@@ -141,18 +141,18 @@ def surface(shape, half, count=20_000):
 def test_codes_number_the_shapes_from_0_and_names_find_them():
     assert [shape.code for shape in in_order()] == list(range(len(SHAPES)))
     assert all(SHAPES[shape.name] is shape and shape_of(shape.name) is shape for shape in SHAPES.values())
-    known = " or ".join(f'"{name}"' for name in SHAPES)
+    names = " or ".join(f'"{name}"' for name in SHAPES)
     for unknown in ("sphere", None, ["box"]):
-        with pytest.raises(InputError, match=f"^it: .* is unknown; use {known}$"):
+        with pytest.raises(InputError, match=f"^it: .* is unknown; use {names}$"):
             shape_of(unknown, "it")
 
 
 @pytest.mark.parametrize("library", [np, jnp])
 def test_each_body_is_told_of_its_own_shape(library):
     kind = library.asarray([[1, 0], [0, 1]])
-    told = by_shape(kind[..., None], lambda shape: library.asarray([shape.code, shape.density]), library)
+    values = by_shape(kind[..., None], lambda shape: library.asarray([shape.code, shape.density]), library)
     expected = [[[shape.code, shape.density] for shape in row] for row in ([*reversed(in_order())], in_order())]
-    np.testing.assert_allclose(told, expected)
+    np.testing.assert_allclose(values, expected)
 
 
 def test_half_extents_that_are_nearest_are_of_the_shape_and_keep_its_volume(shape, half):
@@ -211,11 +211,11 @@ def test_surface_points_are_on_the_surface_and_spread_by_area(shape, half):
 def test_distance_is_that_to_the_nearest_point_of_the_surface(shape, half):
     points = np.random.default_rng(1).uniform(-2, 2, (300, 3)) * half
     nearest, _ = KDTree(surface(shape, half, 200_000)).query(points)
-    told = distance(shape, points, half)
-    outside = told > 0
+    signed = distance(shape, points, half)
+    outside = signed > 0
     assert 50 < outside.sum() < 299
-    np.testing.assert_allclose(told[outside], nearest[outside], atol=1e-3)
-    assert (nearest[~outside] >= -told[~outside] - 1e-9).all()
+    np.testing.assert_allclose(signed[outside], nearest[outside], atol=1e-3)
+    assert (nearest[~outside] >= -signed[~outside] - 1e-9).all()
     steepness = jax.jit(jax.vmap(jax.grad(lambda p: shape.distance(p[:2], p[2], tuple(half.tolist()), jnp))))
     assert jnp.isfinite(steepness(jnp.float32([*points[:20], *np.diag(half), *np.zeros((1, 3))]))).all()
 
@@ -306,13 +306,13 @@ def test_float32_is_close(shape, half):
     """What JAX makes of it, with a leading axis for the bodies."""
     several, points = np.stack([half, 1.2 * half]), surface(shape, half, 2) * 1.01
     for name in ("volume", "moments", "geometry_size", "bounding_radius", "nearest"):
-        told = getattr(shape, name)(jnp.float32(several), jnp)
-        np.testing.assert_allclose(told, getattr(shape, name)(several, np), rtol=1e-5, err_msg=name)
+        values = getattr(shape, name)(jnp.float32(several), jnp)
+        np.testing.assert_allclose(values, getattr(shape, name)(several, np), rtol=1e-5, err_msg=name)
     for name, first, second in (("reach", directions(2), several), ("fall", directions(2), directions(2, seed=1))):
-        told = getattr(shape, name)(jnp.float32(first), jnp.float32(second), jnp)
-        np.testing.assert_allclose(told, getattr(shape, name)(first, second, np), rtol=1e-4, err_msg=name)
-    told = shape.distance(jnp.float32(points[:, :2]), jnp.float32(points[:, 2]), tuple(half.tolist()), jnp)
-    np.testing.assert_allclose(told, distance(shape, points, half), atol=1e-6)
+        values = getattr(shape, name)(jnp.float32(first), jnp.float32(second), jnp)
+        np.testing.assert_allclose(values, getattr(shape, name)(first, second, np), rtol=1e-4, err_msg=name)
+    values = shape.distance(jnp.float32(points[:, :2]), jnp.float32(points[:, 2]), tuple(half.tolist()), jnp)
+    np.testing.assert_allclose(values, distance(shape, points, half), atol=1e-6)
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -369,9 +369,9 @@ def test_a_new_shape_is_read_seen_and_recognised_for_what_it_is(ball):
     points = np.array(camera.position) + (np.array(camera.rotation) @ ray).T * seen.depth[rows, columns, None]
     np.testing.assert_allclose(np.linalg.norm(points - scenario.objects[0].position, axis=1), 0.05, atol=1e-5)
 
-    told = physics_push.bodies(world.superquadrics(there))
-    assert told.kind[jnp.array([0, 1, world.TARGET])].tolist() == [2, 0, 2]
-    np.testing.assert_allclose(told.half_size[0], there.half_size[0], rtol=1e-5)
+    bodies = physics_push.bodies(world.superquadrics(there))
+    assert bodies.kind[jnp.array([0, 1, world.TARGET])].tolist() == [2, 0, 2]
+    np.testing.assert_allclose(bodies.half_size[0], there.half_size[0], rtol=1e-5)
 
 
 def test_a_new_shape_is_simulated(ball):
@@ -380,9 +380,9 @@ def test_a_new_shape_is_simulated(ball):
     mine = model.with_bodies(compiled, world.slots(scenario))
     assert mine.body("body0").mass[0] == pytest.approx(4 / 3 * math.pi * 0.05**3 * ball.density)
     there = jax.tree.map(lambda leaf: leaf[None], world.from_scenario(scenario))
-    found = body_fields(compiled, there.kind, there.half_size, there.valid)
+    fields = body_fields(compiled, there.kind, there.half_size, there.valid)
     for name in BodyFields.__dataclass_fields__:
-        value = np.asarray(getattr(found, name)[0])
+        value = np.asarray(getattr(fields, name)[0])
         np.testing.assert_allclose(value, getattr(mine, name).reshape(value.shape), 2e-6, err_msg=name)
     simulator = NativeWorld()
     before = simulator.reset(scenario)

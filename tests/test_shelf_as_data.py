@@ -215,9 +215,9 @@ def test_a_sight_that_was_given_is_what_is_found_without(two):
     world = jax.tree.map(jnp.asarray, from_scenario(SCENE))
     for problem in two:
         around = problem.camera, problem.shelf
-        given, found = Snapshot(*around, world, sight_of(*around)), Snapshot(*around, world)
-        assert given.view == found.view == thinned_view(*around)
-        assert bool(given.target_seen) == bool(found.target_seen)
+        given, computed = Snapshot(*around, world, sight_of(*around)), Snapshot(*around, world)
+        assert given.view == computed.view == thinned_view(*around)
+        assert bool(given.target_seen) == bool(computed.target_seen)
     blind = dataclasses.replace(Camera(), position=(0.6, 0.1, 0.6))
     # The oracle does not need to see anything.
     beside = Snapshot(blind, SHELF, world, sight_of(blind, SHELF))
@@ -267,11 +267,11 @@ def test_a_shelf_that_is_traced_gives_what_a_constant_does():
 def test_of_100_shelves_and_cameras_nearly_all_are_seen_by_one_program():
     """Measured again, to a millimetre and a tenth of a degree."""
     rng = np.random.default_rng(0)
-    known, sights = traced_as(sight_of(Camera(), SHELF)), []
+    expected, sights = traced_as(sight_of(Camera(), SHELF)), []
     for _ in range(100):
         shelf = SHELF.moved(tuple(rng.normal(scale=1e-3, size=3)))
         sights.append(sight_of(turned(Camera(), rng.normal(scale=TURN / 2)), shelf))
-    assert sum(traced_as(sight) == known for sight in sights) >= 90
+    assert sum(traced_as(sight) == expected for sight in sights) >= 90
 
 
 def test_what_all_actions_share_can_be_static_or_data():

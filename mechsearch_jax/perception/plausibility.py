@@ -126,8 +126,8 @@ def image_faults(
 def _floor_fault(shelf: Shelf, points: Float[np.ndarray, "n 3"]) -> str | None:
     """A warning if the points show no board, or one at another height."""
     x, y, z = points.T
-    over = (x > shelf.front) & (x < shelf.back) & (y > shelf.right) & (y < shelf.left)
-    low = points[over & (np.abs(z - shelf.board) < FLOOR_SEARCH)]
+    above = (x > shelf.front) & (x < shelf.back) & (y > shelf.right) & (y < shelf.left)
+    low = points[above & (np.abs(z - shelf.board) < FLOOR_SEARCH)]
     chosen = low[np.random.default_rng(0).permutation(len(low))[:FLOOR_POINTS]]
     padded = np.zeros((FLOOR_POINTS, 3), np.float32)
     padded[: len(chosen)] = chosen

@@ -212,13 +212,13 @@ def push_reference(
     n, gripper = config.waypoints, config.gripper
     length = jnp.sqrt(jnp.sum(displacement**2))
     end = translate(T_world_gripper, displacement)
-    apart = translate(end, -config.release * displacement / jnp.maximum(length, 1e-6))
+    released = translate(end, -config.release * displacement / jnp.maximum(length, 1e-6))
     path = jnp.concatenate(
         [
             way_in(T_world_gripper, gripper.nearest_outside, gripper, n - 1, n),
             _straight(T_world_gripper, end, n)[1:],
-            _straight(end, apart, n)[1:],
-            way_in(apart, gripper.nearest_outside, gripper, n - 1, n)[::-1][1:],
+            _straight(end, released, n)[1:],
+            way_in(released, gripper.nearest_outside, gripper, n - 1, n)[::-1][1:],
         ]
     )
     q, reachable = path_kinematics(path, q7)
