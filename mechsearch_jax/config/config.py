@@ -101,9 +101,7 @@ class PlannerConfig:
     predicted_collisions: bool = option(
         False, "whether f rules out overlaps with objects in predicted states too, as in the paper"
     )
-    imitates: Imitated = option(
-        "nothing", "what else is done as somebody's code does it, which no option says", get_args(Imitated)
-    )
+    imitates: Imitated = option("nothing", "whose code is imitated where no option applies", get_args(Imitated))
 
     @property
     def weights(self) -> Weights:

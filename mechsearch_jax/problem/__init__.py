@@ -1,1 +1,1 @@
-"""What does not change in an episode, and the workcell that it is built from."""
+"""The constants of an episode, and the workcell from which they are computed."""

@@ -1,1 +1,1 @@
-"""What every part of the package runs on: compiled functions, files, versions, errors."""
+"""Infrastructure of all parts of the package: compiled functions, files, versions, errors."""
