@@ -53,7 +53,7 @@ from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 from mechsearch_jax.workspace.shelf import Shelf
 
 # What a call does many of; how many is in `Timing.shapes`.
-COUNTED = ("evaluations", "operations", "bytes", "recognitions", "predictions")
+COUNTED = ("recognitions", "predictions")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,8 +61,7 @@ class Timing:
     """How long one function takes.
 
     Attributes:
-      subject: "existence", "graspability", "plan", "perceive: ..." and "predict: ..." with what does it, "simulate", or
-        a part of `roofline.bench_inside`.
+      subject: "existence", "graspability", "plan", "perceive: ..." and "predict: ..." with what does it, or "simulate".
       objects: number of objects in the scenes.
       shapes: sizes that the time depends on; for "simulate" also what was seen of overflows and divergence.
       compile_seconds: of tracing and compiling [s]; honest only if compilations are not kept on disk.
@@ -112,15 +111,6 @@ def save_timing(timing: Timing, path: PathLike) -> None:
       InputError: the file cannot be written.
     """
     save_json(timing.value(), path)
-
-
-def save_timings(timings: Sequence[Timing], path: PathLike) -> None:
-    """Write several timings as one JSON file, `{"timings": [...]}`.
-
-    Raises:
-      InputError: the file cannot be written.
-    """
-    save_json({"timings": [timing.value() for timing in timings]}, path)
 
 
 def measure(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repeats: int) -> tuple[float, list[float]]:

@@ -40,26 +40,6 @@ def timing_table(timing: Timing) -> Table:
     return table
 
 
-def timings_table(timings: Sequence[Timing]) -> Table:
-    """Several timings of one device that count what they do, a row for each."""
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    table.add_column("", style="cyan", no_wrap=True)
-    for name in ("G/s", "median", "spread", "compile"):
-        table.add_column(name, justify="right", no_wrap=True)
-    for timing in timings:
-        fastest, slowest = (f"{1e3 * s:.1f}" for s in timing.spread)
-        table.add_row(
-            timing.subject,
-            f"{(timing.rate or 0.0) / 1e9:,.4g}",
-            f"{1e3 * timing.median:.1f} ms",
-            f"{fastest} to {slowest} ms",
-            f"{timing.compile_seconds:.2f} s",
-        )
-    counted = ", ".join(dict.fromkeys(str(timing.unit) for timing in timings))
-    table.caption = f"10^9 {counted} per second; {timings[0].versions['device']}"
-    return table
-
-
 def agreement_table(agreement: Agreement) -> Table:
     """How well two simulators agree: a column for each kind of action."""
     summary = agreement.summary()

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-import tyro
+from typing import TYPE_CHECKING, Literal
 
 from mechsearch_jax.commands.options import (
     DEFAULTS,
@@ -171,49 +169,6 @@ def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, ou
     _print_timing("simulate", out, lambda: benches.bench_simulate(worlds, steps, repeats))
 
 
-def bench_inside(
-    *, placed: int = 1024, objects: int = 8, points: int = 2560, repeats: int = 10, out: JsonFile = None
-) -> None:
-    """Time every point of clouds against every superquadric, and what the device can do at most, apart from compiling.
-
-    Args:
-      placed: clouds in one call; a GPU needs some 100000 to be busy for milliseconds.
-      objects: that each is tested against.
-      points: of a cloud.
-      repeats: number of timed calls.
-      out: JSON file for the result.
-    """
-    from rich.console import Console
-
-    from mechsearch_jax.benchmarks.parts import roofline
-    from mechsearch_jax.benchmarks.parts.bench import save_timings
-    from mechsearch_jax.benchmarks.report.tables import timings_table
-
-    check_files(out)
-    forget_kept_compilations()
-    console = Console(highlight=False)
-    with console.status("timing inside"):
-        timings = roofline.bench_inside(placed, objects, points, repeats)
-    console.print(timings_table(timings))
-    if out is not None:
-        save_timings(timings, out)
-
-
-def bench_roofline(
-    results: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")], /, *, out: Path
-) -> None:
-    """Write the page that compares measured rates with what devices allow, from results of `inside` and `simulate`.
-
-    Args:
-      results: folder with their JSON files; others are left out.
-      out: Markdown file.
-    """
-    from mechsearch_jax.benchmarks.parts.roofline import write_page
-
-    write_page(results, out)
-    print(out)
-
-
 COMMANDS = {
     "existence": _timing_of("existence", "f"),
     "graspability": _timing_of("graspability", "g where f = 1"),
@@ -221,6 +176,4 @@ COMMANDS = {
     "predict": bench_predict,
     "perceive": bench_perceive,
     "simulate": bench_simulate,
-    "inside": bench_inside,
-    "roofline": bench_roofline,
 }
