@@ -164,17 +164,11 @@ def test_shares_are_those_of_the_rows(tmp_path):
 RESULT = Path(__file__).parents[1] / "benchmarks" / "results" / "ceiling-cpu.json"
 
 
-def test_the_table_of_the_ceiling_is_the_stored_result():
+def test_the_stored_summary_of_the_ceiling_is_that_of_its_scenes():
     stored = json.loads(RESULT.read_text())
     rows = [Row(**dict(zip(stored["columns"], each, strict=True))) for each in stored["rows"]]
     lines = summary(rows)
     assert json.loads(json.dumps(lines)) == stored["summary"]
-    guide = (RESULT.parents[2] / "docs" / "results.md").read_text()
-    for line in lines:
-        low, high = line["solvable_interval"]
-        solved = f"{line['solved_in_an_episode']} | {line['solved_by_the_search']} | {line['solvable']:.2f}"
-        name = line["objects"] or "all"
-        assert f"| {name} | {line['scenes']} | {solved} | {low:.2f} to {high:.2f} |" in guide
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The guides: their links lead somewhere, their code runs, and what the source cites of them is there."""
 
+import importlib.util
 import json
 import math
 import re
@@ -11,13 +12,14 @@ import pytest
 import mechsearch_jax
 from mechsearch_jax.benchmarks.guard.guard import read_reference
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
+from mechsearch_jax.benchmarks.report import results_page
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
-from mechsearch_jax.envs.episode.earlier import EARLIER, GONE, RENAMED
 from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, is_chosen_on, recorded
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.workspace.detector import FOUND_PIXELS
 
 ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks/results"
 PAGES = ["README.md", "CHANGELOG.md", *sorted(f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md"))]
 # Links and code may stand between backticks or in a block without meaning what they say.
 BLOCK = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
@@ -119,17 +121,6 @@ def test_the_python_guide_names_all_of_the_front_door():
         assert re.search(rf"`(?:[^`]*\W)?{name}\b", guide), name
 
 
-def test_old_names_are_what_is_read():
-    page = "docs/results.md"
-    renamed = [(old.strip("`"), new.strip("`")) for old, new in rows(page, "| then | now |")]
-    assert dict(pair for pair in renamed if " " not in pair[0]) == RENAMED
-    missing = {name.strip("`"): said(value) for name, value in rows(page, "| option | value then |")}
-    assert missing == {
-        name: pytest.approx(value) if isinstance(value, list) else value for name, value in EARLIER.items()
-    }
-    assert {name.strip("`"): said(value) for name, value in rows(page, "| option | value of today |")} == GONE
-
-
 def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
     table = rows("docs/commands.md", "| option | what it sets | `standard` | `paper` |")
     told = {re.match(r"`--([\w-]+)", row[0])[1].replace("-", "_"): row[2:] for row in table}
@@ -157,30 +148,34 @@ def test_the_scene_sets_are_those_that_there_are():
             assert each == [(b.scenes, b.objects) for b in scene_set.blocks]
 
 
-def test_the_table_of_scenes_is_the_stored_result():
-    stored = json.loads((ROOT / "benchmarks/results/scenes-cpu.json").read_text())
-    told = {
-        (row[0].strip("`"), row[1]): row[2:]
-        for row in rows(
-            "docs/results.md",
-            "| set | objects | scenes | size of f | targets with 0, 1 to 100, more pixels | share of the target seen "
-            "| objects seen (100 pixels or more) | share of each object seen |",
-        )
-    }
-    lines = {(line["source"], str(line["objects"])): line for line in stored["summary"]}
-    assert told.keys() == lines.keys()
-    for key, line in lines.items():
-        scenes, possible, targets, target_share, visible, objects_share = told[key]
-        assert int(scenes) == line["scenes"]
-        assert possible.startswith(f"{line['possible_mean']:.0f} ± {line['possible_standard_error']:.0f}")
-        counts = [line[f"target_{name}"] for name in ("hidden", "below_threshold", "found")]
-        assert [int(count) for count in targets.split(", ")] == counts
-        assert target_share == f"{line['target_share_mean']:.3f}"
-        assert visible == f"{line['visible_mean']:.2f}"
-        assert objects_share.startswith(f"{line['objects_share_mean']:.2f} ± ")
+def test_the_results_page_is_what_its_stored_results_say():
+    written = read("docs/results.md")
+    assert written == results_page.page(RESULTS), f"run `python -m {results_page.__name__}`"
+    assert len(written.splitlines()) <= 150
+
+
+def test_every_stored_result_is_linked_from_a_guide():
+    linked = {Path(link).name for page in PAGES for link in LINK.findall(read(page)) if "benchmarks/results/" in link}
+    assert {file.name for file in RESULTS.glob("*.json")} - linked == set()
+
+
+def test_the_log_begins_with_the_newest():
+    dates = [title for title in headings("docs/experiments.md") if re.fullmatch(r"\d{4}-\d\d-\d\d", title)]
+    assert dates == sorted(set(dates), reverse=True) != []
+
+
+def test_what_the_log_says_of_scenes_is_what_is_stored():
+    stored, log = json.loads((RESULTS / "scenes-cpu.json").read_text()), " ".join(read("docs/experiments.md").split())
     scenes = [dict(zip(stored["columns"], row, strict=True)) for row in stored["rows"]]
     in_sight = {(row["scenario"], str(row["target_pixels"])) for row in scenes if row["target_pixels"] > FOUND_PIXELS}
-    assert set(re.findall(r"`(published-\d-\d\d)` \((\d+)\)", read("docs/results.md"))) == in_sight
+    assert set(re.findall(r"`(published-\d-\d\d)` \((\d+)\)", log)) == in_sight
+    sizes = {
+        (line["source"], line["objects"]): f"{line['possible_mean']:.0f} ± {line['possible_standard_error']:.0f}"
+        for line in stored["summary"]
+    }
+    published, ours = ([sizes[source, objects] for objects in (2, 4, 6, 8)] for source in ("published", "c2"))
+    told = [f"{', '.join(each[:3])} and {each[3]}" for each in (published, ours)]
+    assert f"f has {told[0]} poses in the published scenes and {told[1]} in `c2`" in log
 
 
 def stored_runs(name):
@@ -201,17 +196,12 @@ RATES = {
     "fell": lambda e: (e["failure"] or "").startswith("the target fell"),
     "held": lambda e: e["held_up"],
     "ruled out": lambda e: e["truth_lost"],
+    "with the paper's": lambda e: e["paper_graspable_step"] is not None,
 }
 
 
 def share(name, episodes, digits):
     return f"{sum(bool(RATES[name](episode)) for episode in episodes) / len(episodes):.{digits}f}"
-
-
-def share_of_graspable(episodes):
-    """As a table has it that keeps graspable and retrieved apart: "–" where an episode does not."""
-    apart = all(episode.get("graspable_known") for episode in episodes)
-    return share("graspable", episodes, 2) if apart else "–"
 
 
 def with_interval(name, episodes):
@@ -220,8 +210,62 @@ def with_interval(name, episodes):
     return f"{share(name, episodes, 2)} ({low:.2f} to {high:.2f})"
 
 
-def mean_steps(episodes):
-    return f"{sum(episode['steps'] or 0 for episode in episodes) / len(episodes):.1f}"
+# What a column of the log says of the episodes of a run, and with how many digits.
+COLUMNS = {
+    "found": ("found", 2),
+    "graspable": ("graspable", 2),
+    "graspable or retrieved": ("graspable", 2),
+    "with the paper's grasps": ("with the paper's", 2),
+    "retrieved": ("retrieved", 2),
+    "an object left the board": ("left", 3),
+    "the target fell": ("fell", 3),
+    "the arm was held up": ("held", 2),
+    "f ruled out the true pose": ("ruled out", 3),
+}
+# Where episodes do not say it: the key of a run's own summary.
+SUMMARY = {
+    "an object left the board": "object_left_board",
+    "the target fell": "target_tipped_or_fell",
+    "the arm was held up": "held_up",
+    "f ruled out the true pose": "truth_ruled_out",
+    "actions": "mean_steps",
+}
+
+
+def cell_of(column, run):
+    """What a cell of the log has to say of a run."""
+    episodes = run["episodes"]
+    if column == "episodes":
+        return str(len(episodes))
+    if column.startswith("with 2"):
+        return ", ".join(
+            share("retrieved", with_objects(episodes, count), 2) for count in "2468" if with_objects(episodes, count)
+        )
+    if column in SUMMARY and "steps" not in episodes[0]:
+        digits = 1 if column == "actions" else COLUMNS[column][1]
+        return f"{run['by_objects']['all'][SUMMARY[column]]:.{digits}f}"
+    if column == "actions":
+        return f"{sum(episode['steps'] or 0 for episode in episodes) / len(episodes):.1f}"
+    return share(COLUMNS[column][0], episodes, COLUMNS[column][1])
+
+
+# In their episodes a retrieval may have set the step at which the target was graspable: rows did not tell them apart.
+COUNTED_RETRIEVALS = {
+    "standard-cpu", "standard-h200", "small-segments-cpu", "first-draws-h200", "draws-h200", "rehearsal-cpu",
+}  # fmt: skip
+TABLE = re.compile(r"^\| run of `([\w-]+)` \| (.*) \|\n\|[-|]+\|\n((?:\|.*\|\n)+)", re.MULTILINE)
+
+
+@pytest.mark.parametrize(("name", "columns", "lines"), TABLE.findall(read("docs/experiments.md")))
+def test_the_tables_of_the_log_are_the_stored_runs(name, columns, lines):
+    runs = stored_runs(f"{name}.json")
+    named = {str(i): run for i, run in enumerate(runs)} | {run["name"]: run for run in runs if "name" in run}
+    for line in lines.splitlines():
+        label, *cells = [cell.strip() for cell in line.strip("|").split(" | ")]
+        run = named[re.match(r"`([^`]+)`", label)[1]]
+        assert cells == [cell_of(column, run) for column in columns.split(" | ")], f"{name}: {label}"
+    if "graspable" in columns:
+        assert ("graspable or retrieved" in columns) == (name in COUNTED_RETRIEVALS)
 
 
 def with_objects(episodes, count):
@@ -234,22 +278,21 @@ def new_scenes(episodes):
 
 
 def test_the_rates_of_the_readme_are_the_stored_ones():
-    published = [
-        episode for name in ("standard-cpu.json", "standard-h200.json") for episode in stored_runs(name)[0]["episodes"]
-    ]
-    new = new_scenes(stored_runs("standard-h200.json")[1]["episodes"])
-    columns = [f"{scenes} episodes: found | graspable | retrieved" for scenes in ("published, 150", "new, 90")]
-    header = f"| objects | {' | '.join(columns)} |"
-    told = {row[0]: row[1:] for row in rows("README.md", header)}
+    c2, published = (
+        results_page.Stored(RESULTS).run("standard-h100", name)["episodes"] for name in ("c2", "published")
+    )
+    new = new_scenes(c2)
+    columns = [f"{scenes} episodes: found | graspable | retrieved" for scenes in ("new, 90", "published, 100")]
+    told = {row[0]: row[1:] for row in rows("README.md", f"| objects | {' | '.join(columns)} |")}
     assert list(told) == ["2", "4", "6", "8"]
     for objects, figures in told.items():
-        groups = [with_objects(each, objects) for each in (published, new)]
-        assert list(map(len, groups)) == [150, 90]
-        parts = [
-            (share("found", each, 2), share_of_graspable(each), with_interval("retrieved", each)) for each in groups
+        groups = [with_objects(each, objects) for each in (new, published)]
+        assert list(map(len, groups)) == [90, 100]
+        rates = [
+            (share("found", each, 2), share("graspable", each, 2), with_interval("retrieved", each)) for each in groups
         ]
-        assert figures == [*parts[0], *parts[1]]
-        assert all(is_chosen_on(episode["scenario"]) for episode in groups[0])
+        assert figures == [*rates[0], *rates[1]]
+        assert all(is_chosen_on(episode["scenario"]) for episode in groups[1])
 
 
 # Of its O-Search-for-Grasp.
@@ -298,7 +341,7 @@ def test_what_came_of_searches_in_a_cell_is_what_is_stored():
         *(sum(row[name] for row in rows) for name in ("motions", "failed", "phantoms")),
         sum(row["error"] is not None for row in rows),
     )
-    assert "| " + " | ".join(map(str, counts)) + " |" in read("docs/results.md")
+    assert "| " + " | ".join(map(str, counts)) + " |" in read("docs/experiments.md")
     assert f"took [{counts[2]} of {len(rows)} hidden targets out](" in " ".join(read("README.md").split())
     assert stored["config"] == read("benchmarks/parts/cells/other-cell.toml")
 
@@ -308,58 +351,20 @@ def test_the_guard_is_paired_with_what_it_replaced_as_the_page_says():
     pairs = {one.episode: one.retrieved for one in before.outcomes}
     changes = [(pairs[one.episode], one.retrieved) for one in after.outcomes]
     assert (len(changes), changes.count((False, True)), changes.count((True, False))) == (160, 2, 0)
-    assert "two of 160 episodes are retrieved that were not, and none the other way" in read("docs/commands.md")
+    assert "two of 160 episodes are retrieved that were not, and none the other way" in " ".join(
+        read("docs/experiments.md").split()
+    )
 
 
 def test_scenes_that_nothing_was_chosen_on_are_told_apart():
-    new, page = new_scenes(stored_runs("standard-h200.json")[1]["episodes"]), " ".join(read("docs/results.md").split())
+    new = new_scenes(stored_runs("standard-h200.json")[1]["episodes"])
+    page = " ".join(read("docs/experiments.md").split())
     groups = [with_objects(new, objects) for objects in "2468"]
     found = ", ".join(share("found", each, 2) for each in groups)
     retrieved = ", ".join(with_interval("retrieved", each) for each in groups)
     scenes = "numbers 090 to 179 of `c2`, 90 episodes each, with 2, 4, 6 and 8 objects (95% intervals)"
     assert f"{scenes}: found {found}, retrieved {retrieved}." in page
     assert set(map(len, groups)) == {90}
-
-
-def header_above(page, row):
-    """The header of the table that a row is in."""
-    return re.findall(r"^(\|.*\|)\n\|[-|]+\|$", page[: page.index(row)], re.MULTILINE)[-1]
-
-
-def counts_retrievals(run):
-    """Whether the graspable step of a run's episodes may be that of the retrieval."""
-    return not all(episode.get("graspable_known") for episode in run["episodes"])
-
-
-@pytest.mark.parametrize(
-    ("name", "labels"),
-    [
-        ("rehearsal-h200.json", ["published", "`c2`", "`c2`, nothing rehearsed"]),
-        ("standard-cpu.json", ["published, C MuJoCo"]),
-        ("standard-h100.json", ["`c2`, b62958a", "`c2`, f86e8f8", "`c2`, 8787b53", "published, 8787b53"]),
-        (
-            "standard-h200.json",
-            [
-                "published",
-                "`c2`",
-                "published, `--preset best`, 20 actions",
-                "published, `--recognition masks`",
-                "published, `--recognition full`",
-            ],
-        ),
-    ],
-)
-def test_the_rates_of_the_results_by_number_of_objects_are_the_stored_ones(name, labels):
-    page = read("docs/results.md")
-    for run, label in zip(stored_runs(name), labels, strict=True):
-        for objects in "2468":
-            episodes = with_objects(run["episodes"], objects)
-            rates = [share(rate, episodes, 2) for rate in ("found", "graspable", "retrieved")]
-            rest = [share(rate, episodes, n) for rate, n in (("left", 3), ("fell", 3), ("held", 2), ("ruled out", 3))]
-            cells = [label, objects, str(len(episodes)), *rates, *rest, mean_steps(episodes)]
-            line = f"| {' | '.join(cells)} |"
-            assert line in page
-            assert ("| graspable or retrieved |" in header_above(page, line)) == counts_retrievals(run)
 
 
 def by_scene(*runs):
@@ -381,7 +386,7 @@ def test_what_the_rebuilt_engine_loses_is_what_is_stored():
         low, high = mean_interval(changes, list(now))
         assert low > -2.0
         differences.append([round(value, 1) + 0.0 for value in (statistics.fmean(changes), low, high)])
-    page = " ".join(read("docs/results.md").split())
+    page = " ".join(read("docs/experiments.md").split())
     (one, low, high), (other, least, most) = differences
     assert f"three runs against one, {one:.1f} ({low:+.1f} to {high:+.1f}) points" in page
     assert f"the native simulator, {other:+.1f} ({least:+.1f} to {most:+.1f})." in page
@@ -395,20 +400,20 @@ def test_what_the_rebuilt_engine_loses_is_what_is_stored():
     assert f"{actions:,} actions: {1000 * seconds['planning'] / actions:.0f} ms each" in page
 
 
-def test_the_rates_of_the_experiments_are_the_stored_ones():
-    page = read("docs/results.md")
-    for run in stored_runs("first-draws-h200.json"):
-        shares = [(rate, 2) for rate in ("found", "graspable", "retrieved", "left")]
-        cells = [share(rate, run["episodes"], n) for rate, n in (*shares, ("ruled out", 3))]
-        line = f"| {' | '.join(cells)} | {mean_steps(run['episodes'])} |"
-        assert line in page
-        assert ("| graspable or retrieved |" in header_above(page, line)) == counts_retrievals(run)
-    for run in stored_runs("rehearsal-frictions-cpu.json"):
-        found, retrieved, held = (share(rate, run["episodes"], 2) for rate in ("found", "retrieved", "held"))
-        assert f"| {found} | {retrieved} | {held} | {mean_steps(run['episodes'])} |" in page
+def test_what_another_friction_costs_is_what_is_stored():
+    runs = {run["name"]: run["episodes"] for run in stored_runs("rehearsal-frictions-cpu.json")}
+    factors = {"0.5": "X5", "0.75": "XA5", "1.5": "XA1", "2": "X2", "3": "XA2"}
+    told = [f"{factor} {points('retrieved', [(runs[name], runs['X1'])], 0)}" for factor, name in factors.items()]
+    page = " ".join(read("docs/experiments.md").split())
+    assert f"Retrieved, paired with 1: {', '.join(told)}." in page
+    for factor, name in {**factors, "1": "X1"}.items():
+        assert f"| `{name}` {factor} |" in page
+    # Of two frictions the larger one decides.
+    ends = {name: [(each["scenario"], each["retrieved"], each["steps"]) for each in runs[name]] for name in runs}
+    assert (ends["XC5"], ends["XC1"]) == (ends["X1"], ends["X2"])
 
 
-def points(name, pairs):
+def points(name, pairs, digits=1):
     """A difference in percentage points with its error, the seeds of a scene averaged first."""
     scenes = {}
     for one, other in pairs:
@@ -417,12 +422,12 @@ def points(name, pairs):
             if (pair := (episode["scenario"], episode["seed"])) in before:
                 scenes.setdefault(episode["scenario"], []).append(bool(RATES[name](episode)) - before[pair])
     means = [statistics.fmean(values) for values in scenes.values()]
-    mean = round(100 * statistics.fmean(means), 1)
-    told = f"{mean:+.1f}" if mean else "0.0"
-    return f"{told} ± {100 * statistics.stdev(means) / math.sqrt(len(means)):.1f}"
+    mean = round(100 * statistics.fmean(means), digits)
+    told = f"{mean:+.{digits}f}" if mean else "0.0"
+    return f"{told} ± {100 * statistics.stdev(means) / math.sqrt(len(means)):.{digits}f}"
 
 
-# In words of docs/results.md: the file and the runs, by their names or places, and the rate.
+# In words of docs/experiments.md: the file and the runs, by their names or places, and the rate.
 DIFFERENCES = {
     "nothing was gained (found {} points": ("opened-cpu.json", [(1, 0)], "found"),
     "points, retrieved {}, [opened-cpu": ("opened-cpu.json", [(1, 0)], "retrieved"),
@@ -451,7 +456,7 @@ def test_differences_are_those_of_scenes(words):
     runs = stored_runs(name)
     known = {run.get("name"): run["episodes"] for run in runs} | {i: run["episodes"] for i, run in enumerate(runs)}
     told = points(rate, [(known[one], known[other]) for one, other in pairs])
-    assert words.format(told) in " ".join(read("docs/results.md").split())
+    assert words.format(told) in " ".join(read("docs/experiments.md").split())
 
 
 def test_stored_scenes_are_those_on_record():
@@ -472,3 +477,28 @@ def test_the_code_of_the_python_guide_runs():
     code = re.findall(r"^```python\n(.*?)^```$", read("docs/python.md"), re.MULTILINE | re.DOTALL)
     # Classes in it are pytrees, and look for the module that they are defined in.
     exec(compile("\n".join(code), "docs/python.md", "exec"), {"__name__": "guide"})
+
+
+def glossary():
+    """The words of the glossary with what their rows say: meaning, paper, code, option."""
+    lines = re.findall(r"^\| (?!word |-)(.*) \|$", read("docs/glossary.md"), re.MULTILINE)
+    return {row[0]: row[1:] for row in (line.split(" | ") for line in lines)}
+
+
+def test_the_code_that_the_glossary_names_is_there():
+    for word, (_, _, code, _) in glossary().items():
+        path = code.strip("`").replace("ms.", "")
+        package, _, name = f"mechsearch_jax.{path}".rpartition(".")
+        there = hasattr(importlib.import_module(package), name) or importlib.util.find_spec(f"{package}.{name}")
+        assert code == "–" or there, f"{word}: {code}"
+
+
+def test_the_options_that_the_glossary_names_are_there():
+    commands = read("docs/commands.md")
+    for word, (*_, option) in glossary().items():
+        assert option == "–" or option.strip("`") in commands, f"{word}: {option}"
+
+
+def test_the_glossary_says_a_word_once():
+    words = [word for row in glossary() for word in row.split(", ")]
+    assert len(words) == len(set(words)) > 50
