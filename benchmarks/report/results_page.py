@@ -82,7 +82,7 @@ def with_interval(episodes: Sequence[Episode], key: str) -> str:
 
 def rate_cells(episodes: Sequence[Episode]) -> list[str]:
     """The cells under `RATES` without the number of objects."""
-    told_apart = all(episode.get("graspable_known") for episode in episodes)
+    told_apart = all("graspable_step" in episode for episode in episodes)
     return [
         str(len(episodes)),
         with_interval(episodes, "found_step"),
