@@ -123,9 +123,9 @@ def test_the_python_guide_names_all_of_the_front_door():
 
 def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
     table = rows("docs/commands.md", "| option | what it sets | `standard` | `paper` |")
-    told = {re.match(r"`--([\w-]+)", row[0])[1].replace("-", "_"): row[2:] for row in table}
-    assert {option.name for option in OPTIONS} == set(told) - {"preset", "recognition", "simulator", "protocol"}
-    for name, cells in told.items():
+    stated = {re.match(r"`--([\w-]+)", row[0])[1].replace("-", "_"): row[2:] for row in table}
+    assert {option.name for option in OPTIONS} == set(stated) - {"preset", "recognition", "simulator", "protocol"}
+    for name, cells in stated.items():
         for preset, cell in zip(("standard", "paper"), cells, strict=False):
             value = PRESETS[preset]().options().get(name)
             if value is not None and name not in ("actions", "push_distances"):
@@ -133,15 +133,15 @@ def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
 
 
 def test_the_scene_sets_are_those_that_there_are():
-    told = {row[0].strip("`"): row[1:] for row in rows("docs/method.md", "| set | scenes | what | seeds | digest |")}
+    stated = {row[0].strip("`"): row[1:] for row in rows("docs/method.md", "| set | scenes | what | seeds | digest |")}
     whole = [scene_set for scene_set in SETS.values() if scene_set.about]
-    assert list(told) == [scene_set.name for scene_set in whole]
+    assert list(stated) == [scene_set.name for scene_set in whole]
     for scene_set in whole:
-        scenes, _, seeds, digest_told = told[scene_set.name]
+        scenes, _, seeds, digest_stated = stated[scene_set.name]
         first, last = map(int, seeds.split(" to "))
         assert int(re.match(r"\d+", scenes)[0]) == scene_set.scenes
         assert {(b.first_seed, b.first_seed + b.scenes - 1) for b in scene_set.blocks} == {(first, last)}
-        assert digest_told == digest(scene_set)
+        assert digest_stated == digest(scene_set)
         counts = re.search(r"(\d+) each with ([\d, ]+) objects", scenes)
         if counts:
             each = [(int(counts[1]), int(objects)) for objects in counts[2].split(", ")]
@@ -174,8 +174,8 @@ def test_what_the_log_says_of_scenes_is_what_is_stored():
         for line in stored["summary"]
     }
     published, ours = ([sizes[source, objects] for objects in (2, 4, 6, 8)] for source in ("published", "c2"))
-    told = [f"{', '.join(each[:3])} and {each[3]}" for each in (published, ours)]
-    assert f"f has {told[0]} poses in the published scenes and {told[1]} in `c2`" in log
+    stated = [f"{', '.join(each[:3])} and {each[3]}" for each in (published, ours)]
+    assert f"f has {stated[0]} poses in the published scenes and {stated[1]} in `c2`" in log
 
 
 def stored_runs(name):
@@ -278,9 +278,9 @@ def test_the_rates_of_the_readme_are_the_stored_ones():
     )
     new = new_scenes(c2)
     columns = [f"{scenes} episodes: found | graspable | retrieved" for scenes in ("new, 90", "published, 100")]
-    told = {row[0]: row[1:] for row in rows("README.md", f"| objects | {' | '.join(columns)} |")}
-    assert list(told) == ["2", "4", "6", "8"]
-    for objects, figures in told.items():
+    stated = {row[0]: row[1:] for row in rows("README.md", f"| objects | {' | '.join(columns)} |")}
+    assert list(stated) == ["2", "4", "6", "8"]
+    for objects, figures in stated.items():
         groups = [with_objects(each, objects) for each in (new, published)]
         assert list(map(len, groups)) == [90, 100]
         rates = [
@@ -298,9 +298,9 @@ def test_preset_paper_stands_beside_the_papers_figures():
     run = stored_runs("published-paper-h200.json")[0]
     assert (run["preset"], run["policy"]) == ("paper", "search-for-grasp")
     header = "| objects | preset `paper`: found | graspable | retrieved | the paper: found | graspable |"
-    told = rows("README.md", header)
-    assert [objects for objects, *_ in told] == ["2", "4", "6", "8"]
-    for objects, *figures in told:
+    stated = rows("README.md", header)
+    assert [objects for objects, *_ in stated] == ["2", "4", "6", "8"]
+    for objects, *figures in stated:
         episodes = with_objects(run["episodes"], objects)
         ours = [share(rate, episodes, 2) for rate in ("found", "graspable", "retrieved")]
         assert figures == [*ours, f"{PAPER[objects].find:.2f}", f"{PAPER[objects].grasp:.2f}"]
@@ -408,9 +408,9 @@ def test_what_the_rebuilt_engine_loses_is_what_is_stored():
 def test_what_another_friction_costs_is_what_is_stored():
     runs = {run["name"]: run["episodes"] for run in stored_runs("rehearsal-frictions-cpu.json")}
     factors = {"0.5": "X5", "0.75": "XA5", "1.5": "XA1", "2": "X2", "3": "XA2"}
-    told = [f"{factor} {points('retrieved', [(runs[name], runs['X1'])], 0)}" for factor, name in factors.items()]
+    stated = [f"{factor} {points('retrieved', [(runs[name], runs['X1'])], 0)}" for factor, name in factors.items()]
     page = " ".join(read("docs/experiments.md").split())
-    assert f"Retrieved, paired with 1: {', '.join(told)}." in page
+    assert f"Retrieved, paired with 1: {', '.join(stated)}." in page
     for factor, name in {**factors, "1": "X1"}.items():
         assert f"| `{name}` {factor} |" in page
     # Of two frictions the larger one decides.
@@ -428,8 +428,8 @@ def points(name, pairs, digits=1):
                 scenes.setdefault(episode["scenario"], []).append(bool(RATES[name](episode)) - before[pair])
     means = [statistics.fmean(values) for values in scenes.values()]
     mean = round(100 * statistics.fmean(means), digits)
-    told = f"{mean:+.{digits}f}" if mean else "0.0"
-    return f"{told} ± {100 * statistics.stdev(means) / math.sqrt(len(means)):.{digits}f}"
+    stated = f"{mean:+.{digits}f}" if mean else "0.0"
+    return f"{stated} ± {100 * statistics.stdev(means) / math.sqrt(len(means)):.{digits}f}"
 
 
 # In words of docs/experiments.md: the file and the runs, by their names or places, and the rate.
@@ -460,8 +460,8 @@ def test_differences_are_those_of_scenes(words):
     name, pairs, rate = DIFFERENCES[words]
     runs = stored_runs(name)
     known = {run.get("name"): run["episodes"] for run in runs} | {i: run["episodes"] for i, run in enumerate(runs)}
-    told = points(rate, [(known[one], known[other]) for one, other in pairs])
-    assert words.format(told) in " ".join(read("docs/experiments.md").split())
+    stated = points(rate, [(known[one], known[other]) for one, other in pairs])
+    assert words.format(stated) in " ".join(read("docs/experiments.md").split())
 
 
 def test_stored_scenes_are_those_on_record():

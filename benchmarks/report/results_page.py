@@ -75,18 +75,18 @@ def share(reached: Sequence[bool], digits: int = 2) -> str:
 
 def with_interval(episodes: Sequence[Episode], key: str) -> str:
     """A share of episodes with its 95% interval."""
-    got = reached(episodes, key)
-    low, high = share_interval(got, [episode["scenario"] for episode in episodes])
-    return f"{share(got)} ({low:.2f} to {high:.2f})"
+    flags = reached(episodes, key)
+    low, high = share_interval(flags, [episode["scenario"] for episode in episodes])
+    return f"{share(flags)} ({low:.2f} to {high:.2f})"
 
 
 def rate_cells(episodes: Sequence[Episode]) -> list[str]:
     """The cells under `RATES` without the number of objects."""
-    told_apart = all("graspable_step" in episode for episode in episodes)
+    has_graspable = all("graspable_step" in episode for episode in episodes)
     return [
         str(len(episodes)),
         with_interval(episodes, "found_step"),
-        with_interval(episodes, "graspable_step") if told_apart else "–",
+        with_interval(episodes, "graspable_step") if has_graspable else "–",
         share(reached(episodes, "paper_graspable_step")),
         with_interval(episodes, "retrieved"),
         f"{sum(episode['steps'] for episode in episodes) / len(episodes):.1f}",
@@ -207,6 +207,10 @@ def main() -> None:
     parser.add_argument("--results", default="benchmarks/results", help="folder of the stored results")
     parser.add_argument("--out", default="docs/results.md", help="the page")
     arguments = parser.parse_args()
+    if not Path(arguments.results).is_dir():
+        parser.error(
+            f"{arguments.results}: is no folder; start it at the root of a checkout, or name one with --results"
+        )
     with replacing(arguments.out) as file:
         file.write(page(arguments.results).encode())
 
