@@ -5,6 +5,7 @@ import pytest
 import scipy.stats
 
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
+from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
 
 DRAWS = 2000
 
@@ -69,7 +70,40 @@ def test_a_mean_is_of_scenes_drawn_again():
         (steps,), np.mean, n_resamples=20_000, method="percentile", rng=np.random.default_rng(1)
     ).confidence_interval
     assert (low, high) == pytest.approx((expected.low, expected.high), abs=0.12)
-    assert mean_interval(steps[::-1], names) == (low, high)
+    # The same again with another seed is not twice as much.
     assert mean_interval(steps * 3, names * 3) == (low, high)
     assert mean_interval([4, 4], "ab") == (4.0, 4.0)
     assert mean_interval([4, 5], "aa") is mean_interval([], []) is None
+
+
+def test_intervals_do_not_depend_on_the_order_of_episodes():
+    rng = np.random.default_rng(0)
+    scenes, values = rng.integers(0, 40, 300), rng.normal(size=300)
+    reached = rng.random(300) < 0.7
+    order = rng.permutation(300)
+    for function, of in (
+        (share_interval, reached),
+        (mean_interval, values),
+        (PairedDifference.of, values),
+        (lambda values, scenes: PairedDifference.of(values, scenes).interval, values),
+    ):
+        assert function(of.tolist(), scenes.tolist()) == function(of[order].tolist(), scenes[order].tolist())
+
+
+def test_a_mean_holds_the_true_one_as_often_as_it_says():
+    """Of 40 scenes with 3 episodes each, whose means differ."""
+    rng = np.random.default_rng(0)
+    names = np.repeat(np.arange(40), 3).tolist()
+    draws = rng.normal(size=(300, 40, 1)) + rng.normal(size=(300, 40, 3))
+    bounds = [mean_interval(values, names) for values in draws.reshape(300, -1).tolist()]
+    assert 0.9 <= np.mean([low <= 0.0 <= high for low, high in bounds]) <= 0.98
+
+
+def test_a_paired_difference_is_of_scenes():
+    change = PairedDifference.of([1, 1, 1, -1, 0], ["a", "a", "a", "b", "c"])
+    assert change == PairedDifference((-1.0, 0.0, 1.0), 5, 3, 1)
+    assert (change.scenes, change.mean, change.standard_error) == (3, 0.0, pytest.approx(1 / 3**0.5))
+    assert change.interval == (-1.0, 1.0)
+    alone = PairedDifference.of([2.0], ["a"])
+    assert (alone.mean, alone.standard_error, alone.interval) == (2.0, None, None)
+    assert PairedDifference.of([], []).mean is None

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import io
 import json
+import re
 
 import pytest
 from matplotlib import image
@@ -12,6 +13,7 @@ from rich.console import Console
 from mechsearch_jax.benchmarks.report import report
 from mechsearch_jax.benchmarks.report.episode_tables import events_table, rates_table
 from mechsearch_jax.benchmarks.report.report_figures import reached, success_figure
+from mechsearch_jax.benchmarks.report.report_files import FILES, write_report
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.store.rows import EVENTS, Row, write_rows
@@ -29,6 +31,11 @@ OTHER = dataclasses.replace(WON, policy="search-and-grasp")
 ROWS = [WON, LOST, BROKEN, OTHER]
 
 
+def page_of(folder):
+    """The Markdown page of a report, in which one space is between cells."""
+    return re.sub(" +", " ", (folder / "report.md").read_text())
+
+
 def test_goals_are_reached_once_and_for_all():
     assert reached(ROWS, "found", 4) == [0, 3, 3, 3, 3]
     assert reached(ROWS, "graspable", 4) == [0, 0, 2, 2, 2]
@@ -43,8 +50,8 @@ def test_failures_are_counted_by_reason():
 
 
 def test_a_report_holds_what_the_rows_say(tmp_path):
-    report.write_report(ROWS, tmp_path / "new")
-    assert {path.name for path in (tmp_path / "new").iterdir()} == set(report.FILES)
+    write_report(ROWS, tmp_path / "new")
+    assert {path.name for path in (tmp_path / "new").iterdir()} == set(FILES)
     with open(tmp_path / "new" / "rates.csv", newline="") as file:
         lines = list(csv.DictReader(file))
     assert [(line["method"], line["objects"], line["episodes"], line["errors"]) for line in lines] == [
@@ -59,7 +66,7 @@ def test_a_report_holds_what_the_rows_say(tmp_path):
     value = json.loads((tmp_path / "new" / "rates.json").read_text())
     assert value["rates"][-1]["retrieved_high"] == pytest.approx(high)
     assert value["failures"][0]["reason"] == "found, but not graspable"
-    text = (tmp_path / "new" / "report.md").read_text()
+    text = page_of(tmp_path / "new")
     assert f"| search-for-grasp | all | 3 | 1 | 0.67 (0.21 to 0.94) | 0.33 ({low:.2f} to {high:.2f}) |" in text
     assert "| search-for-grasp | error: a \\| b c | 1 | 0.33 |" in text
     assert "](success.png)" in text
@@ -68,8 +75,8 @@ def test_a_report_holds_what_the_rows_say(tmp_path):
 
 def test_a_report_tells_the_papers_grasps_of_the_episodes_that_say_so(tmp_path):
     said = [dataclasses.replace(WON, paper_graspable=True, paper_graspable_step=2), LOST]
-    report.write_report([*said, dataclasses.replace(LOST, scenario="c", paper_graspable=False), OTHER], tmp_path)
-    text = (tmp_path / "report.md").read_text()
+    write_report([*said, dataclasses.replace(LOST, scenario="c", paper_graspable=False), OTHER], tmp_path)
+    text = page_of(tmp_path)
     low, high = wilson(1, 2)
     assert f"| 0.33 (0.06 to 0.79) | 0.50 ({low:.2f} to {high:.2f}) | 0.33 (0.06 to 0.79) |" in text
     assert "| 1.00 (0.21 to 1.00) | - | 1.00 (0.21 to 1.00) |" in text
@@ -82,8 +89,8 @@ def test_a_report_tells_the_papers_grasps_of_the_episodes_that_say_so(tmp_path):
 
 
 def test_a_report_of_one_success_has_no_failures(tmp_path):
-    report.write_report([WON], tmp_path)
-    assert "None did." in (tmp_path / "report.md").read_text()
+    write_report([WON], tmp_path)
+    assert "None did." in page_of(tmp_path)
     assert (tmp_path / "failures.csv").read_text() == "method,reason,episodes,share\n"
 
 
@@ -103,8 +110,8 @@ def test_a_report_says_what_happened_on_the_way(tmp_path):
         ),
         dataclasses.replace(LOST, seed=2, failure=f"{fell} at action 10"),
     ]
-    report.write_report(rows, tmp_path)
-    text = (tmp_path / "report.md").read_text()
+    write_report(rows, tmp_path)
+    text = page_of(tmp_path)
     assert "| search-for-grasp | all | 2 | 0.500 | 0.375 | 0.000 | 0.500 | 0.000 | 0.000 |" in text
     with open(tmp_path / "events.csv", newline="") as file:
         lines = list(csv.DictReader(file))
@@ -118,8 +125,8 @@ def test_a_report_says_what_happened_on_the_way(tmp_path):
 
 
 def test_rows_of_earlier_versions_have_no_events(tmp_path):
-    report.write_report(ROWS, tmp_path)
-    assert "These episodes do not say" in (tmp_path / "report.md").read_text()
+    write_report(ROWS, tmp_path)
+    assert "These episodes do not say" in page_of(tmp_path)
     assert (tmp_path / "events.csv").read_text().startswith("method,objects,episodes,truth_lost,")
     assert json.loads((tmp_path / "rates.json").read_text())["events"] == []
     assert events_table(ROWS) is None
@@ -151,8 +158,8 @@ def test_scenarios_that_changed_between_rows_are_named(tmp_path):
     assert report.changed_scenarios([same, dataclasses.replace(same, seed=5), LOST]) == []
     for rows in ([same, other, LOST], [same, unknown, LOST]):
         assert report.changed_scenarios(rows) == ["a"]
-        report.write_report(rows, tmp_path)
-        assert "not the same, or not known, in all rows count as several: a." in (tmp_path / "report.md").read_text()
+        write_report(rows, tmp_path)
+        assert "not the same, or not known, in all rows count as several: a." in page_of(tmp_path)
     many = [dataclasses.replace(row, scenario=f"s{i}") for i in range(7) for row in (same, other)]
-    assert report.told_of_changes(many).endswith("s0, s1, s2, s3, s4 and 2 more.")
-    assert report.told_of_changes([same]) == ""
+    assert report.changed_scenarios_remark(many).endswith("s0, s1, s2, s3, s4 and 2 more.")
+    assert report.changed_scenarios_remark([same]) == ""

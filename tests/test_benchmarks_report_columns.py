@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from matplotlib import image
 
+from mechsearch_jax.benchmarks.pages.pages import Heading, Paragraph, Table, as_html, as_latex, as_markdown
 from mechsearch_jax.benchmarks.report import films
-from mechsearch_jax.benchmarks.report.pages import Heading, Paragraph, Table, as_html, as_latex, as_markdown
-from mechsearch_jax.benchmarks.report.report import ASKED_FILES, FILES, Asked, Report, write_report
+from mechsearch_jax.benchmarks.report.report import Report, ReportOptions
 from mechsearch_jax.benchmarks.report.report_figures import COLOURS, curve_figure, rates_figure, success_figure
+from mechsearch_jax.benchmarks.report.report_files import FILES, OPTIONAL_FILES, write_report
 from mechsearch_jax.benchmarks.report.report_page import blocks
 from mechsearch_jax.benchmarks.running.worker import Worker
-from mechsearch_jax.benchmarks.statistics.paired import paired
+from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, by_variant, paired
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, column, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, options_of, write_rows
@@ -123,17 +124,17 @@ def test_differences_are_paired():
     slower = dataclasses.replace(WON, scenario="s4", content_hash="s4", seed=7, steps=6)
     other = rows(0.5, {"s1", "s2"}, [slower, dataclasses.replace(WON, scenario="s5")])
     label = label_variants([*base, *other])[0]
-    found = {each.goal: each for each in paired([*base, *other], label, ["scenario"])}
+    ((variant, goals),) = by_variant(paired([*base, *other], label, ["scenario"])).items()
     values = [1.0, -1.0, -1.0, 0.0]
-    assert {each.method for each in found.values()} == {"search-for-grasp, gamma 0.5"}
-    retrieved = found["retrieved"]
+    assert variant == "search-for-grasp, gamma 0.5"
+    retrieved = goals["retrieved"]
     assert (retrieved.pairs, retrieved.gains, retrieved.losses) == (4, 1, 2)
-    assert retrieved.difference == pytest.approx(np.mean(values))
+    assert retrieved.mean == pytest.approx(np.mean(values))
     assert retrieved.standard_error == pytest.approx(np.std(values, ddof=1) / math.sqrt(4))
     # Only s4 was retrieved by both: after 3 actions, and after 3 and 6.
-    steps = found["retrieved_steps"]
-    assert (steps.pairs, steps.difference, steps.standard_error) == (1, 1.5, None)
-    assert {each.goal: each.pairs for each in paired([*base, *other], label)}["found"] == 4
+    steps = goals["retrieved_steps"]
+    assert (steps.pairs, steps.mean, steps.standard_error, steps.interval) == (1, 1.5, None, None)
+    assert {each.change.pairs for each in paired([*base, *other], label) if each.goal == "found"} == {4}
     with pytest.raises(InputError, match="no other variant shares seed with the baseline"):
         paired([*base, *(dataclasses.replace(row, seed=9) for row in other)], label, ["seed"])
 
@@ -144,23 +145,21 @@ def test_the_seeds_of_a_scene_are_no_pairs_of_their_own():
     base = [dataclasses.replace(LOST if name == "a" else WON, scenario=name, seed=seed) for name, seed in episodes]
     other = [dataclasses.replace(WON, scenario=name, seed=seed, gamma=0.5) for name, seed in episodes]
     label = label_variants([*base, *other])[0]
-    found = {each.goal: each for each in paired([*base, *other], label)}["retrieved"]
-    values = [1.0, 0.0, 0.0]
-    assert (found.pairs, found.scenes, found.gains, found.losses) == (5, 3, 3, 0)
-    assert found.difference == pytest.approx(np.mean(values))
-    assert found.standard_error == pytest.approx(np.std(values, ddof=1) / math.sqrt(3))
+
+    def goals(base, *columns):
+        return next(iter(by_variant(paired([*base, *other], label, *columns)).values()))
+
+    retrieved, values = goals(base)["retrieved"], [1.0, 0.0, 0.0]
+    assert (retrieved.pairs, retrieved.scenes, retrieved.gains, retrieved.losses) == (5, 3, 3, 0)
+    assert retrieved.mean == pytest.approx(np.mean(values))
+    assert retrieved.standard_error == pytest.approx(np.std(values, ddof=1) / math.sqrt(3))
     # Where pairs are not told apart by their scenes, each of them counts.
-    by_seed = {each.goal: each for each in paired([*base, *other], label, ["seed"])}["retrieved"]
-    assert (by_seed.pairs, by_seed.scenes, by_seed.difference) == (3, 3, pytest.approx((1 / 3 + 1 + 1) / 3))
+    by_seed = goals(base, ["seed"])["retrieved"]
+    assert (by_seed.pairs, by_seed.scenes, by_seed.mean) == (3, 3, pytest.approx((1 / 3 + 1 + 1) / 3))
     # What an episode does not say makes no difference.
-    silent = [dataclasses.replace(row, graspable_known=False, graspable_step=None) for row in base]
-    goals = {each.goal: each for each in paired([*silent, *other], label)}
-    assert (goals["graspable"].pairs, goals["graspable"].difference, goals["graspable_steps"].difference) == (
-        0,
-        None,
-        None,
-    )
-    assert goals["retrieved"] == found
+    silent = goals([dataclasses.replace(row, graspable_known=False, graspable_step=None) for row in base])
+    assert silent["graspable"] == silent["graspable_steps"] == PairedDifference.of([], [])
+    assert (silent["graspable"].mean, silent["retrieved"]) == (None, retrieved)
 
 
 def test_a_report_says_which_scenes_were_chosen_on_and_what_is_not_known(tmp_path):
@@ -168,7 +167,7 @@ def test_a_report_says_which_scenes_were_chosen_on_and_what_is_not_known(tmp_pat
     rows = [dataclasses.replace(WON, scenario=name) for name in names]
     rows[0] = dataclasses.replace(rows[0], graspable_known=False, graspable_step=None)
     write_report(rows, tmp_path)
-    said = (tmp_path / "report.md").read_text()
+    said = re.sub(" +", " ", (tmp_path / "report.md").read_text())
     assert "3 of the 5 episodes are on scenes that settings were chosen on (the published ones," in said
     assert "An earlier version ran 1 of the episodes, in which a retrieval counted as *graspable*, too" in said
     line = next(line for line in said.splitlines() if line.startswith("| search-for-grasp | 2 | 5 | 0 |"))
@@ -184,7 +183,7 @@ def test_a_report_says_which_scenes_were_chosen_on_and_what_is_not_known(tmp_pat
 def test_pictures_are_readable_with_few_and_with_many_variants(tmp_path, variants):
     rows = rows_of(variants, lost=lambda variant, episode: (variant + episode) % 3 == 0)
     report = Report.of(
-        rows, Asked(curve=["gamma", "guided_fraction"], baseline="V03" if variants > 2 else "criterion a")
+        rows, ReportOptions(curve=["gamma", "guided_fraction"], baseline="V03" if variants > 2 else "criterion a")
     )
     write_report(report, tmp_path)
     for name in ("success.png", "rates.png", "curve.png"):
@@ -198,7 +197,7 @@ def test_pictures_are_readable_with_few_and_with_many_variants(tmp_path, variant
         assert any(label.startswith("V03, ") for label in named)
     ticks = rates_figure(report.variants, report.key).axes[-1].get_xticklabels()
     assert {tick.get_text() for tick in ticks} == set(report.key.short.values())
-    assert {path.name for path in tmp_path.iterdir()} == {*FILES, *ASKED_FILES}
+    assert {path.name for path in tmp_path.iterdir()} == {*FILES, *OPTIONAL_FILES}
     # What is not asked for any more does not stay.
     write_report(rows, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == set(FILES)
@@ -206,8 +205,8 @@ def test_pictures_are_readable_with_few_and_with_many_variants(tmp_path, variant
 
 def test_many_variants_have_a_line_each_and_the_rest_is_folded(tmp_path):
     rows = rows_of(96, lost=lambda variant, episode: episode == variant % 3)
-    write_report(Report.of(rows, Asked(baseline="V01", paired=["scenario"])), tmp_path)
-    text, page = ((tmp_path / name).read_text() for name in ("report.md", "report.html"))
+    write_report(Report.of(rows, ReportOptions(baseline="V01", paired=["scenario"])), tmp_path)
+    text, page = (re.sub(" +", " ", (tmp_path / name).read_text()) for name in ("report.md", "report.html"))
     assert len(re.findall(r"^\| [a-d] \| .* \| V\d\d \| all \|", text, re.MULTILINE)) == 96
     assert "see rates.csv" in text
     assert "| V96 | 1 | a |" not in text
@@ -258,17 +257,26 @@ def test_the_page_holds_everything_and_what_is_said_is_no_markup(tmp_path):
 
 
 def test_a_page_is_written_three_ways():
-    parts = [Heading("A_b", 1), Paragraph("50% *of* all"), Table(("x", "n"), [("p|q", "1")]), Heading("C")]
-    assert as_markdown(parts) == "# A_b\n\n50% *of* all\n\n| x | n |\n| --- | --- |\n| p\\|q | 1 |\n\n## C\n"
+    long = "x" * 100
+    table = Table.of(("x", "n"), [("p|q\n<r>", "0.50"), *[(long, 1)] * 99])
+    parts = [Heading("A_b", 1), Paragraph("50% *of* <all>"), table, Heading("C")]
+    text = re.sub(" +", " ", as_markdown(parts))
+    assert text.startswith("# A_b\n\n50% *of* <all>\n\n| x | n |\n|:--")
+    assert "| p\\|q <r> | 0.50 |\n" in text
+    assert text.endswith(f"| {long} | 1 |\n\n## C\n")
     tex = as_latex(parts)
     assert "\\section*{A\\_b}\n\n50\\% " in tex
-    assert "\\begin{longtable}{lr}\n\\toprule\nx & n \\\\\n\\midrule\n\\endhead\np\\textbar{}q & 1 \\\\\n" in tex
-    assert "<p>50% <em>of</em> all</p>" in as_html(parts, "t", {})
+    assert "\\begin{longtable}{lr}\n\\toprule\nx & n \\\\\n\\midrule\n" in tex
+    assert "p\\textbar{}q \\textless{}r\\textgreater{} & 0.50 \\\\\n" in tex
+    page = as_html(parts, "t", {})
+    assert "<p>50% <em>of</em> &lt;all&gt;</p>" in page
+    assert "<td>p|q &lt;r&gt;</td>" in page
+    assert page.count(long) == text.count(long) == tex.count(long) == 99
 
 
 def test_a_curve_is_over_one_column_with_lines_for_another():
     rows = rows_of(96)
-    report = Report.of(rows, Asked(curve=["gamma", "criterion"]))
+    report = Report.of(rows, ReportOptions(curve=["gamma", "criterion"]))
     assert len(report.curve) == 24
     assert {rates.episodes for rates in report.curve} == {12}
     axes = curve_figure(report.curve, report.curve_columns, {}).axes
@@ -276,9 +284,9 @@ def test_a_curve_is_over_one_column_with_lines_for_another():
     assert axes[0].get_lines()[0].get_xdata() == pytest.approx([0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
     assert "Rates over gamma and criterion" in as_markdown(blocks(report))
     with pytest.raises(InputError, match="give one column, or a second one"):
-        Report.of(rows, Asked(curve=["gamma", "criterion", "seed"]))
+        Report.of(rows, ReportOptions(curve=["gamma", "criterion", "seed"]))
     with pytest.raises(InputError, match="method has 96 values"):
-        Report.of(rows, Asked(curve=["gamma", "method"]))
+        Report.of(rows, ReportOptions(curve=["gamma", "method"]))
 
 
 def test_the_command_tells_what_is_asked_for(tmp_path, monkeypatch, capsys):

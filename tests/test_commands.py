@@ -11,7 +11,7 @@ import sys
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.report.report import FILES
+from mechsearch_jax.benchmarks.report.report_files import FILES
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.store.rows import Row, write_rows
 from mechsearch_jax.commands import main as cli
@@ -389,11 +389,17 @@ def test_help_on_what_has_no_such_options_does_without_the_planner():
     code = (
         "import sys; from mechsearch_jax.commands import main\n"
         "try: main.parse(sys.argv[1:])\n"
-        "except SystemExit: print('jax' in sys.modules)"
+        "except SystemExit: print({'jax', 'pandas', 'jinja2', 'scipy.stats'} & set(sys.modules))"
     )
     for arguments in (["--help"], ["scenarios", "generate", "--help"], ["bench", "--help"]):
         answer = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
-        assert answer.stdout.endswith("False\n"), answer.stderr
+        assert answer.stdout.endswith("set()\n"), answer.stderr
+
+
+def test_planning_does_without_what_reports_are_made_with():
+    code = "import sys, mechsearch_jax.session.searcher; print({'pandas', 'jinja2', 'scipy.stats'} & set(sys.modules))"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert answer.stdout == "set()\n", answer.stderr
 
 
 def test_many_episodes_are_run_as_asked(folder, monkeypatch, capsys):

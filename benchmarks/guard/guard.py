@@ -18,6 +18,8 @@ import scipy.stats
 
 from mechsearch_jax.benchmarks.parts.images import save_rows
 from mechsearch_jax.benchmarks.running.evaluate import present_code
+from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
+from mechsearch_jax.benchmarks.statistics.rates import says
 from mechsearch_jax.benchmarks.store.rows import Row, set_by_retrievals
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block
 from mechsearch_jax.runtime.errors import InputError
@@ -68,7 +70,7 @@ class Outcome:
             objects=row.objects,
             seed=row.seed,
             found=row.found_step is not None,
-            graspable=row.graspable_step is not None if row.graspable_known else None,
+            graspable=row.graspable_step is not None if says(row, "graspable") else None,
             retrieved=row.retrieved,
             steps=row.steps,
             failure=row.failure,
@@ -133,27 +135,26 @@ def compare(before: Sequence[Outcome], now: Sequence[Outcome]) -> list[Compariso
     Raises:
       InputError: there is nothing to compare, or the reference lacks an episode.
     """
-    known = {outcome.episode: outcome for outcome in before}
-    missing = [outcome.scenario for outcome in now if outcome.episode not in known]
+    reference = {outcome.episode: outcome for outcome in before}
+    missing = [outcome.scenario for outcome in now if outcome.episode not in reference]
     if missing or not now:
         what = f"{missing[0]} as it is here" if missing else "anything"
         raise InputError(f"bench guard: the reference does not hold {what}; write a new one with --write")
     changes = []
     for measure in MEASURES:
-        pairs = [(getattr(known[one.episode], measure), getattr(one, measure)) for one in now]
+        pairs = [(getattr(reference[outcome.episode], measure), getattr(outcome, measure)) for outcome in now]
         if any(None in pair for pair in pairs):
             continue
-        gains, losses = (sum(pair == change for pair in pairs) for change in ((False, True), (True, False)))
-        before_held, now_held = (sum(column) for column in zip(*pairs, strict=True))
+        change = PairedDifference.of([b - a for a, b in pairs], [outcome.content_hash for outcome in now])
         changes.append(
             Comparison(
                 measure=measure,
-                pairs=len(pairs),
-                before=before_held,
-                now=now_held,
-                gains=gains,
-                losses=losses,
-                p_value=sign_test(gains, losses),
+                pairs=change.pairs,
+                before=sum(a for a, _ in pairs),
+                now=sum(b for _, b in pairs),
+                gains=change.gains,
+                losses=change.losses,
+                p_value=sign_test(change.gains, change.losses),
                 alpha=ALPHA / len(MEASURES),
             )
         )
@@ -197,9 +198,9 @@ def save_reference(rows: Sequence[Row], command: str, path: PathLike) -> None:
     """
     errors = [row for row in rows if row.is_error]
     if errors or not rows:
-        told = f"{errors[0].scenario} ended with {errors[0].failure!r}" if errors else "there are no episodes"
-        raise InputError(f"bench guard: {told}; nothing is stored")
-    if not all(row.graspable_known for row in rows):
+        reason = f"{errors[0].scenario} ended with {errors[0].failure!r}" if errors else "there are no episodes"
+        raise InputError(f"bench guard: {reason}; nothing is stored")
+    if not all(says(row, "graspable") for row in rows):
         raise InputError("bench guard: an earlier version wrote these rows; nothing is stored; use another folder")
     head = {
         "command": command,
@@ -215,9 +216,10 @@ def save_reference(rows: Sequence[Row], command: str, path: PathLike) -> None:
 
 def _shares(rows: Sequence[Row], measure: str) -> dict[int, float]:
     """A measure's share of the episodes with each number of objects."""
-    outcomes = [Outcome.of_row(row) for row in rows]
-    groups = {n: [one for one in outcomes if one.objects == n] for n in sorted({one.objects for one in outcomes})}
-    return {n: sum(getattr(one, measure) for one in group) / len(group) for n, group in groups.items()}
+    groups: dict[int, list[Outcome]] = {}
+    for row in sorted(rows, key=lambda row: row.objects):
+        groups.setdefault(row.objects, []).append(Outcome.of_row(row))
+    return {n: sum(getattr(outcome, measure) for outcome in group) / len(group) for n, group in groups.items()}
 
 
 class Reference(NamedTuple):

@@ -8,29 +8,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from jaxtyping import Float
 from rich.console import Group
 from rich.table import Table
 
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, Figures, PaperTable, paper_figures
 from mechsearch_jax.benchmarks.running.evaluate import Job
-from mechsearch_jax.benchmarks.statistics.intervals import RESAMPLES, SEED, share_interval
-from mechsearch_jax.benchmarks.statistics.rates import says, scene_of, step_of
+from mechsearch_jax.benchmarks.statistics.intervals import Interval
+from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
+from mechsearch_jax.benchmarks.statistics.rates import Rates, says, scene_of, step_of, summarise
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.runtime.files import PathLike, check_writable, replacing
 
-# What cells differ in, and in the words of tables. Differences are told against the first value of each.
-FACTORS = {
-    "method": "method",
-    "recognition": "recognition",
-    "actions": "actions",
-    "preset": "preset",
-    "protocol": "protocol",
-}
+# What cells differ in. Differences are from the first value of each.
+FACTORS = ("method", "recognition", "actions", "preset", "protocol")
 # What the paper calls the goals, and what rows do.
 GOALS = {"find": "found", "grasp": "graspable"}
-Interval = tuple[float, float]
 
 
 class Setting(NamedTuple):
@@ -44,14 +36,16 @@ class Setting(NamedTuple):
 
 
 class Mean(NamedTuple):
-    """A mean with its 95% interval, of so many; None and (None, None) of none."""
+    """A mean with its 95% interval, of so many values; None where it is not known."""
 
     value: float | None
-    interval: tuple[float | None, float | None]
+    interval: Interval | tuple[None, None]
     count: int
 
-
-_UNKNOWN = Mean(None, (None, None), 0)
+    @classmethod
+    def of(cls, value: float | None, interval: Interval | None, count: int) -> Mean:
+        """The mean; without an interval where there is no value."""
+        return cls(value, (None, None) if value is None or interval is None else interval, count)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,9 +57,9 @@ class Cell:
       objects: number of surrounding objects; None for all.
       episodes: how many there are.
       errors: how many of them could not be run to their end; they count as failures.
-      find, grasp: share of the episodes in which the target was found, and found and graspable, with the interval of
-        `share_interval`; no value of what rows of an earlier version do not say.
-      find_steps, grasp_steps: number of actions until then, of the episodes that got there; bootstrapped over scenes.
+      find, grasp: share of the episodes in which the target was found, and found and graspable; no value of what rows
+        of an earlier version do not say.
+      find_steps, grasp_steps: number of actions until then, of the episodes that got there.
       paper: what the paper says; None where nothing.
     """
 
@@ -86,11 +80,11 @@ class Difference:
 
     Attributes:
       factor: one of `FACTORS`.
-      setting: the one; `base` is the value of the factor in the other.
+      setting: of the first; `base` is the value of the factor in the other.
       objects: number of surrounding objects; None for all.
       pairs: how many episodes both have.
-      find, grasp: how much larger the shares are.
-      find_steps, grasp_steps: how many actions more it took, where both got there. All are bootstrapped over scenes.
+      find, grasp: how much larger the shares are: see `PairedDifference`.
+      find_steps, grasp_steps: how many actions more it took, where both got there.
     """
 
     factor: str
@@ -104,41 +98,15 @@ class Difference:
     grasp_steps: Mean
 
 
-def bootstrap(total: Float[np.ndarray, " n"], count: Float[np.ndarray, " n"]) -> Mean:
-    """A mean over clusters, and its 95% interval from resampling whole clusters (percentiles; the same every time).
-
-    Args:
-      total, count: of each cluster, the sum of its values and their number.
-    """
-    n = int(count.sum())
-    if n == 0:
-        return _UNKNOWN
-    rng = np.random.default_rng(SEED)
-    drawn = rng.multinomial(len(total), np.full(len(total), 1.0 / len(total)), size=RESAMPLES)
-    totals, counts = drawn @ total, drawn @ count
-    low, high = np.percentile(totals[counts > 0] / counts[counts > 0], [2.5, 97.5])
-    return Mean(float(total.sum() / n), (float(low), float(high)), n)
-
-
-def _by_scene(values: Sequence[tuple[str, float]]) -> Mean:
-    """The mean of values that belong to scenes, bootstrapped over these."""
-    scenes: dict[str, list[float]] = {}
-    for scene, value in values:
-        scenes.setdefault(scene, []).append(value)
-    sums = np.array([sum(own) for own in scenes.values()])
-    return bootstrap(sums, np.array([len(own) for own in scenes.values()], float))
-
-
-def _cell(setting: Setting, objects: int | None, rows: Sequence[Row], paper: Figures | None) -> Cell:
-    n, told = len(rows), {}
-    for goal, said in GOALS.items():
-        known = all(says(row, said) for row in rows)
-        reached = [step_of(row, said) is not None for row in rows]
-        steps = [(row.scenario, float(s)) for row in rows if (s := step_of(row, said)) is not None]
-        share = Mean(sum(reached) / n, share_interval(reached, list(map(scene_of, rows))), n)
-        told[goal] = share if known else _UNKNOWN
-        told[f"{goal}_steps"] = _by_scene(steps) if known else _UNKNOWN
-    return Cell(setting, objects, n, sum(row.is_error for row in rows), **told, paper=paper)
+def _cell(setting: Setting, objects: int | None, rates: Rates, paper: Figures | None) -> Cell:
+    means = {}
+    for name, goal in GOALS.items():
+        share, steps = getattr(rates, goal), getattr(rates, f"{goal}_steps")
+        episodes = 0 if share is None else rates.episodes
+        means[name] = Mean.of(share, getattr(rates, f"{goal}_interval"), episodes)
+        reached = round((share or 0.0) * episodes)
+        means[f"{name}_steps"] = Mean.of(steps, getattr(rates, f"{goal}_steps_interval"), reached)
+    return Cell(setting, objects, rates.episodes, rates.errors, **means, paper=paper)
 
 
 class Results(NamedTuple):
@@ -153,15 +121,15 @@ class Results(NamedTuple):
 
     def cells(self) -> list[Cell]:
         """All cells of which there are rows."""
-        found = []
+        cells = []
         for setting, rows in self.rows.items():
+            rates = {group.group["objects"]: group for group in summarise(rows, ["objects"])}
             for count in self._counts():
-                own = [row for row in rows if count in (None, row.objects)]
                 paper = None
                 if count is not None:
                     paper = paper_figures(self.table, setting.recognition, setting.method, setting.actions, count)
-                found += [_cell(setting, count, own, paper)] if own else []
-        return found
+                cells += [_cell(setting, count, rates[count], paper)] if count in rates else []
+        return cells
 
     def differences(self) -> list[Difference]:
         """How settings differ from those that have the first value of one factor, and all else in common."""
@@ -183,28 +151,31 @@ class Results(NamedTuple):
 
 def _paired(rows: Sequence[Row], base: Sequence[Row], objects: int | None) -> list[tuple[Row, Row]]:
     """The same episodes in both."""
-
-    def named(row: Row) -> tuple[str, str | None, int]:
-        return row.scenario, row.content_hash, row.seed
-
-    known = {named(row): row for row in base}
-    return [(row, known[named(row)]) for row in rows if named(row) in known and objects in (None, row.objects)]
+    partners = {(scene_of(row), row.seed): row for row in base}
+    return [
+        (row, partner)
+        for row in rows
+        if objects in (None, row.objects) and (partner := partners.get((scene_of(row), row.seed)))
+    ]
 
 
 def _difference(
     factor: str, setting: Setting, base: Setting, objects: int | None, pairs: Sequence[tuple[Row, Row]]
 ) -> Difference:
-    told = {}
-    for goal, said in GOALS.items():
-        if not all(says(row, said) for pair in pairs for row in pair):
-            told |= {goal: _UNKNOWN, f"{goal}_steps": _UNKNOWN}
-            continue
-        steps = [(row.scenario, step_of(row, said), step_of(other, said)) for row, other in pairs]
-        told[goal] = _by_scene([(scene, float(a is not None) - float(b is not None)) for scene, a, b in steps])
-        told[f"{goal}_steps"] = _by_scene(
-            [(scene, float(a - b)) for scene, a, b in steps if a is not None and b is not None]
-        )
-    return Difference(factor, setting, getattr(base, factor), objects, len(pairs), **told)
+    means = {}
+    for name, goal in GOALS.items():
+        known = all(says(row, goal) for pair in pairs for row in pair)
+        steps = [(scene_of(row), step_of(row, goal), step_of(other, goal)) for row, other in pairs] if known else []
+        means[name] = _mean_change([(scene, (a is not None) - (b is not None)) for scene, a, b in steps])
+        both = [(scene, a - b) for scene, a, b in steps if a is not None and b is not None]
+        means[f"{name}_steps"] = _mean_change(both)
+    return Difference(factor, setting, getattr(base, factor), objects, len(pairs), **means)
+
+
+def _mean_change(changes: Sequence[tuple[Any, float]]) -> Mean:
+    """The mean of changes, each with its scene."""
+    change = PairedDifference.of([value for _, value in changes], [scene for scene, _ in changes])
+    return Mean.of(change.mean, change.interval, change.pairs)
 
 
 def results_of(table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], rows: Mapping[str, Row]) -> Results:
@@ -215,14 +186,15 @@ def results_of(table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], rows: M
       jobs: its episodes.
       rows: by `Job.key`.
     """
-    found = {setting: [rows[job.key] for job in own if job.key in rows] for setting, own in jobs.items()}
-    return Results(table, {setting: own for setting, own in found.items() if own})
+    ended = {setting: [rows[job.key] for job in own if job.key in rows] for setting, own in jobs.items()}
+    return Results(table, {setting: own for setting, own in ended.items() if own})
 
 
-def _told(mean: Mean, form: str) -> str:
+def _text(mean: Mean, form: str) -> str:
     if mean.value is None:
         return "-"
-    return f"{form.format(mean.value)} ({' to '.join(form.format(bound) for bound in mean.interval)})"
+    bounds = "" if None in mean.interval else f" ({' to '.join(form.format(bound) for bound in mean.interval)})"
+    return f"{form.format(mean.value)}{bounds}"
 
 
 def _actions(setting: Setting) -> str:
@@ -233,28 +205,34 @@ def _objects(count: int | None) -> str:
     return "all" if count is None else str(count)
 
 
-COLUMNS = (
+CELL_COLUMNS = (
     *("recognition", "method", "actions", "objects", "episodes", "find", "paper", "grasp", "paper"),
     *("steps to find", "paper", "steps to grasp", "paper"),
 )
+DIFFERENCE_COLUMNS = (
+    *("of", "against", "method", "recognition", "actions", "preset", "protocol", "objects", "pairs"),
+    *("find", "grasp", "steps to find", "steps to grasp"),
+)
 
 
-def _line(cell: Cell) -> list[str]:
+def _cell_line(cell: Cell) -> list[str]:
     paper = cell.paper or Figures(None, None, None, None)
-    told = [cell.setting.recognition, cell.setting.method, _actions(cell.setting), _objects(cell.objects)]
-    told.append(f"{cell.episodes}" + (f", {cell.errors} errors" if cell.errors else ""))
+    line = [cell.setting.recognition, cell.setting.method, _actions(cell.setting), _objects(cell.objects)]
+    line.append(f"{cell.episodes}" + (f", {cell.errors} errors" if cell.errors else ""))
     for name in Figures._fields:
-        figure = getattr(paper, name)
-        told += [_told(getattr(cell, name), "{:.2f}" if "steps" in name else "{:.3f}"), f"{figure or '-'}"]
-    return told
+        form = "{:.2f}" if "steps" in name else "{:.3f}"
+        line += [_text(getattr(cell, name), form), f"{getattr(paper, name) or '-'}"]
+    return line
 
 
-def _parts(cells: Sequence[Cell]) -> dict[tuple[str, str], list[Cell]]:
-    """Cells by preset and protocol."""
-    parts: dict[tuple[str, str], list[Cell]] = {}
-    for cell in cells:
-        parts.setdefault((cell.setting.preset, cell.setting.protocol), []).append(cell)
-    return parts
+def _difference_line(difference: Difference) -> list[str]:
+    base = difference.setting._replace(**{difference.factor: difference.base})
+    against = _actions(base) if difference.factor == "actions" else str(difference.base)
+    setting = difference.setting
+    line = [difference.factor, against, setting.method, setting.recognition, _actions(setting), *setting[3:]]
+    shares = [_text(getattr(difference, goal), "{:+.3f}") for goal in GOALS]
+    steps = [_text(getattr(difference, f"{goal}_steps"), "{:+.2f}") for goal in GOALS]
+    return [*line, _objects(difference.objects), str(difference.pairs), *shares, *steps]
 
 
 def screen(results: Results) -> Group:
@@ -283,48 +261,44 @@ def screen(results: Results) -> Group:
 def _beside(cell: Cell) -> list[str]:
     """Ours and the paper's figures."""
 
-    def told(value: float | None) -> str:
+    def text(value: float | None) -> str:
         return "-" if value is None else f"{value:.2f}"
 
     paper = cell.paper or Figures(None, None, None, None)
-    return [f"{told(getattr(cell, name).value)}/{told(getattr(paper, name))}" for name in Figures._fields]
-
-
-def _markdown_table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> list[str]:
-    return ["| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *lines)]
+    return [f"{text(getattr(cell, name).value)}/{text(getattr(paper, name))}" for name in Figures._fields]
 
 
 def markdown(results: Results, command: str) -> str:
     """All of it as a page."""
-    text = [
-        f"# Table {results.table.name.removeprefix('table')} of the paper, in this simulator",
-        "",
-        f"{results.table.about}. The paper's figures are of scenes of its own, in PyBullet. `{command}`",
-        "",
-        "Shares of all episodes, with Wilson's 95% interval for as many independent episodes as those of the same",
-        "scenes are worth; steps are the mean number of actions in the episodes that got there, with a 95% interval",
-        "from resampling scenes. The paper's R stands beside `masks`, its own setting, and `full`.",
-    ]
-    for (preset, protocol), cells in _parts(results.cells()).items():
-        text += ["", f"## Preset {preset}, protocol {protocol}", "", *_markdown_table(COLUMNS, list(map(_line, cells)))]
-    text += ["", "## Paired differences", ""]
-    text += [
-        "Over the same scenes and seeds, with 95% intervals from resampling scenes; steps where both got there.",
-        "",
-    ]
-    header = ["of", "against", *("method", "recognition", "actions", "preset", "protocol"), "objects", "pairs"]
-    header += ["find", "grasp", "steps to find", "steps to grasp"]
-    text += _markdown_table(header, list(map(_difference_line, results.differences())))
-    return "\n".join(text) + "\n"
+    from mechsearch_jax.benchmarks.pages import pages
 
-
-def _difference_line(told: Difference) -> list[str]:
-    base = told.setting._replace(**{told.factor: told.base})
-    name = _actions(base) if told.factor == "actions" else str(told.base)
-    setting = [told.setting.method, told.setting.recognition, _actions(told.setting), *told.setting[3:]]
-    shares = [_told(getattr(told, goal), "{:+.3f}") for goal in GOALS]
-    steps = [_told(getattr(told, f"{goal}_steps"), "{:+.2f}") for goal in GOALS]
-    return [FACTORS[told.factor], name, *setting, _objects(told.objects), str(told.pairs), *shares, *steps]
+    page: list[pages.Block] = [
+        pages.Heading(f"Table {results.table.name.removeprefix('table')} of the paper, in this simulator", 1),
+        pages.Paragraph(
+            f"{results.table.about}. The paper's figures are of scenes of its own, in PyBullet. `{command}`"
+        ),
+        pages.Paragraph(
+            "Shares of all episodes, with Wilson's 95% interval for as many independent episodes as those of the same "
+            "scenes are worth; steps are the mean number of actions in the episodes that got there, with a 95% "
+            "interval from resampling scenes. The paper's R stands beside `masks`, its own setting, and `full`."
+        ),
+    ]
+    parts: dict[tuple[str, str], list[Cell]] = {}
+    for cell in results.cells():
+        parts.setdefault((cell.setting.preset, cell.setting.protocol), []).append(cell)
+    for (preset, protocol), cells in parts.items():
+        lines = list(map(_cell_line, cells))
+        page += [pages.Heading(f"Preset {preset}, protocol {protocol}"), pages.Table.of(CELL_COLUMNS, lines, texts=3)]
+    lines = list(map(_difference_line, results.differences()))
+    page += [
+        pages.Heading("Paired differences"),
+        pages.Paragraph(
+            "Over the same scenes and seeds, a scene's seeds averaged first, with 95% intervals from resampling "
+            "scenes; steps where both got there."
+        ),
+        pages.Table.of(DIFFERENCE_COLUMNS, lines, texts=7),
+    ]
+    return pages.as_markdown(page)
 
 
 def write_table(results: Results, out: PathLike, command: str) -> list[Path]:
@@ -346,7 +320,7 @@ def write_table(results: Results, out: PathLike, command: str) -> list[Path]:
         "code": sorted({row.code or "unknown" for row in rows}),
         "devices": sorted({row.device or "unknown" for row in rows}),
         "cells": [_flat(cell) for cell in results.cells()],
-        "differences": [_flat(told) for told in results.differences()],
+        "differences": [_flat(difference) for difference in results.differences()],
     }
     texts = {"md": markdown(results, command), "json": json.dumps(value, indent=1, allow_nan=False) + "\n"}
     files = [Path(out) / f"{results.table.name}.{ending}" for ending in texts]
@@ -356,10 +330,10 @@ def write_table(results: Results, out: PathLike, command: str) -> list[Path]:
     return files
 
 
-def _flat(told: Cell | Difference) -> dict[str, Any]:
+def _flat(record: Cell | Difference) -> dict[str, Any]:
     """As JSON has it: tuples with names are objects."""
 
     def plain(value: Any) -> Any:
         return {name: plain(part) for name, part in value._asdict().items()} if hasattr(value, "_asdict") else value
 
-    return {field.name: plain(getattr(told, field.name)) for field in dataclasses.fields(told)}
+    return {field.name: plain(getattr(record, field.name)) for field in dataclasses.fields(record)}

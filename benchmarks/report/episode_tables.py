@@ -13,7 +13,7 @@ from rich.text import Text
 from mechsearch_jax.benchmarks.ceiling import solvability
 from mechsearch_jax.benchmarks.guard import guard
 from mechsearch_jax.benchmarks.report.tables import plain_table
-from mechsearch_jax.benchmarks.statistics.paired import Difference, by_variant
+from mechsearch_jax.benchmarks.statistics.paired import VariantDifference, by_variant
 from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
 from mechsearch_jax.benchmarks.store.rows import Row
@@ -29,8 +29,8 @@ def print_summary(console: Console, summary: Sequence[Rates], key: Key) -> None:
     console.print(summary_table(summary, key))
     console.print("plan, act: seconds per action", style="dim")
     if any(rates.graspable is None for rates in summary):
-        said = "graspable -: not known; in an earlier version a retrieval counted as graspable, too"
-        console.print(said, style="dim", soft_wrap=True)
+        remark = "graspable -: not known; in an earlier version a retrieval counted as graspable, too"
+        console.print(remark, style="dim", soft_wrap=True)
     if key.numbered:
         console.print()
         for label, short in key.short.items():
@@ -49,13 +49,12 @@ def summary_table(summary: Sequence[Rates], key: Key) -> Table:
 
     "paper's" is the share that is graspable with the paper's grasps alone, of the episodes that say so.
     """
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    columns = list(summary[0].group)
-    for name in columns:
+    table = plain_table()
+    for name in summary[0].group:
         _add_group_column(table, name)
     for name in ("runs", "found", "graspable", "paper's", "retrieved", "actions", "plan", "act"):
         table.add_column(name, justify="right", no_wrap=True)
-    for rates in _told(summary, key):
+    for rates in _shown(summary, key):
         shares = rates.found, rates.graspable, rates.paper_graspable, rates.retrieved
         table.add_row(
             *_group(rates.group, key),
@@ -77,22 +76,18 @@ def _add_group_column(table: Table, name: str) -> None:
 
 
 def _group(group: Mapping[str, Hashable], key: Key) -> list[str]:
-    """What a group has in common, as cells; what a cell says is no markup."""
-    found = []
-    for value in group.values():
-        told = f"{value:g}" if isinstance(value, float) else key.short.get(str(value), str(value))
-        found.append("all" if value is None else escape(told))
-    return found
+    """What a group has in common, as cells without markup."""
+    return [escape(key.text(value)) for value in group.values()]
 
 
-def _told(summary: Sequence[Any], key: Key) -> Sequence[Any]:
+def _shown(summary: Sequence[Any], key: Key) -> Sequence[Any]:
     """What is printed: all, or where there are many variants, what is over all numbers of objects."""
     if len(key.short) <= MOST_IN_FULL or list(summary[0].group) != [VARIANT, "objects"]:
         return summary
     return [each for each in summary if each.objects is None]
 
 
-def differences_table(differences: Sequence[Difference], key: Key, baseline: str) -> Table:
+def differences_table(differences: Sequence[VariantDifference], key: Key, baseline: str) -> Table:
     """How variants differ from one of them over pairs of episodes, in percentage points, each ± a standard error."""
     table = plain_table(f"points more than {key.short[baseline]}, same episodes")
     table.add_column("variant", overflow="fold")
@@ -101,9 +96,9 @@ def differences_table(differences: Sequence[Difference], key: Key, baseline: str
     for label, goals in by_variant(differences).items():
         cells = []
         for goal in GOALS:
-            one = goals[goal]
-            error = "" if one.standard_error is None else f" ± {100 * one.standard_error:.1f}"
-            cells.append("-" if one.difference is None else f"{100 * one.difference:+.1f}{error}")
+            change = goals[goal]
+            error = "" if change.standard_error is None else f" ± {100 * change.standard_error:.1f}"
+            cells.append("-" if change.mean is None else f"{100 * change.mean:+.1f}{error}")
         table.add_row(escape(key.short[label]), str(goals["found"].pairs), *cells)
     return table
 
@@ -116,12 +111,12 @@ def events_table(rows: Sequence[Row]) -> Table | None:
 
 def events_summary_table(summary: Sequence[Events], key: Key) -> Table:
     """What happened on the way, of at least one group."""
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    table = plain_table()
     for name in summary[0].group:
         _add_group_column(table, name)
     for name in ("runs", *EVENTS.values()):
         table.add_column(name, justify="right")
-    for events in _told(summary, key):
+    for events in _shown(summary, key):
         table.add_row(
             *_group(events.group, key),
             str(events.episodes),
@@ -157,10 +152,11 @@ def guard_table(comparisons: Sequence[guard.Comparison], code: str) -> Group:
     table = plain_table(f"{pairs} episodes against {code}")
     for name in ("", "before", "now", "gains", "losses", "p", "verdict"):
         table.add_column(name, justify="right", no_wrap=True)
-    for one in comparisons:
-        verdict = "lost" if one.lost else "no significant loss"
-        counts = (one.before, one.now, one.gains, one.losses)
-        table.add_row(one.measure, *map(str, counts), f"{one.p_value:.3f}", verdict, style="bold" if one.lost else None)
+    for comparison in comparisons:
+        verdict = "lost" if comparison.lost else "no significant loss"
+        counts = (comparison.before, comparison.now, comparison.gains, comparison.losses)
+        cells = (comparison.measure, *map(str, counts), f"{comparison.p_value:.3f}", verdict)
+        table.add_row(*cells, style="bold" if comparison.lost else None)
     alone, beside = (100 * guard.detectable(pairs, flips) for flips in (0.0, guard.FLIPS))
     explanation = (
         f"p: one-sided sign test, significant up to {comparisons[0].alpha:g}, so that a false alarm has a chance of "
@@ -168,7 +164,7 @@ def guard_table(comparisons: Sequence[guard.Comparison], code: str) -> Group:
         f"nothing else changes, of {beside:.1f} where {100 * guard.FLIPS:.0f}% of the episodes end otherwise by "
         "chance, as with another seed."
     )
-    left_out = [name for name in guard.MEASURES if name not in {one.measure for one in comparisons}]
+    left_out = [name for name in guard.MEASURES if name not in {comparison.measure for comparison in comparisons}]
     why = (
         f"{' and '.join(left_out)}: not compared, since in the reference a retrieval counts as graspable, too; write a "
         "new one with --write"

@@ -62,10 +62,10 @@ def chosen(rows: Sequence[Row]) -> list[tuple[str, Row]]:
     """
     ended = [row for row in rows if not row.is_error]
     won = [row for row in ended if row.retrieved]
-    found: list[tuple[str, Row]] = []
+    episodes: list[tuple[str, Row]] = []
     if won:
         usual = statistics.median_low(row.steps for row in won)
-        found += [(TYPICAL, row) for row in sorted((r for r in won if r.steps == usual), key=episode_key)[:EACH]]
+        episodes += [(TYPICAL, row) for row in sorted((r for r in won if r.steps == usual), key=episode_key)[:EACH]]
     reasons: dict[str, list[Row]] = {}
     for row in ended:
         if not row.retrieved:
@@ -79,9 +79,9 @@ def chosen(rows: Sequence[Row]) -> list[tuple[str, Row]]:
         lost.append(group[0])
         if group[1:]:
             turns.append(group[1:])
-    found += [(LOST, row) for row in lost]
+    episodes += [(LOST, row) for row in lost]
     slow = sorted(ended, key=lambda row: (-_seconds(row), episode_key(row)))
-    return [*found, *((SLOWEST, row) for row in slow[:EACH])]
+    return [*episodes, *((SLOWEST, row) for row in slow[:EACH])]
 
 
 def _reason(row: Row) -> str:
@@ -110,19 +110,19 @@ def films(rows: Sequence[Row], out: PathLike, draw: Draw | None = None) -> list[
         `InputError` says why it cannot. If None, nothing is drawn.
     """
     labels = dict(zip(map(id, rows), label_variants(rows), strict=True))
-    told: dict[str, str] = {}
-    found: list[Film] = []
+    notes: dict[str, str] = {}
+    shown: list[Film] = []
     for why, row in chosen(rows):
         key, file = episode_key(row), Path(out) / FOLDER / f"{episode_key(row)}.png"
-        if draw is not None and key not in told and not file.is_file():
+        if draw is not None and key not in notes and not file.is_file():
             try:
-                told[key] = draw(row, file)
+                notes[key] = draw(row, file)
             except InputError as error:
-                told[key] = f"no picture: {error}"
+                notes[key] = f"no picture: {error}"
         drawn = file.is_file()
-        note = told.get(key, "" if drawn else "no picture; report --films draws it")
-        found.append(Film(row, labels[id(row)], why, f"{_caption(row)}{note and f' ({note})'}", drawn))
-    return found
+        note = notes.get(key, "" if drawn else "no picture; report --films draws it")
+        shown.append(Film(row, labels[id(row)], why, f"{_caption(row)}{note and f' ({note})'}", drawn))
+    return shown
 
 
 class Frames:

@@ -68,9 +68,9 @@ def shown_variants(rows: Sequence[Row], key: Key, baseline: str | None = None) -
         all_of[label] += 1
         won[label] += row.retrieved
     ranked = sorted(key.short, key=lambda label: -won[label] / all_of[label])
-    told = {label: f"{key.short[label]}, {place} of {len(ranked)}" for place, label in enumerate(ranked, start=1)}
+    named = {label: f"{key.short[label]}, {place} of {len(ranked)}" for place, label in enumerate(ranked, start=1)}
     chosen = [*([baseline] if baseline else []), *ranked[:BEST], *ranked[-WORST:]]
-    return {label: told[label] for label in dict.fromkeys(chosen)}
+    return {label: named[label] for label in dict.fromkeys(chosen)}
 
 
 def success_figure(rows: Sequence[Row], baseline: str | None = None) -> Figure:
@@ -89,13 +89,13 @@ def success_figure(rows: Sequence[Row], baseline: str | None = None) -> Figure:
             axes: Axes = grid[i][j]
             # Not found out anew for every one of a hundred curves.
             axes.set(xlim=(-0.05 * actions, 1.05 * actions), ylim=(-0.03, 1.03))
-            told = {label: rows for (label, n), rows in groups.items() if n == count and _say(rows, goal)}
+            curves = {label: rows for (label, n), rows in groups.items() if n == count and _say(rows, goal)}
             for label in key.short:
-                if label not in shown and (group := told.get(label)):
+                if label not in shown and (group := curves.get(label)):
                     share = np.array(reached(group, goal, actions)) / len(group)
                     axes.plot(range(actions + 1), share, color=MUTED, alpha=0.25, linewidth=0.7)
             for colour, (label, short) in zip(COLOURS, shown.items(), strict=False):
-                if group := told.get(label):
+                if group := curves.get(label):
                     _curve(axes, group, goal, actions, colour, short)
             _plain(axes)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -148,8 +148,8 @@ def rates_figure(summary: Sequence[Rates], key: Key) -> Figure:
 
 def _drawn(rates: Sequence[Rates], goal: str) -> np.ndarray:
     """Shares, their lower and upper bounds, shape (3, n); NaN, which is not drawn, where a share is not known."""
-    known = [(getattr(one, goal), *getattr(one, f"{goal}_interval")) for one in rates]
-    return np.array([(np.nan,) * 3 if told[0] is None else told for told in known]).T
+    shares = [(getattr(group, goal), *getattr(group, f"{goal}_interval")) for group in rates]
+    return np.array([(np.nan,) * 3 if share[0] is None else share for share in shares]).T
 
 
 def curve_rates(rows: Sequence[Row], columns: Sequence[str]) -> list[Rates]:
@@ -161,27 +161,27 @@ def curve_rates(rows: Sequence[Row], columns: Sequence[str]) -> list[Rates]:
     names = [canonical(name) for name in columns]
     if not 1 <= len(names) <= 2:
         raise InputError(f"report: --curve {' '.join(columns)}: give one column, or a second one for a line each")
-    found = [rates for rates in summarise(rows, names[::-1]) if rates.group[names[0]] is not None]
-    lines = {rates.group[name] for rates in found for name in names[1:]}
+    points = [rates for rates in summarise(rows, names[::-1]) if rates.group[names[0]] is not None]
+    lines = {rates.group[name] for rates in points for name in names[1:]}
     if len(lines) > MOST_CURVES:
         raise InputError(f"report: {names[1]} has {len(lines)} values; --curve draws at most {MOST_CURVES} lines")
-    return found
+    return points
 
 
-def curve_figure(found: Sequence[Rates], columns: Sequence[str], short: Mapping[str, str]) -> Figure:
+def curve_figure(points: Sequence[Rates], columns: Sequence[str], short: Mapping[str, str]) -> Figure:
     """Rates over a column, with their intervals: a panel for each goal, a line for each value of the second column.
 
     Args:
-      found: of `curve_rates`.
+      points: of `curve_rates`.
       columns: one or two.
       short: labels for values that have them.
     """
     first, *second = map(canonical, columns)
-    values = sorted({rates.group[first] for rates in found}, key=natural)
+    values = sorted({rates.group[first] for rates in points}, key=natural)
     numeric = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
     places = {value: float(str(value)) if numeric else float(i) for i, value in enumerate(values)}
     lines: dict[Hashable, list[Rates]] = {}
-    for rates in found:
+    for rates in points:
         lines.setdefault(rates.group[second[0]] if second else "all", []).append(rates)
     colours = COLOURS
     if len(lines) > len(COLOURS):
@@ -201,8 +201,8 @@ def curve_figure(found: Sequence[Rates], columns: Sequence[str], short: Mapping[
         axes.set_title(title, fontsize=10, color=INK)
         axes.set_xlabel(first.replace("_", " "), fontsize=9, color=INK)
         if not numeric:
-            told = [short.get(str(value), str(value)) for value in values]
-            axes.set_xticks([places[value] for value in values], told, rotation=30 if len(told) > 3 else 0)
+            ticks = [short.get(str(value), str(value)) for value in values]
+            axes.set_xticks([places[value] for value in values], ticks, rotation=30 if len(ticks) > 3 else 0)
     grid[0][0].set_ylabel("share", fontsize=9, color=INK)
     if second:
         _legend(figure, grid, [short.get(str(line), str(line)) for line in lines], second[0].replace("_", " "))

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import collections
-from collections.abc import Hashable, Sequence
+import dataclasses
+from collections.abc import Sequence
 
-from mechsearch_jax.benchmarks.report.pages import Block, Heading, Paragraph, Picture, Table
-from mechsearch_jax.benchmarks.report.report import Report, reason_of, told_of_changes, told_of_choices, told_of_unknown
-from mechsearch_jax.benchmarks.statistics.paired import Difference, by_variant
+from mechsearch_jax.benchmarks.pages.pages import Block, Heading, Paragraph, Picture, Table
+from mechsearch_jax.benchmarks.report.report import (
+    Report,
+    changed_scenarios_remark,
+    chosen_scenes_remark,
+    failure_reason,
+    unknown_graspable_remark,
+)
+from mechsearch_jax.benchmarks.statistics.intervals import Interval
+from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, by_variant
 from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates
 from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
 
@@ -22,7 +30,9 @@ SHARES = {
 
 def blocks(report: Report) -> list[Block]:
     """The page of a report."""
-    remarks = [told(report.episodes) for told in (told_of_changes, told_of_choices, told_of_unknown)]
+    remarks = [
+        remark(report.episodes) for remark in (changed_scenarios_remark, chosen_scenes_remark, unknown_graspable_remark)
+    ]
     return [
         Heading("Results", 1),
         Paragraph(
@@ -55,34 +65,23 @@ def _key(key: Key) -> list[Block]:
     if not key.numbered:
         return []
     lines = [(short, *key.options[label].values()) for label, short in key.short.items()]
-    return [Heading("Key"), Table(("label", *next(iter(key.options.values()))), lines)]
+    return [Heading("Key"), Table.of(("label", *next(iter(key.options.values()))), lines)]
 
 
 def _many(report: Report) -> bool:
     return len(report.key.short) > MOST_IN_FULL
 
 
-def said(value: Hashable, key: Key) -> str:
-    """A value of a column in a table."""
-    if value is None:
-        return "all"
-    return f"{value:g}" if isinstance(value, float) else key.short.get(str(value), str(value))
-
-
-def _share(value: float | None, interval: tuple[float, float]) -> str:
-    return "-" if value is None else f"{value:.2f} ({interval[0]:.2f} to {interval[1]:.2f})"
-
-
-def _steps(value: float | None, interval: tuple[float, float] | None) -> str:
+def _cell(value: float | None, interval: Interval | None, digits: int) -> str:
     if value is None:
         return "-"
-    return f"{value:.1f}" if interval is None else f"{value:.1f} ({interval[0]:.1f} to {interval[1]:.1f})"
+    bounds = "" if interval is None else f" ({interval[0]:.{digits}f} to {interval[1]:.{digits}f})"
+    return f"{value:.{digits}f}{bounds}"
 
 
-def _rates_table(rates: Sequence[Rates], key: Key, spelt: bool = False) -> Table:
-    """A line for each group; where `spelt`, with what a variant's options are that differ."""
+def _rates_table(rates: Sequence[Rates], key: Key, options: Sequence[str] = ()) -> Table:
+    """A line for each group, which begins with what these options of its variant are."""
     columns = list(rates[0].group)
-    options = list(next(iter(key.options.values()))) if spelt else []
     header = (
         *options,
         *(column.replace("_", " ") for column in columns),
@@ -92,27 +91,26 @@ def _rates_table(rates: Sequence[Rates], key: Key, spelt: bool = False) -> Table
     )
     lines = [
         (
-            *(key.options[str(one.method)][name] for name in options),
-            *(said(one.group[column], key) for column in columns),
-            *(str(one.episodes), str(one.errors)),
-            *(_share(getattr(one, goal), getattr(one, f"{goal}_interval")) for goal in SHARES),
-            *(_steps(getattr(one, f"{goal}_steps"), getattr(one, f"{goal}_steps_interval")) for goal in GOALS),
-            *(f"{value:.2f}" for value in (one.steps, one.planning_seconds, one.simulation_seconds)),
+            *(key.options[str(group.method)][name] for name in options),
+            *(key.text(group.group[column]) for column in columns),
+            *(group.episodes, group.errors),
+            *(_cell(getattr(group, goal), getattr(group, f"{goal}_interval"), 2) for goal in SHARES),
+            *(_cell(getattr(group, f"{goal}_steps"), getattr(group, f"{goal}_steps_interval"), 1) for goal in GOALS),
+            *(f"{value:.2f}" for value in (group.steps, group.planning_seconds, group.simulation_seconds)),
         )
-        for one in rates
+        for group in rates
     ]
-    return Table(header, lines, texts=len(columns) + len(options))
+    return Table.of(header, lines, texts=len(options) + len(columns))
 
 
 def _rates(report: Report) -> list[Block]:
     table = _rates_table(report.rates, report.key)
     if not (_many(report) and list(report.rates[0].group) == [VARIANT, "objects"]):
         return [Heading("Rates"), table]
-    everything = [rates for rates in report.rates if rates.objects is None]
-    whole = _rates_table(everything, report.key, spelt=report.key.numbered)
+    options = list(next(iter(report.key.options.values()))) if report.key.numbered else []
+    whole = _rates_table([rates for rates in report.rates if rates.objects is None], report.key, options)
     instead = "By number of objects too: see rates.csv."
-    folded = Table(table.header, table.lines, table.texts, True, "by number of objects", instead)
-    return [Heading("Rates"), whole, folded]
+    return [Heading("Rates"), whole, dataclasses.replace(table, folded="by number of objects", instead=instead)]
 
 
 def _curve(report: Report) -> list[Block]:
@@ -131,15 +129,15 @@ def _differences(report: Report) -> list[Block]:
         return []
     short = report.key.short
 
-    def cell(one: Difference, scale: float, digits: int) -> str:
-        if one.difference is None:
+    def cell(change: PairedDifference, scale: float, digits: int) -> str:
+        if change.mean is None:
             return "-"
-        error = "" if one.standard_error is None else f" ± {scale * one.standard_error:.{digits}f}"
-        return f"{scale * one.difference:+.{digits}f}{error}"
+        error = "" if change.standard_error is None else f" ± {scale * change.standard_error:.{digits}f}"
+        return f"{scale * change.mean:+.{digits}f}{error}"
 
     lines = [
         (
-            *(short[label], str(goals["found"].pairs)),
+            *(short[label], goals["found"].pairs),
             *(cell(goals[goal], 100.0, 1) for goal in GOALS),
             f"{goals['retrieved'].gains}, {goals['retrieved'].losses}",
             *(cell(goals[f"{goal}_steps"], 1.0, 2) for goal in GOALS),
@@ -157,7 +155,7 @@ def _differences(report: Report) -> list[Block]:
             "scene's pairs are averaged first. Shares in percentage points; actions over the pairs in which both got "
             "there."
         ),
-        Table(header, lines),
+        Table.of(header, lines),
     ]
 
 
@@ -165,59 +163,55 @@ def _reasons(report: Report) -> list[Block]:
     heading = Heading("Why episodes failed")
     if not report.reasons:
         return [heading, Paragraph("None did.")]
-    each = [(report.key.short[f.method], f.reason, str(f.episodes), f"{f.share:.2f}") for f in report.reasons]
-    table = Table(("method", "reason", "episodes", "share"), each, texts=2)
+    lines = [(report.key.short[f.method], f.reason, f.episodes, f"{f.share:.2f}") for f in report.reasons]
+    by_method = Table.of(("method", "reason", "episodes", "share"), lines, texts=2)
     if len(report.key.short) == 1:
-        return [heading, table]
-    counts = collections.Counter(reason_of(row) for row in report.episodes if not row.retrieved)
-    total = len(report.episodes)
-    lines = [(reason, str(n), f"{n / total:.2f}") for reason, n in counts.most_common()]
-    if not _many(report):
-        return [heading, Table(("reason", "episodes", "share"), lines), table]
-    instead = "By variant: see failures.csv."
-    return [
-        heading,
-        Table(("reason", "episodes", "share"), lines),
-        Table(table.header, table.lines, table.texts, True, "by variant", instead),
-    ]
+        return [heading, by_method]
+    counts = collections.Counter(failure_reason(row) for row in report.episodes if not row.retrieved)
+    shares = [(reason, n, f"{n / len(report.episodes):.2f}") for reason, n in counts.most_common()]
+    if _many(report):
+        by_method = dataclasses.replace(by_method, folded="by variant", instead="By variant: see failures.csv.")
+    return [heading, Table.of(("reason", "episodes", "share"), shares), by_method]
 
 
 def _events(report: Report) -> list[Block]:
     """What happened on the way."""
     if not report.events:
         return [Paragraph("These episodes do not say: an earlier version ran them, or they ended in errors.")]
-    told = Paragraph(
+    explanation = Paragraph(
         "Shares of the episodes that say so; *of all looks* is the share of the steps before the target was found at "
         "which f ruled out its true pose."
     )
 
-    def line(events: Events) -> tuple[str, ...]:
-        named = (said(value, report.key) for value in events.group.values())
-        return (*named, str(events.episodes), *(f"{getattr(events, name):.3f}" for name in EVENTS))
+    def table(events: Sequence[Events]) -> Table:
+        lines = [
+            (
+                *map(report.key.text, group.group.values()),
+                group.episodes,
+                *(f"{getattr(group, name):.3f}" for name in EVENTS),
+            )
+            for group in events
+        ]
+        return Table.of((VARIANT, "objects", "episodes", *EVENTS.values()), lines, texts=2)
 
-    header = (VARIANT, "objects", "episodes", *EVENTS.values())
-    lines = [line(events) for events in report.events]
+    everything = table(report.events)
     if not _many(report):
-        return [told, Table(header, lines, texts=2)]
-    whole = [line(events) for events in report.events if events.group["objects"] is None]
+        return [explanation, everything]
     instead = "By number of objects too: see events.csv."
-    return [told, Table(header, whole, texts=2), Table(header, lines, 2, True, "by number of objects", instead)]
+    return [
+        explanation,
+        table([events for events in report.events if events.objects is None]),
+        dataclasses.replace(everything, folded="by number of objects", instead=instead),
+    ]
 
 
 def _films(report: Report) -> list[Block]:
     if not report.films:
         return []
-    found: list[Block] = [Heading("Single episodes")]
-    for why, films in _by_why(report).items():
-        found.append(Heading(why, 3))
-        found += films
-    return found
-
-
-def _by_why(report: Report) -> dict[str, list[Block]]:
     groups: dict[str, list[Block]] = {}
     for film in report.films:
-        label = report.key.short[film.method]
-        shown = Picture(film.file, f"{label}, seed {film.seed}: {film.caption}") if film.drawn else None
-        groups.setdefault(film.why, []).append(shown or Paragraph(f"{label}, seed {film.seed}: {film.caption}"))
-    return groups
+        caption = f"{report.key.short[film.method]}, seed {film.seed}: {film.caption}"
+        block = Picture(film.file, caption) if film.drawn else Paragraph(caption)
+        groups.setdefault(film.why, []).append(block)
+    parts = [[Heading(why, 3), *films] for why, films in groups.items()]
+    return [Heading("Single episodes"), *(block for part in parts for block in part)]

@@ -19,6 +19,11 @@ from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.scenes import scene_sets
 
 
+def plain_table(title: str | None = None) -> Table:
+    """A table without lines, beneath its title."""
+    return Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left")
+
+
 def timing_table(timing: Timing) -> Table:
     """One timing, and what it was measured on."""
     table = Table(box=None, pad_edge=False, show_header=False)
@@ -96,10 +101,6 @@ def recognition_tables(measured: Measured) -> Group:
     return Group(*tables.values(), Text(explanation, style="dim"))
 
 
-def plain_table(title: str) -> Table:
-    return Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left")
-
-
 def _recognition_table(title: str) -> Table:
     table = plain_table(title)
     table.add_column("method", no_wrap=True, min_width=15)
@@ -110,7 +111,7 @@ def _recognition_table(title: str) -> Table:
 
 def recognition_times_table(measured: Measured) -> Table:
     """How long each method takes for an object, and on what."""
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    table = plain_table()
     table.add_column("method", no_wrap=True)
     for name in ("median of an object", "10% to 90%", "compile"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -218,26 +219,27 @@ def scenes_table(rows: Sequence[scenes.Row]) -> Group:
         "pose that is nearest to the target's. hidden, ≤100, >100: scenes by the target's pixels. seen: share of the "
         "target's pixels. visible: objects that show at least 100 pixels. of each: share of an object's that is seen."
     )
-    told = [
+    beside_exact = [
         f"{line['source']}, {line['objects']} objects: f is {line['possible_over_exact_cells']:.2f} times what brute "
         f"force finds, and lacks {100 * line['exact_missed_share']:.1f}% of that"
         for line in scenes.summary(rows)
         if "exact_scenes" in line
     ]
-    return Group(table, Text(explanation, style="dim"), *(Text(one) for one in told))
+    return Group(table, Text(explanation, style="dim"), *map(Text, beside_exact))
 
 
 def scene_sets_table() -> Table:
     """The named sets of scenes, with a digest of what each holds."""
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    table = plain_table()
     table.add_column("set", no_wrap=True)
     table.add_column("scenes", justify="right", no_wrap=True)
     for name in ("objects", "target", "digest"):
         table.add_column(name, no_wrap=True)
     table.add_column("what")
-    for one in scene_sets.SETS.values():
-        objects = ", ".join(str(block.objects) for block in one.blocks)
-        table.add_row(one.name, str(one.scenes), objects, one.blocks[0].target, scene_sets.digest(one), one.about)
+    for scene_set in scene_sets.SETS.values():
+        objects = ", ".join(str(block.objects) for block in scene_set.blocks)
+        first, digest = scene_set.blocks[0], scene_sets.digest(scene_set)
+        table.add_row(scene_set.name, str(scene_set.scenes), objects, first.target, digest, scene_set.about)
     return table
 
 

@@ -1,49 +1,86 @@
-"""How variants differ from one of them over the same episodes: paired differences with their standard errors.
+"""Paired differences: how much more one of two episodes on the same scene reaches than the other.
 
-The seeds of a scene are not independent, so that its differences are averaged first, and scenes are what is counted.
+The episodes of a scene are not independent. So a scene's differences are averaged first, and scenes are counted.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Hashable, Mapping, Sequence
 
+import numpy as np
+import scipy.stats
+
+from mechsearch_jax.benchmarks.statistics.intervals import Interval, by_scene, mean_interval
 from mechsearch_jax.benchmarks.statistics.rates import GOALS, says, step_of
 from mechsearch_jax.benchmarks.statistics.variants import canonical, column, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.runtime.errors import InputError
 
-# What makes a pair where nothing else is asked for.
+# What two episodes of a pair have in common by default.
 PAIRED = ("scenario", "seed")
 
 
 @dataclasses.dataclass(frozen=True)
-class Difference:
-    """A variant less the baseline in one goal, over the pairs that both have.
+class PairedDifference:
+    """Differences of a measure over pairs of episodes.
+
+    Attributes:
+      scene_means: the mean difference of each scene's pairs, ascending.
+      pairs: how many pairs.
+      gains, losses: in how many of them the difference is above, and below 0.
+    """
+
+    scene_means: tuple[float, ...]
+    pairs: int
+    gains: int
+    losses: int
+
+    @classmethod
+    def of(cls, differences: Sequence[float], scenes: Sequence[Hashable]) -> PairedDifference:
+        """The paired difference of pairs, each on one of these scenes."""
+        sums, counts = by_scene(differences, scenes)
+        gains, losses = sum(value > 0 for value in differences), sum(value < 0 for value in differences)
+        return cls(tuple(sorted((sums / counts).tolist())), len(differences), gains, losses)
+
+    @property
+    def scenes(self) -> int:
+        """How many scenes the pairs are on."""
+        return len(self.scene_means)
+
+    @property
+    def mean(self) -> float | None:
+        """The mean over scenes; None where there are no pairs."""
+        return float(np.mean(self.scene_means)) if self.scene_means else None
+
+    @property
+    def standard_error(self) -> float | None:
+        """Of the mean, from how scenes differ, by SciPy; None below two scenes."""
+        return float(scipy.stats.sem(self.scene_means)) if self.scenes > 1 else None
+
+    @property
+    def interval(self) -> Interval | None:
+        """The 95% interval of the mean, from drawing scenes; None below two scenes."""
+        return mean_interval(self.scene_means, range(self.scenes))
+
+
+@dataclasses.dataclass(frozen=True)
+class VariantDifference:
+    """A variant less the baseline in one goal.
 
     Attributes:
       method: the variant's label; see `label_variants`.
       goal: one of `GOALS`, or that and "_steps" for the number of actions until then, over the pairs in which both
         got there.
-      pairs: how many; none for `graspable` where an episode does not say it (see `Row.graspable_known`).
-      scenes: of how many scenes they are; of as many as there are pairs where these are not told apart by scenes.
-      difference: mean over scenes of the mean difference of a scene's pairs; None where there are no pairs.
-      standard_error: of that mean, from how scenes differ; None below two scenes.
-      gains, losses: in how many pairs the variant has more, and less.
+      change: over the pairs that both have; none of `graspable` where an episode does not say it (see `says`).
     """
 
     method: str
     goal: str
-    pairs: int
-    scenes: int
-    difference: float | None
-    standard_error: float | None
-    gains: int
-    losses: int
+    change: PairedDifference
 
 
-def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) -> list[Difference]:
+def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) -> list[VariantDifference]:
     """How every other variant differs from the baseline.
 
     Several episodes of a variant that the columns do not tell apart count as one, with their mean. Scenarios of the
@@ -57,58 +94,57 @@ def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) 
     Raises:
       InputError: there is no such column, or no episode of another variant makes a pair with one of the baseline.
     """
-    named = [canonical(name) for name in columns]
-    # What a scenario holds belongs to its name.
-    said = [column(rows, name) for name in (*named, *(("content_hash",) if "scenario" in named else ()))]
+    names = [canonical(name) for name in columns]
+    # The content of a scenario belongs to its name.
+    values = [column(rows, name) for name in (*names, *(("content_hash",) if "scenario" in names else ()))]
     variants: dict[str, dict[tuple[Hashable, ...], list[Row]]] = {}
-    for label, values, row in zip(label_variants(rows), zip(*said, strict=True), rows, strict=True):
-        variants.setdefault(label, {}).setdefault(values, []).append(row)
+    for label, pair, row in zip(label_variants(rows), zip(*values, strict=True), rows, strict=True):
+        variants.setdefault(label, {}).setdefault(pair, []).append(row)
     base = variants.pop(baseline)
-    common = {label: [pair for pair in found if pair in base] for label, found in variants.items()}
+    common = {label: [pair for pair in own if pair in base] for label, own in variants.items()}
     if not any(common.values()):
-        raise InputError(f"report: no other variant shares {', '.join(named)} with the baseline {baseline}")
-    # Where the scenario is among them, its place in what makes a pair; what it holds comes last.
-    scene = [named.index("scenario"), -1] if "scenario" in named else None
-
-    def unit(pair: tuple[Hashable, ...]) -> Hashable:
-        return pair if scene is None else tuple(pair[i] for i in scene)
-
+        raise InputError(f"report: no other variant shares {', '.join(names)} with the baseline {baseline}")
+    # The places of the scenario's name and content in a pair; without them each pair is a scene.
+    places = [names.index("scenario"), -1] if "scenario" in names else range(len(names))
     return [
-        _difference(label, goal, [(unit(pair), variants[label][pair], base[pair]) for pair in common[label]])
+        VariantDifference(
+            label,
+            goal,
+            _change(
+                goal,
+                [(variants[label][pair], base[pair]) for pair in common[label]],
+                [tuple(pair[i] for i in places) for pair in common[label]],
+            ),
+        )
         for label in sorted(variants, key=natural)
         for goal in (*GOALS, *(f"{goal}_steps" for goal in GOALS))
     ]
 
 
-def _difference(label: str, goal: str, pairs: Sequence[tuple[Hashable, Sequence[Row], Sequence[Row]]]) -> Difference:
-    """The difference in a goal over pairs, each with its scene."""
-    known = all(says(row, goal.removesuffix("_steps")) for _, rows, base in pairs for row in (*rows, *base))
-    values = [(scene, _mean(rows, goal), _mean(base, goal)) for scene, rows, base in pairs] if known else []
-    found = [(scene, a - b) for scene, a, b in values if a is not None and b is not None]
-    scenes: dict[Hashable, list[float]] = {}
-    for scene, value in found:
-        scenes.setdefault(scene, []).append(value)
-    own = [sum(each) / len(each) for each in scenes.values()]
-    count = len(own)
-    mean = sum(own) / count if count else None
-    error = None
-    if mean is not None and count > 1:
-        error = math.sqrt(sum((value - mean) ** 2 for value in own) / (count - 1) / count)
-    gains, losses = sum(value > 0 for _, value in found), sum(value < 0 for _, value in found)
-    return Difference(label, goal, len(found), count, mean, error, gains, losses)
+def _change(
+    goal: str, pairs: Sequence[tuple[Sequence[Row], Sequence[Row]]], scenes: Sequence[Hashable]
+) -> PairedDifference:
+    """The difference in a goal over pairs of episodes that count as one each."""
+    if not all(says(row, goal.removesuffix("_steps")) for pair in pairs for rows in pair for row in rows):
+        return PairedDifference.of([], [])
+    values = [(_mean(rows, goal), _mean(base, goal)) for rows, base in pairs]
+    differences = [
+        (a - b, scene) for (a, b), scene in zip(values, scenes, strict=True) if a is not None and b is not None
+    ]
+    return PairedDifference.of([value for value, _ in differences], [scene for _, scene in differences])
 
 
 def _mean(rows: Sequence[Row], goal: str) -> float | None:
-    """The share of rows that reached a goal, or how many actions those took that did; None where none did."""
-    if goal in GOALS:
-        return sum(step_of(row, goal) is not None for row in rows) / len(rows)
+    """The share of rows that reached a goal, or the mean number of actions until then; None where none did."""
     steps = [step for row in rows if (step := step_of(row, goal.removesuffix("_steps"))) is not None]
+    if goal in GOALS:
+        return len(steps) / len(rows)
     return sum(steps) / len(steps) if steps else None
 
 
-def by_variant(differences: Sequence[Difference]) -> Mapping[str, Mapping[str, Difference]]:
+def by_variant(differences: Sequence[VariantDifference]) -> Mapping[str, Mapping[str, PairedDifference]]:
     """Differences by variant and goal."""
-    found: dict[str, dict[str, Difference]] = {}
-    for one in differences:
-        found.setdefault(one.method, {})[one.goal] = one
-    return found
+    table: dict[str, dict[str, PairedDifference]] = {}
+    for difference in differences:
+        table.setdefault(difference.method, {})[difference.goal] = difference.change
+    return table

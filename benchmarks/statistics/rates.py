@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -141,37 +142,37 @@ def summarise(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")
 def _rates(group: Mapping[str, Hashable], rows: Sequence[Row]) -> Rates:
     count, actions = len(rows), max(sum(row.steps for row in rows), 1)
     by_paper = [row for row in rows if row.paper_graspable is not None]
-    said = [bool(row.paper_graspable) for row in by_paper]
-    told: dict[str, Any] = {}
+    paper_graspable = [bool(row.paper_graspable) for row in by_paper]
+    goals: dict[str, Any] = {}
     for goal in GOALS:
-        told |= _goal(rows, goal)
+        goals |= _goal(rows, goal)
     return Rates(
         group=group,
         episodes=count,
         errors=sum(row.is_error for row in rows),
-        **told,
-        paper_episodes=len(said),
-        paper_graspable=sum(said) / len(said) if said else None,
-        paper_graspable_interval=share_interval(said, list(map(scene_of, by_paper))),
+        **goals,
+        paper_episodes=len(by_paper),
+        paper_graspable=sum(paper_graspable) / len(by_paper) if by_paper else None,
+        paper_graspable_interval=share_interval(paper_graspable, list(map(scene_of, by_paper))),
         steps=sum(row.steps for row in rows) / count,
-        planning_seconds=sum(row.planning_seconds for row in rows) / actions,
-        simulation_seconds=sum(row.simulation_seconds for row in rows) / actions,
+        planning_seconds=math.fsum(row.planning_seconds for row in rows) / actions,
+        simulation_seconds=math.fsum(row.simulation_seconds for row in rows) / actions,
     )
 
 
 def _goal(rows: Sequence[Row], goal: str) -> dict[str, Any]:
-    """The fields of `Rates` that tell of a goal."""
+    """The fields of `Rates` that belong to a goal."""
     names = goal, f"{goal}_interval", f"{goal}_steps", f"{goal}_steps_interval"
     if not all(says(row, goal) for row in rows):
         return dict(zip(names, (None, (0.0, 1.0), None, None), strict=True))
-    scenes, after = list(map(scene_of, rows)), [step_of(row, goal) for row in rows]
-    got = [(float(step), scene) for step, scene in zip(after, scenes, strict=True) if step is not None]
-    steps, own = [step for step, _ in got], [scene for _, scene in got]
+    scenes, steps = list(map(scene_of, rows)), [step_of(row, goal) for row in rows]
+    reached = [step is not None for step in steps]
+    known_steps = [step for step in steps if step is not None]
     values = (
-        len(steps) / len(rows),
-        share_interval([step is not None for step in after], scenes),
-        sum(steps) / len(steps) if steps else None,
-        mean_interval(steps, own),
+        len(known_steps) / len(rows),
+        share_interval(reached, scenes),
+        sum(known_steps) / len(known_steps) if known_steps else None,
+        mean_interval(known_steps, list(itertools.compress(scenes, reached))),
     )
     return dict(zip(names, values, strict=True))
 
@@ -180,18 +181,18 @@ def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "ob
     """What happened on the way, grouped as `summarise` does; groups of which nothing is known are left out."""
     summary = []
     for group, members in _groups(rows, columns):
-        known = [row for row in members if row.looks is not None]
-        if not known:
+        recorded = [row for row in members if row.looks is not None]
+        if not recorded:
             continue
 
-        def share(name: str, known: Sequence[Row] = known) -> float:
-            return sum(getattr(row, name) > 0 for row in known) / len(known)
+        def share(name: str, rows: Sequence[Row] = recorded) -> float:
+            return sum(getattr(row, name) > 0 for row in rows) / len(rows)
 
-        looks, lost = (sum(getattr(row, name) for row in known) for name in ("looks", "truth_lost"))
+        looks, lost = (sum(getattr(row, name) for row in recorded) for name in ("looks", "truth_lost"))
         summary.append(
             Events(
                 group=group,
-                episodes=len(known),
+                episodes=len(recorded),
                 truth_lost=share("truth_lost"),
                 looks_truth_lost=lost / max(looks, 1),
                 restarted=share("restarts"),
@@ -206,9 +207,9 @@ def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "ob
 def _groups(rows: Sequence[Row], columns: Sequence[str]) -> Iterator[tuple[Mapping[str, Hashable], list[Row]]]:
     """The rows by columns, and after those that differ in the last one alone, with None for it, all of them."""
     names = [canonical(name) for name in columns]
-    found = grouped(rows, names)
-    for outer, inner in itertools.groupby(found, key=lambda values: values[:-1]):
-        values = list(inner)
-        for value in values:
-            yield dict(zip(names, value, strict=True)), found[value]
-        yield dict(zip(names, (*outer, None), strict=True)), [row for value in values for row in found[value]]
+    groups = grouped(rows, names)
+    for outer, inner in itertools.groupby(groups, key=lambda values: values[:-1]):
+        members = list(inner)
+        for values in members:
+            yield dict(zip(names, values, strict=True)), groups[values]
+        yield dict(zip(names, (*outer, None), strict=True)), [row for values in members for row in groups[values]]

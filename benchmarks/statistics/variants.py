@@ -25,7 +25,7 @@ _variant = operator.attrgetter("configuration", *OPTIONS)
 _NUMBER = re.compile(r"(-?\d+(?:\.\d+)?(?:e-?\d+)?)")
 
 
-def _said(value: Any) -> str:
+def _text(value: Any) -> str:
     values = value if isinstance(value, list) else [value]
     return "/".join(f"{v:g}" if isinstance(v, float) else str(v) for v in values)
 
@@ -35,7 +35,7 @@ def _label(policy: str, differing: Mapping[str, str]) -> str:
 
 
 def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dict[str, str]]]]:
-    """For each row what is known of its options, and for each of those the policy and the options that differ."""
+    """For each row its variant, and for each variant the policy and the options that differ."""
     variants = list(map(_variant, rows))
     # Thousands of rows have the same few options.
     each = {variant: {**GONE, **options_of(row)} for variant, row in dict(zip(variants, rows, strict=True)).items()}
@@ -44,7 +44,7 @@ def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dic
     parts = {
         variant: (
             str(options["policy"]),
-            {name.replace("_", " "): _said(options.get(name, "unknown")) for name in differing},
+            {name.replace("_", " "): _text(options.get(name, "unknown")) for name in differing},
         )
         for variant, options in each.items()
     }
@@ -57,7 +57,7 @@ def label_variants(rows: Sequence[Row]) -> list[str]:
     Rows that ran under different options never share a label.
     """
     variants, parts = _differing(rows)
-    labels = {variant: _label(*said) for variant, said in parts.items()}
+    labels = {variant: _label(*part) for variant, part in parts.items()}
     return [labels[variant] for variant in variants]
 
 
@@ -88,11 +88,11 @@ class Key:
     @classmethod
     def of(cls, rows: Sequence[Row]) -> Key:
         """The key of rows: labels without a policy that all have, or numbers where these are too long."""
-        known = {_label(*said): said for said in _differing(rows)[1].values()}
-        labels = sorted(known, key=natural)
-        policies = {policy for policy, _ in known.values()}
+        parts = {_label(*part): part for part in _differing(rows)[1].values()}
+        labels = sorted(parts, key=natural)
+        policies = {policy for policy, _ in parts.values()}
         common = policies.pop() if len(policies) == 1 and len(labels) > 1 else ""
-        options = {label: {**({} if common else {"policy": known[label][0]}), **known[label][1]} for label in labels}
+        options = {label: {**({} if common else {"policy": parts[label][0]}), **parts[label][1]} for label in labels}
         plain = {label: label.removeprefix(f"{common}, ") if common else label for label in labels}
         if max(map(len, plain.values()), default=0) <= LONGEST:
             return cls(plain, common, options)
@@ -104,6 +104,12 @@ class Key:
         """Whether the short labels say nothing by themselves."""
         return any(short not in label for label, short in self.short.items())
 
+    def text(self, value: Hashable) -> str:
+        """A value of a column in a table: None, for all values, is "all", and a variant has its short label."""
+        if value is None:
+            return "all"
+        return f"{value:g}" if isinstance(value, float) else self.short.get(str(value), str(value))
+
     def named(self, text: str) -> str:
         """The label that a text stands for: itself, its short one, or some of its parts, as "gamma 0.5" or "gamma=0.5".
 
@@ -113,14 +119,14 @@ class Key:
         if text in self.short:
             return text
         parts = {part.strip().replace("=", " ").replace("_", " ") for part in text.split(",")}
-        found = [
+        matches = [
             label for label, short in self.short.items() if text == short or parts <= set(label.split(", ")) | {short}
         ]
-        if len(found) == 1:
-            return found[0]
-        among = found or list(self.short)
-        told = "; ".join(f"{self.short[label]} ({label})" for label in among[:4]) + ("; ..." if len(among) > 4 else "")
-        raise InputError(f'report: variant "{text}" is {"one of several" if found else "unknown"}: {told}')
+        if len(matches) == 1:
+            return matches[0]
+        among = matches or list(self.short)
+        names = "; ".join(f"{self.short[label]} ({label})" for label in among[:4]) + ("; ..." if among[4:] else "")
+        raise InputError(f'report: variant "{text}" is {"one of several" if matches else "unknown"}: {names}')
 
 
 def column(rows: Sequence[Row], name: str) -> list[Hashable]:
@@ -140,10 +146,11 @@ def column(rows: Sequence[Row], name: str) -> list[Hashable]:
     variants = list(map(_variant, rows))
     each = {variant: options_of(row) for variant, row in dict(zip(variants, rows, strict=True)).items()}
     if not any(name in options for options in each.values()):
-        options = {option for known in each.values() for option in known}
+        options = {option for names in each.values() for option in names}
         raise InputError(f"report: column {name} is unknown; {nearest(name, [VARIANT, *fields, *sorted(options)])}")
     values: dict[Any, Hashable] = {
-        variant: _plain(options.get(name, GONE.get(name))) for variant, options in each.items()
+        variant: _text(value) if isinstance(value := options.get(name, GONE.get(name)), list) else value
+        for variant, options in each.items()
     }
     return [values[variant] for variant in variants]
 
@@ -152,10 +159,6 @@ def canonical(name: str) -> str:
     """A column's name as `Row` has it, of one that may be written as an option."""
     plain = name.strip().removeprefix("--").replace("-", "_")
     return _ALIASES.get(plain, plain)
-
-
-def _plain(value: Any) -> Hashable:
-    return "/".join(f"{v:g}" if isinstance(v, float) else str(v) for v in value) if isinstance(value, list) else value
 
 
 def grouped(rows: Sequence[Row], columns: Sequence[str]) -> dict[tuple[Hashable, ...], list[Row]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +14,10 @@ from mechsearch_jax.commands.options import find_scenario, find_scenarios
 from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from mechsearch_jax.benchmarks.report.films import Draw
+    from mechsearch_jax.benchmarks.report.report import Report
     from mechsearch_jax.benchmarks.store.rows import Row
 
 
@@ -37,16 +40,16 @@ def report(
 ) -> None:
     """Print rates by variant and number of objects from results of evaluate or sweep, and write them with plots.
 
-    What happened on the way is told too: the truth ruled out, objects fallen, the arm held up, bodies never at rest.
+    It also says what happened on the way: the truth ruled out, objects fallen, the arm held up, bodies never at rest.
     Columns are those of the results: fields of rows, options, and "method" for the variant.
 
     Args:
       results: folders of evaluate, folders of those, and Parquet files of earlier versions.
       out: folder for report.html, which holds everything, report.md, report.tex, CSV and JSON files and pictures; only
         prints if not given.
-      rows: columns to tell rates by, instead of method and objects; rates over all values of the last one are told too.
+      rows: columns to group rates by, instead of method and objects; also over all values of the last one.
       curve: rates over this column; of two, with a line for each value of the second.
-      baseline: a variant by its label, or what tells it from others, as gamma=0.5; paired differences from it are told.
+      baseline: a variant by its label, or what tells it from others, as gamma=0.5; adds paired differences from it.
       paired: what two episodes of a pair have in common; scenario and seed if not given.
       films: draw three typical episodes, three lost and the slowest, by running them again.
       scenes: where the scenarios of these are, if they are neither shipped nor in a scene set.
@@ -54,39 +57,48 @@ def report(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.report import films as single
-    from mechsearch_jax.benchmarks.report.episode_tables import differences_table, events_summary_table, print_summary
-    from mechsearch_jax.benchmarks.report.report import Asked, Report, read_tables, told_of_changes, write_report
+    from mechsearch_jax.benchmarks.report.report import Report, ReportOptions, changed_scenarios_remark, read_tables
     from mechsearch_jax.benchmarks.statistics.paired import PAIRED
 
     if films and out is None:
         raise InputError("report: --films are drawn into a folder; give --out")
     if paired and baseline is None:
         raise InputError("report: --paired says what is compared with a baseline; give --baseline")
-    found = read_tables(results)
-    told = Report.of(found, Asked(_columns(rows), _columns(curve), baseline, _columns(paired) or PAIRED))
+    episodes = read_tables(results)
+    options = ReportOptions(_columns(rows), _columns(curve), baseline, _columns(paired) or PAIRED)
+    results_report = Report.of(episodes, options)
     console = Console(highlight=False)
     if out is not None:
+        from mechsearch_jax.benchmarks.report.report_files import write_report
+
         with Console(stderr=True).status("writing") as status:
             draw = _drawer(scenes, status.update) if films else None
-            told = dataclasses.replace(told, films=single.films(found, out, draw))
-            write_report(told, out, lambda file: status.update(f"writing {file}"))
-    print_summary(console, told.rates, told.key)
-    if told.curve:
-        console.print()
-        print_summary(console, told.curve, dataclasses.replace(told.key, common=""))
-    if told.differences:
-        console.print()
-        console.print(differences_table(told.differences, told.key, str(told.baseline)))
-    if told.events and not rows:
-        console.print()
-        console.print(events_summary_table(told.events, told.key))
-    if told_of_changes(found):
-        print(f"report: {told_of_changes(found)}", file=sys.stderr)
+            results_report = dataclasses.replace(results_report, films=single.films(episodes, out, draw))
+            write_report(results_report, out, lambda file: status.update(f"writing {file}"))
+    _print(console, results_report, bool(rows))
+    if remark := changed_scenarios_remark(episodes):
+        print(f"report: {remark}", file=sys.stderr)
     if out is not None:
         console.print(f"{out / 'report.html'}\n{out / 'report.md'}", soft_wrap=True)
 
 
-def _drawer(scenes: Sequence[str], status) -> Draw:
+def _print(console: Console, report: Report, own_columns: bool) -> None:
+    """Print rates, and what the report has of curve, differences and, unless columns were chosen, events."""
+    from mechsearch_jax.benchmarks.report.episode_tables import differences_table, events_summary_table, print_summary
+
+    print_summary(console, report.rates, report.key)
+    if report.curve:
+        console.print()
+        print_summary(console, report.curve, dataclasses.replace(report.key, common=""))
+    if report.differences:
+        console.print()
+        console.print(differences_table(report.differences, report.key, str(report.baseline)))
+    if report.events and not own_columns:
+        console.print()
+        console.print(events_summary_table(report.events, report.key))
+
+
+def _drawer(scenes: Sequence[str], status: Callable[[str], None]) -> Draw:
     """What draws an episode's filmstrip, its scenario found among these, the shipped ones or those of scene sets."""
     from mechsearch_jax.benchmarks.report.films import replay
     from mechsearch_jax.problem.cache import keep_compilations

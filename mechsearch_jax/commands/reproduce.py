@@ -71,10 +71,10 @@ def _jobs(
 
     methods = {setting: method_of(setting) for setting in settings}
     jobs = make_jobs(scenarios, list(methods.values()), list(dict.fromkeys(seeds)))
-    found: dict[Any, list[Job]] = {}
+    by_method: dict[Any, list[Job]] = {}
     for job in jobs:
-        found.setdefault(job.method, []).append(job)
-    return {setting: found[method] for setting, method in methods.items()}
+        by_method.setdefault(job.method, []).append(job)
+    return {setting: by_method[method] for setting, method in methods.items()}
 
 
 def reproduce(
@@ -132,10 +132,10 @@ def reproduce(
         for setting, own in jobs.items():
             print(f"{len(own)} episodes: {', '.join(['+'.join(p) if isinstance(p, tuple) else p for p in setting])}")
 
-    def told(console: Console, rows: Sequence[Row]) -> None:
+    def draw(console: Console, rows: Sequence[Row]) -> None:
         _draw(console, chosen, jobs, out)
 
-    run_jobs("reproduce", every, out, run, simulator, told)
+    run_jobs("reproduce", every, out, run, simulator, draw)
 
 
 def _draw(console: Console, table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], out: Path) -> None:
@@ -143,9 +143,9 @@ def _draw(console: Console, table: PaperTable, jobs: Mapping[Setting, Sequence[J
     from mechsearch_jax.benchmarks.paper.reproduce import results_of, screen, write_table
     from mechsearch_jax.benchmarks.store.shards import Results
 
-    known = Results(out)
-    known.refresh()
-    results = results_of(table, jobs, known.rows)
+    folder = Results(out)
+    folder.refresh()
+    results = results_of(table, jobs, folder.rows)
     page, _ = write_table(results, out, shlex.join(["mechsearch", *sys.argv[1:]]))
     console.print(screen(results))
     console.print(str(page), soft_wrap=True)

@@ -275,7 +275,7 @@ def weights(kept):
 
 def report(kept):
     """What is written of a few episodes whose wall times are made up."""
-    from mechsearch_jax.benchmarks.report.report import write_report
+    from mechsearch_jax.benchmarks.report.report_files import write_report
     from mechsearch_jax.benchmarks.store.rows import Row
     from mechsearch_jax.workspace.scenario import example_scenarios
 
