@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -172,7 +172,7 @@ def _difference(
     return Difference(factor, setting, getattr(base, factor), objects, len(pairs), **means)
 
 
-def _mean_change(changes: Sequence[tuple[Any, float]]) -> Mean:
+def _mean_change(changes: Sequence[tuple[Hashable, int | float]]) -> Mean:
     """The mean of changes, each with its scene."""
     change = PairedDifference.of([value for _, value in changes], [scene for scene, _ in changes])
     return Mean.of(change.mean, change.interval, change.pairs)

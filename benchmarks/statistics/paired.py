@@ -37,7 +37,7 @@ class PairedDifference:
     losses: int
 
     @classmethod
-    def of(cls, differences: Sequence[float], scenes: Sequence[Hashable]) -> PairedDifference:
+    def of(cls, differences: Sequence[int | float], scenes: Sequence[Hashable]) -> PairedDifference:
         """The paired difference of pairs, each on one of these scenes."""
         sums, counts = by_scene(differences, scenes)
         gains, losses = sum(value > 0 for value in differences), sum(value < 0 for value in differences)
