@@ -64,8 +64,9 @@ def blocks(report: Report) -> list[Block]:
 def _key(key: Key) -> list[Block]:
     if not key.numbered:
         return []
+    header = ("label", *next(iter(key.options.values())))
     lines = [(short, *key.options[label].values()) for label, short in key.short.items()]
-    return [Heading("Key"), Table.of(("label", *next(iter(key.options.values()))), lines)]
+    return [Heading("Key"), Table.of(header, lines, texts=len(header))]
 
 
 def _many(report: Report) -> bool:
