@@ -19,7 +19,7 @@ from mechsearch_jax.benchmarks.report.report_figures import COLOURS, curve_figur
 from mechsearch_jax.benchmarks.report.report_files import FILES, OPTIONAL_FILES, write_report
 from mechsearch_jax.benchmarks.report.report_page import blocks
 from mechsearch_jax.benchmarks.running.worker import Worker
-from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, by_variant, paired
+from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, paired
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, column, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, options_of, write_rows
@@ -124,7 +124,7 @@ def test_differences_are_paired():
     slower = dataclasses.replace(WON, scenario="s4", content_hash="s4", seed=7, steps=6)
     other = rows(0.5, {"s1", "s2"}, [slower, dataclasses.replace(WON, scenario="s5")])
     label = label_variants([*base, *other])[0]
-    ((variant, goals),) = by_variant(paired([*base, *other], label, ["scenario"])).items()
+    ((variant, goals),) = paired([*base, *other], label, ["scenario"]).items()
     values = [1.0, -1.0, -1.0, 0.0]
     assert variant == "search-for-grasp, gamma 0.5"
     retrieved = goals["retrieved"]
@@ -134,7 +134,7 @@ def test_differences_are_paired():
     # Only s4 was retrieved by both: after 3 actions, and after 3 and 6.
     steps = goals["retrieved_steps"]
     assert (steps.pairs, steps.mean, steps.standard_error, steps.interval) == (1, 1.5, None, None)
-    assert {each.change.pairs for each in paired([*base, *other], label) if each.goal == "found"} == {4}
+    assert paired([*base, *other], label)[variant]["found"].pairs == 4
     with pytest.raises(InputError, match="no other variant shares seed with the baseline"):
         paired([*base, *(dataclasses.replace(row, seed=9) for row in other)], label, ["seed"])
 
@@ -147,7 +147,7 @@ def test_the_seeds_of_a_scene_are_no_pairs_of_their_own():
     label = label_variants([*base, *other])[0]
 
     def goals(base, *columns):
-        return next(iter(by_variant(paired([*base, *other], label, *columns)).values()))
+        return next(iter(paired([*base, *other], label, *columns).values()))
 
     retrieved, values = goals(base)["retrieved"], [1.0, 0.0, 0.0]
     assert (retrieved.pairs, retrieved.scenes, retrieved.gains, retrieved.losses) == (5, 3, 3, 0)

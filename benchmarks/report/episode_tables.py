@@ -13,7 +13,7 @@ from rich.text import Text
 from mechsearch_jax.benchmarks.ceiling import solvability
 from mechsearch_jax.benchmarks.guard import guard
 from mechsearch_jax.benchmarks.report.tables import plain_table
-from mechsearch_jax.benchmarks.statistics.paired import VariantDifference, by_variant
+from mechsearch_jax.benchmarks.statistics.paired import VariantDifferences
 from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
 from mechsearch_jax.benchmarks.store.rows import Row
@@ -87,13 +87,13 @@ def _shown(summary: Sequence[Any], key: Key) -> Sequence[Any]:
     return [each for each in summary if each.objects is None]
 
 
-def differences_table(differences: Sequence[VariantDifference], key: Key, baseline: str) -> Table:
+def differences_table(differences: VariantDifferences, key: Key, baseline: str) -> Table:
     """How variants differ from one of them over pairs of episodes, in percentage points, each ± a standard error."""
     table = plain_table(f"points more than {key.short[baseline]}, same episodes")
     table.add_column("variant", overflow="fold")
     for name in ("pairs", *GOALS):
         table.add_column(name, justify="right", no_wrap=True)
-    for label, goals in by_variant(differences).items():
+    for label, goals in differences.items():
         cells = []
         for goal in GOALS:
             change = goals[goal]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from mechsearch_jax.benchmarks.report.films import Film
 from mechsearch_jax.benchmarks.report.report_figures import curve_rates
-from mechsearch_jax.benchmarks.statistics.paired import PAIRED, VariantDifference, paired
+from mechsearch_jax.benchmarks.statistics.paired import PAIRED, VariantDifferences, paired
 from mechsearch_jax.benchmarks.statistics.rates import Events, Rates, says, summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import Key, canonical, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row, identity
@@ -161,7 +161,7 @@ class Report:
     curve_columns: Sequence[str]
     curve: Sequence[Rates]
     baseline: str | None
-    differences: Sequence[VariantDifference]
+    differences: VariantDifferences
     films: Sequence[Film] = ()
 
     @classmethod
@@ -184,5 +184,5 @@ class Report:
             curve_columns=[canonical(name) for name in options.curve],
             curve=curve_rates(rows, options.curve) if options.curve else [],
             baseline=baseline,
-            differences=[] if baseline is None else paired(rows, baseline, options.paired),
+            differences={} if baseline is None else paired(rows, baseline, options.paired),
         )

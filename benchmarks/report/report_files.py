@@ -15,7 +15,6 @@ from mechsearch_jax.benchmarks.pages.pages import as_html, as_latex, as_markdown
 from mechsearch_jax.benchmarks.report.report import Failures, Report
 from mechsearch_jax.benchmarks.report.report_figures import curve_figure, rates_figure, success_figure
 from mechsearch_jax.benchmarks.report.report_page import blocks
-from mechsearch_jax.benchmarks.statistics.paired import VariantDifference
 from mechsearch_jax.benchmarks.statistics.rates import Events, Rates
 from mechsearch_jax.benchmarks.statistics.variants import VARIANT, label_variants
 from mechsearch_jax.benchmarks.store.rows import Row, options_of
@@ -53,10 +52,13 @@ def _columns(kind: type, group: Sequence[str]) -> list[str]:
     return [*group, *(name for name in names if name != "group")]
 
 
-def _difference_record(difference: VariantDifference) -> dict[str, Any]:
-    change = difference.change
-    values = (difference.method, difference.goal, change.pairs, change.scenes, change.mean, change.standard_error)
-    return dict(zip(DIFFERENCE_COLUMNS, (*values, change.gains, change.losses), strict=True))
+def _difference_records(report: Report) -> list[dict[str, Any]]:
+    lines = [
+        (label, goal, each.pairs, each.scenes, each.mean, each.standard_error, each.gains, each.losses)
+        for label, goals in report.differences.items()
+        for goal, each in goals.items()
+    ]
+    return [dict(zip(DIFFERENCE_COLUMNS, line, strict=True)) for line in lines]
 
 
 def _key_records(report: Report) -> list[dict[str, Any]]:
@@ -81,7 +83,7 @@ def _tables(report: Report) -> dict[str, str]:
     """The files that hold figures, by their names."""
     rates, events, curve = ([_record(each) for each in part] for part in (report.rates, report.events, report.curve))
     reasons = [dataclasses.asdict(each) for each in report.reasons]
-    differences = [_difference_record(each) for each in report.differences]
+    differences = _difference_records(report)
     value = {"rates": rates, "failures": reasons, "events": events, "key": dict(report.key.short)}
     value |= {"curve": curve} if curve else {}
     value |= {"baseline": report.baseline, "paired": differences} if differences else {}

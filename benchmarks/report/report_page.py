@@ -15,7 +15,7 @@ from mechsearch_jax.benchmarks.report.report import (
     unknown_graspable_remark,
 )
 from mechsearch_jax.benchmarks.statistics.intervals import Interval
-from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, by_variant
+from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
 from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates
 from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key
 
@@ -143,7 +143,7 @@ def _differences(report: Report) -> list[Block]:
             f"{goals['retrieved'].gains}, {goals['retrieved'].losses}",
             *(cell(goals[f"{goal}_steps"], 1.0, 2) for goal in GOALS),
         )
-        for label, goals in by_variant(report.differences).items()
+        for label, goals in report.differences.items()
     ]
     header = (
         *("variant", "pairs", *(f"{goal} [points]" for goal in GOALS), "more, less often retrieved"),

@@ -64,27 +64,15 @@ class PairedDifference:
         return mean_interval(self.scene_means, range(self.scenes))
 
 
-@dataclasses.dataclass(frozen=True)
-class VariantDifference:
-    """A variant less the baseline in one goal.
-
-    Attributes:
-      method: the variant's label; see `label_variants`.
-      goal: one of `GOALS`, or that and "_steps" for the number of actions until then, over the pairs in which both
-        got there.
-      change: over the pairs that both have; none of `graspable` where an episode does not say it (see `says`).
-    """
-
-    method: str
-    goal: str
-    change: PairedDifference
+# By variant, and by goal or goal and "_steps": the actions until then, over the pairs in which both got there.
+VariantDifferences = Mapping[str, Mapping[str, PairedDifference]]
 
 
-def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) -> list[VariantDifference]:
-    """How every other variant differs from the baseline.
+def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) -> VariantDifferences:
+    """How every other variant differs from the baseline, by label and goal.
 
     Several episodes of a variant that the columns do not tell apart count as one, with their mean. Scenarios of the
-    same name that hold something else are no pair.
+    same name that hold something else are no pair, nor are any for `graspable` where an episode does not say it.
 
     Args:
       rows: of all variants.
@@ -106,19 +94,17 @@ def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) 
         raise InputError(f"report: no other variant shares {', '.join(names)} with the baseline {baseline}")
     # The places of the scenario's name and content in a pair; without them each pair is a scene.
     places = [names.index("scenario"), -1] if "scenario" in names else range(len(names))
-    return [
-        VariantDifference(
-            label,
-            goal,
-            _change(
+    return {
+        label: {
+            goal: _change(
                 goal,
                 [(variants[label][pair], base[pair]) for pair in common[label]],
                 [tuple(pair[i] for i in places) for pair in common[label]],
-            ),
-        )
+            )
+            for goal in (*GOALS, *(f"{goal}_steps" for goal in GOALS))
+        }
         for label in sorted(variants, key=natural)
-        for goal in (*GOALS, *(f"{goal}_steps" for goal in GOALS))
-    ]
+    }
 
 
 def _change(
@@ -140,11 +126,3 @@ def _mean(rows: Sequence[Row], goal: str) -> float | None:
     if goal in GOALS:
         return len(steps) / len(rows)
     return sum(steps) / len(steps) if steps else None
-
-
-def by_variant(differences: Sequence[VariantDifference]) -> Mapping[str, Mapping[str, PairedDifference]]:
-    """Differences by variant and goal."""
-    table: dict[str, dict[str, PairedDifference]] = {}
-    for difference in differences:
-        table.setdefault(difference.method, {})[difference.goal] = difference.change
-    return table
