@@ -30,6 +30,7 @@ from mechsearch_jax.geometry.collision import Clouds, collisions
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
 from mechsearch_jax.robot.entry import gripper_enters
+from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option
@@ -37,7 +38,6 @@ from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-WRIST_ORIGIN = math.pi / 4
 # So many points of a cloud are looked at first.
 COARSE = 256
 # What a pose where no grasp is feasible counts for, in objects hit: one more than the eight objects of a scene and its
@@ -131,18 +131,6 @@ class GraspTables(flax.struct.PyTreeNode):
     def swept(self) -> Clouds:
         """The clouds."""
         return Clouds(self.clouds, self.low, self.high, self.gap, COARSE)
-
-
-def gripper_rotation(yaw: Float[Array, "*batch"], tilt: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
-    """`R_world_gripper` that approaches along `yaw` from +x, points down by `tilt` and closes horizontally [rad].
-
-    The gripper's y points to the right of the approach, as it does in the home configuration.
-    """
-    c, s, cosine, sine, zero = jnp.cos(yaw), jnp.sin(yaw), jnp.cos(tilt), jnp.sin(tilt), jnp.zeros_like(yaw)
-    x = jnp.stack([c * sine, s * sine, cosine], axis=-1)
-    y = jnp.stack([s, -c, zero], axis=-1)
-    z = jnp.stack([c * cosine, s * cosine, -sine], axis=-1)
-    return jnp.stack([x, y, z], axis=-1)
 
 
 def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):

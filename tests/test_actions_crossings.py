@@ -16,8 +16,9 @@ from mechsearch_jax.dynamics import rigid
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.collision import collisions
 from mechsearch_jax.geometry.transforms import make, transform, translate, upright_pose, yaw_rotation
-from mechsearch_jax.graspability import FoundGrasps, GraspConfig, grasp_hits, grasp_tables, gripper_rotation
+from mechsearch_jax.graspability import FoundGrasps, GraspConfig, grasp_hits, grasp_tables
 from mechsearch_jax.robot.entry import crossing_length
+from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf

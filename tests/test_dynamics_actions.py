@@ -13,8 +13,8 @@ from mechsearch_jax.actions.sampler import _shares
 from mechsearch_jax.belief.belief import possible_space
 from mechsearch_jax.dynamics import quasi_static, rigid
 from mechsearch_jax.geometry import footprints, superquadric, transforms
-from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.observation import Observation
+from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of

@@ -20,9 +20,9 @@ from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig,
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.geometry import footprints, superquadric, transforms
-from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.networks.push import PushConfig
 from mechsearch_jax.networks.push_geometry import NORMALS, push_start, reach
+from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.box import CODE as BOX
 from mechsearch_jax.shapes.cylinder import CODE as CYLINDER

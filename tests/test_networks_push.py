@@ -17,12 +17,12 @@ from mechsearch_jax.dynamics.learned import LearnedPush, predicted
 from mechsearch_jax.envs.scenes.generator import separation
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.networks import push
 from mechsearch_jax.networks import push_geometry as geometry
 from mechsearch_jax.networks.push import PushConfig, PushNetwork
 from mechsearch_jax.networks.push_geometry import REACH, push_geometry, push_start
 from mechsearch_jax.networks.weights import read_card, save_weights
+from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.geometry.transforms import back_off, make
-from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.robot import entry
+from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import gripper_pose, inverse_kinematics, line_kinematics, path_kinematics
 from mechsearch_jax.robot.motion import (

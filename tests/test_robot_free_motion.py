@@ -13,9 +13,9 @@ from mechsearch_jax.envs.world import model as models
 from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.graspability import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.arm_clearance import FARTHEST, ArmBody, Held, Obstacles, clearance, tip_positions
 from mechsearch_jax.robot.free_motion import FreeMotionConfig, check_joints, free_motion, free_path
+from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.kinematics import HOME, JOINT_LOWER, JOINT_UPPER, gripper_pose, inverse_kinematics
 from mechsearch_jax.robot.robot_trajectory import limit_shares
 from mechsearch_jax.runtime.errors import InputError

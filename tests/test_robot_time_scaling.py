@@ -14,8 +14,8 @@ from scipy.interpolate import CubicSpline
 from mechsearch_jax.actions import ActionConfig
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.graspability import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot import motion
+from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.kinematics import (
     ACCELERATION_LIMIT,
     HOME,

@@ -16,11 +16,11 @@ from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.world.world import from_scenario, true_superquadrics
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.graspability import gripper_rotation
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception.doubt import DoubtConfig, recognition_doubt
 from mechsearch_jax.robot.arm_clearance import tip_positions
 from mechsearch_jax.robot.free_motion import FreeMotionConfig
+from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig

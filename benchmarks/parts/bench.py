@@ -34,7 +34,7 @@ from mechsearch_jax.envs.world.world import TARGET, World, from_scenario, true_s
 from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.graspability import WRIST_ORIGIN, grasp_hits, graspability, gripper_rotation, pairs
+from mechsearch_jax.graspability import grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Config, Decision, Problem
 from mechsearch_jax.planner import trials as trying
@@ -42,6 +42,7 @@ from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot import motion
+from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, save_json
 from mechsearch_jax.runtime.versions import versions

@@ -12,7 +12,7 @@ import numpy as np
 
 from mechsearch_jax.actions.object_grasps import ObjectGraspConfig
 from mechsearch_jax.dynamics.push_model import LEVERAGE
-from mechsearch_jax.graspability import WRIST_ORIGIN
+from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.geometry.footprints import QUARTER_TURN, Footprints
 from mechsearch_jax.geometry.transforms import make
-from mechsearch_jax.graspability import gripper_rotation
+from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option

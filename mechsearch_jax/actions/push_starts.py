@@ -18,7 +18,7 @@ from mechsearch_jax.geometry.footprints import TOUCH, Footprints, extents, turne
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make, transform
-from mechsearch_jax.graspability import gripper_rotation
+from mechsearch_jax.robot.grasp_frames import gripper_rotation
 
 # A push whose direction is nearer than this to +x or -x begins behind the object, any other beside it [rad].
 BEHIND = (math.radians(75), math.radians(45))

@@ -219,7 +219,7 @@ def made_up_pushes():
     from mechsearch_jax.envs.pushing.pushes import Pushes
     from mechsearch_jax.envs.world.world import BODIES, from_scenario
     from mechsearch_jax.geometry.transforms import make
-    from mechsearch_jax.graspability import gripper_rotation
+    from mechsearch_jax.robot.grasp_frames import gripper_rotation
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
 
     worlds = [from_scenario(load_scenario(file)) for file in example_scenarios().values()]
