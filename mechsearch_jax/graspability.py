@@ -8,7 +8,7 @@ and a scene only adds the table H[pair, object] of who is hit. Moving one object
 
 An approximation: where the straight way in begins inside the shelf, the gripper first gets there along x. That the arm
 can is part of what is feasible, but H does not say what stands in the way there, nor what links 2 to 5 touch; for a
-target that has been found `belief.found_target` does.
+target that has been found `retrieval` does.
 """
 
 from __future__ import annotations
@@ -22,11 +22,10 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
 import trimesh
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from mechsearch_jax.geometry.collision import Clouds, collisions
+from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
 from mechsearch_jax.robot.entry import gripper_enters
@@ -92,22 +91,16 @@ class GraspConfig:
 
 
 class GraspTables(flax.struct.PyTreeNode):
-    """The target's grasps: constants of a `Problem`.
+    """Grasps of the target and what each sweeps: constants of a `Problem`.
 
     Attributes:
-      T_target_gripper: candidate grasps, shape (G, 4, 4).
+      T_target_gripper: where the gripper closes, shape (G, 4, 4).
       q7: angle of joint 7 in each, shape (G,).
       wrist: index of the wrist's swept gripper cloud, shape (G,).
       clouds: what gripper and target sweep in each grasp, in the gripper's frame as rows, shape (G, 3, P) [m].
       low, high: box around each cloud, shape (G, 3) [m].
       still_gripper: what the open gripper takes up with each wrist, in its own frame as rows, shape (W, 3, S) [m].
       still_target: surface of the target in its own frame as rows, shape (3, R) [m].
-      T_world_target: candidate poses, shape (X, 4, 4).
-      pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose. After them the last one is repeated, so
-        that the shape seldom changes where the shelf stands a little elsewhere.
-      pair_valid: false for what is repeated, shape (K,).
-      pose_pairs: the pairs of each candidate pose, and K where there are no more, shape (X, P).
-      found_grasp: the grasps of a target that has been found, shape (F,): all of them, or none in tables of candidates.
       gap: how far a point of a cloud may be from the nearest of its first `COARSE` [m].
     """
 
@@ -119,12 +112,6 @@ class GraspTables(flax.struct.PyTreeNode):
     high: jax.Array
     still_gripper: jax.Array
     still_target: jax.Array
-    T_world_target: jax.Array
-    pair_pose: jax.Array
-    pair_grasp: jax.Array
-    pair_valid: jax.Array
-    pose_pairs: jax.Array
-    found_grasp: jax.Array
     gap: jax.Array
 
     @property
@@ -133,7 +120,32 @@ class GraspTables(flax.struct.PyTreeNode):
         return Clouds(self.clouds, self.low, self.high, self.gap, COARSE)
 
 
-def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):
+class CandidateGrasps(GraspTables):
+    """Grasps of the target, and which of them are feasible at its candidate poses: constants of a `Problem`.
+
+    Attributes:
+      T_world_target: candidate poses, shape (X, 4, 4).
+      pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose. After them the last one is repeated, so
+        that the shape seldom changes where the shelf stands a little elsewhere.
+      pair_valid: false for what is repeated, shape (K,).
+      pose_pairs: the pairs of each candidate pose, and K where there are no more, shape (X, P).
+    """
+
+    T_world_target: jax.Array
+    pair_pose: jax.Array
+    pair_grasp: jax.Array
+    pair_valid: jax.Array
+    pose_pairs: jax.Array
+
+
+def _target_grasps(
+    target: Target, gripper: Gripper, config: GraspConfig
+) -> tuple[Float[Array, "g 4 4"], Int[np.ndarray, " g"]]:
+    """`T_target_gripper` of each grasp, and the index of its wrist.
+
+    Raises:
+      InputError: the target is too wide for the gripper.
+    """
     yaws, widths = shape_of(target.shape).grasps(target.half_size, config.yaws, config.max_yaw)
     yaws = yaws[widths <= gripper.usable_opening]
     if len(yaws) == 0:
@@ -145,7 +157,7 @@ def _target_grasps(target: Target, gripper: Gripper, config: GraspConfig):
     height = min(config.height, 0.6 * target.half_size[2])
     above = np.broadcast_to(np.array([0.0, 0.0, height], np.float32), (len(grasps), 3))
     T = jax.jit(lambda yaw, tilt, above: make(gripper_rotation(yaw, tilt), above))(yaw, tilt, above)
-    return T, yaw, wrist
+    return T, wrist
 
 
 def swept_target(target: Target, direction: np.ndarray, distance: float, count: int, erosion: float) -> np.ndarray:
@@ -180,19 +192,13 @@ def feasible_grasps(
     return gripper_enters(shelf, gripper, config.waypoints, tables.clouds, grasp, poses, q7, mask).reshape(n, g)
 
 
-def grasp_tables(
-    shelf: Shelf, gripper: Gripper, target: Target, config: GraspConfig, candidates: bool = True
-) -> GraspTables:
-    """Precompute the target's grasps, their swept clouds and the feasible pairs of a pose and a grasp.
-
-    Args:
-      shelf, gripper, target, config: what there is to grasp, and how.
-      candidates: whether the tables are for the candidate poses, or only for a target that has been found.
+def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> GraspTables:
+    """Precompute the target's grasps and what each sweeps.
 
     Raises:
       InputError: the target is too wide for the gripper.
     """
-    T_target_gripper, _, wrist = _target_grasps(target, gripper, config)
+    T_target_gripper, wrist = _target_grasps(target, gripper, config)
     angles = [WRIST_ORIGIN + a for a in config.wrists]
     swept = [swept_cloud(gripper, gripper.max_opening, a, config.points) for a in angles]
     still = [gripper_cloud(gripper, gripper.max_opening, a, config.still_points[0]) for a in angles]
@@ -208,13 +214,11 @@ def grasp_tables(
         for key, direction in ways.items()
     }
     for T, w, direction in zip(np.asarray(T_target_gripper), wrist, outward, strict=True):
-        own = swept_targets[direction.tobytes()]
-        inside = (own - T[:3, 3]) @ T[:3, :3]
+        inside = (swept_targets[direction.tobytes()] - T[:3, 3]) @ T[:3, :3]
         both = np.concatenate([swept[w], inside])
         clouds.append(both[order].T)
         low.append(both.min(axis=0))
         high.append(both.max(axis=0))
-    poses = jax.jit(upright_pose)(target.candidate_poses(shelf), target.height(shelf))
     still_target = swept_target(target, np.array([1.0, 0.0, 0.0]), 0.0, config.still_points[1], config.erosion)
     fields = {
         "T_target_gripper": T_target_gripper,
@@ -225,26 +229,27 @@ def grasp_tables(
         "high": np.float32(np.stack(high)),
         "still_gripper": np.float32(np.stack([cloud.T for cloud in still])),
         "still_target": np.float32(still_target.T),
-        "T_world_target": np.asarray(poses),
-        "pair_pose": np.zeros(0, np.int32),
-        "pair_grasp": np.zeros(0, np.int32),
-        "pair_valid": np.zeros(0, bool),
-        "pose_pairs": np.zeros((len(poses), 0), np.int32),
-        "found_grasp": np.zeros(0, np.int32),
-        "gap": np.float32(max(_gap(cloud.T, COARSE) for cloud in clouds)),
+        "gap": np.float32(max(gap_of(cloud.T, COARSE) for cloud in clouds)),
     }
-    if candidates:
-        judge = jax.jit(lambda tables, shelf: feasible_grasps(tables, shelf, gripper, config, tables.T_world_target))
-        pose, grasp = np.nonzero(np.asarray(judge(GraspTables(**jax.device_put(fields)), shelf)))
-        fields |= _padded_pairs(pose, grasp, len(poses))
-    else:
-        fields |= {name: fields[name][:0] for name in ("T_world_target", "pose_pairs")}
-        fields["found_grasp"] = np.arange(len(clouds), dtype=np.int32)
     return GraspTables(**jax.device_put(fields))
 
 
+def candidate_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: GraspConfig) -> CandidateGrasps:
+    """Precompute the target's grasps and the feasible pairs of a candidate pose and a grasp.
+
+    Raises:
+      InputError: the target is too wide for the gripper.
+    """
+    tables = grasp_tables(gripper, target, config)
+    poses = np.asarray(jax.jit(upright_pose)(target.candidate_poses(shelf), target.height(shelf)))
+    judge = jax.jit(lambda tables, shelf, poses: feasible_grasps(tables, shelf, gripper, config, poses))
+    pose, grasp = np.nonzero(np.asarray(judge(tables, shelf, jax.device_put(poses))))
+    candidates = {"T_world_target": poses, **_padded_pairs(pose, grasp, len(poses))}
+    return CandidateGrasps(**vars(tables), **jax.device_put(candidates))
+
+
 def _padded_pairs(pose: Int[np.ndarray, " pairs"], grasp: Int[np.ndarray, " pairs"], poses: int) -> dict[str, Any]:
-    """The fields of `GraspTables` that say which grasps are feasible at which of the candidate poses."""
+    """The fields of `CandidateGrasps` that say which grasps are feasible at which of the candidate poses."""
     rows = len(pose) + -len(pose) % PAIRS_STEP
     count = np.bincount(pose, minlength=poses)
     place = np.arange(len(pose)) - np.repeat(np.cumsum(count) - count, count)
@@ -257,25 +262,6 @@ def _padded_pairs(pose: Int[np.ndarray, " pairs"], grasp: Int[np.ndarray, " pair
         "pair_valid": np.arange(rows) < len(pose),
         "pose_pairs": pose_pairs,
     }
-
-
-def _gap(points: np.ndarray, first: int) -> float:
-    """How far a point is at most from the nearest of the first ones [m]."""
-    return float(scipy.spatial.KDTree(points[:first]).query(points)[0].max()) if len(points) > first else 0.0
-
-
-class FoundGrasps(flax.struct.PyTreeNode):
-    """The grasps of a target that has been found, whose pose need not be a candidate.
-
-    Attributes:
-      T_world_target: pose of the target, shape (4, 4).
-      feasible: which grasps the arm and the shelf allow, shape (F,).
-      q: joint angles at a few poses on the way in to each, shape (F, W, 7) [rad].
-    """
-
-    T_world_target: jax.Array
-    feasible: jax.Array
-    q: jax.Array
 
 
 class Pairs(NamedTuple):
@@ -296,13 +282,18 @@ class Pairs(NamedTuple):
     found: bool
 
 
-def pairs(candidates: GraspTables, found: FoundGrasps | None = None) -> Pairs:
-    """The rows of H; those of the candidates alone where nothing is said of a found target."""
+def pairs(candidates: CandidateGrasps, found: Bool[Array, " f"] | None = None) -> Pairs:
+    """The rows of H.
+
+    Args:
+      candidates: constants of the problem.
+      found: which grasps of a found target are feasible; the rows are those of the candidates alone if left out.
+    """
     pose, allowed, table = candidates.pair_pose, candidates.pair_valid, candidates.pose_pairs
     if found is None:
         return Pairs(pose, allowed, table, len(pose), False)
-    both = jnp.concatenate([pose, jnp.full(found.feasible.shape, len(table), jnp.int32)])
-    return Pairs(both, jnp.concatenate([allowed, found.feasible]), table, len(pose), True)
+    both = jnp.concatenate([pose, jnp.full(found.shape, len(table), jnp.int32)])
+    return Pairs(both, jnp.concatenate([allowed, found]), table, len(pose), True)
 
 
 def no_hits(rows: Pairs, capacity: int) -> Bool[Array, "k n"]:
@@ -311,20 +302,18 @@ def no_hits(rows: Pairs, capacity: int) -> Bool[Array, "k n"]:
 
 
 def grasp_hits(
-    tables: GraspTables,
-    found: FoundGrasps | None,
+    tables: CandidateGrasps,
     scene: Superquadrics,
     exists: Bool[Array, " x"],
     previous: Bool[Array, "k n"] | None = None,
     moved: Bool[Array, " n"] | None = None,
 ) -> Bool[Array, "k n"]:
-    """H: which objects the grasp of each feasible pair, or each feasible grasp of a found target, would hit.
+    """H of the candidates: which objects the grasp of each feasible pair would hit.
 
     Args:
-      tables: constants of the problem, of the candidates or of a found target.
-      found: the found target; None for tables of candidates.
+      tables: constants of the problem.
       scene: the objects, fields (N, ...).
-      exists: at which of the poses of the tables H matters, of a found target at one; it reads False elsewhere.
+      exists: at which candidate poses H matters; it reads False elsewhere.
       previous: H before some objects moved.
       moved: which objects moved since; only their columns are computed anew.
 
@@ -332,12 +321,8 @@ def grasp_hits(
       H, shape (pairs, N).
     """
     fresh = scene.valid if moved is None else moved & scene.valid
-    if found is None:
-        grasp, T_world_target = tables.pair_grasp, tables.T_world_target[tables.pair_pose]
-        counts = exists[tables.pair_pose] & tables.pair_valid
-    else:
-        grasp, T_world_target = tables.found_grasp, found.T_world_target[None]
-        counts = found.feasible & exists
+    grasp, T_world_target = tables.pair_grasp, tables.T_world_target[tables.pair_pose]
+    counts = exists[tables.pair_pose] & tables.pair_valid
     T_world_gripper = compose(T_world_target, tables.T_target_gripper[grasp])
     hit = collisions(tables.swept, grasp, T_world_gripper, scene, counts[:, None] & fresh[None])
     if previous is None or moved is None:
@@ -350,8 +335,8 @@ def _per_pose(reduce: Callable[[Array], Array], rows: Pairs, hits: Bool[Array, "
     is not feasible."""
     count = jnp.where(rows.allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), -1)
     candidates, found = jnp.split(count, [rows.candidates])
-    known = reduce(jnp.append(candidates, -1)[rows.pose_pairs])
-    return jnp.append(known, reduce(found)) if rows.found else known
+    of_candidates = reduce(jnp.append(candidates, -1)[rows.pose_pairs])
+    return jnp.append(of_candidates, reduce(found)) if rows.found else of_candidates
 
 
 def graspability(rows: Pairs, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:

@@ -11,7 +11,8 @@ from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
-from mechsearch_jax.planner import Decision, Sequences, graspable_at
+from mechsearch_jax.planner import Decision, Sequences
+from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -131,7 +132,7 @@ class Grab(flax.struct.PyTreeNode):
     charge: float = 1.0
 
     def __call__(self, key, problem, belief, observation):
-        grasp = graspable_at(problem, observation.objects, belief.found_pose, belief.found)
+        grasp = best_grasp(problem.target_grasps, observation.objects, belief.found_pose, belief.found)
         able = belief.found & grasp.success
         distance = jax.random.uniform(key, minval=0.05, maxval=0.15)
         T = jnp.eye(4).at[:3, 3].set(jnp.array([0.5, 0.0, 0.5]))

@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mechsearch_jax import retrieval
 from mechsearch_jax.actions import approach, pick_and_place, push
 from mechsearch_jax.actions.config import CLOSED, OPEN, ActionConfig, ActionSpace, action_tables
 from mechsearch_jax.actions.nothing import no_action
-from mechsearch_jax.belief import found_target
 from mechsearch_jax.dynamics import rigid
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.collision import collisions
 from mechsearch_jax.geometry.transforms import make, transform, translate, upright_pose, yaw_rotation
-from mechsearch_jax.graspability import FoundGrasps, GraspConfig, grasp_hits, grasp_tables
+from mechsearch_jax.graspability import GraspConfig, grasp_tables
 from mechsearch_jax.robot.entry import crossing_length
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud
@@ -41,7 +41,7 @@ def tables(space):
 @pytest.fixture(scope="module")
 def grasps():
     config = GraspConfig(yaws=3, tilts=(math.radians(30),), wrists=(math.radians(60),), points=512)
-    return grasp_tables(SHELF, GRIPPER, Target(), config, candidates=False)
+    return grasp_tables(GRIPPER, Target(), config)
 
 
 def pose(position, yaw=40.0, tilt=30.0):
@@ -314,25 +314,25 @@ def test_a_retrieval_past_a_post_that_only_its_crossing_touches_hits_it(grasps):
     turned = int(jnp.argmax(grasps.T_target_gripper[:, 1, 2]))
     grasp = make(grasps.T_target_gripper[turned, :3, :3], T[turned])
     feasible = jnp.arange(len(grasps.q7)) == turned
-    crossing_hits = jax.jit(found_target.crossing_hits, static_argnums=1)
+    crossing_hits = jax.jit(retrieval.crossing_hits, static_argnums=1)
     for top, hit in ((-0.005, True), (-0.045, True), (-0.15, False)):
         scene = in_the_way(grasp, top)
         hits = crossing_hits(grasps, GRIPPER, scene, T_world_target, feasible)
         assert bool(hits[turned, 0]) == hit
         assert not hits[~np.asarray(feasible)].any()
         assert not hits[:, 1].any()
-        found = FoundGrasps(T_world_target, feasible, jnp.zeros((len(grasps.q7), 1, 7)))
-        z = jax.jit(grasp_hits)(grasps, found, scene, jnp.ones(1, bool))
+        found = retrieval.FoundGrasps(T_world_target, feasible, jnp.zeros((len(grasps.q7), 1, 7)))
+        z = jax.jit(retrieval.straight_hits)(grasps, found, scene)
         assert not z.any()
 
 
 def test_the_arm_is_followed_closely_to_just_before_the_fingers_close():
-    poses, last = found_target.ARM_POSES, found_target.CROSSINGS + approach.CLOSE_WAYPOINTS - 1
+    poses, last = retrieval.ARM_POSES, retrieval.CROSSINGS + approach.CLOSE_WAYPOINTS - 1
     assert poses[-1] == last - 1
     # The longest way along x is 17 cm; the approach begins at row CROSSINGS.
     along = np.concatenate(
         [
-            0.17 * np.arange(found_target.CROSSINGS) / found_target.CROSSINGS,
+            0.17 * np.arange(retrieval.CROSSINGS) / retrieval.CROSSINGS,
             0.17 + GRIPPER.approach * np.linspace(0.0, 1.0, approach.CLOSE_WAYPOINTS),
         ]
     )

@@ -21,9 +21,9 @@ from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, from_scenario
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import GraspChoice, Sequences, graspable_at
-from mechsearch_jax.planner.retrieval import best_grasps
+from mechsearch_jax.planner import Sequences
 from mechsearch_jax.planner.rollout import present_state
+from mechsearch_jax.retrieval import GraspChoice, best_grasp, best_grasps
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
@@ -248,7 +248,7 @@ def test_a_judgement_is_the_planners_own(problem):
         judgement = jax.device_get(
             judge(problem, InFullView(), planner.PlannerConfig().weights, world, jnp.array(True))
         )
-        grasp = graspable_at(problem, objects, pose)
+        grasp = best_grasp(problem.target_grasps, objects, pose)
         assert judgement.least == int(grasp.hits)
         seen = Observation(objects, jnp.array(True), pose)
         belief = planner.update_belief(problem, planner.initial_belief(problem), seen)

@@ -29,9 +29,9 @@ from mechsearch_jax.envs.world.world import bodies_of, from_scenario
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Config, Decision, initial_belief, search_for_grasp, update_belief
-from mechsearch_jax.planner.retrieval import ALIKE, ALIKE_WRIST, graspable_at, worth_trying
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.trials import TRIES, TrialResult, TrialScenes, choose, decide, scenes_of
+from mechsearch_jax.retrieval import ALIKE, ALIKE_WRIST, best_grasp, worth_trying
 from mechsearch_jax.runtime.errors import InputError
 
 TARGET = standing("cylinder", (0.02, 0.02, 0.05), 0.6, 0.0)
@@ -121,7 +121,7 @@ def told(problem):
     found = {}
     for name, objects in SCENES.items():
         seen, at = known(problem, objects)
-        tried = worth_trying(problem, seen, at)
+        tried = worth_trying(problem.target_grasps, seen, at)
         found[name] = tried, told_of(MODEL, problem, seen, at, True, tried.action, tried.feasible)
     return found
 
@@ -134,10 +134,11 @@ def test_the_grasps_that_are_tried_differ_and_the_clearest_come_first(problem, t
         wrist = np.abs(q7[:, None] - q7[None])
         alike = (apart < ALIKE - 1e-3) & (wrist < ALIKE_WRIST - 1e-3) & ~np.eye(TRIES, dtype=bool)
         assert not alike.any(), name
-        best = graspable_at(problem, *known(problem, SCENES[name]))
+        best = best_grasp(problem.target_grasps, *known(problem, SCENES[name]))
         assert bool(tried.success[0]) == bool(best.success)
     first = told["open"][0].action.T_world_gripper[0]
-    np.testing.assert_array_equal(first, graspable_at(problem, *known(problem, OPEN)).action.T_world_gripper)
+    best = best_grasp(problem.target_grasps, *known(problem, OPEN))
+    np.testing.assert_array_equal(first, best.action.T_world_gripper)
 
 
 def test_what_is_free_to_move_may_be_hit_and_what_is_not_may_not(told):
@@ -273,7 +274,7 @@ def test_where_no_grasp_succeeds_one_that_hits_nothing_is_made(problem):
         decision = made(proposes(aside), says(*[FAILED] * TRIES), problem, belief, observation)
         assert int(decision.action.kind) == kind
         if kind == ActionKind.RETRIEVE:
-            plain = graspable_at(problem, *known(problem, objects))
+            plain = best_grasp(problem.target_grasps, *known(problem, objects))
             np.testing.assert_array_equal(decision.action.T_world_gripper, plain.action.T_world_gripper)
 
 

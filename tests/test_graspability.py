@@ -7,12 +7,12 @@ import pytest
 from mechsearch_jax import graspability, planner
 from mechsearch_jax.geometry import superquadric, transforms
 from mechsearch_jax.graspability import GraspConfig
+from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.robot import kinematics
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace import scenario
-from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 
@@ -24,7 +24,7 @@ def objects():
 @pytest.fixture(scope="module")
 def hits(problem, objects):
     everywhere = jnp.ones(problem.poses.shape[0], bool)
-    return np.asarray(graspability.grasp_hits(problem.grasps, None, objects, everywhere))
+    return np.asarray(graspability.grasp_hits(problem.grasps, objects, everywhere))
 
 
 def least_implicit(objects, k, points):
@@ -62,8 +62,8 @@ def test_moving_one_object_recomputes_its_column_alone(problem, objects, hits):
     everywhere = jnp.ones(problem.poses.shape[0], bool)
     moved = objects.replace(position=objects.position.at[2].add(jnp.float32([0.0, 0.05, 0.0])))
     which = jnp.arange(objects.capacity) == 2
-    update = graspability.grasp_hits(problem.grasps, None, moved, everywhere, jnp.asarray(hits), which)
-    whole = graspability.grasp_hits(problem.grasps, None, moved, everywhere)
+    update = graspability.grasp_hits(problem.grasps, moved, everywhere, jnp.asarray(hits), which)
+    whole = graspability.grasp_hits(problem.grasps, moved, everywhere)
     np.testing.assert_array_equal(update, whole)
     np.testing.assert_array_equal(np.delete(np.asarray(update), 2, axis=1), np.delete(hits, 2, axis=1))
 
@@ -99,7 +99,7 @@ def test_grasps_point_into_the_shelf_and_down(problem):
 
 def test_a_wide_target_is_refused_with_what_would_do():
     with pytest.raises(InputError, match="use a thinner target"):
-        graspability.grasp_tables(Shelf(), Gripper(), Target(half_size=(0.05, 0.05, 0.05)), GraspConfig())
+        graspability.grasp_tables(Gripper(), Target(half_size=(0.05, 0.05, 0.05)), GraspConfig())
     with pytest.raises(InputError, match="waypoints"):
         GraspConfig(waypoints=1)
 
@@ -118,7 +118,7 @@ def test_what_the_target_sweeps_is_the_target_and_its_way():
 
 def test_a_found_target_in_the_open_is_grasped_and_one_behind_a_wall_of_boxes_is_not(problem):
     pose = jnp.float32([0.6, 0.1, 0.0])
-    free = planner.graspable_at(problem, superquadric.empty(8), pose)
+    free = best_grasp(problem.target_grasps, superquadric.empty(8), pose)
     assert bool(free.success)
     np.testing.assert_allclose(free.action.T_world_gripper[:2, 3], pose[:2], atol=1e-5)
     wall = superquadric.empty(8)
@@ -129,6 +129,6 @@ def test_a_found_target_in_the_open_is_grasped_and_one_behind_a_wall_of_boxes_is
             position=wall.position.at[i].set(jnp.float32([0.5, y, problem.shelf.board + 0.15])),
             valid=wall.valid.at[i].set(True),
         )
-    blocked = planner.graspable_at(problem, wall, pose)
+    blocked = best_grasp(problem.target_grasps, wall, pose)
     assert not bool(blocked.success)
     assert int(blocked.hits) >= 1

@@ -28,6 +28,7 @@ from mechsearch_jax.planner.objective import SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import PredictByKind
 from mechsearch_jax.planner.proposal import ALONE, DEPTH, as_predicted, blame, passed_on, sampling_weights
 from mechsearch_jax.planner.rollout import Rollout, plan, prefix_values, present_state, repeated, sequence_values
+from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import scenario
 
@@ -395,7 +396,7 @@ def test_the_same_key_and_state_give_the_same_decision(decision, problem):
 
 def test_nothing_is_compiled_anew_when_objects_come_go_or_move(decision, problem):
     objects = decision[0]
-    functions = (policies._plan, planner.update_belief, planner.graspable_at)
+    functions = (policies._plan, planner.update_belief, best_grasp)
     counts = [f._cache_size() for f in functions]
     fewer = objects.replace(valid=objects.valid.at[0].set(False))
     moved = objects.replace(position=objects.position.at[1].add(jnp.float32([0.01, 0.02, 0.0])))
@@ -405,7 +406,7 @@ def test_nothing_is_compiled_anew_when_objects_come_go_or_move(decision, problem
     found = look(problem, objects, True, (0.7, 0.2, 0.0))
     told = POLICY(jax.random.key(1), problem, found, seen(objects, True, (0.7, 0.2, 0.0)))
     assert float(told.cost) < superquadric.empty(8).capacity + 3
-    planner.graspable_at(problem, fewer, jnp.float32([0.6, 0.0, 0.0]))
+    best_grasp(problem.target_grasps, fewer, jnp.float32([0.6, 0.0, 0.0]))
     after = [f._cache_size() for f in functions]
     assert after[:2] == counts[:2]
     assert after[2] <= counts[2] + 1

@@ -13,6 +13,7 @@ from mechsearch_jax.geometry.superquadric import empty, pad
 from mechsearch_jax.graspability import INFEASIBLE, graspability, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner.rollout import present_state
+from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.workspace import scenario
 
 CAPACITIES = (8, 12)
@@ -67,13 +68,13 @@ def test_an_object_draws_the_same_numbers():
 def test_the_target_is_taken_out_the_same_way(problem, objects):
     scenes = [pad(objects, capacity) for capacity in CAPACITIES]
     pose = jnp.float32([0.6, 0.1, 0.0])
-    one, other = (planner.graspable_at(problem, scene, pose) for scene in scenes)
+    one, other = (best_grasp(problem.target_grasps, scene, pose) for scene in scenes)
     same(one, other)
     assert one.feasible
     assert 0 < one.hits < INFEASIBLE
     # Nothing is feasible where there is nothing to be grasped.
     for scene in scenes:
-        none = planner.graspable_at(problem, scene, pose, jnp.array(False))
+        none = best_grasp(problem.target_grasps, scene, pose, jnp.array(False))
         assert (bool(none.success), bool(none.feasible), int(none.hits)) == (False, False, INFEASIBLE)
 
 

@@ -111,7 +111,7 @@ def test_the_cost_of_a_pushed_target_is_that_of_its_candidate(problem, objects, 
     _, after, cost = states
     pose = int(np.argmax(after.target_at))
     rows = pairs(problem.grasps)
-    hits = grasp_hits(problem.grasps, None, objects, jnp.asarray(after.target_at))
+    hits = grasp_hits(problem.grasps, objects, jnp.asarray(after.target_at))
     of_pose = np.asarray(rows.pose) == pose
     np.testing.assert_array_equal(after.hits[: len(of_pose), :8][of_pose], np.asarray(hits)[of_pose])
     g, crowd = (float(of(rows, hits)[pose]) for of in (graspability, crowding))

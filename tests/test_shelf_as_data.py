@@ -27,10 +27,10 @@ from mechsearch_jax.perception import recogniser as recognising
 from mechsearch_jax.perception import recognition
 from mechsearch_jax.perception.recogniser import Recogniser
 from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
-from mechsearch_jax.planner.retrieval import graspable_at
 from mechsearch_jax.planner.rollout import no_sequences
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.problem.problem import build_problem
+from mechsearch_jax.retrieval import best_grasp
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.runtime.compiled import Kept
@@ -150,11 +150,11 @@ def test_a_plan_is_traced_once_for_both(two):
 
 def test_belief_and_retrieval_are_compiled_once_for_both(two):
     pose = jnp.float32([0.6, 0.1, 0.0])
-    parts = initial_belief, update_belief, graspable_at
+    parts = initial_belief, update_belief, best_grasp
 
     def run(problem):
         belief = update_belief(problem, initial_belief(problem), SEEN)
-        return belief, graspable_at(problem, OBJECTS, pose)
+        return belief, best_grasp(problem.target_grasps, OBJECTS, pose)
 
     # Compiled before, as for an episode, whatever ran before.
     (belief, grasp), sizes = run(two[0]), [cache_size(f) for f in parts]

@@ -104,7 +104,7 @@ def test_nothing_is_built_for_a_camera_that_sees_nothing(problem, monkeypatch):
     def built(*args, **kwargs):
         raise AssertionError("tables were built")
 
-    for name in ("grasp_tables", "existence_tables", "action_tables"):
+    for name in ("candidate_grasps", "grasp_tables", "existence_tables", "action_tables"):
         monkeypatch.setattr(problems, name, built)
     camera = mistaken(Camera())[INVERTED]
     for make in (

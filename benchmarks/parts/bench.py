@@ -158,7 +158,7 @@ def f_of(problem: Problem, scene: Superquadrics) -> Bool[Array, " x"]:
 
 def g_of(problem: Problem, belief: Belief, scene: Superquadrics) -> Int[Array, " x"]:
     """g of a single state, where f = 1."""
-    return graspability(pairs(problem.grasps), grasp_hits(problem.grasps, None, scene, belief.exists))
+    return graspability(pairs(problem.grasps), grasp_hits(problem.grasps, scene, belief.exists))
 
 
 def bench_part(

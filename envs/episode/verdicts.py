@@ -10,16 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from mechsearch_jax.belief.found_target import no_grasps
 from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, true_target_pose
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, transform, upright_pose
-from mechsearch_jax.graspability import grasp_hits
 from mechsearch_jax.planner import Problem, paper
-from mechsearch_jax.planner.retrieval import best_grasp, graspable_at
-from mechsearch_jax.problem.problem import TargetGrasps, target_grasps
+from mechsearch_jax.retrieval import TargetGrasps, best_grasp, no_grasps, straight_hits, target_grasps
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.workspace.camera import Camera
@@ -56,10 +53,9 @@ def paper_grasps(shelf: Shelf, gripper: Gripper, target: Target) -> TargetGrasps
 def judge(problem: Problem, here: Snapshot) -> Verdict:
     """The verdict on one scene."""
     objects, pose = objects_on_the_board(here), true_target_pose(here.world)
-    others = paper_grasps(problem.shelf, problem.gripper, problem.target)
-    # The first called as the policies call it, so that nothing is compiled twice.
-    found = graspable_at(problem, objects, pose).success, _graspable(others, objects, pose)
-    return Verdict(*map(bool, jax.device_get(found)))
+    # Called as the policies call it, so that nothing is compiled twice.
+    free = [best_grasp(grasps, objects, pose).success for grasps in judged_sets(problem)]
+    return Verdict(*map(bool, jax.device_get(free)))
 
 
 def judge_many(problem: Problem, worlds: World, active: Bool[Array, " n"]) -> list[Verdict]:
@@ -100,13 +96,8 @@ def swept_free(
     wanted = jnp.broadcast_to(active, tables.q7.shape)
     free = wanted & ~masked_vmap(touches, wanted, shelf, None, (T_world_gripper, tables.clouds))
     found = no_grasps(grasps).replace(T_world_target=T_world_target, feasible=free)
-    hits = grasp_hits(tables, found, scene, jnp.asarray(active)[None])
+    hits = straight_hits(tables, found, scene, active)
     return jnp.any(free & ~jnp.any(hits, axis=1))
-
-
-@kept()
-def _graspable(grasps: TargetGrasps, objects: Superquadrics, pose: Float[Array, " 3"]) -> Bool[Array, ""]:
-    return best_grasp(grasps, objects, pose).success
 
 
 @kept()

@@ -18,7 +18,7 @@ from mechsearch_jax.envs.camera.simulated_camera import target_pixels
 from mechsearch_jax.envs.simulators.native import NativeWorld
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.graspability import GraspConfig, GraspTables, feasible_grasps, grasp_tables
+from mechsearch_jax.graspability import GraspConfig, GraspTables, candidate_grasps, feasible_grasps, grasp_tables
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.errors import InputError
@@ -103,7 +103,7 @@ def graspable_alone(shelf: Shelf, target: Target, gripper: Gripper | None = None
 
     See `_approaching`.
     """
-    tables = grasp_tables(shelf, _approaching(gripper), target, GraspConfig())
+    tables = candidate_grasps(shelf, _approaching(gripper), target, GraspConfig())
     graspable = np.zeros(len(tables.T_world_target), bool)
     graspable[np.asarray(tables.pair_pose)] = True
     graspable.setflags(write=False)
@@ -114,7 +114,7 @@ def graspable_at(shelf: Shelf, target: Target, gripper: Gripper | None = None) -
     """What tells of any pose (x, y [m], yaw [rad]) whether the target could be grasped there if there were no other
     objects. See `_approaching`."""
     gripper = _approaching(gripper)
-    tables = grasp_tables(shelf, gripper, target, GraspConfig(), candidates=False)
+    tables = grasp_tables(gripper, target, GraspConfig())
     return lambda pose: bool(_any_grasp(tables, shelf, gripper, target, jnp.asarray(pose, jnp.float32)))
 
 

@@ -42,7 +42,7 @@ def retrieve_action(
 
 @dataclasses.dataclass(frozen=True)
 class Retrieve:
-    """A `kind.Kind`; which grasp takes the target out, `planner.retrieval` decides."""
+    """A `kind.Kind`; which grasp takes the target out, `retrieval` decides."""
 
     code: int = CODE
     name: str = "retrieve"

@@ -9,14 +9,14 @@ from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
-from mechsearch_jax.belief.found_target import found_grasps, no_grasps
 from mechsearch_jax.belief.unseen_motion import reopened
 from mechsearch_jax.existence import allowances, closer_image, existence, object_views, plainly_elsewhere
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import upright_pose
-from mechsearch_jax.graspability import FoundGrasps, grasp_hits, graspability, pairs
+from mechsearch_jax.graspability import grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.retrieval import FoundGrasps, found_grasps, no_grasps
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 
@@ -174,4 +174,4 @@ def with_target(problem: Problem, belief: Belief, objects: Superquadrics) -> tup
 def graspability_map(problem: Problem, belief: Belief, objects: Superquadrics) -> Int[Array, " x"]:
     """g at every candidate pose, also where f is 0: 1, 0, -1, ... (section B.4), shape (X,)."""
     everywhere = jnp.ones(problem.poses.shape[0], bool)
-    return graspability(pairs(problem.grasps), grasp_hits(problem.grasps, None, objects, everywhere))
+    return graspability(pairs(problem.grasps), grasp_hits(problem.grasps, objects, everywhere))

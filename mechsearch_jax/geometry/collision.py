@@ -17,6 +17,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int, Integer, UInt8
 
 from mechsearch_jax.geometry import superquadric
@@ -54,6 +55,11 @@ class Clouds(flax.struct.PyTreeNode):
 def clouds_of(points: Float[Array, "c 3 p"]) -> Clouds:
     """Clouds from their points, as rows of coordinates [m]."""
     return Clouds(points, jnp.min(points, axis=-1), jnp.max(points, axis=-1))
+
+
+def gap_of(points: Float[np.ndarray, "p 3"], first: int) -> float:
+    """`Clouds.gap` of a cloud: how far a point is at most from the nearest of the first ones [m]."""
+    return float(scipy.spatial.KDTree(points[:first]).query(points)[0].max()) if len(points) > first else 0.0
 
 
 def collisions(

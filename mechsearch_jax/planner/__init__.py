@@ -24,7 +24,6 @@ from mechsearch_jax.planner.policies import (
     search_and_grasp,
     search_for_grasp,
 )
-from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at
 from mechsearch_jax.planner.state import Decision, Sequences
 from mechsearch_jax.problem.problem import Problem, build_problem
 
@@ -36,7 +35,6 @@ __all__ = [
     "Belief",
     "Config",
     "Decision",
-    "GraspChoice",
     "Option",
     "PlannerConfig",
     "Policy",
@@ -50,7 +48,6 @@ __all__ = [
     "build_problem",
     "expanded",
     "graspability_map",
-    "graspable_at",
     "greedy",
     "initial_belief",
     "paper",

@@ -49,7 +49,7 @@ def _where_and_how_graspable(problem, belief, state):
     nothing tells where it really went.
     """
     f = possible_poses(belief, state.exists, state.target_at).astype(jnp.float32)
-    rows = pairs(problem.grasps, belief.grasps)
+    rows = pairs(problem.grasps, belief.grasps.feasible)
     hidden = jnp.append(state.exists & belief.found, False)
     g = jnp.minimum(graspability(rows, state.hits), jnp.where(hidden, 1 - INFEASIBLE, 1)).astype(jnp.float32)
     return f, 1.0 - g, crowding(rows, state.hits)

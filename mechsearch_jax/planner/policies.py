@@ -30,11 +30,11 @@ from mechsearch_jax.planner.imitation import IMITATIONS, Slots
 from mechsearch_jax.planner.objective import Indifferent, Objective, SearchAndGrasp, SearchForGrasp
 from mechsearch_jax.planner.prediction import Predict, PredictByKind
 from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted, guided_draw
-from mechsearch_jax.planner.retrieval import GraspChoice, graspable_at, worth_trying
 from mechsearch_jax.planner.rollout import Rollout, no_sequences, plan
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import grasps_to_try, in_turn, sequences_to_try
 from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.retrieval import GraspChoice, best_grasp, worth_trying
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
 
@@ -160,8 +160,8 @@ class Search(flax.struct.PyTreeNode):
         """
         # Called the same as elsewhere where the target is known to be found, so that nothing is compiled twice.
         active = (belief.found,) if isinstance(belief.found, Tracer) else ()
-        look = worth_trying if self.tries else graspable_at
-        grasp = look(problem, observation.objects, belief.found_pose, *active)
+        look = worth_trying if self.tries else best_grasp
+        grasp = look(problem.target_grasps, observation.objects, belief.found_pose, *active)
         return _retrieval(self, belief, observation, grasp)
 
     def search(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:

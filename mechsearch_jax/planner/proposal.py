@@ -106,7 +106,7 @@ def sampling_weights(
     A found target that may be pushed is one more object in the way of each of its grasps that is blocked; where none is
     feasible, it alone is in the way.
     """
-    rows = pairs(problem.grasps, belief.grasps)
+    rows = pairs(problem.grasps, belief.grasps.feasible)
     counts = rows.allowed & objective.needs_graspability(belief, state)[rows.pose]
     target = state.available & state.is_target
     blocked = jnp.any(state.hits, axis=1)

@@ -21,7 +21,6 @@ from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.sampler import contact_risk
 from mechsearch_jax.actions.types import Action, Prediction, Sample
 from mechsearch_jax.belief.belief import Belief, possible_space, with_target
-from mechsearch_jax.belief.found_target import found_hits
 from mechsearch_jax.belief.moved_target import candidate_of
 from mechsearch_jax.config.config import PlannerConfig
 from mechsearch_jax.existence import existence, no_views, object_views
@@ -33,6 +32,7 @@ from mechsearch_jax.planner.prediction import Predict
 from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted
 from mechsearch_jax.planner.state import Decision, Sequences, State
 from mechsearch_jax.problem.problem import Problem
+from mechsearch_jax.retrieval import found_hits
 
 # A sequence whose value is a smaller share of J gains nothing.
 GAIN = 0.02
@@ -84,7 +84,7 @@ def present_state(problem: Problem, belief: Belief, objects: Superquadrics, conf
         exists=belief.exists,
         target_at=jnp.zeros_like(belief.exists),
         views=no_views(scene.capacity, problem.config.existence, places),
-        hits=no_hits(pairs(problem.grasps, belief.grasps), scene.capacity),
+        hits=no_hits(pairs(problem.grasps, belief.grasps.feasible), scene.capacity),
         options=no_candidates(problem.space, scene.capacity),
         moved=scene.valid,
         available=scene.valid & (~is_target | config.move_target),
@@ -130,7 +130,7 @@ class Rollout:
         grasps, known = self.belief.grasps, problem.grasps.pair_pose.shape[0]
         # Where the target has moved, other rows of H count, of which nothing is known yet.
         unknown = moved | jnp.any(moved & state.is_target)
-        hits = grasp_hits(problem.grasps, None, objects, counts, state.hits[:known], unknown)
+        hits = grasp_hits(problem.grasps, objects, counts, state.hits[:known], unknown)
         of_found = found_hits(problem.target_grasps, grasps, objects, found, state.hits[known:], moved)
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, of_found]))
 

@@ -26,7 +26,7 @@ from mechsearch_jax.planner.state import Alternatives, Decision, Sequences
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.runtime.compiled import kept
 
-# So many alternatives of a kind are tried out at most: grasps of a found target, or first actions of sequences.
+# So many first actions of sequences are tried out at most; of grasps `retrieval.TRIES`.
 TRIES = 8
 # What a plan may begin with.
 PLANNED = tuple(ActionKind(kind.code) for kind in SAMPLED_KINDS)

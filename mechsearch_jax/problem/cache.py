@@ -17,7 +17,7 @@ import numpy as np
 from mechsearch_jax.actions.config import ActionTables
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import ExistenceTables
-from mechsearch_jax.graspability import GraspTables
+from mechsearch_jax.graspability import CandidateGrasps, GraspTables
 from mechsearch_jax.problem import problem as problems
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.gripper import Gripper
@@ -34,7 +34,7 @@ VARIABLE = "MECHSEARCH_CACHE_DIR"
 # So many built problems are kept, for users who switch between versions of the package.
 CACHED_PROBLEMS = 6
 
-_TABLES = {"existence": ExistenceTables, "grasps": GraspTables, "actions": ActionTables, "retrieval": GraspTables}
+_TABLES = {"existence": ExistenceTables, "grasps": CandidateGrasps, "actions": ActionTables, "retrieval": GraspTables}
 _ARRAYS = ("poses", "cell")
 
 

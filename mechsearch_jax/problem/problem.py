@@ -10,7 +10,8 @@ from mechsearch_jax.actions.config import ActionSpace, ActionTables, action_tabl
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.existence import ExistenceTables, existence_tables
-from mechsearch_jax.graspability import GraspConfig, GraspTables, grasp_tables
+from mechsearch_jax.graspability import CandidateGrasps, GraspTables, candidate_grasps, grasp_tables
+from mechsearch_jax.retrieval import TargetGrasps
 from mechsearch_jax.robot.entry import check_outside
 from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.runtime.cores import on_host
@@ -24,38 +25,12 @@ from mechsearch_jax.workspace.target import Target
 NOWHERE = "shelf: the arm reaches the target nowhere; check the shelf's place before the robot"
 
 
-class TargetGrasps(flax.struct.PyTreeNode):
-    """The grasps for taking out a found target, and what decides which of them are feasible.
-
-    Attributes:
-      tables: of the grasps, without candidate poses.
-      shelf: data.
-      gripper, target, config: static.
-    """
-
-    tables: GraspTables
-    shelf: Shelf
-    gripper: Gripper = flax.struct.field(pytree_node=False)
-    target: Target = flax.struct.field(pytree_node=False)
-    config: GraspConfig = flax.struct.field(pytree_node=False)
-
-
-def target_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: GraspConfig) -> TargetGrasps:
-    """The grasps of a configuration for a found target. Not to be called inside `jit`.
-
-    Raises:
-      InputError: the target is too wide for the gripper.
-    """
-    tables = grasp_tables(shelf, gripper, target, config, candidates=False)
-    return TargetGrasps(tables, shelf, gripper, target, config)
-
-
 class Problem(flax.struct.PyTreeNode):
     """The constants of an episode: everything but the objects, and the tables that follow from it.
 
     Attributes:
       existence, grasps, actions: tables of f, g and the actions.
-      retrieval: a denser set of grasps for the found target, without candidate poses.
+      retrieval: a denser set of grasps for the found target.
       poses: the candidate poses X as x, y [m], yaw [rad], shape (X, 3).
       cell: their spacing in x and y [m], shape (2,).
       camera, shelf: dynamic but for the image's size, so that other poses compile nothing.
@@ -63,7 +38,7 @@ class Problem(flax.struct.PyTreeNode):
     """
 
     existence: ExistenceTables
-    grasps: GraspTables
+    grasps: CandidateGrasps
     actions: ActionTables
     retrieval: GraspTables
     poses: jax.Array
@@ -114,14 +89,14 @@ def build_problem(
     check_kinds(config.actions.actions)
     # This compiles a hundred small programs, which takes longer for a GPU.
     with on_host():
-        grasps = grasp_tables(shelf, gripper, target, config.grasps)
+        grasps = candidate_grasps(shelf, gripper, target, config.grasps)
         if grasps.pair_pose.shape[0] == 0:
             raise InputError(NOWHERE)
         tables = {
             "existence": existence_tables(camera, shelf, target, config.existence),
             "grasps": grasps,
             "actions": action_tables(gripper, config.grasps.wrists, config.actions),
-            "retrieval": target_grasps(shelf, gripper, target, config.retrieval).tables,
+            "retrieval": grasp_tables(gripper, target, config.retrieval),
             "poses": target.candidate_poses(shelf),
             "cell": np.array(target.cell(shelf)[:2], np.float32),
         }

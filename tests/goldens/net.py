@@ -130,6 +130,7 @@ def chosen_actions():
     from mechsearch_jax.actions import ActionKind, no_action
     from mechsearch_jax.observation import Observation
     from mechsearch_jax.problem.cache import cached_problem
+    from mechsearch_jax.retrieval import best_grasp
     from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario, superquadrics
 
     scenario = load_scenario(example_scenarios()["first-light"])
@@ -145,7 +146,7 @@ def chosen_actions():
         found.append(jax.tree.map(lambda a, i=first: a[i], firsts))
     clear = objects.replace(valid=jnp.zeros_like(objects.valid))
     x, y, _ = scenario.target.position
-    found.append(planner.graspable_at(problem, clear, jnp.float32([x, y, 0.0])).action)
+    found.append(best_grasp(problem.target_grasps, clear, jnp.float32([x, y, 0.0])).action)
     return {
         name: np.stack([np.asarray(getattr(action, name)) for action in found])
         for name in ("T_world_gripper", "displacement", "T_world_place", "q7", "opening", "object")
