@@ -1,0 +1,192 @@
+"""A closer look, in a finer image, at places where the coarse one leaves in doubt whether the target would be found."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from mechsearch_jax.existence.config import ExistenceConfig
+from mechsearch_jax.existence.function import in_window, shown_pixels
+from mechsearch_jax.existence.tables import ExistenceTables
+from mechsearch_jax.existence.views import ObjectViews, without_unseen
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import inverse, make, transform
+from mechsearch_jax.workspace import render
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.detector import found_pixels
+from mechsearch_jax.workspace.target import Target
+
+# The most coarse pixels that a target may show for a closer look to be worth it; no target that the detector misses was
+# seen to show more than 12.
+DOUBTFUL = 16
+# Of a pose's places those that show least are looked at again, this many.
+CLOSER_PLACES = 3
+# A count at a third of the camera's resolution may be off by as much.
+CLOSER_TOLERANCE = 1.5
+# A target shows so many times what the detector needs where it cannot be missed: neither for a sensor that measures a
+# third of its pixels only, nor behind an object that is recognised 5 mm too narrow along one side of it.
+PLAIN = 3.0
+# An object that is recognised a little elsewhere, or touches the target, reaches no deeper into it than this [m].
+TOUCHING = 0.01
+# Of a found target's image and the largest one of a candidate.
+NEARER = 1.25
+# The edges of superquadrics that stand for boxes and cylinders are rounded: what they hide is that of a larger one [m].
+ROUNDED = 1e-3
+
+
+def allowances(
+    tables: ExistenceTables,
+    camera: Camera,
+    target: Target,
+    views: ObjectViews,
+    closer: Float[Array, "h w"],
+    config: ExistenceConfig,
+) -> Int[Array, "x s"]:
+    """How many coarse pixels a target that the detector does not find may show at each place.
+
+    As many as the detector's threshold makes; more where no place of a pose shows as few, but a closer look at what the
+    camera sees now says that the target is hidden.
+
+    Args:
+      tables: constants of the problem.
+      camera: the camera at full resolution.
+      target: static.
+      views: of the objects that the camera sees.
+      closer: of `closer_image`.
+      config: static.
+    """
+    least = config.allowed(camera)
+    bound = jnp.full(tables.corner.shape[:2], least, jnp.int32)
+    if config.criterion != "detector" or not config.closer_look:
+        return bound
+    everywhere = jnp.ones(tables.corner.shape[0], bool)
+    coarse = camera.scaled(config.step(camera))
+    image = render.merge_windows(coarse, views.windows)
+    shown = shown_pixels(tables, coarse, image, everywhere)
+    free = jnp.ones(shown.shape, bool) if views.collides is None else ~jnp.any(views.collides, axis=-1)
+    settled = jnp.any(free & (shown <= least), axis=1)
+    doubtful = free & ~settled[:, None] & (shown > least) & (shown <= DOUBTFUL)
+    order = jnp.argsort(jnp.where(doubtful, shown, DOUBTFUL + 1), axis=1, stable=True)
+    doubtful &= jnp.argsort(order, axis=1) < CLOSER_PLACES
+    counted = _counted(tables, camera, target, closer, doubtful, config)
+    hidden = doubtful & (counted <= CLOSER_TOLERANCE * found_pixels(camera, config.found_pixels))
+    return jnp.where(hidden, shown, bound)
+
+
+def _counted(
+    tables: ExistenceTables,
+    camera: Camera,
+    target: Target,
+    closer: Float[Array, "h w"],
+    doubtful: Bool[Array, "x s"],
+    config: ExistenceConfig,
+) -> Float[Array, "x s"]:
+    """Pixels of the full resolution that a target shows at doubtful places, by a closer look; 0 at the others."""
+
+    def counted(shared, closer, T):
+        tables, camera = shared
+        return _pixels(tables, camera, target, closer, T, config)
+
+    T, mask = tables.T_world_target.reshape(-1, 4, 4), doubtful.reshape(-1)
+    return masked_vmap(counted, mask, (tables, camera), closer, T, block=64).reshape(doubtful.shape)
+
+
+def closer_image(
+    camera: Camera, scene: Superquadrics, views: ObjectViews, config: ExistenceConfig
+) -> Float[Array, "h w"]:
+    """The depth image of a closer look [m]; the coarse one where the configuration has none.
+
+    Args:
+      camera: the camera at full resolution.
+      scene: the objects that the camera sees, fields (N, ...).
+      views: of them.
+      config: static.
+    """
+    scale, step = config.closer_step(camera), config.step(camera)
+    closer, grown = camera.scaled(scale), step / scale
+    if scale == step:
+        return render.merge_windows(closer, views.windows)
+    window = math.ceil(config.window[0] * grown), math.ceil(config.window[1] * grown)
+    scene = scene.replace(size=scene.size + ROUNDED)
+
+    def view(closer, _, body):
+        return render.object_window(closer, body, window)
+
+    windows = without_unseen(masked_vmap(view, scene.valid, closer, None, scene, block=1), scene.valid)
+    return render.merge_windows(closer, windows)
+
+
+def _pixels(
+    tables: ExistenceTables,
+    camera: Camera,
+    target: Target,
+    closer: Any,
+    T_world_target: Float[Array, "4 4"],
+    config: ExistenceConfig,
+    nearer: float = 1.0,
+) -> Float[Array, ""]:
+    """How many pixels of the full resolution a target would show, counted in the image of a closer look.
+
+    Args:
+      tables: constants of the problem.
+      camera: the camera at full resolution.
+      target: static.
+      closer: of `closer_image`.
+      T_world_target: where the target would stand.
+      config: static.
+      nearer: how many times as large as the largest candidate its image may be; static.
+    """
+    scale = config.closer_step(camera)
+    grown = nearer * config.step(camera) / scale
+    h, w = tables.depth.shape[-2:]
+    window = math.ceil(h * grown), math.ceil(w * grown)
+    placed = Superquadrics(
+        size=jnp.float32(target.half_size),
+        exponents=jnp.array(target.exponents, np.float32),
+        position=T_world_target[:3, 3],
+        rotation=T_world_target[:3, :3],
+        valid=jnp.array(True),
+    )
+    target_image = render.object_window(camera.scaled(scale), placed, window)
+    behind, inside = in_window(camera.scaled(scale), closer, target_image.corner, window)
+    return jnp.sum(inside & (target_image.depth < behind)) * float(scale**2)
+
+
+def plainly_elsewhere(
+    tables: ExistenceTables,
+    camera: Camera,
+    target: Target,
+    scene: Superquadrics,
+    closer: Float[Array, "h w"],
+    T_world_target: Float[Array, "4 4"],
+    config: ExistenceConfig,
+) -> Bool[Array, ""]:
+    """Whether a target that the detector does not see cannot be at a pose: it would be in plain sight there, or an
+    object stands there. In doubt it can.
+
+    Args:
+      tables: constants of the problem.
+      camera: the camera at full resolution.
+      target: static.
+      scene: the objects that the camera sees, fields (N, ...).
+      closer: of `closer_image`.
+      T_world_target: the pose, which need not be a candidate.
+      config: static.
+    """
+    shows = _pixels(tables, camera, target, closer, T_world_target, config, NEARER)
+    slim = jnp.maximum(scene.size - TOUCHING, 0.25 * scene.size)
+    points = transform(T_world_target, tables.cloud.T)
+
+    def reaches(size, exponents, position, rotation):
+        local = transform(inverse(make(rotation, position)), points)
+        return jnp.any(superquadric.gauge(size, exponents, local) < 1.0)
+
+    inside = jax.vmap(reaches)(slim, scene.exponents, scene.position, scene.rotation) & scene.valid
+    return (shows > PLAIN * found_pixels(camera, config.found_pixels)) | jnp.any(inside)

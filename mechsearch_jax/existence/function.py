@@ -1,0 +1,119 @@
+"""f itself: where a target would show few enough pixels, and run into nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Shaped
+
+from mechsearch_jax.existence.config import ExistenceConfig
+from mechsearch_jax.existence.tables import ExistenceTables
+from mechsearch_jax.existence.views import ObjectViews
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.workspace import render
+from mechsearch_jax.workspace.camera import Camera
+
+# What "depth-mse" takes for the depth where no object is seen [m].
+FAR = 1.5
+
+
+def existence(
+    tables: ExistenceTables,
+    camera: Camera,
+    views: ObjectViews,
+    exists: Bool[Array, " x"],
+    allowed: Int[Array, "x s"],
+    config: ExistenceConfig,
+) -> Bool[Array, " x"]:
+    """`f_t` from `f_{t-1}` and the views of the objects (equation 4 with c = 0): it can only shrink.
+
+    Args:
+      tables: constants of the problem.
+      camera: the camera at full resolution.
+      views: of all objects, with the collisions of every pose where `exists` if they count.
+      exists: `f_{t-1}`; all True at the start.
+      allowed: how many coarse pixels a hidden target may show, see `allowances`.
+      config: static.
+
+    Returns:
+      Where the target can be.
+    """
+    coarse = camera.scaled(config.step(camera))
+    image = render.merge_windows(coarse, views.windows)
+    if config.criterion == "detector":
+        possible = shown_pixels(tables, coarse, image, exists) <= allowed
+    else:
+        possible = _alike(tables, coarse, image, exists, config)
+    if views.collides is not None:
+        possible &= ~jnp.any(views.collides, axis=-1)
+    return exists & jnp.any(possible, axis=-1)
+
+
+def _at_places(
+    tables: ExistenceTables,
+    coarse: Camera,
+    image: Float[Array, "h w"],
+    exists: Bool[Array, " x"],
+    measure: Callable[[Array, Array, Array], Array],
+) -> Shaped[Array, "x s"]:
+    """A measure of the target's window at each place of the poses that matter; 0 at the others.
+
+    Args:
+      tables: constants of the problem.
+      coarse: the camera at the coarse resolution, whose size alone counts.
+      image: its depth image of the objects.
+      exists: the poses that matter.
+      measure: of the target's depth, the depth behind it, and which pixels are in the image; closes over no array.
+    """
+
+    def at_places(_, image, row):
+        def at(depth, corner):
+            return measure(depth, *in_window(coarse, image, corner, depth.shape))
+
+        return jax.vmap(at)(*row)
+
+    # All of them at once, for every state of a batch, would be most of a plan's memory.
+    return masked_vmap(at_places, exists, None, image, (tables.depth, tables.corner), block=512)
+
+
+def in_window(camera: Camera, image: Any, corner: Array, window: tuple[int, int]) -> tuple[Array, Array]:
+    """What a camera's image shows in a window, and which of the window's pixels are in the image."""
+    height, width = camera.height, camera.width
+    rows = corner[0] + jnp.arange(window[0])[:, None]
+    columns = corner[1] + jnp.arange(window[1])[None]
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    return image[jnp.clip(rows, 0, height - 1), jnp.clip(columns, 0, width - 1)], inside
+
+
+def shown_pixels(
+    tables: ExistenceTables,
+    coarse: Camera,
+    image: Float[Array, "h w"],
+    exists: Bool[Array, " x"],
+) -> Int[Array, "x s"]:
+    """How many coarse pixels the target would show at each place of the poses that matter; 0 at the others."""
+
+    def shown(depth, behind, inside):
+        return jnp.sum(inside & (depth < behind))
+
+    return _at_places(tables, coarse, image, exists, shown)
+
+
+def _alike(
+    tables: ExistenceTables,
+    coarse: Camera,
+    image: Float[Array, "h w"],
+    exists: Bool[Array, " x"],
+    config: ExistenceConfig,
+) -> Bool[Array, "x s"]:
+    """Whether the depth image with the target at each place of the poses that matter is like the one without."""
+
+    def alike(depth, behind, inside):
+        difference = jnp.where(inside, jnp.maximum(jnp.minimum(behind, FAR) - depth, 0.0), 0.0)
+        square = jnp.sum(jnp.where(jnp.isfinite(depth), difference, 0.0) ** 2)
+        return square / (coarse.height * coarse.width) < config.depth_threshold
+
+    return _at_places(tables, coarse, image, exists, alike)

@@ -1,0 +1,124 @@
+"""What f needs of the candidate poses, the camera and the target, computed once for a problem."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from mechsearch_jax.existence.config import ExistenceConfig
+from mechsearch_jax.geometry import superquadric
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import transform, upright_pose
+from mechsearch_jax.workspace import render
+from mechsearch_jax.workspace.camera import Camera, project
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+
+class ExistenceTables(flax.struct.PyTreeNode):
+    """What f needs of the candidate poses, the camera and the target: constants of a `Problem`.
+
+    Attributes:
+      T_world_target: the places where the target is tried, shape (X, S, 4, 4).
+      depth: the target's depth in a window at each place, infinite around it, shape (X, S, h, w) [m].
+      corner: first row and column of that window in the coarse image, shape (X, S, 2).
+      middle: row and column of the pixel in the middle of the target's image at the first place, shape (X, 2).
+      nearest: the least depth of the target at the first place, shape (X,) [m].
+      cloud: surface of the drawn-in target in its own frame as rows of coordinates, shape (3, P) [m].
+      radius: radius of a sphere that holds the target [m].
+    """
+
+    T_world_target: jax.Array
+    depth: jax.Array
+    corner: jax.Array
+    middle: jax.Array
+    nearest: jax.Array
+    cloud: jax.Array
+    radius: jax.Array
+
+
+def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: ExistenceConfig) -> ExistenceTables:
+    """Precompute, for every candidate pose, the target's own depth image and collision cloud."""
+    places = target.places(shelf, config.places)
+    T = jax.jit(upright_pose)(np.asarray(places, np.float32), target.height(shelf))
+    coarse = camera.scaled(config.step(camera))
+    half = np.array(target.half_size, np.float32)
+    window, around = target_window(coarse, half, T)
+
+    def view(coarse, pose):
+        placed = Superquadrics(
+            size=jnp.asarray(half),
+            exponents=jnp.array(target.exponents),
+            position=pose[:3, 3],
+            rotation=pose[:3, :3],
+            valid=jnp.array(True),
+        )
+        return render.object_window(coarse, placed, window), render.window_place(coarse, placed, around)[0]
+
+    each = jax.vmap(jax.vmap(view, in_axes=(None, 0)), in_axes=(None, 0))
+    views, first = jax.jit(each)(coarse, T)
+    depth, corner, first = jax.device_get((views.depth, views.corner, first))
+    middle = first[:, 0] + np.array(around, np.int32)[None] // 2
+    sample = jax.jit(superquadric.sample_surface, static_argnames="count")
+    cloud = np.asarray(
+        sample(half - np.float32(config.erosion), np.array(target.exponents, np.float32), count=config.points)
+    )
+    nearest = depth[:, 0].min(axis=(-1, -2))
+    radius = np.float32(np.linalg.norm(half))
+    return ExistenceTables(*jax.device_put((T, depth, corner, middle, nearest, cloud.T, radius)))
+
+
+def _window_side(extent: float) -> int:
+    """How many rows or columns of pixels hold an image that is so many pixels long, wherever it begins: an even number.
+
+    A camera that was calibrated again sees the target a little larger or smaller. Were this the least number, such a
+    camera would now and then change a shape, and all that is compiled for it.
+    """
+    # What is measured in single precision may be measured as a little more elsewhere.
+    return 2 * math.ceil((math.ceil(extent + 1e-3) + 1) / 2)
+
+
+def target_window(
+    coarse: Camera, half: Float[np.ndarray, "3"], T_world_target: Float[Array, "*batch 4 4"]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Rows and columns of a window that holds what a camera sees of a target at each of some poses, and of the least
+    such window, whose middle does not depend on how the other's sides are rounded.
+
+    Hardly larger than the image with one pixel around it, wherever the camera is.
+
+    Args:
+      coarse, half, T_world_target: as of `target_extent`.
+    """
+    rows, columns = target_extent(coarse, half, T_world_target)
+    return (_window_side(rows), _window_side(columns)), (math.ceil(rows) + 2, math.ceil(columns) + 2)
+
+
+def target_extent(
+    coarse: Camera, half: Float[np.ndarray, "3"], T_world_target: Float[Array, "*batch 4 4"]
+) -> tuple[float, float]:
+    """Rows and columns that the largest image of a target at some poses takes, at most those of the camera's image.
+
+    Args:
+      coarse: the camera at the resolution that is meant.
+      half: half-extents of the target [m].
+      T_world_target: the poses.
+    """
+    corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
+    pixels = np.asarray(_seen_at(coarse, T_world_target, corners), float)
+    # As far as `render.window_place` follows what is outside of the image.
+    limit = np.array([coarse.height, coarse.width])
+    low, high = (np.clip(bound, -1, limit) for bound in (pixels.min(axis=-2), pixels.max(axis=-2)))
+    rows, columns = np.minimum((high - low).reshape(-1, 2).max(axis=0), limit)
+    return float(rows), float(columns)
+
+
+@jax.jit
+def _seen_at(camera: Camera, T: Float[Array, "*batch 4 4"], points: Float[Array, "k 3"]) -> Float[Array, "*batch k 2"]:
+    """Where a camera sees points of bodies that stand at these poses."""
+    return project(camera, transform(T[..., None, :, :], points))[0]

@@ -1,0 +1,123 @@
+"""The objects as f needs them: their images in windows, and where the target would run into them."""
+
+from __future__ import annotations
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from mechsearch_jax.existence.config import ExistenceConfig
+from mechsearch_jax.existence.tables import ExistenceTables
+from mechsearch_jax.geometry.collision import clouds_of, collisions
+from mechsearch_jax.geometry.masked import masked_vmap
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.workspace import render
+from mechsearch_jax.workspace.camera import Camera
+
+
+class ObjectViews(flax.struct.PyTreeNode):
+    """Per object, what f needs of it; only what moved has to be computed anew.
+
+    Attributes:
+      windows: the objects' images, with a leading axis N.
+      collides: whether the target at a place would run into the object, shape (X, S, N); None if that does not count.
+    """
+
+    windows: render.Window
+    collides: jax.Array | None
+
+
+def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | None = None) -> ObjectViews:
+    """Views of so many objects that are yet to be looked at: they hide nothing, as empty slots never do.
+
+    Args:
+      capacity: how many.
+      config: static.
+      places: number of candidate poses, and of places at each, if collisions count; None if they do not.
+    """
+    return ObjectViews(
+        windows=render.Window(
+            depth=jnp.full((capacity, *config.window), jnp.inf),
+            corner=jnp.zeros((capacity, 2), jnp.int32),
+            stride=jnp.ones(capacity, jnp.int32),
+        ),
+        collides=None if places is None else jnp.zeros((*places, capacity), bool),
+    )
+
+
+def object_views(
+    tables: ExistenceTables,
+    camera: Camera,
+    scene: Superquadrics,
+    exists: Bool[Array, " x"] | None,
+    config: ExistenceConfig,
+    previous: ObjectViews | None = None,
+    moved: Bool[Array, " n"] | None = None,
+) -> ObjectViews:
+    """Render the objects and test them against the target's places.
+
+    Args:
+      tables: constants of the problem.
+      camera: the camera at full resolution.
+      scene: the objects, fields (N, ...).
+      exists: poses that matter; collisions at the others are not computed and read False. None if collisions do not
+        count at all.
+      config: static.
+      previous: views of the same objects before some of them moved.
+      moved: which objects moved since; only they are computed anew.
+
+    Returns:
+      The views of all objects.
+    """
+    coarse = camera.scaled(config.step(camera))
+    fresh = scene.valid if moved is None else moved & scene.valid
+
+    def view(coarse, _, body):
+        return render.object_window(coarse, body, config.window)
+
+    windows = without_unseen(masked_vmap(view, fresh, coarse, None, scene, block=8), fresh)
+    collides = None if exists is None else _collisions(tables, scene, exists, fresh)
+    if previous is None or moved is None:
+        return ObjectViews(windows, collides)
+    if collides is not None and previous.collides is not None:
+        collides = jnp.where(moved[None, None], collides, previous.collides)
+    return ObjectViews(
+        windows=jax.tree.map(
+            lambda a, b: jnp.where(moved.reshape(-1, *[1] * (a.ndim - 1)), a, b), windows, previous.windows
+        ),
+        collides=collides,
+    )
+
+
+def without_unseen(windows: render.Window, mask: Bool[Array, " n"]) -> render.Window:
+    """Windows, where those outside of the mask show nothing."""
+    return windows.replace(
+        depth=jnp.where(mask[:, None, None], windows.depth, jnp.inf), stride=jnp.maximum(windows.stride, 1)
+    )
+
+
+def _collisions(tables: ExistenceTables, scene: Superquadrics, exists: Array, fresh: Array) -> Bool[Array, "x s n"]:
+    """Whether the target at each place of the poses that matter would run into the objects that are fresh."""
+    places, spread = tables.T_world_target.shape[:2]
+    n = scene.capacity
+
+    T = tables.T_world_target.reshape(-1, 4, 4)
+    wanted = jnp.repeat(exists, spread)[:, None] & fresh[None]
+    hits = collisions(clouds_of(tables.cloud[None]), np.zeros(len(T), np.int32), T, scene, wanted)
+    return hits.reshape(places, spread, n)
+
+
+def occluders(tables: ExistenceTables, views: ObjectViews) -> Bool[Array, "x n"]:
+    """Which objects hide a target at every candidate pose, judged by the one pixel in the middle of its image.
+
+    An approximation, for telling which objects matter; what is visible, `existence` says.
+    """
+    windows = views.windows
+    pixel = (tables.middle[:, None] - windows.corner[None]) // windows.stride[None, :, None]
+    size = jnp.array(windows.depth.shape[-2:])
+    inside = jnp.all((pixel >= 0) & (pixel < size[None, None]), axis=-1)
+    row, column = jnp.moveaxis(jnp.clip(pixel, 0, size[None, None] - 1), -1, 0)
+    depth = windows.depth[jnp.arange(windows.depth.shape[0])[None], row, column]
+    return inside & (depth < tables.nearest[:, None])
