@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from mechsearch_jax.geometry.collision import Clouds, collisions, gap_of
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import compose, make, upright_pose
-from mechsearch_jax.robot.entry import gripper_enters
+from mechsearch_jax.robot.entry import WaysIn, gripper_enters
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
 from mechsearch_jax.runtime.errors import InputError
@@ -187,9 +187,8 @@ def feasible_grasps(
     ahead = T[..., 0, 2] >= jnp.cos(config.max_yaw + 1e-4) * jnp.sqrt(T[..., 0, 2] ** 2 + T[..., 1, 2] ** 2)
     ahead &= active
 
-    poses, q7, grasp = T.reshape(-1, 4, 4), jnp.tile(tables.q7, n), np.tile(np.arange(g), n)
-    mask = ahead.reshape(-1)
-    return gripper_enters(shelf, gripper, config.waypoints, tables.clouds, grasp, poses, q7, mask).reshape(n, g)
+    ways = WaysIn(T.reshape(-1, 4, 4), jnp.tile(tables.q7, n), np.tile(np.arange(g), n))
+    return gripper_enters(shelf, gripper, config.waypoints, tables.clouds, ways, ahead.reshape(-1)).reshape(n, g)
 
 
 def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> GraspTables:

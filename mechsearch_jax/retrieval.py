@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.approach import CLOSE_WAYPOINTS, CROSSING_PLACES
-from mechsearch_jax.actions.retrieve import retrieve_action
+from mechsearch_jax.actions.kinds.retrieve import retrieve_action
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.geometry.collision import clouds_of, collisions
 from mechsearch_jax.geometry.masked import masked_vmap

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from mechsearch_jax import retrieval
-from mechsearch_jax.actions import approach, pick_and_place, push
+from mechsearch_jax.actions import approach
 from mechsearch_jax.actions.config import CLOSED, OPEN, ActionConfig, ActionSpace, action_tables
-from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.kinds import placement, push
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.dynamics import rigid
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.collision import collisions
@@ -30,12 +31,8 @@ WRIST = 2
 
 @pytest.fixture(scope="module")
 def space():
-    return ActionSpace(SHELF, GRIPPER, ActionConfig(), math.radians(45), 4, 3)
-
-
-@pytest.fixture(scope="module")
-def tables(space):
-    return action_tables(GRIPPER, GraspConfig().wrists, space.config)
+    tables = action_tables(GRIPPER, GraspConfig().wrists, ActionConfig())
+    return ActionSpace(SHELF, tables, GRIPPER, ActionConfig(), math.radians(45), 4)
 
 
 @pytest.fixture(scope="module")
@@ -108,10 +105,10 @@ def touches(tables, cloud, T, scene):
 
 
 @jax.jit
-def open_hand_hits(space, tables, T, scene):
+def open_hand_hits(space, T, scene):
     """Whether the open gripper hits anything on its crossing to a pose."""
     places, crosses = approach.crossing_places(space, T[None])
-    return crosses[0] & jnp.any(touched(tables, OPEN, places[0], scene, still=True))
+    return crosses[0] & jnp.any(touched(space.tables, OPEN, places[0], scene, still=True))
 
 
 def push_from(T, way=(0.0, 0.0, 0.0)):
@@ -127,22 +124,22 @@ def absent(scene):
 
 
 @jax.jit
-def meets(space, tables, scene, after, action, moved=True, pushes=True):
+def meets(space, scene, after, action, moved=True, pushes=True):
     """`push.gripper_meets`; where all objects are moved, only those on the ways in and back count."""
     moved = jnp.broadcast_to(jnp.asarray(moved), scene.capacity)
-    return push.gripper_meets(space, tables, scene, after, action, jnp.int32(WRIST), moved, jnp.asarray(pushes))
+    return push.gripper_meets(space, scene, after, action, jnp.int32(WRIST), moved, jnp.asarray(pushes))
 
 
-def closed_hand_hits(space, tables, T, scene):
+def closed_hand_hits(space, T, scene):
     """Whether a push from a pose meets anything on its way in along x."""
-    return meets(space, tables, scene, absent(scene), push_from(T))
+    return meets(space, scene, absent(scene), push_from(T))
 
 
 HANDS = pytest.mark.parametrize(("opening", "judge"), [(OPEN, open_hand_hits), (CLOSED, closed_hand_hits)])
 
 
 @HANDS
-def test_the_gripper_hits_on_its_crossing_what_a_float64_reference_says(space, tables, opening, judge):
+def test_the_gripper_hits_on_its_crossing_what_a_float64_reference_says(space, opening, judge):
     rng = np.random.default_rng(0)
     seen = []
     for _ in range(60):
@@ -153,34 +150,34 @@ def test_the_gripper_hits_on_its_crossing_what_a_float64_reference_says(space, t
             (half, tips[0] - rng.uniform(-0.06, 0.16), tips[1] + rng.uniform(-0.1, 0.1)),
             shape=str(rng.choice(["box", "cylinder"])),
         )
-        points = swept(T, GRIPPER.max_opening if opening == OPEN else 0.0, float(tables.q7[opening, WRIST]))
-        found = bool(judge(space, tables, T, scene))
+        points = swept(T, GRIPPER.max_opening if opening == OPEN else 0.0, float(space.tables.q7[opening, WRIST]))
+        found = bool(judge(space, T, scene))
         # Clouds have gaps: what is touched less than a centimetre deep may be missed.
         if least_gauge(scene, points) > 1.0 + 1e-3:
             assert not found
         elif float(crossing_length(T, 0.374, GRIPPER)) > 0.03 and least_gauge(scene, points, -0.01) < 1.0:
             # A push may begin to touch something where its straight way in begins: that is proposals' to look at.
-            assert found or (opening == CLOSED and touched(tables, opening, T[None], scene).any())
+            assert found or (opening == CLOSED and touched(space.tables, opening, T[None], scene).any())
         seen.append(found)
     assert 5 < sum(seen) < 50
 
 
 @HANDS
-def test_where_there_is_no_crossing_nothing_is_hit(space, tables, opening, judge):
+def test_where_there_is_no_crossing_nothing_is_hit(space, opening, judge):
     T = pose((0.56, 0.1, 0.5))
     scene = in_the_way(T, 0.1)
-    assert touched(tables, opening, approach.crossing_places(space, T[None])[0][0], scene, still=True).any()
-    assert not judge(space, tables, T, scene)
+    assert touched(space.tables, opening, approach.crossing_places(space, T[None])[0][0], scene, still=True).any()
+    assert not judge(space, T, scene)
 
 
 @pytest.mark.parametrize("ends", ["start", "end"])
-def test_a_push_past_a_post_that_only_its_crossing_touches_is_impossible(space, tables, ends):
+def test_a_push_past_a_post_that_only_its_crossing_touches_is_impossible(space, ends):
     action = push_from(pose(DEEP), (0.0, 0.25, 0.0))
     T, end = action.T_world_gripper, action.T_world_place
     scene = in_the_way(T if ends == "start" else end)
     free = absent(scene)
-    judge = lambda a, b, pushes: meets(space, tables, a, b, action, pushes=pushes)  # noqa: E731
-    assert not touched(tables, CLOSED, jnp.stack([T, end]), scene).any()
+    judge = lambda a, b, pushes: meets(space, a, b, action, pushes=pushes)  # noqa: E731
+    assert not touched(space.tables, CLOSED, jnp.stack([T, end]), scene).any()
     assert bool(judge(scene, scene, True))
     assert bool(judge(scene, free, True)) == (ends == "start")
     assert bool(judge(free, scene, True)) == (ends == "end")
@@ -194,10 +191,10 @@ def beside(T, side, shift=0.0):
     return standing(((0.02, 0.02, 0.06), x, y + side * shift))
 
 
-def test_a_push_meets_what_it_leaves_in_place_and_not_what_it_moves(space, tables):
+def test_a_push_meets_what_it_leaves_in_place_and_not_what_it_moves(space):
     # No crossing, so that the way in along x is no matter.
     action = push_from(pose((0.5, 0.1, SHELF.board + 0.05), 0.0), (0.0, 0.15, 0.0))
-    judge = lambda scene, moved: meets(space, tables, scene, absent(scene), action, moved)  # noqa: E731
+    judge = lambda scene, moved: meets(space, scene, absent(scene), action, moved)  # noqa: E731
     for share in (1 / 3, 2 / 3, 1.0):
         scene = beside(translate(action.T_world_gripper, share * action.displacement), 1.0)
         assert bool(judge(scene, False))
@@ -205,10 +202,10 @@ def test_a_push_meets_what_it_leaves_in_place_and_not_what_it_moves(space, table
     assert not bool(judge(beside(action.T_world_place, 1.0, 0.15), False))
 
 
-def test_a_push_meets_on_its_way_back_what_it_moved_beside_its_own(space, tables):
+def test_a_push_meets_on_its_way_back_what_it_moved_beside_its_own(space):
     action = push_from(pose((0.5, 0.1, SHELF.board + 0.05), 0.0), (0.0, 0.15, 0.0))
     nothing = absent(beside(action.T_world_place, 1.0))
-    judge = lambda after, index, moved: meets(space, tables, nothing, after, action.replace(object=index), moved)  # noqa: E731
+    judge = lambda after, index, moved: meets(space, nothing, after, action.replace(object=index), moved)  # noqa: E731
     own, another = jnp.int32(0), jnp.int32(1)
     in_the_hand = beside(action.T_world_place, 1.0)
     assert bool(judge(in_the_hand, another, True))
@@ -218,10 +215,10 @@ def test_a_push_meets_on_its_way_back_what_it_moved_beside_its_own(space, tables
     reach = next(
         d
         for d in np.arange(0.0, 0.1, 0.001)
-        if not touched(tables, CLOSED, action.T_world_place[None], beside(action.T_world_place, 1.0, d)).any()
+        if not touched(space.tables, CLOSED, action.T_world_place[None], beside(action.T_world_place, 1.0, d)).any()
     )
     touching = beside(action.T_world_place, 1.0, reach - 0.004)
-    assert touched(tables, CLOSED, action.T_world_place[None], touching).any()
+    assert touched(space.tables, CLOSED, action.T_world_place[None], touching).any()
     assert not bool(judge(touching, another, True))
 
 
@@ -230,15 +227,15 @@ SMALL = (0.02, 0.02, 0.06)
 
 
 @pytest.fixture(scope="module")
-def transfers(space, tables):
+def transfers(space):
     """Whether a body of some half size at `DEEP` can be taken to two places, with or without a post: compiled once.
 
     The arm gets anywhere and touches nothing, so that what the gripper and its load hit is all that can be in the way;
     unless a number says what is wrong with it.
     """
-    turned = pick_and_place.LARGEST_TRANSFER + 0.1
+    turned = placement.LARGEST_TRANSFER + 0.1
 
-    def able(space, tables, half, post, post_there, T, wanted, fault):
+    def able(space, half, post, post_there, T, wanted, fault):
         def fails(what):
             return fault == FAULTS[what]
 
@@ -251,35 +248,36 @@ def transfers(space, tables):
         scene = jax.tree.map(lambda a, b: jnp.stack([a[0], b[0]]), body.replace(size=body.size.at[0].set(half)), post)
         scene = scene.replace(valid=jnp.array([True, False]).at[1].set(post_there))
         index = jnp.int32(0)
+        grasp = placement.ObjectGrasp(index, T[0], jnp.int32(WRIST), wanted[0])
         held = make(rigid.in_hand(scene, index, T[0]), scene.position[0])
         put = [rigid.pick_and_place(scene, index, T[0], place) for place in T[1:]]
         objects = jnp.stack([held, *(make(after.rotation[0], after.position[0]) for after in put)])
         cloud = superquadric.sample_surface(scene.size[0], scene.exponents[0], space.config.object_points)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(pick_and_place, "ways_in", ways_in)
+            patch.setattr(placement, "ways_in", ways_in)
             arm_hits = lambda q, scene: jnp.full((len(q), scene.capacity), fails("arm_hits"))  # noqa: E731
-            patch.setattr(pick_and_place, "arm_hits", arm_hits)
-            patch.setattr(pick_and_place, "arm_hits_shelf", lambda q, shelf: jnp.full(len(q), fails("arm_hits_shelf")))
-            patch.setattr(pick_and_place, "cloud_hits_shelf", lambda shelf, T, cloud: fails("cloud_hits_shelf"))
-            return pick_and_place.transfers(space, tables, scene, index, cloud, jnp.int32(WRIST), T, objects, wanted)
+            patch.setattr(placement, "arm_hits", arm_hits)
+            patch.setattr(placement, "arm_hits_shelf", lambda q, shelf: jnp.full(len(q), fails("arm_hits_shelf")))
+            patch.setattr(placement, "cloud_hits_shelf", lambda shelf, T, cloud: fails("cloud_hits_shelf"))
+            return placement.transfers(space, scene, grasp, cloud, placement.Ends(T, objects, wanted))
 
     compiled = jax.jit(able)
 
     def transferable(post, places, half, post_there, wanted=(True, True, True), fault=ANYWHERE):
         # One program for all: a single place is looked at twice.
         T = jnp.stack([pose(DEEP), *places, *places][:3])
-        return compiled(space, tables, jnp.float32(half), post, post_there, T, jnp.array(wanted), fault)
+        return compiled(space, jnp.float32(half), post, post_there, T, jnp.array(wanted), fault)
 
     return transferable
 
 
 @pytest.mark.parametrize("ends", ["grasp", "place"])
-def test_a_pick_past_a_post_that_only_its_crossing_touches_is_impossible(space, tables, transfers, ends):
+def test_a_pick_past_a_post_that_only_its_crossing_touches_is_impossible(space, transfers, ends):
     T, place, other = (pose((DEEP[0], DEEP[1] + y, DEEP[2])) for y in (0.0, 0.15, -0.15))
     post = in_the_way(T if ends == "grasp" else place)
     able = functools.partial(transfers, post, [place, other], SMALL)
     wider = post.replace(size=post.size + space.config.clearance)
-    assert not touched(tables, OPEN, jnp.stack([T, place, other]), wider).any()
+    assert not touched(space.tables, OPEN, jnp.stack([T, place, other]), wider).any()
     assert able(False).tolist() == [True, True]
     # Past what is in the way of the grasp it goes nowhere; past what is in the way of a place, to the others.
     assert able(True).tolist() == [False, ends == "place"]
@@ -288,12 +286,12 @@ def test_a_pick_past_a_post_that_only_its_crossing_touches_is_impossible(space, 
     assert able(False, (False, True, True)).tolist() == [False, False]
 
 
-def test_what_is_held_must_get_past_too_and_out_of_the_shelf(space, tables, transfers):
+def test_what_is_held_must_get_past_too_and_out_of_the_shelf(space, transfers):
     """Lower than the hand, but not than what hangs from it."""
     T, place = pose(DEEP), pose((DEEP[0], DEEP[1] + 0.15, DEEP[2]))
     post = in_the_way(T, -0.045)
     able = functools.partial(transfers, post, [place])
-    assert not open_hand_hits(space, tables, T, post)
+    assert not open_hand_hits(space, T, post)
     assert able(SMALL, False).all()
     assert not able(SMALL, True).any()
     # Longer than there is room for between the gripper's place outside and the shelf.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.actions.object_grasps import (
+from mechsearch_jax.actions.kinds.object_grasps import (
     LOWEST,
     PALM,
     PASSING_GAP,

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.actions import ActionConfig, ActionSpace, action_tables, no_action
-from mechsearch_jax.actions.push import Push
-from mechsearch_jax.actions.push_starts import object_pushes, push_starts
+from mechsearch_jax.actions.kinds.push import Push
+from mechsearch_jax.actions.kinds.push_starts import object_pushes, push_starts
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.robot.gripper import Gripper
@@ -27,14 +27,14 @@ SHAPES = ("box", "cylinder")
 
 def space_of(**changes):
     config = dataclasses.replace(CONFIG, **changes)
-    return ActionSpace(SHELF, Gripper(), config, math.pi / 4, 4, len(config.push_wrists))
+    return ActionSpace(SHELF, TABLES, Gripper(), config, math.pi / 4, 4)
 
 
 def proposed(space, scene):
-    return object_pushes(space, TABLES, scene, footprints.footprints(scene), scene.valid)
+    return object_pushes(space, scene, footprints.footprints(scene), scene.valid)
 
 
-STARTS = jax.jit(proposed, static_argnums=0)
+STARTS = jax.jit(proposed)
 
 
 def standing(shape, half, yaw, x=0.6, y=0.1):

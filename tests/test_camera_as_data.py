@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.existence import allowances, closer_image, existence, existence_tables, object_views
 from mechsearch_jax.images.cloud import BLOCK, thinned_view, view
 from mechsearch_jax.images.examples import example_images

@@ -28,7 +28,7 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.shelf import Shelf
 
 START = jax.device_get(from_scenario(TWO))
-SEARCH = planner.search(objective=InFullView())
+SEARCH = planner.planning_policy(objective=InFullView())
 
 
 @dataclasses.dataclass
@@ -263,7 +263,7 @@ def test_a_judgement_is_the_planners_own(problem):
 
 @pytest.mark.slow
 def test_a_hidden_target_is_taken_out(problem):
-    search = planner.search(planner.PlannerConfig(sequences=4, horizon=2), objective=InFullView())
+    search = planner.planning_policy(planner.PlannerConfig(sequences=4, horizon=2), objective=InFullView())
     config = KnownSearchConfig(simulated=4, worlds=1, rounds=4, grasps=2)
     found = known_search.known_search(HIDDEN, problem, search, NativeSimulator(), config)
     assert found.actions is not None

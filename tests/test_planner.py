@@ -10,8 +10,8 @@ import pytest
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionConfig, ActionKind
-from mechsearch_jax.actions.nothing import no_action
-from mechsearch_jax.actions.sampler import contact_risk
+from mechsearch_jax.actions.kinds.nothing import no_action
+from mechsearch_jax.actions.sampler import contact_probability
 from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.belief.belief import possible_space
 from mechsearch_jax.config.config import Weights
@@ -71,7 +71,7 @@ def root(decision, problem):
         rollout = rollout_of(problem, belief)
         state = rollout.root(objects)
         state = rollout.update(state, state.moved)
-        return state.replace(options=rollout.options(state, state.moved))
+        return state.replace(ways=rollout.ways(state, state.moved))
 
     return begin(problem, belief, objects)
 
@@ -218,8 +218,8 @@ def test_later_actions_are_drawn_in_the_present_scene_in_the_published_code(prob
         def update(self, state, moved):
             return state
 
-        def options(self, state, moved):
-            return state.options
+        def ways(self, state, moved):
+            return state.ways
 
         def cost(self, state):
             return jnp.sum(state.scene.position[0])
@@ -340,14 +340,14 @@ def test_the_share_of_what_cannot_be_moved_yet_goes_to_what_is_in_the_way(root):
     n = root.scene.capacity
     given = jax.jit(passed_on)
     for chance in (0.1, 0.5, 0.8):
-        options = [
+        ways = [
             w.replace(reached=rng.random(w.reached.shape) < 0.05, hits=rng.random(w.hits.shape) < chance)
-            for w in root.options
+            for w in root.ways
         ]
-        state = root.replace(options=tuple(options), available=jnp.asarray(rng.random(n) < 0.8))
+        state = root.replace(ways=tuple(ways), available=jnp.asarray(rng.random(n) < 0.8))
         able, share = np.asarray(state.able), rng.random(n)
         ways = [[] for _ in range(n)]
-        for kind, can in zip(options, able, strict=True):
+        for kind, can in zip(ways, able, strict=True):
             for i in range(n):
                 ways[i] += [hits for hits, at in zip(kind.hits[i], kind.reached[i], strict=True) if can[i] and at.any()]
         expected, stuck = (
@@ -499,12 +499,12 @@ def test_pushes_may_topple_what_they_move(drawn):
     np.testing.assert_array_equal(feared, sure)
 
 
-def charges_of(rollout, root, keys):
+def penalties_of(rollout, root, keys):
     act = jax.jit(jax.vmap(lambda key: rollout.act(jnp.array(True), root, key)[2]))
     return jax.device_get(act(keys))
 
 
-def test_what_may_touch_the_target_is_charged_for(decision, root, problem):
+def test_what_may_touch_the_target_has_a_penalty(decision, root, problem):
     action = jax.tree.map(lambda a: a[0, 0], decision[2].sequences.actions)
 
     def somewhere(key, *_):
@@ -521,28 +521,28 @@ def test_what_may_touch_the_target_is_charged_for(decision, root, problem):
     keys = jax.random.split(jax.random.key(0), 5)
     belief = decision[1]
     possible = possible_space(problem, belief, root.exists)
-    risk = jax.jit(jax.vmap(lambda s: contact_risk(problem.space, problem.actions, root.scene, possible, s)))
-    share = np.asarray(risk(jax.vmap(somewhere)(keys)))
+    probability = jax.jit(jax.vmap(lambda s: contact_probability(problem.space, root.scene, possible, s)))
+    share = np.asarray(probability(jax.vmap(somewhere)(keys)))
     assert len(np.unique(share)) > 2
-    charges = charges_of(rollout_of(problem, belief, policy), root, keys)
-    np.testing.assert_allclose(charges, 0.5 * share, rtol=1e-6)
+    penalties = penalties_of(rollout_of(problem, belief, policy), root, keys)
+    np.testing.assert_allclose(penalties, 0.5 * share, rtol=1e-6)
     policy = dataclasses.replace(policy, propose=lambda *_: Sample(action, jnp.int32(0)))
-    assert not charges_of(rollout_of(problem, belief, policy), root, keys).any()
+    assert not penalties_of(rollout_of(problem, belief, policy), root, keys).any()
 
 
 def test_what_is_dear_is_not_chosen():
     # A push that would make J half of what it is, and a pick that takes off a quarter.
     cost = jnp.float32([[20.0, 10.0], [20.0, 15.0]])
-    for price, best in ((0.0, 0), (0.5 * 0.4, 0), (2.0 * 0.4, 1)):
-        charge = jnp.float32([[price * 20.0], [0.0]])
-        value = [prefix_values(c, h, jnp.array([True]), 0.9)[0] for c, h in zip(cost, charge, strict=True)]
+    for share, best in ((0.0, 0), (0.5 * 0.4, 0), (2.0 * 0.4, 1)):
+        penalty = jnp.float32([[share * 20.0], [0.0]])
+        value = [prefix_values(c, h, jnp.array([True]), 0.9)[0] for c, h in zip(cost, penalty, strict=True)]
         assert int(np.argmin(value)) == best
 
 
 def test_a_risk_is_taken_only_where_nothing_else_gains():
     acted = jnp.ones((2, 1), bool)
     risky = jnp.float32([[19.0], [0.0]])
-    # The first sequence gains 10 at a risk of 19; the second 0.1 or 4 at none.
+    # The first sequence gains 10 at a penalty of 19; the second 0.1 or 4 at none.
     for safe, best, value in ((19.9, 0, -10.0), (16.0, 1, -4.0)):
         values, length = sequence_values(jnp.float32([[20.0, 10.0], [20.0, safe]]), risky, acted, 0.9)
         assert int(jnp.argmin(values)) == best

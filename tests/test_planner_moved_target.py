@@ -9,7 +9,7 @@ import pytest
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Prediction, Sample
 from mechsearch_jax.belief.belief import possible_poses, with_target

@@ -43,8 +43,8 @@ class Line(Rollout):
     def update(self, state, moved):
         return state
 
-    def options(self, state, moved):
-        return state.options
+    def ways(self, state, moved):
+        return state.ways
 
     def cost(self, state):
         place = jnp.round((state.scene.position[0, 1] - self.start) / STEP).astype(jnp.int32)

@@ -94,7 +94,9 @@ def test_the_gripper_enters_where_the_arm_follows_and_what_it_sweeps_leaves_the_
     clouds = jnp.float32(np.stack([np.zeros((50, 3)), hanging])).swapaxes(1, 2)
     cloud = np.arange(len(T)) % 2
     find = jax.jit(
-        lambda T, mask: entry.gripper_enters(SHELF, GRIPPER, 4, clouds, cloud, T, jnp.full(len(T), Q7), mask)
+        lambda T, mask: entry.gripper_enters(
+            SHELF, GRIPPER, 4, clouds, entry.WaysIn(T, jnp.full(len(T), Q7), cloud), mask
+        )
     )
     entered = np.asarray(find(T, mask))
     follows = jax.jit(jax.vmap(lambda path: entry.arm_follows(path, Q7, SHELF)))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.actions import Action
-from mechsearch_jax.actions.retrieve import retrieve_action
+from mechsearch_jax.actions.kinds.retrieve import retrieve_action
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.world.world import from_scenario, true_superquadrics
 from mechsearch_jax.geometry.superquadric import empty

@@ -24,7 +24,7 @@ from mechsearch_jax.envs.known_target.judgement import InFullView
 from mechsearch_jax.envs.known_target.search import Found, KnownSearchConfig, Node, known_search
 from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.simulators.native import NativeSimulator
-from mechsearch_jax.planner import PRESETS, Config, search
+from mechsearch_jax.planner import PRESETS, Config, planning_policy
 from mechsearch_jax.problem.cache import cached_problem
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, save_json
@@ -144,7 +144,9 @@ class Ceiling:
         self._simulator = NativeSimulator()
         self._problem = functools.cache(cached_problem)
         first, later = push_models(self._planner.push_model)
-        self._search = search(self._planner.planner, objective=InFullView(), push_model=first, later_push_model=later)
+        self._policy = planning_policy(
+            self._planner.planner, objective=InFullView(), push_model=first, later_push_model=later
+        )
         self.settings: dict[str, Any] = {**dataclasses.asdict(config), "planner": self._planner.options()}
 
     def row(
@@ -166,7 +168,7 @@ class Ceiling:
         if known is None:
             begin = time.perf_counter()
             problem = self._problem(target_of(scenario), self._planner.problem)
-            found = known_search(scenario, problem, self._search, self._simulator, self._config, told)
+            found = known_search(scenario, problem, self._policy, self._simulator, self._config, told)
             known = told_of(found) | {"seconds": round(time.perf_counter() - begin, 1)}
             if found.actions is None:
                 figure = unsolved.picture(found, problem, scenario.name, str(known["reason"]))

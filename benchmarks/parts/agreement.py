@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax.actions import SAMPLED_KINDS, Action, PossibleSpace, candidates, kind_of, sample_action
+from mechsearch_jax.actions import SAMPLED_KINDS, Action, PossibleSpace, all_ways, kind_of, sample_action
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
@@ -169,10 +169,10 @@ def _sampler(problem: Problem) -> Callable[[Array, World], Action]:
 
     def draw(keys: Array, world: World, problem: Problem) -> Action:
         scene = true_superquadrics(world)
-        options = candidates(problem.space, problem.actions, scene, nowhere)
+        ways = all_ways(problem.space, scene, nowhere)
 
         def one(key: Array) -> Action:
-            return sample_action(key, problem.space, problem.actions, scene, nowhere, options, scene.valid).action
+            return sample_action(key, problem.space, scene, nowhere, ways, scene.valid).action
 
         return jax.vmap(one)(keys)
 

@@ -241,7 +241,7 @@ class ManySlots:
         done = jax.tree.map(lambda a: jax.ShapeDtypeStruct((self._at_once, *a.shape), a.dtype), no_action())
         fresh = jax.ShapeDtypeStruct((self._count,), bool)
         problem, state = self._problem, self._state
-        twice = [("search", True), ("search", False), ("retrieval", False)]
+        twice = [("planned", True), ("planned", False), ("retrieval", False)]
         questions = twice if isinstance(self._policy, AsksTwice) else [("__call__", False)]
         calls = [(self._policy, own, problem, state, keys, rows, *how) for how in questions]
 
@@ -297,8 +297,8 @@ class ManySlots:
         there = np.asarray(self._state.belief.found)
         choices = self._ask("retrieval", keys, [r for r in rows if there[r]])
         choices = {r: choice for r, choice in choices.items() if takes_target(choice)}
-        choices |= self._ask("search", keys, [r for r in rows if there[r] and r not in choices])
-        return choices | self._ask("search", keys, [r for r in rows if not there[r]], hidden=True)
+        choices |= self._ask("planned", keys, [r for r in rows if there[r] and r not in choices])
+        return choices | self._ask("planned", keys, [r for r in rows if not there[r]], hidden=True)
 
     def _ask(self, question: str, keys: Array, rows: Sequence[int], hidden: bool = False) -> dict[int, Choice]:
         """What the policy answers to a question in some slots, after trials; see `_propose`."""

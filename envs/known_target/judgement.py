@@ -15,7 +15,7 @@ from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, 
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import no_hits, pairs
-from mechsearch_jax.planner import Belief, Problem, Search, Sequences, initial_belief
+from mechsearch_jax.planner import Belief, PlanningPolicy, Problem, Sequences, initial_belief
 from mechsearch_jax.planner.objective import Objective, SearchForGrasp
 from mechsearch_jax.planner.rollout import plan, present_state
 from mechsearch_jax.retrieval import GraspChoice, best_grasps, found_grasps, found_hits
@@ -78,10 +78,10 @@ def _known(problem: Problem, world: World, active: Bool[Array, ""] | bool = True
 
 
 @jax.jit
-def sample(search: Search, key: Array, problem: Problem, world: World) -> Sequences:
+def sample(policy: PlanningPolicy, key: Array, problem: Problem, world: World) -> Sequences:
     """Sequences of actions from a world, best first, as the planner samples them."""
     objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-    return plan(search.rollout(problem, _known(problem, world)), key, objects).sequences
+    return plan(policy.rollout(problem, _known(problem, world)), key, objects).sequences
 
 
 def retrievals_of(problem: Problem, world: World, count: int) -> GraspChoice:

@@ -26,7 +26,7 @@ from mechsearch_jax.envs.known_target.judgement import Judgement, judge, retriev
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import TARGET, World
-from mechsearch_jax.planner import Problem, Search
+from mechsearch_jax.planner import PlanningPolicy, Problem
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Scenario
 
@@ -121,7 +121,7 @@ class Found:
 def known_search(
     scenario: Scenario,
     problem: Problem,
-    search: Search,
+    policy: PlanningPolicy,
     simulator: Simulator,
     config: KnownSearchConfig | None = None,
     told: Callable[[int, Node], None] = lambda round, best: None,
@@ -131,12 +131,12 @@ def known_search(
     Args:
       scenario: where everything stands at the start.
       problem: built for its target.
-      search: samples sequences and predicts them; its objective should be `InFullView`.
+      policy: samples sequences and predicts them; its objective should be `InFullView`.
       simulator: executes actions in as many worlds as are asked for.
       config: how much is tried.
       told: after every round, of its number and of the best world so far.
     """
-    running = _Running(scenario, problem, search, simulator, config or KnownSearchConfig())
+    running = _Running(scenario, problem, policy, simulator, config or KnownSearchConfig())
     while running.goes_on:
         running.round()
         told(running.rounds, running.best)
@@ -192,9 +192,14 @@ class _Running:
     """A search under way."""
 
     def __init__(
-        self, scenario: Scenario, problem: Problem, search: Search, simulator: Simulator, config: KnownSearchConfig
+        self,
+        scenario: Scenario,
+        problem: Problem,
+        policy: PlanningPolicy,
+        simulator: Simulator,
+        config: KnownSearchConfig,
     ) -> None:
-        self._problem, self._search, self._simulator, self._config = problem, search, simulator, config
+        self._problem, self._policy, self._simulator, self._config = problem, policy, simulator, config
         self._judges = jax.jit(jax.vmap(self._judge_one))
         world = jax.device_get(jax.tree.map(lambda a: a[0], simulator.reset([scenario])))
         self.rounds = self._simulated = 0
@@ -248,8 +253,8 @@ class _Running:
                 self._open.add(node)
 
     def _judge_one(self, world: World, active: Bool[Array, ""]) -> Judgement:
-        search = self._search
-        return judge(self._problem, search.objective, search.config.weights, world, active)
+        policy = self._policy
+        return judge(self._problem, policy.objective, policy.config.weights, world, active)
 
     def _judged(self, worlds: Sequence[World]) -> list[Judgement]:
         """Judge worlds, so many at once as are simulated at once."""
@@ -264,7 +269,7 @@ class _Running:
 
     def _proposals(self, node: Node, key: Array) -> list[_Proposal]:
         """The sampled sequences whose first actions differ, best first."""
-        sequences = jax.device_get(sample(self._search, key, self._problem, node.world))
+        sequences = jax.device_get(sample(self._policy, key, self._problem, node.world))
         room = self._config.max_steps - 1 - len(node.actions)
         found: dict[tuple[str | int, ...], _Proposal] = {}
         for i in np.flatnonzero(np.isfinite(sequences.value)):

@@ -1,16 +1,16 @@
 """What the robot can do: one file for each kind of action, their registry, and how they are sampled."""
 
-from mechsearch_jax.actions.candidates import Candidates, candidates, free_ways, no_candidates
 from mechsearch_jax.actions.config import ActionConfig, ActionSpace, ActionTables, action_tables
 from mechsearch_jax.actions.kind import Kind, SampledKind
-from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.kinds.nothing import no_action
+from mechsearch_jax.actions.kinds.retrieve import retrieve_action
 from mechsearch_jax.actions.registry import KINDS, SAMPLED_KINDS, ActionKind, kind_of
-from mechsearch_jax.actions.retrieve import retrieve_action
 from mechsearch_jax.actions.sampler import sample_action
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.trajectory import JointTrajectory, joint_trajectory
 from mechsearch_jax.actions.types import Action, Prediction, Sample, Ways
 from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
+from mechsearch_jax.actions.ways import AllWays, all_ways, free_ways, no_ways
 
 __all__ = [
     "KINDS",
@@ -20,7 +20,7 @@ __all__ = [
     "ActionKind",
     "ActionSpace",
     "ActionTables",
-    "Candidates",
+    "AllWays",
     "JointTrajectory",
     "Kind",
     "PossibleSpace",
@@ -30,12 +30,12 @@ __all__ = [
     "Sketch",
     "Ways",
     "action_tables",
-    "candidates",
+    "all_ways",
     "free_ways",
     "joint_trajectory",
     "kind_of",
     "no_action",
-    "no_candidates",
+    "no_ways",
     "retrieve_action",
     "sample_action",
     "widen",

@@ -10,7 +10,7 @@ import flax.struct
 import jax
 import numpy as np
 
-from mechsearch_jax.actions.object_grasps import ObjectGraspConfig
+from mechsearch_jax.actions.kinds.object_grasps import ObjectGraspConfig
 from mechsearch_jax.dynamics.push_model import LEVERAGE
 from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN
 from mechsearch_jax.robot.gripper import Gripper, gripper_cloud, swept_cloud
@@ -135,27 +135,31 @@ class ActionTables(flax.struct.PyTreeNode):
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=("shelf",),
-    meta_fields=("gripper", "config", "max_yaw", "waypoints", "wrists"),
+    data_fields=("shelf", "tables"),
+    meta_fields=("gripper", "config", "max_yaw", "waypoints"),
 )
 @dataclasses.dataclass(frozen=True)
 class ActionSpace:
-    """What all actions share and no scene changes, gathered so that it can be passed on as one argument: a pytree, of
-    which all but the shelf is static.
+    """What all actions share and no scene changes, gathered so that it can be passed on as one argument: a pytree.
 
     Attributes:
-      shelf, gripper, config: as elsewhere.
-      max_yaw: of grasps, as in `graspability.GraspConfig`.
-      waypoints: poses at which an approach has to be reachable.
-      wrists: number of angles of joint 7.
+      shelf, tables: data.
+      gripper, config: static.
+      max_yaw: of grasps, as in `graspability.GraspConfig`; static.
+      waypoints: poses at which an approach has to be reachable; static.
     """
 
     shelf: Shelf
+    tables: ActionTables
     gripper: Gripper
     config: ActionConfig
     max_yaw: float
     waypoints: int
-    wrists: int
+
+    @property
+    def wrists(self) -> int:
+        """Number of angles of joint 7."""
+        return self.tables.q7.shape[1]
 
 
 def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: ActionConfig) -> ActionTables:

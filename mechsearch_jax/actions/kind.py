@@ -8,9 +8,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions.config import ActionSpace, ActionTables
+from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.actions.types import Action, Draft, Prediction, Ways
+from mechsearch_jax.actions.types import Action, Draft, DrawnWay, Prediction, Ways
 from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.footprints import Footprints
@@ -46,7 +46,6 @@ class Kind(Protocol):
     def predict(
         self,
         space: ActionSpace,
-        tables: ActionTables,
         push_model: PushModel,
         scene: Superquadrics,
         untouchable: Bool[Array, " n"],
@@ -56,8 +55,7 @@ class Kind(Protocol):
         """What an action of this kind does to the objects; called for actions of other kinds too, and then ignored.
 
         Args:
-          space: all but the shelf is static.
-          tables: constants of the problem.
+          space: what all actions share.
           push_model: predicts pushes.
           scene: the objects, fields (N, ...).
           untouchable: which of them must not be moved.
@@ -111,19 +109,12 @@ class SampledKind(Kind, Protocol):
         ...
 
     def propose(
-        self,
-        space: ActionSpace,
-        tables: ActionTables,
-        scene: Superquadrics,
-        prints: Footprints,
-        fresh: Bool[Array, " n"],
+        self, space: ActionSpace, scene: Superquadrics, prints: Footprints, fresh: Bool[Array, " n"]
     ) -> tuple[Float[Array, "n v 4 4"], Float[Array, "n v"]]:
         """Gripper poses of all ways, and their `Ways.weight`; of objects that are not `fresh`, anything."""
         ...
 
-    def travels(
-        self, space: ActionSpace, tables: ActionTables, T: Float[Array, "k 4 4"], near: Bool[Array, " k"]
-    ) -> Bool[Array, "k d"]:
+    def travels(self, space: ActionSpace, T: Float[Array, "k 4 4"], near: Bool[Array, " k"]) -> Bool[Array, "k d"]:
         """Whether arm and shelf allow the rest of the motion, for all ways of all objects whose approach is `near`."""
         ...
 
@@ -134,7 +125,7 @@ class SampledKind(Kind, Protocol):
         ...
 
     def entering(
-        self, space: ActionSpace, tables: ActionTables, scene: Superquadrics, possible: PossibleSpace, ways: Ways
+        self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, ways: Ways
     ) -> Bool[Array, "n v d"]:
         """Which ways enter space where the target may be; looked at only where nothing stands in the way."""
         ...
@@ -143,14 +134,10 @@ class SampledKind(Kind, Protocol):
         self,
         key: jax.Array,
         space: ActionSpace,
-        tables: ActionTables,
         scene: Superquadrics,
         possible: PossibleSpace,
         ways: Ways,
-        index: Int[Array, ""],
-        way: Int[Array, ""],
-        wanted: Bool[Array, ""],
+        drawn: DrawnWay,
     ) -> Draft:
-        """An action from the way and distance `way` (of V times D, clipped) of object `index`; anything if it is not
-        `wanted`."""
+        """An action from a way that was drawn, whose number may be out of range where it is not wanted."""
         ...

@@ -5,8 +5,8 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping, Sequence
 
-from mechsearch_jax.actions import nothing, pick_and_place, push, retrieve
 from mechsearch_jax.actions.kind import Kind, SampledKind
+from mechsearch_jax.actions.kinds import nothing, pick_and_place, push, retrieve
 from mechsearch_jax.runtime.errors import InputError, shown
 
 

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from mechsearch_jax.actions.candidates import Candidates, free_ways
-from mechsearch_jax.actions.config import ActionSpace, ActionTables
+from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.registry import SAMPLED_KINDS, ActionKind
-from mechsearch_jax.actions.types import Sample
-from mechsearch_jax.actions.unseen_space import PossibleSpace, risk
+from mechsearch_jax.actions.types import DrawnWay, Sample
+from mechsearch_jax.actions.unseen_space import PossibleSpace, touch_probability
+from mechsearch_jax.actions.ways import AllWays, free_ways
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
@@ -59,10 +59,9 @@ def _stacked(rows: Sequence[Shaped[Array, "n _ _"]]) -> Shaped[Array, "rows widt
 def sample_action(
     key: Array,
     space: ActionSpace,
-    tables: ActionTables,
     scene: Superquadrics,
     possible: PossibleSpace,
-    options: Candidates,
+    all_ways: AllWays,
     available: Bool[Array, "*kinds n"],
     weights: Float[Array, " n"] | None = None,
 ) -> Sample:
@@ -70,20 +69,19 @@ def sample_action(
 
     Args:
       key: PRNG key.
-      space: all but the shelf is static.
-      tables: constants of the problem.
+      space: what all actions share.
       scene: the objects.
       possible: where the target may be. An object's actions that enter it are drawn only if it has no others.
-      options: of this scene, by kind.
+      all_ways: the ways to move the objects of this scene.
       available: which objects may be moved, by all kinds alike or by each of `SAMPLED_KINDS`.
       weights: sampling weights of the objects, positive; the paper's, and those left out, are equal.
     """
     n = scene.capacity
     key_choice, key_place = jax.random.split(key)
     able = jnp.broadcast_to(available, (len(SAMPLED_KINDS), n))
-    ways = _stacked([free_ways(w) & a[:, None, None] for w, a in zip(options, able, strict=True)])
-    enters = _stacked([w.enters for w in options])
-    beside = _stacked([jnp.broadcast_to(w.weight[..., None], w.reached.shape) for w in options])
+    ways = _stacked([free_ways(w) & a[:, None, None] for w, a in zip(all_ways, able, strict=True)])
+    enters = _stacked([w.enters for w in all_ways])
+    beside = _stacked([jnp.broadcast_to(w.weight[..., None], w.reached.shape) for w in all_ways])
     weights = jnp.ones(n) if weights is None else weights
     weight = jnp.tile(weights, len(SAMPLED_KINDS))[:, None] * _shares(ways & ~enters, ways, beside)
     numbers = _numbers(key_choice, len(SAMPLED_KINDS), n, ways.shape[1])
@@ -92,8 +90,8 @@ def sample_action(
     chosen, index = row // n, row % n
 
     drafts = [
-        kind.draft(key_place, space, tables, scene, possible, w, index, way, possible_at_all & (chosen == i))
-        for i, (kind, w) in enumerate(zip(SAMPLED_KINDS, options, strict=True))
+        kind.draft(key_place, space, scene, possible, w, DrawnWay(index, way, possible_at_all & (chosen == i)))
+        for i, (kind, w) in enumerate(zip(SAMPLED_KINDS, all_ways, strict=True))
     ]
     draft = drafts[-1]
     for i in reversed(range(len(drafts) - 1)):
@@ -103,14 +101,13 @@ def sample_action(
     return Sample(draft.action.replace(kind=kind), draft.wrist, draft.grippers, draft.bodies)
 
 
-def contact_risk(
-    space: ActionSpace, tables: ActionTables, scene: Superquadrics, possible: PossibleSpace, sample: Sample
+def contact_probability(
+    space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, sample: Sample
 ) -> Float[Array, ""]:
     """Share of the possible poses at which a sampled action would touch the target; 0 where none is possible.
 
     Args:
-      space: static.
-      tables: constants of the problem.
+      space: what all actions share.
       scene: the objects that the action was sampled for.
       possible: where the target may be.
       sample: the action.
@@ -121,8 +118,8 @@ def contact_risk(
     opening = jnp.select([action.kind == kind.code for kind in SAMPLED_KINDS], [k.opening for k in SAMPLED_KINDS])
     size, exponents = scene.size[action.object], scene.exponents[action.object]
     body = superquadric.sample_surface(size, exponents, space.config.object_points)
-    gripper = tables.clouds[opening, sample.wrist].T
+    gripper = space.tables.clouds[opening, sample.wrist].T
     swept = jnp.concatenate(
         [transform(sample.grippers[:, None], gripper[None]), transform(sample.bodies[:, None], body[None])], axis=1
     )
-    return jnp.where(action.kind == ActionKind.NONE, 0.0, risk(possible, swept))
+    return jnp.where(action.kind == ActionKind.NONE, 0.0, touch_probability(possible, swept))

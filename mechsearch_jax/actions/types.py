@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import flax.struct
 import jax
+from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.geometry.superquadric import Superquadrics
 
@@ -45,6 +48,20 @@ class Sample(flax.struct.PyTreeNode):
     wrist: jax.Array
     grippers: jax.Array | None = None
     bodies: jax.Array | None = None
+
+
+class DrawnWay(NamedTuple):
+    """Which way of moving which object was drawn.
+
+    Attributes:
+      object: index of the object.
+      number: of the way and its distance, among V times D.
+      wanted: whether it is looked at; where it is not, what comes of it means nothing.
+    """
+
+    object: Int[Array, ""]
+    number: Int[Array, ""]
+    wanted: Bool[Array, ""]
 
 
 class Draft(flax.struct.PyTreeNode):

@@ -60,7 +60,7 @@ def cloud_enters(
     return jnp.any(_enters(space, *transform_rows(T_world_cloud, cloud)), axis=-1)
 
 
-def risk(space: PossibleSpace, points: Float[Array, "... 3"]) -> Float[Array, ""]:
+def touch_probability(space: PossibleSpace, points: Float[Array, "... 3"]) -> Float[Array, ""]:
     """Share of the possible poses at which the target would be touched by world points."""
     x, y, z = points.reshape(-1, 3).T
     row, column, inside = _cells(space, x, y, z)

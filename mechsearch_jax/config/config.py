@@ -15,7 +15,7 @@ import jax
 from jaxtyping import Array
 
 from mechsearch_jax.actions.config import ActionConfig
-from mechsearch_jax.actions.object_grasps import ObjectGraspConfig
+from mechsearch_jax.actions.kinds.object_grasps import ObjectGraspConfig
 from mechsearch_jax.dynamics.named import PushModelName, check_name
 from mechsearch_jax.existence import ExistenceConfig
 from mechsearch_jax.graspability import GraspConfig
@@ -63,9 +63,9 @@ class PlannerConfig:
       gamma: discount of equation 2, in (0, 1]. The paper gives none; 0.9 is ours.
       horizon: M, actions in a sequence; static.
       sequences: number of sequences sampled for a decision; static.
-      unseen_contact_penalty: cost of touching the hidden target, in units of J: a sampled action is charged with J
+      unseen_contact_penalty: cost of touching the hidden target, in units of J: the penalty of a sampled action is J
         times the share of the possible poses at which it would touch the target, unless no sequence gains anything
-        then. The paper charges nothing.
+        then. The paper has none.
       guided_fraction: share of the draws that prefer objects that hide much or are in the way, from 0 to below 1; the
         other draws are uniform, as all are in the paper.
       crowding_weight: weight in J of objects that only some of a pose's grasps hit; the paper's J counts the best grasp

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array
 
-from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.belief.belief import Belief, without_grasps
 from mechsearch_jax.config.config import PlannerConfig
@@ -84,7 +84,7 @@ class Plan(Protocol):
         ...
 
 
-class Search(flax.struct.PyTreeNode):
+class PlanningPolicy(flax.struct.PyTreeNode):
     """The engine as a `Policy`: takes a found target out as soon as a grasp will do, and else plans.
 
     It also is a policy that `trials.AsksTwice`.
@@ -110,7 +110,7 @@ class Search(flax.struct.PyTreeNode):
         return Rollout(problem, belief, self.config, self.propose, self.predict, self.objective, self.drawn_in)
 
     @property
-    def _planning(self) -> Search:
+    def _planning(self) -> PlanningPolicy:
         """What a plan depends on: it is the same, and compiled once, whether or not anything is tried out."""
         return self.replace(tries=False)
 
@@ -128,18 +128,18 @@ class Search(flax.struct.PyTreeNode):
         """See `Policy`."""
         if not isinstance(belief.found, Tracer) and not belief.found:
             # Outside of any transformation, what is not needed is neither computed nor compiled.
-            return self.search(key, problem, belief, observation)
+            return self.planned(key, problem, belief, observation)
         grasp = self.retrieval(key, problem, belief, observation)
         able = grasp.action.kind == ActionKind.RETRIEVE
         # The belief may be known where the observation is traced.
         if not isinstance(able, Tracer):
             if able:
                 return grasp
-            return _grasps_first(grasp, self.search(key, problem, belief, observation))
+            return _grasps_first(grasp, self.planned(key, problem, belief, observation))
         # Both are computed, each with next to nothing to do where it does not count. A `cond` would under `vmap` give
         # every scene of a batch a problem of its own, and what they share could no longer be computed together.
         rest = observation.objects.replace(valid=observation.objects.valid & ~able)
-        planned = self.search(
+        planned = self.planned(
             key,
             problem,
             belief.replace(exists=belief.exists & ~able, found=belief.found & ~able),
@@ -164,7 +164,7 @@ class Search(flax.struct.PyTreeNode):
         grasp = look(problem.target_grasps, observation.objects, belief.found_pose, *active)
         return _retrieval(self, belief, observation, grasp)
 
-    def search(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
+    def planned(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """What is planned, as if no grasp would do.
 
         Args:
@@ -191,16 +191,16 @@ def _grasps_first(grasp: Decision, planned: Decision) -> Decision:
 
 
 @kept()
-def _plan(search: Search, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
-    return search.plan(search.rollout(problem, belief), key, observation.objects)
+def _plan(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
+    return policy.plan(policy.rollout(problem, belief), key, observation.objects)
 
 
 @kept()
-def _retrieval(search: Search, belief: Belief, observation: Observation, grasp: GraspChoice) -> Decision:
+def _retrieval(policy: PlanningPolicy, belief: Belief, observation: Observation, grasp: GraspChoice) -> Decision:
     """The decision to take a found target out with a grasp, or the first of several, that hits nothing."""
-    reached, objects = search.objective.reached, observation.objects
+    reached, objects = policy.objective.reached, observation.objects
     alternatives = None
-    if search.tries:
+    if policy.tries:
         alternatives = grasps_to_try(grasp.action, grasp.feasible & belief.found, objects, reached)
         grasp = jax.tree.map(lambda a: a[0], grasp)
     able = belief.found & grasp.success
@@ -210,7 +210,7 @@ def _retrieval(search: Search, belief: Belief, observation: Observation, grasp: 
         cost=jnp.float32(reached),
         predicted_cost=jnp.float32(jnp.nan),
         predicted=objects,
-        sequences=no_sequences(search.config, objects),
+        sequences=no_sequences(policy.config, objects),
         refused=jnp.int32(0),
         alternatives=alternatives,
     )
@@ -227,7 +227,7 @@ def _planner_config(config: PlannerConfig | None) -> PlannerConfig:
     return config or PlannerConfig()
 
 
-def search(
+def planning_policy(
     config: PlannerConfig | None = None,
     *,
     push_model: PushModel | None = None,
@@ -236,7 +236,7 @@ def search(
     objective: Objective,
     propose: Propose = guided_draw,
     **changes: Any,
-) -> Search:
+) -> PlanningPolicy:
     """The engine with slots; see `PolicyFactory` for the first arguments.
 
     Args:
@@ -253,20 +253,20 @@ def search(
     push_model = push_model or own_push_model("learned")
     config = dataclasses.replace(_planner_config(config), **changes)
     slots = Slots(propose, PredictByKind(push_model, later_push_model or push_model), objective)
-    return Search(config=config, tries=tries, **IMITATIONS[config.imitates](slots)._asdict())
+    return PlanningPolicy(config=config, tries=tries, **IMITATIONS[config.imitates](slots)._asdict())
 
 
 # Minds the grasp while it searches: f and g together (equation 2).
-search_for_grasp = functools.partial(search, objective=SearchForGrasp())
+search_for_grasp = functools.partial(planning_policy, objective=SearchForGrasp())
 # First finds the target, and then clears the way to it.
-search_and_grasp = functools.partial(search, objective=SearchAndGrasp())
+search_and_grasp = functools.partial(planning_policy, objective=SearchAndGrasp())
 
 
-def random_action(config: PlannerConfig | None = None, **options: Any) -> Search:
+def random_action(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
     """A baseline: a random possible action, by the sampler's even draw, until the target can be taken out.
 
     It plans no further, and leaves a found target where it is: of `config`, the horizon, `move_target`, the guided
-    fraction and all charges are not used.
+    fraction and all penalties are not used.
     """
     even = dataclasses.replace(
         _planner_config(config),
@@ -275,16 +275,16 @@ def random_action(config: PlannerConfig | None = None, **options: Any) -> Search
         guided_fraction=0.0,
         unseen_contact_penalty=0.0,
     )
-    return search(even, objective=Indifferent(), **options)
+    return planning_policy(even, objective=Indifferent(), **slots)
 
 
-def greedy(config: PlannerConfig | None = None, **options: Any) -> Search:
+def greedy(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
     """A baseline: the one action that leaves the least of f, as lateral-access X-RAY reduces the area where the target
     can be; once the target is found, the one that brings it nearest to a free grasp.
 
     One step of the first term of J, and of the second at a found target: X-RAY's suction cup needs no free grasp. Draws
     are even, and nothing but J counts: of `config`, the horizon, the guided fraction, the crowding weight and all
-    charges are not used.
+    penalties are not used.
     """
     plain = dataclasses.replace(
         _planner_config(config),
@@ -293,10 +293,10 @@ def greedy(config: PlannerConfig | None = None, **options: Any) -> Search:
         crowding_weight=0.0,
         unseen_contact_penalty=0.0,
     )
-    return search_and_grasp(plain, **options)
+    return search_and_grasp(plain, **slots)
 
 
-def mctx(config: PlannerConfig | None = None, **options: Any) -> Search:
+def mctx(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
     """A baseline: Monte-Carlo tree search with the library `mctx` on the cost of `search_for_grasp`; see `tree_search`.
 
     Raises:
@@ -306,7 +306,7 @@ def mctx(config: PlannerConfig | None = None, **options: Any) -> Search:
     from mechsearch_jax.planner.tree_search import import_mctx, tree_plan
 
     import_mctx()
-    return search_for_grasp(config, **options).replace(plan=tree_plan)
+    return search_for_grasp(config, **slots).replace(plan=tree_plan)
 
 
 POLICIES: Mapping[str, PolicyFactory] = {

@@ -64,11 +64,11 @@ class PredictByKind:
         action, scene = sample.action, state.scene
         # What is sampled may move the target only by pushing it itself.
         untouchable = state.is_target & (jnp.arange(scene.capacity) != action.object)
-        found = Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False))
+        prediction = Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False))
         for code, kind in KINDS.items():
-            told = kind.predict(problem.space, problem.actions, push_model, scene, untouchable, action, sample.wrist)
-            found = jax.tree.map(lambda a, b, code=code: jnp.where(action.kind == code, a, b), told, found)
-        lost = state.is_target & found.moved & beyond_candidates(problem, found.scene.position)
-        found = found.replace(possible=found.possible & ~jnp.any(lost))
-        after = jax.tree.map(lambda new, old: jnp.where(found.possible, new, old), found.scene, scene)
-        return found.replace(scene=after, moved=found.moved & found.possible)
+            of_kind = kind.predict(problem.space, push_model, scene, untouchable, action, sample.wrist)
+            prediction = jax.tree.map(lambda a, b, code=code: jnp.where(action.kind == code, a, b), of_kind, prediction)
+        lost = state.is_target & prediction.moved & beyond_candidates(problem, prediction.scene.position)
+        possible = prediction.possible & ~jnp.any(lost)
+        after = jax.tree.map(lambda new, old: jnp.where(possible, new, old), prediction.scene, scene)
+        return Prediction(after, prediction.moved & possible, possible)

@@ -87,8 +87,8 @@ def passed_on(state: State, share: Float[Array, " n"]) -> Float[Array, " n"]:
       state: with the ways to move each object.
       share: of each object, shape (N,).
     """
-    reached = [jnp.any(w.reached, axis=-1) & able[:, None] for w, able in zip(state.options, state.able, strict=True)]
-    wanted, hits = jnp.concatenate(reached, axis=1), jnp.concatenate([ways.hits for ways in state.options], axis=1)
+    reached = [jnp.any(w.reached, axis=-1) & able[:, None] for w, able in zip(state.ways, state.able, strict=True)]
+    wanted, hits = jnp.concatenate(reached, axis=1), jnp.concatenate([ways.hits for ways in state.ways], axis=1)
     stuck = ~jnp.any(wanted & ~jnp.any(hits, axis=-1), axis=1) & jnp.any(state.able, axis=0)
     in_the_way = jax.vmap(blame)(hits, wanted)
     for _ in range(DEPTH):
@@ -130,10 +130,9 @@ def guided_draw(
     return sample_action(
         key,
         problem.space,
-        problem.actions,
         state.scene,
         possible_space(problem, belief, state.exists),
-        state.options,
+        state.ways,
         state.able,
         sampling_weights(problem, belief, objective, guided_fraction, state),
     )

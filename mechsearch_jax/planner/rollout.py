@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions.candidates import candidates, no_candidates
-from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
-from mechsearch_jax.actions.sampler import contact_risk
+from mechsearch_jax.actions.sampler import contact_probability
 from mechsearch_jax.actions.types import Action, Prediction, Sample
+from mechsearch_jax.actions.ways import AllWays, all_ways, no_ways
 from mechsearch_jax.belief.belief import Belief, possible_space, with_target
 from mechsearch_jax.belief.moved_target import candidate_of
 from mechsearch_jax.config.config import PlannerConfig
@@ -39,32 +39,32 @@ GAIN = 0.02
 # Draws an action in a state, and predicts it: one of several.
 Attempt = Callable[[State, Array], tuple[Sample, Prediction]]
 # What an action changes in a state, and what is then computed for the next one.
-CHANGING = ("scene", "target_at", "moved", "available", "alive", "options")
+CHANGING = ("scene", "target_at", "moved", "available", "alive", "ways")
 
 
 def prefix_values(
-    cost: Float[Array, " n"], charge: Float[Array, " m"], acted: Bool[Array, " m"], gamma: Array | float
+    cost: Float[Array, " n"], penalty: Float[Array, " m"], acted: Bool[Array, " m"], gamma: Array | float
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Equation 2 for every prefix of a sequence, with what its actions are charged: the best value, and its length.
+    """Equation 2 for every prefix of a sequence, with the penalties of its actions: the best value, and its length.
 
     `cost` is J before each action and after the last.
     """
-    discount = gamma ** jnp.arange(charge.shape[0], dtype=jnp.float32)
-    values = jnp.where(acted, jnp.cumsum(discount * (jnp.diff(cost) + charge)), jnp.inf)
+    discount = gamma ** jnp.arange(penalty.shape[0], dtype=jnp.float32)
+    values = jnp.where(acted, jnp.cumsum(discount * (jnp.diff(cost) + penalty)), jnp.inf)
     return jnp.min(values), jnp.argmin(values) + 1
 
 
 def sequence_values(
-    cost: Float[Array, "s n"], charge: Float[Array, "s m"], acted: Bool[Array, "s m"], gamma: Array | float
+    cost: Float[Array, "s n"], penalty: Float[Array, "s m"], acted: Bool[Array, "s m"], gamma: Array | float
 ) -> tuple[Float[Array, " s"], Int[Array, " s"]]:
     """`prefix_values` of all sequences, which begin in the same state.
 
-    Where none of them gains anything, nothing is charged: a risk is taken rather than nothing done.
+    Where none of them gains anything, there are no penalties: what is risky is done rather than nothing.
     """
     values = jax.vmap(functools.partial(prefix_values, gamma=gamma))
-    charged, free = values(cost, charge, acted), values(cost, jnp.zeros_like(charge), acted)
-    stuck = jnp.min(charged[0]) > -GAIN * cost[0, 0]
-    return jax.tree.map(functools.partial(jnp.where, stuck), free, charged)
+    penalised, free = values(cost, penalty, acted), values(cost, jnp.zeros_like(penalty), acted)
+    stuck = jnp.min(penalised[0]) > -GAIN * cost[0, 0]
+    return jax.tree.map(functools.partial(jnp.where, stuck), free, penalised)
 
 
 def present_state(problem: Problem, belief: Belief, objects: Superquadrics, config: PlannerConfig) -> State:
@@ -85,7 +85,7 @@ def present_state(problem: Problem, belief: Belief, objects: Superquadrics, conf
         target_at=jnp.zeros_like(belief.exists),
         views=no_views(scene.capacity, problem.config.existence, places),
         hits=no_hits(pairs(problem.grasps, belief.grasps.feasible), scene.capacity),
-        options=no_candidates(problem.space, scene.capacity),
+        ways=no_ways(problem.space, scene.capacity),
         moved=scene.valid,
         available=scene.valid & (~is_target | config.move_target),
         alive=jnp.array(True),
@@ -126,19 +126,21 @@ class Rollout:
         )
         here = jnp.where(self.belief.found, state.target_at, state.exists)
         exists = existence(problem.existence, problem.camera, views, here, self.belief.allowed, settings)
-        counts, found = split_found(self.objective.needs_graspability(self.belief, state.replace(exists=exists)))
-        grasps, known = self.belief.grasps, problem.grasps.pair_pose.shape[0]
+        of_candidates, of_found = split_found(
+            self.objective.needs_graspability(self.belief, state.replace(exists=exists))
+        )
+        grasps, rows = self.belief.grasps, problem.grasps.pair_pose.shape[0]
         # Where the target has moved, other rows of H count, of which nothing is known yet.
         unknown = moved | jnp.any(moved & state.is_target)
-        hits = grasp_hits(problem.grasps, objects, counts, state.hits[:known], unknown)
-        of_found = found_hits(problem.target_grasps, grasps, objects, found, state.hits[known:], moved)
-        return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, of_found]))
+        hits = grasp_hits(problem.grasps, objects, of_candidates, state.hits[:rows], unknown)
+        more = found_hits(problem.target_grasps, grasps, objects, of_found, state.hits[rows:], moved)
+        return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, more]))
 
-    def options(self, state: State, moved: Bool[Array, " n"]):
+    def ways(self, state: State, moved: Bool[Array, " n"]) -> AllWays:
         """What can be done where an action of a state is drawn, after the `moved` objects did."""
         possible = possible_space(self.problem, self.belief, state.exists)
-        space, tables, drawn_in = self.problem.space, self.problem.actions, self.drawn_in(self.present, state)
-        return candidates(space, tables, drawn_in.scene, possible, state.options, moved, state.able)
+        scene = self.drawn_in(self.present, state).scene
+        return all_ways(self.problem.space, scene, possible, state.ways, moved, state.able)
 
     def cost(self, state: State) -> Float[Array, ""]:
         """J of a state that is up to date."""
@@ -159,30 +161,30 @@ class Rollout:
         return (_one_after_the_other if on_cpu() else _at_once)(attempt, state, draws, most)
 
     def act(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[dict[str, Any], Action, Array]:
-        """Sample an action and predict what it changes in a state; also what it may cost beside, as a share of J."""
-        sample, told = self._draw(first, state, key)
-        acted = told.possible & state.alive
+        """Sample an action and predict what it changes in a state; also its penalty, as a share of J."""
+        sample, prediction = self._draw(first, state, key)
+        acted = prediction.possible & state.alive
         action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
         spent = (jnp.arange(state.scene.capacity) == action.object) & (not self.config.move_again)
-        moved = told.moved & acted
+        moved = prediction.moved & acted
         target_at = state.target_at
         if self.config.move_target:
-            at = candidate_of(self.problem, told.scene, state.is_target)
+            at = candidate_of(self.problem, prediction.scene, state.is_target)
             target_at = jnp.where(jnp.any(moved & state.is_target), at, target_at)
         changes = {
-            "scene": told.scene,
+            "scene": prediction.scene,
             "target_at": target_at,
             "moved": moved,
             "available": state.available & ~spent,
             "alive": acted,
         }
-        return changes, action, self.config.unseen_contact_penalty * self.risk(state, sample)
+        return changes, action, self.config.unseen_contact_penalty * self.contact_probability(state, sample)
 
-    def risk(self, state: State, sample: Sample) -> Float[Array, ""]:
+    def contact_probability(self, state: State, sample: Sample) -> Float[Array, ""]:
         """Share of the possible poses at which an action would touch the target, where it was drawn."""
         possible = possible_space(self.problem, self.belief, state.exists)
         scene = self.drawn_in(self.present, state).scene
-        return contact_risk(self.problem.space, self.problem.actions, scene, possible, sample)
+        return contact_probability(self.problem.space, scene, possible, sample)
 
     def step(self, states: State, keys: Array, time: Int[Array, ""]):
         """All sequences by one action: the states after it, and what is to be kept of the ones before it."""
@@ -195,18 +197,18 @@ class Rollout:
         states = shared(jax.vmap(self.update)(states.replace(exists=states.exists & computes), moved))
 
         def go_on():
-            options = shared(jax.vmap(self.options)(states, moved))
+            ways = shared(jax.vmap(self.ways)(states, moved))
             act = jax.vmap(functools.partial(self.act, first))
-            changes, actions, price = act(states.replace(options=options), keys)
-            return changes | {"options": options}, actions, price
+            changes, actions, penalty = act(states.replace(ways=ways), keys)
+            return changes | {"ways": ways}, actions, penalty
 
         def stay():
             changes = {name: getattr(states, name) for name in CHANGING}
             return changes, repeated(no_action(), count), jnp.zeros(count)
 
         # After the last action only the cost counts. What the actions do not change does not pass through the branches.
-        changes, actions, price = jax.lax.cond(time < self.config.horizon, go_on, stay)
-        kept = (actions, jax.vmap(self.cost)(states), price, changes["scene"])
+        changes, actions, penalty = jax.lax.cond(time < self.config.horizon, go_on, stay)
+        kept = (actions, jax.vmap(self.cost)(states), penalty, changes["scene"])
         return states.replace(**changes), kept
 
 
@@ -226,13 +228,13 @@ def _one_after_the_other(attempt: Attempt, state: State, draws: Int[Array, ""], 
     blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
 
     def again(carry):
-        i, (_, found) = carry
+        i, (_, prediction) = carry
         # In a batch, those that have an action go round with the others.
-        return i + 1, attempt(_to_do_in(state, state.alive & ~found.possible), i)
+        return i + 1, attempt(_to_do_in(state, state.alive & ~prediction.possible), i)
 
     def wanted(carry):
-        i, (_, found) = carry
-        return (i < draws) & ~found.possible & state.alive
+        i, (_, prediction) = carry
+        return (i < draws) & ~prediction.possible & state.alive
 
     return jax.lax.while_loop(wanted, again, (jnp.int32(0), blank))[1]
 
@@ -241,10 +243,10 @@ def _at_once(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -
     """The first attempt that is possible, of all of them: for a GPU, on which waiting for the first takes longer."""
     number = jnp.arange(most, dtype=jnp.int32)
 
-    sample, found = jax.vmap(lambda i: attempt(_to_do_in(state, state.alive & (i < draws)), i))(number)
-    works = found.possible & (number < draws)
-    sample, found = jax.tree.map(lambda a: a[jnp.argmax(works)], (sample, found))
-    return sample, found.replace(possible=jnp.any(works))
+    sample, prediction = jax.vmap(lambda i: attempt(_to_do_in(state, state.alive & (i < draws)), i))(number)
+    works = prediction.possible & (number < draws)
+    sample, prediction = jax.tree.map(lambda a: a[jnp.argmax(works)], (sample, prediction))
+    return sample, prediction.replace(possible=jnp.any(works))
 
 
 def repeated(tree: Any, count: int) -> Any:
@@ -269,12 +271,12 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     rollout = dataclasses.replace(rollout, present=root.scene)
     states = repeated(root, count)
     keys = jnp.swapaxes(jax.vmap(lambda k: jax.random.split(k, horizon + 1))(jax.random.split(key, count)), 0, 1)
-    _, (actions, cost, price, scenes) = jax.lax.scan(
+    _, (actions, cost, penalty, scenes) = jax.lax.scan(
         lambda states, now: rollout.step(states, *now), states, (keys, jnp.arange(horizon + 1))
     )
-    actions, price = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, price))
+    actions, penalty = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, penalty))
     cost, now = jnp.swapaxes(cost, 0, 1), cost[0, 0]
-    value, length = sequence_values(cost, price * cost[:, :-1], actions.kind != ActionKind.NONE, config.gamma)
+    value, length = sequence_values(cost, penalty * cost[:, :-1], actions.kind != ActionKind.NONE, config.gamma)
     # Without the target's slot, which comes after those of the objects.
     after = jax.tree.map(lambda a: a[0, :, : objects.capacity], scenes)
     sequences = Sequences(actions, cost[:, 1:], value, length, after)

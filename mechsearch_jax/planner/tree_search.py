@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.config.config import PlannerConfig
@@ -36,7 +36,7 @@ class Node(flax.struct.PyTreeNode):
       depth: number of actions before it, int32.
       cost: its J.
       action: that led to it; of kind NONE where that is impossible, and at the root.
-      price: what that action is charged, in units of J.
+      penalty: of that action, in units of J.
     """
 
     state: State
@@ -44,7 +44,7 @@ class Node(flax.struct.PyTreeNode):
     depth: jax.Array
     cost: jax.Array
     action: Action
-    price: jax.Array
+    penalty: jax.Array
 
 
 def import_mctx() -> ModuleType:
@@ -65,13 +65,13 @@ def import_mctx() -> ModuleType:
 def _up_to_date(rollout: Rollout, state: State) -> State:
     """A state with its f, g and actions, after `state.moved` moved."""
     state = rollout.update(state, state.moved)
-    return state.replace(options=rollout.options(state, state.moved))
+    return state.replace(ways=rollout.ways(state, state.moved))
 
 
 def _step(rollout: Rollout, key: Array, index: Array, node: Node) -> Node:
     """What the action of an index leads to; the same index means the same action whenever it is tried."""
     draw = jax.random.fold_in(jax.random.wrap_key_data(node.key), index)
-    changes, action, charge = rollout.act(node.depth == 0, node.state, draw)
+    changes, action, penalty = rollout.act(node.depth == 0, node.state, draw)
     state = _up_to_date(rollout, node.state.replace(**changes))
     return Node(
         state=state,
@@ -79,7 +79,7 @@ def _step(rollout: Rollout, key: Array, index: Array, node: Node) -> Node:
         depth=node.depth + 1,
         cost=rollout.cost(state),
         action=action,
-        price=charge * node.cost,
+        penalty=penalty * node.cost,
     )
 
 
@@ -119,15 +119,15 @@ def tree_plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
         node = jax.tree.map(lambda a: a[0], batch)
         after = _step(rollout, key, index[0], node)
         acted = after.action.kind != ActionKind.NONE
-        told = mctx.RecurrentFnOutput(
-            reward=jnp.where(acted, node.cost - after.cost - after.price, 0.0)[None],
+        output = mctx.RecurrentFnOutput(
+            reward=jnp.where(acted, node.cost - after.cost - after.penalty, 0.0)[None],
             discount=jnp.where(acted, config.gamma, 0.0).astype(jnp.float32)[None],
             prior_logits=logits,
             value=jnp.zeros(1),
         )
-        return told, jax.tree.map(lambda a: a[None], after)
+        return output, jax.tree.map(lambda a: a[None], after)
 
-    found = mctx.gumbel_muzero_policy(
+    result = mctx.gumbel_muzero_policy(
         params=(),
         rng_key=key_search,
         root=mctx.RootFnOutput(
@@ -139,12 +139,12 @@ def tree_plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
         max_num_considered_actions=width(config),
         gumbel_scale=0.0,
     )
-    return _decision(rollout, begin, found, objects.capacity)
+    return _decision(rollout, begin, result, objects.capacity)
 
 
-def _decision(rollout: Rollout, begin: Node, found: Any, slots: int) -> Decision:
+def _decision(rollout: Rollout, begin: Node, result: Any, slots: int) -> Decision:
     """What a search came to; an action that turned out impossible is never chosen."""
-    tree, config = found.search_tree, rollout.config
+    tree, config = result.search_tree, rollout.config
     child = tree.children_index[0, tree.ROOT_INDEX]
     tried = functools.partial(jax.tree.map, lambda a: a[0, jnp.maximum(child, 0)])
     node = tree.embeddings
@@ -153,7 +153,7 @@ def _decision(rollout: Rollout, begin: Node, found: Any, slots: int) -> Decision
     value = jnp.where(acted, -tree.qvalues(jnp.full(1, tree.ROOT_INDEX))[0], jnp.inf)
     actions = actions.replace(kind=jnp.where(acted, actions.kind, ActionKind.NONE).astype(jnp.int32))
     # The one that the search trusts comes first, wherever its value stands.
-    trusted = (jnp.arange(width(config)) == found.action[0]) & acted
+    trusted = (jnp.arange(width(config)) == result.action[0]) & acted
     order = jnp.argsort(jnp.where(trusted, -jnp.inf, value), stable=True)
     actions, cost, value, scenes = jax.tree.map(lambda a: a[order], (actions, cost, value, scenes))
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import SAMPLED_KINDS, ActionKind
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.belief.belief import Belief
@@ -91,7 +91,7 @@ class AsksTwice(Protocol):
         """Whether to take out a target that is found: an action of kind RETRIEVE, or of kind NONE."""
         ...
 
-    def search(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
+    def planned(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """What to do otherwise."""
         ...
 
@@ -115,7 +115,7 @@ def decide(
         decision = tried(trials, problem, belief, observation, policy.retrieval(*arguments))
         if int(decision.action.kind) == ActionKind.RETRIEVE:
             return decision
-    return tried(trials, problem, belief, observation, policy.search(*arguments))
+    return tried(trials, problem, belief, observation, policy.planned(*arguments))
 
 
 def tried(

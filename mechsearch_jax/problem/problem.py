@@ -51,14 +51,14 @@ class Problem(flax.struct.PyTreeNode):
 
     @property
     def space(self) -> ActionSpace:
-        """The settings that all actions share: static but for the shelf."""
+        """The settings and tables that all actions share."""
         return ActionSpace(
             shelf=self.shelf,
+            tables=self.actions,
             gripper=self.gripper,
             config=self.config.actions,
             max_yaw=self.config.grasps.max_yaw,
             waypoints=self.config.grasps.waypoints,
-            wrists=self.actions.q7.shape[1],
         )
 
     @property

@@ -9,6 +9,8 @@ gripper's frame, and the free space of the shelf is a prism along x. Links 2 to 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -157,14 +159,26 @@ def _followed(
     return q, reachable & ~jnp.any(joints_hit_shelf(q, shelf))
 
 
+class WaysIn(NamedTuple):
+    """Ways into the shelf; C of them.
+
+    Attributes:
+      T_world_gripper: where they end, shape (C, 4, 4).
+      q7: angles of joint 7 [rad], shape (C,).
+      cloud: which of several clouds the gripper sweeps on each, shape (C,).
+    """
+
+    T_world_gripper: Float[Array, "c 4 4"]
+    q7: Float[Array, " c"]
+    cloud: Int[Array | np.ndarray, " c"]
+
+
 def gripper_enters(
     shelf: Shelf,
     gripper: Gripper,
     waypoints: int,
     clouds: Float[Array, "k 3 p"],
-    cloud: Int[Array | np.ndarray, " c"],
-    T_world_gripper: Float[Array, "c 4 4"],
-    q7: Float[Array, " c"],
+    ways: WaysIn,
     mask: Bool[Array, " c"],
 ) -> Bool[Array, " c"]:
     """Whether the arm can follow the way in to each pose, and neither it nor the gripper's sweep touches the shelf.
@@ -176,9 +190,7 @@ def gripper_enters(
       gripper: static.
       waypoints: poses on the approach; there are `FEW_CROSSINGS` on the crossing.
       clouds: swept clouds of grippers in their frames, as rows of coordinates [m].
-      cloud: index of the cloud of each way.
-      T_world_gripper: where the ways end.
-      q7: angles of joint 7 [rad].
+      ways: the ways in.
       mask: which ways to test; the result is False for the others.
     """
 
@@ -187,4 +199,4 @@ def gripper_enters(
         path = way_in(T, gripper.nearest_outside, gripper, FEW_CROSSINGS, waypoints)
         return arm_follows(path, q7, shelf) & ~cloud_hits_shelf(shelf, T, taken(clouds, cloud[None])[0])
 
-    return masked_vmap(enters, mask, (shelf, clouds), None, (T_world_gripper, q7, jnp.asarray(cloud)))
+    return masked_vmap(enters, mask, (shelf, clouds), None, (ways.T_world_gripper, ways.q7, jnp.asarray(ways.cloud)))

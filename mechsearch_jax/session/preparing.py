@@ -21,7 +21,7 @@ from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Policy, Problem, initial_belief, update_belief
-from mechsearch_jax.planner.policies import Search
+from mechsearch_jax.planner.policies import PlanningPolicy
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.cores import cores
 
@@ -61,7 +61,7 @@ def first_decision(problem: Problem, policy: Policy, motion: MotionConfig) -> li
     seen: Observation = jax.tree.map(lambda s: jax.device_put(np.zeros(s.shape, s.dtype)), shapes)
     belief = initial_belief(problem)
     programs = []
-    if isinstance(policy, Search):
+    if isinstance(policy, PlanningPolicy):
         programs.append(program("plan", policy, jax.random.key(0), problem, belief, seen))
     programs.append(program("belief", update_belief, problem, belief, seen, seen, no_action()))
     return [*programs, *motions(motion)]

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import KINDS, ActionKind, kind_of
 from mechsearch_jax.belief.belief import Belief, initial_belief, update_belief
 from mechsearch_jax.belief.impasse import impasse

@@ -6,7 +6,7 @@ from typing import Any
 
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.dynamics.named import own_push_model
-from mechsearch_jax.planner.policies import Policy, Search, search_for_grasp
+from mechsearch_jax.planner.policies import PlanningPolicy, Policy, search_for_grasp
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.errors import InputError
 
@@ -19,7 +19,7 @@ UNTRIED = (
 
 def tries_nothing(policy: Policy, trials: Trials | None) -> bool:
     """Whether no action of a search-for-grasp policy is tried in physics; False for other policies, which may try."""
-    return isinstance(policy, Search) and (trials is None or not policy.tries)
+    return isinstance(policy, PlanningPolicy) and (trials is None or not policy.tries)
 
 
 def filled(policy: Policy | None, config: Config, trials: Trials | None, slots: dict[str, Any]) -> Policy:
@@ -36,7 +36,7 @@ def filled(policy: Policy | None, config: Config, trials: Trials | None, slots: 
                 f"Searcher: {' and '.join(given)} would have no effect beside a policy, which has its own; give it the "
                 f"{given[0]} when it is made, and leave the keyword out"
             )
-        if trials is not None and isinstance(policy, Search) and not policy.tries:
+        if trials is not None and isinstance(policy, PlanningPolicy) and not policy.tries:
             raise InputError(
                 "Searcher: rehearsal would have no effect, for the policy proposes nothing to be tried; make it with "
                 "tries=True"

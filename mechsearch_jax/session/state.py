@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mechsearch_jax.actions.nothing import no_action
+from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.belief.belief import Belief, initial_belief
 from mechsearch_jax.geometry.superquadric import empty

@@ -36,7 +36,7 @@ class Nothing:
     takes_target: bool = False
     returns_home: bool = False
 
-    def predict(self, space, tables, push_model, scene, untouchable, action, wrist) -> Prediction:
+    def predict(self, space, push_model, scene, untouchable, action, wrist) -> Prediction:
         """Nothing changes, and nothing is achieved: not a possible action."""
         return Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False))
 

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
-from mechsearch_jax.actions.config import ActionConfig, ActionSpace, ActionTables
-from mechsearch_jax.actions.object_grasps import PASSING_GAP
+from mechsearch_jax.actions.config import ActionConfig, ActionSpace
+from mechsearch_jax.actions.kinds.object_grasps import PASSING_GAP
 from mechsearch_jax.dynamics.push_model import LOW_CONTACT
 from mechsearch_jax.geometry.footprints import TOUCH, Footprints, extents, turned
 from mechsearch_jax.geometry.masked import masked_vmap
@@ -117,7 +117,7 @@ def _half_extents(scene: Superquadrics, vectors: Float[np.ndarray, "v 2"]) -> Fl
 
 
 def object_pushes(
-    space: ActionSpace, tables: ActionTables, scene: Superquadrics, prints: Footprints, fresh: Bool[Array, " n"]
+    space: ActionSpace, scene: Superquadrics, prints: Footprints, fresh: Bool[Array, " n"]
 ) -> tuple[Float[Array, "n v 4 4"], Float[Array, "n v"]]:
     """Gripper poses where pushes start, at `push_gap` from each object, and their sampling weights.
 
@@ -137,19 +137,19 @@ def object_pushes(
     centre = jnp.concatenate([place, (shelf.board + height)[..., None]], axis=-1)
     T = make(jnp.broadcast_to(rotation[None], (n, v, 3, 3)), centre)
     # The hand and the fingers are where they are whatever the wrist's angle.
-    told = np.column_stack([starts.heading, starts.share, starts.depth, starts.yaw])
-    _, first, alike = np.unique(told, axis=0, return_index=True, return_inverse=True)
+    begins = np.column_stack([starts.heading, starts.share, starts.depth, starts.yaw])
+    _, first, alike = np.unique(begins, axis=0, return_index=True, return_inverse=True)
     headings = starts.heading[first]
 
     def clear(shared, _, row):
-        (shelf, pusher), (one, T, heading) = shared, row
+        (shelf, pusher), (body, T, heading) = shared, row
         world = transform(T, pusher)
-        level = (world[:, 2] > one.low - config.push_gap) & (world[:, 2] < one.high + config.push_gap)
-        local = turned(-one.yaw, world[:, :2] - one.position[None])
-        heading = turned(-one.yaw, -heading)
+        level = (world[:, 2] > body.low - config.push_gap) & (world[:, 2] < body.high + config.push_gap)
+        local = turned(-body.yaw, world[:, :2] - body.position[None])
+        heading = turned(-body.yaw, -heading)
         # In front of the object the palm may pass close by; only along the push does it keep the whole gap.
-        grown = one.half + PASSING_GAP
-        away = _exit_distance(grown[None], one.round, local, jnp.broadcast_to(heading[None], local.shape))
+        grown = body.half + PASSING_GAP
+        away = _exit_distance(grown[None], body.round, local, jnp.broadcast_to(heading[None], local.shape))
         away = jnp.where(level, away, 0.0)
         farthest = jnp.max(away)
         touching = level & (away > farthest - TOUCH)
@@ -158,8 +158,8 @@ def object_pushes(
 
     each = jax.tree.map(lambda a: jnp.repeat(a, len(first), axis=0), prints)
     rows = (each, T[:, first].reshape(-1, 4, 4), np.tile(headings, (n, 1)))
-    found = masked_vmap(clear, jnp.repeat(fresh, len(first)), (shelf, tables.pusher), None, rows)
-    distance, contact = (a.reshape(n, len(first))[:, alike.reshape(-1)] for a in found)
+    measured = masked_vmap(clear, jnp.repeat(fresh, len(first)), (shelf, space.tables.pusher), None, rows)
+    distance, contact = (a.reshape(n, len(first))[:, alike.reshape(-1)] for a in measured)
     stable = contact <= jnp.maximum(leverage, LOW_CONTACT)
     back = -distance[..., None] * starts.heading[None]
     return T.at[..., :2, 3].add(back), stable.astype(jnp.float32)

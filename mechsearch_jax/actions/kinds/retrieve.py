@@ -51,7 +51,7 @@ class Retrieve:
     takes_target: bool = True
     returns_home: bool = False
 
-    def predict(self, space, tables, push_model, scene, untouchable, action, wrist) -> Prediction:
+    def predict(self, space, push_model, scene, untouchable, action, wrist) -> Prediction:
         """A retrieval that hits nothing leaves all objects where they are."""
         return Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(True))
 

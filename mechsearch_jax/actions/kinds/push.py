@@ -19,10 +19,10 @@ from mechsearch_jax.actions.approach import (
     gripper_clouds,
     object_clouds,
 )
-from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace, ActionTables
-from mechsearch_jax.actions.push_starts import PushStarts, object_pushes, push_starts
+from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace
+from mechsearch_jax.actions.kinds.push_starts import PushStarts, object_pushes, push_starts
 from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.actions.types import Action, Draft, Prediction, Ways
+from mechsearch_jax.actions.types import Action, Draft, DrawnWay, Prediction, Ways
 from mechsearch_jax.actions.unseen_space import PossibleSpace, cloud_enters
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.collision import collisions
@@ -38,8 +38,9 @@ from mechsearch_jax.robot.entry import (
     crossing_poses,
     way_in,
 )
+from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.motion import MotionConfig, Reference, push_reference
-from mechsearch_jax.workspace.shelf import cloud_hits_shelf
+from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf
 
 CODE = 1
 # Number of places on the way of a push that are tested for collision.
@@ -57,7 +58,12 @@ def _displacements(config: ActionConfig, heading: Float[np.ndarray, "*batch 2"])
 
 
 def motion_free(
-    space: ActionSpace, scene: Superquadrics, after: Superquadrics, still: Bool[Array, " n"], action: Action
+    shelf: Shelf,
+    gripper: Gripper,
+    scene: Superquadrics,
+    after: Superquadrics,
+    still: Bool[Array, " n"],
+    action: Action,
 ) -> Bool[Array, ""]:
     """Whether the arm can follow a push from outside the shelf to outside, and links 2 to 5 touch nothing.
 
@@ -65,18 +71,19 @@ def motion_free(
     rule out most; this is for the few that are drawn.
 
     Args:
-      space: all but the shelf is static.
+      shelf: the shelf.
+      gripper: static.
       scene, after: the objects before and after the push.
       still: which objects it leaves in place.
       action: the push.
     """
-    n, gripper = CLOSE_WAYPOINTS, space.gripper
+    n = CLOSE_WAYPOINTS
     start, end = action.T_world_gripper, action.T_world_place
     way = translate(jnp.broadcast_to(start, (n, 4, 4)), jnp.linspace(0.0, 1.0, n)[:, None] * (end - start)[None, :3, 3])
     into, back = jax.vmap(lambda T: way_in(T, gripper.nearest_outside, gripper, CLOSE_CROSSINGS, n))(
         jnp.stack([start, end])
     )
-    q, follows = arm_path(jnp.concatenate([into, way[1:], back[::-1][1:]]), action.q7, space.shelf)
+    q, follows = arm_path(jnp.concatenate([into, way[1:], back[::-1][1:]]), action.q7, shelf)
     begins, ends = len(into), len(into) + n - 1
     # Poses 5 cm apart at most, of which those before the push see the objects where they were.
     stretches = q[:begins:2], q[begins:ends:3], q[ends::2]
@@ -95,7 +102,6 @@ def _joined(*scenes: Superquadrics) -> Superquadrics:
 
 def gripper_meets(
     space: ActionSpace,
-    tables: ActionTables,
     scene: Superquadrics,
     after: Superquadrics,
     action: Action,
@@ -110,15 +116,14 @@ def gripper_meets(
     push's own, and along x against all objects as they are then.
 
     Args:
-      space: all but the shelf is static.
-      tables: constants of the problem.
+      space: what all actions share.
       scene, after: the objects before and after the push.
       action: the push.
       wrist: index of its wrist angle.
       moved: which objects it moves.
       pushes: whether it is one; nothing is hit where it is not.
     """
-    n, k = scene.capacity, PUSH_PLACES
+    n, k, tables = scene.capacity, PUSH_PLACES, space.tables
     slim = after.replace(size=jnp.maximum(after.size - TOUCHING, 0.5 * after.size))
     ends = jnp.stack([action.T_world_gripper, action.T_world_place])
     share = (jnp.arange(k) + 1.0) / k
@@ -174,16 +179,16 @@ class Push:
     def distances(self, space: ActionSpace) -> int:
         return len(space.config.push_distances)
 
-    def propose(self, space, tables, scene, prints, fresh):
+    def propose(self, space, scene, prints, fresh):
         """See `object_pushes`."""
-        return object_pushes(space, tables, scene, prints, fresh)
+        return object_pushes(space, scene, prints, fresh)
 
     def _displacements(self, space: ActionSpace, capacity: int) -> Float[Array, "k d 3"]:
         return _displacements(space.config, np.tile(self._starts(space).heading, (capacity, 1)))
 
-    def travels(self, space: ActionSpace, tables: ActionTables, T, near) -> Bool[Array, "k d"]:
+    def travels(self, space: ActionSpace, T, near) -> Bool[Array, "k d"]:
         """Whether the arm follows the push from outside to outside and nothing of it touches the shelf at its end."""
-        d = self.distances(space)
+        d, tables = self.distances(space), space.tables
         wrist = self.wrists(space)
         capacity = T.shape[0] // len(wrist)
         wrist = np.tile(wrist, capacity)
@@ -210,16 +215,16 @@ class Push:
         return jnp.zeros(mask.shape, bool)
 
     def entering(
-        self, space: ActionSpace, tables: ActionTables, scene: Superquadrics, possible: PossibleSpace, ways: Ways
+        self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, ways: Ways
     ) -> Bool[Array, "n v d"]:
         """Whether gripper or object enter possible space at places on the way less than two finger widths apart."""
         n, v, d = ways.reached.shape
-        wrist, owner = np.tile(self.wrists(space), n), np.repeat(np.arange(n), v)
+        tables, wrist, owner = space.tables, np.tile(self.wrists(space), n), np.repeat(np.arange(n), v)
         clouds = object_clouds(scene, space.config.object_points)
         usable = ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None] & space.config.avoid_unseen
         shift = self._displacements(space, n)
 
-        def one(grippers, own, row):
+        def enters(grippers, own, row):
             T, shift, gripper, owner = row
             possible, poses, bodies = own
             way = shift[None] * jnp.linspace(0.0, 1.0, PLACES)[:, None]
@@ -237,12 +242,12 @@ class Push:
             jnp.asarray(np.repeat(owner, d)),
         )
         grippers, own = gripper_clouds(tables).points, (possible, make(scene.rotation, scene.position), clouds)
-        return masked_vmap(one, usable.reshape(-1), grippers, own, rows, block=64).reshape(n, v, d)
+        return masked_vmap(enters, usable.reshape(-1), grippers, own, rows, block=64).reshape(n, v, d)
 
-    def draft(self, key, space: ActionSpace, tables: ActionTables, scene, possible, ways, index, way, wanted) -> Draft:
+    def draft(self, key, space: ActionSpace, scene, possible, ways, drawn: DrawnWay) -> Draft:
         """The push, and the space that it sweeps between its ends."""
         _, v, d = ways.reached.shape
-        way = jnp.clip(way, 0, v * d - 1)
+        index, way = drawn.object, jnp.clip(drawn.number, 0, v * d - 1)
         push, distance = way // d, way % d
         starts = self._starts(space)
         T, wrist = ways.T_world_gripper[index, push], jnp.asarray(starts.wrist)[push]
@@ -253,7 +258,7 @@ class Push:
             T_world_gripper=T,
             displacement=displacement,
             T_world_place=translate(T, displacement),
-            q7=tables.q7[CLOSED, wrist],
+            q7=space.tables.q7[CLOSED, wrist],
             opening=jnp.float32(0.0),
         )
         T_object = make(scene.rotation[index], scene.position[index])
@@ -265,7 +270,6 @@ class Push:
     def predict(
         self,
         space: ActionSpace,
-        tables: ActionTables,
         push_model: PushModel,
         scene: Superquadrics,
         untouchable: Bool[Array, " n"],
@@ -280,19 +284,19 @@ class Push:
         pushes = action.kind == CODE
         # A model that simulates has less to do where nothing is pushed.
         way = jnp.where(pushes, action.displacement, 0.0)
-        pushed = push_model(space.shelf, scene, tables.pusher, action.T_world_gripper, way, action.q7)
+        pushed = push_model(space.shelf, scene, space.tables.pusher, action.T_world_gripper, way, action.q7)
         moved = pushed.moved
         config = space.config
         holds = pushed.resolved & jnp.isfinite(pushed.residual) & jnp.all(pushed.topples <= config.topple)
         spoiled = ~holds | jnp.any(moved & untouchable)
         spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
-        spoiled |= gripper_meets(space, tables, scene, pushed.scene, action, wrist, moved, pushes & ~spoiled)
+        spoiled |= gripper_meets(space, scene, pushed.scene, action, wrist, moved, pushes & ~spoiled)
 
-        def free(space, own, _):
-            return motion_free(space, *own)
+        def free(shelf, own, _):
+            return motion_free(shelf, space.gripper, *own)
 
         own = (scene, pushed.scene, scene.valid & ~moved, action)
-        follows = masked_vmap(free, (pushes & ~spoiled)[None], space, own, None)[0]
+        follows = masked_vmap(free, (pushes & ~spoiled)[None], space.shelf, own, None)[0]
         return Prediction(pushed.scene, moved, ~spoiled & follows)
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:

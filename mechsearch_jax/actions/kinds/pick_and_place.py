@@ -1,0 +1,139 @@
+"""Pick-and-places: an object is taken out of the shelf and put down elsewhere on the board (paper appendix B.5)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from mechsearch_jax.actions.approach import (
+    PLACES,
+    SWEPT_PLACES,
+    approach_enters,
+    cloud_index,
+    object_clouds,
+    swept_places,
+)
+from mechsearch_jax.actions.config import OPEN, ActionSpace
+from mechsearch_jax.actions.kinds.object_grasps import grasp_variants, object_grasps
+from mechsearch_jax.actions.kinds.placement import ObjectGrasp, placement
+from mechsearch_jax.actions.sketch import Sketch
+from mechsearch_jax.actions.types import Action, Draft, DrawnWay, Prediction, Ways
+from mechsearch_jax.actions.unseen_space import PossibleSpace
+from mechsearch_jax.dynamics.rigid import in_hand, pick_and_place
+from mechsearch_jax.geometry.collision import clouds_of, collisions
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import make
+from mechsearch_jax.robot.motion import MotionConfig, Reference, pick_and_place_reference
+
+CODE = 2
+
+
+def _object_hits(T, owner, held, scene, clouds, distance, mask):
+    """Which others an object hits on its way along the gripper's -z: (C,) grasps of objects `owner` against (N).
+
+    `held` says how each owner is turned in the hand. Its own column has to be masked out.
+    """
+    c, n = mask.shape
+    places = swept_places(make(held, scene.position[owner]), -T[:, :3, 2], distance)
+    wanted = jnp.repeat(mask, SWEPT_PLACES, axis=0)
+    hits = collisions(
+        clouds_of(clouds), jnp.repeat(owner, SWEPT_PLACES), places.reshape(-1, 4, 4), scene, wanted, own=True
+    )
+    return jnp.any(hits.reshape(c, SWEPT_PLACES, n), axis=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class PickAndPlace:
+    """A `kind.SampledKind`: a side grasp, and a random free place."""
+
+    code: int = CODE
+    name: str = "pick-and-place"
+    moves_object: bool = True
+    holds_object: bool = True
+    takes_target: bool = False
+    returns_home: bool = True
+    opening: int = OPEN
+    surrounds_object: bool = True
+    # What could be picked could be taken out.
+    moves_target: bool = False
+
+    def wrists(self, space: ActionSpace) -> Int[np.ndarray, " v"]:
+        return grasp_variants(space.config.grasps, space.wrists)[1]
+
+    def distances(self, space: ActionSpace) -> int:
+        return 1
+
+    def propose(self, space, scene, prints, fresh):
+        """See `object_grasps`."""
+        T, plausible = object_grasps(
+            space.shelf, space.gripper, prints, space.config.grasps, space.max_yaw, space.wrists
+        )
+        return T, plausible.astype(jnp.float32)
+
+    def travels(self, space, T, near) -> Bool[Array, "k d"]:
+        """The way out is the way in."""
+        return near[:, None]
+
+    def swept_hits(self, space: ActionSpace, scene: Superquadrics, T, mask) -> Bool[Array, "k n"]:
+        """Which objects the grasped one hits on its way out; it may brush them `contact_tolerance` deep."""
+        n, config = scene.capacity, space.config
+        owner = jnp.asarray(np.repeat(np.arange(n), len(self.wrists(space))))
+        held = jax.vmap(lambda index, T: in_hand(scene, index, T))(owner, T)
+        slim = scene.replace(size=jnp.maximum(scene.size - config.contact_tolerance, 0.5 * scene.size))
+        clouds = object_clouds(slim, config.object_points)
+        return _object_hits(T, owner, held, scene, clouds, space.gripper.approach, mask)
+
+    def entering(
+        self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, ways: Ways
+    ) -> Bool[Array, "n v d"]:
+        """Whether the gripper enters possible space as it grasps; where the object is put is looked at later."""
+        n, v, d = ways.reached.shape
+        usable = ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None] & space.config.avoid_unseen
+        cloud = cloud_index(space.tables, OPEN, np.tile(self.wrists(space), n))
+        T = ways.T_world_gripper.reshape(-1, 4, 4)
+        return approach_enters(space.tables, possible, cloud, T, usable.reshape(-1)).reshape(n, v, d)
+
+    def draft(self, key, space: ActionSpace, scene, possible, ways, drawn: DrawnWay) -> Draft:
+        """The grasp, a place that it can be taken to, and the space at both ends."""
+        index, way = drawn.object, jnp.clip(drawn.number, 0, ways.reached.shape[1] - 1)
+        T, wrist = ways.T_world_gripper[index, way], jnp.asarray(self.wrists(space))[way]
+        placed, T_place, T_object = placement(key, space, scene, possible, ObjectGrasp(index, T, wrist, drawn.wanted))
+        action = Action(
+            kind=jnp.int32(CODE),
+            object=index.astype(jnp.int32),
+            T_world_gripper=T,
+            displacement=jnp.zeros(3),
+            T_world_place=T_place,
+            q7=space.tables.q7[OPEN, wrist],
+            opening=jnp.float32(space.gripper.max_opening),
+        )
+        grippers = jnp.stack([T, *[T_place] * (PLACES - 1)])
+        return Draft(placed, action, wrist, grippers, jnp.broadcast_to(T_object, (PLACES, 4, 4)))
+
+    def predict(self, space, push_model, scene, untouchable, action: Action, wrist) -> Prediction:
+        """The object, turned in the hand, moves with the gripper; `draft` has found out that it can."""
+        after = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
+        moved = scene.valid & (jnp.arange(scene.capacity) == action.object)
+        return Prediction(after, moved, action.kind == CODE)
+
+    def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
+        """See `motion.pick_and_place_reference`."""
+        return pick_and_place_reference(action.T_world_gripper, action.T_world_place, action.q7, action.opening, config)
+
+    def sketch(self, scene: Superquadrics, after: Superquadrics, action: Action) -> Sketch:
+        """The hand at both ends, and the object's way, as an arch above the others from its top to its top."""
+        i = int(action.object)
+        begin, end = (np.asarray(s.position, float)[i] for s in (scene, after))
+        top = np.array([0.0, 0.0, float(np.abs(np.asarray(scene.rotation)[i, 2]) @ np.asarray(scene.size)[i])])
+        share = np.linspace(0.0, 1.0, 40)[:, None]
+        arch = 4 * share * (1 - share) * np.array([0.0, 0.0, 0.25 * np.linalg.norm(end - begin)])
+        hands = np.stack([np.asarray(T, float) for T in (action.T_world_gripper, action.T_world_place)])
+        return Sketch(hands, float(action.opening), path=begin + top + share * (end - begin) + arch)
+
+    def describe(self, action: Action, target: int | None = None) -> str:
+        shift = np.asarray(action.T_world_place - action.T_world_gripper)[:2, 3]
+        return f"pick object {int(action.object)} and place it {100 * np.linalg.norm(shift):.0f} cm away"

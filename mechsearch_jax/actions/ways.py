@@ -1,0 +1,142 @@
+"""Every way to move every object of a scene, and what stands in the way: one batched evaluation for all kinds."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from mechsearch_jax.actions.approach import cloud_index, gripper_clouds
+from mechsearch_jax.actions.config import ActionSpace
+from mechsearch_jax.actions.kind import SampledKind
+from mechsearch_jax.actions.registry import SAMPLED_KINDS
+from mechsearch_jax.actions.types import Ways
+from mechsearch_jax.actions.unseen_space import PossibleSpace
+from mechsearch_jax.geometry.collision import collisions
+from mechsearch_jax.geometry.footprints import footprints
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.robot.entry import WaysIn, gripper_enters
+
+# The ways of every sampled kind, in the order of `SAMPLED_KINDS`.
+AllWays = tuple[Ways, ...]
+
+
+def no_ways(space: ActionSpace, capacity: int) -> AllWays:
+    """The ways to move so many objects that are yet to be looked at."""
+
+    def none(kind: SampledKind) -> Ways:
+        n, v, d = capacity, len(kind.wrists(space)), kind.distances(space)
+        return Ways(
+            T_world_gripper=jnp.zeros((n, v, 4, 4)),
+            weight=jnp.zeros((n, v)),
+            reached=jnp.zeros((n, v, d), bool),
+            hits=jnp.zeros((n, v, n), bool),
+            enters=jnp.zeros((n, v, d), bool),
+        )
+
+    return tuple(none(kind) for kind in SAMPLED_KINDS)
+
+
+def all_ways(
+    space: ActionSpace,
+    scene: Superquadrics,
+    possible: PossibleSpace,
+    previous: AllWays | None = None,
+    moved: Bool[Array, " n"] | None = None,
+    available: Bool[Array, "*kinds n"] | None = None,
+) -> AllWays:
+    """All ways to move all objects, and what stands in their way.
+
+    The kinds are tested together as far as they are alike: the approaches of the first kind to all objects, then those
+    of the next.
+
+    Args:
+      space: what all actions share.
+      scene: the objects, fields (N, ...).
+      possible: where the target may be.
+      previous: the ways before some objects moved.
+      moved: which moved since; only what concerns them is computed anew.
+      available: which objects may be moved, by all kinds alike or by each of `SAMPLED_KINDS`; all if left out. What the
+        ways of the others enter is not looked at.
+    """
+    n = scene.capacity
+    previous = no_ways(space, n) if previous is None else previous
+    fresh = scene.valid if moved is None else moved & scene.valid
+    concerns = fresh[:, None] | fresh[None, :]
+    others = concerns & scene.valid[:, None] & scene.valid[None, :]
+    proposed = _proposed(space, scene, previous, fresh)
+    T_world_gripper, _, cloud = proposed.approaches
+    clouds = gripper_clouds(space.tables)
+    near = gripper_enters(
+        space.shelf, space.gripper, space.waypoints, clouds.points, proposed.approaches, proposed.wanted
+    )
+
+    reached, against = [], []
+    for kind, before, T, part in zip(SAMPLED_KINDS, previous, proposed.T_world_gripper, proposed.parts, strict=True):
+        travels = kind.travels(space, T_world_gripper[part], near[part]).reshape(*T.shape[:2], -1)
+        reached.append(jnp.where(fresh[:, None, None], travels, before.reached))
+        obstacles = others & ~jnp.eye(n, dtype=bool) if kind.surrounds_object else others
+        owner = np.repeat(np.arange(n), T.shape[1])
+        against.append(obstacles[owner] & jnp.any(reached[-1], axis=-1).reshape(-1)[:, None])
+    mask = jnp.concatenate(against)
+    by_hand = collisions(clouds, cloud, T_world_gripper, scene, mask)
+
+    able = jnp.broadcast_to(True if available is None else available, (len(SAMPLED_KINDS), n))
+    tested = []
+    for i, (kind, before) in enumerate(zip(SAMPLED_KINDS, previous, strict=True)):
+        T, weight, part = proposed.T_world_gripper[i], proposed.weight[i], proposed.parts[i]
+        hits = by_hand[part]
+        hits |= kind.swept_hits(space, scene, T_world_gripper[part], mask[part] & ~hits)
+        hits = jnp.where(concerns[:, None, :], hits.reshape(*T.shape[:2], n), before.hits)
+        ways = Ways(T, weight, reached[i], hits, before.enters)
+        looked_at = ways.replace(reached=reached[i] & able[i][:, None, None])
+        tested.append(ways.replace(enters=kind.entering(space, scene, possible, looked_at)))
+    return tuple(tested)
+
+
+class _Proposed(NamedTuple):
+    """All ways before anything is tested.
+
+    Attributes:
+      T_world_gripper, weight: as in `Ways`, of each kind.
+      parts: which of the K ways of all kinds together are those of each.
+      approaches: the straight way in to each of the K.
+      wanted: which of the K are tested.
+    """
+
+    T_world_gripper: list[Float[Array, "n _ 4 4"]]
+    weight: list[Float[Array, "n _"]]
+    parts: list[slice]
+    approaches: WaysIn
+    wanted: Bool[Array, " k"]
+
+
+def _proposed(space: ActionSpace, scene: Superquadrics, previous: AllWays, fresh: Bool[Array, " n"]) -> _Proposed:
+    """What each kind proposes for the fresh objects, beside what was proposed for the others before."""
+    n, prints = scene.capacity, footprints(scene)
+    poses, weights, wanted, wrists, openings, parts = [], [], [], [], [], []
+    first = 0
+    for kind, before in zip(SAMPLED_KINDS, previous, strict=True):
+        T, weight = kind.propose(space, scene, prints, fresh)
+        poses.append(jnp.where(fresh[:, None, None, None], T, before.T_world_gripper))
+        weights.append(jnp.where(fresh[:, None], weight, before.weight))
+        wanted.append(((weight > 0.0) & (kind.name in space.config.actions) & fresh[:, None]).reshape(-1))
+        count = n * T.shape[1]
+        wrists.append(np.tile(kind.wrists(space), n))
+        openings.append(np.full(count, kind.opening))
+        parts.append(slice(first, first + count))
+        first += count
+    opening, wrist = np.concatenate(openings), np.concatenate(wrists)
+    approaches = WaysIn(
+        jnp.concatenate([T.reshape(-1, 4, 4) for T in poses]),
+        space.tables.q7[opening, wrist],
+        cloud_index(space.tables, opening, wrist),
+    )
+    return _Proposed(poses, weights, parts, approaches, jnp.concatenate(wanted))
+
+
+def free_ways(ways: Ways) -> Bool[Array, "n v d"]:
+    """Which ways nothing stands in the way of."""
+    return ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None]
