@@ -11,8 +11,8 @@ from mechsearch_jax.benchmarks.guard import guard
 from mechsearch_jax.benchmarks.guard.guard import Outcome, compare, detectable, power, sign_test, suite
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.commands import bench_episodes
 from mechsearch_jax.commands import main as cli
+from mechsearch_jax.commands.bench import episodes
 from mechsearch_jax.envs.scenes.scene_sets import recorded
 from mechsearch_jax.runtime.errors import InputError
 
@@ -108,7 +108,7 @@ def test_a_suite_has_as_many_scenes_of_each_number_of_objects():
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """Runs the command, whose episodes come to what is given; nothing is planned."""
-    monkeypatch.setattr(bench_episodes, "files_of", lambda scenes: [])
+    monkeypatch.setattr(episodes, "files_of", lambda scenes: [])
     reference = tmp_path / "guard.json"
 
     def run(retrieved, *arguments):

@@ -14,7 +14,7 @@ import pytest
 from mechsearch_jax.benchmarks.parts import images, recognition, recognition_figure
 from mechsearch_jax.benchmarks.parts.recognition import Bench, Method, Row
 from mechsearch_jax.benchmarks.report import tables
-from mechsearch_jax.commands import bench_quality
+from mechsearch_jax.commands.bench import quality
 from mechsearch_jax.envs.world.world import true_superquadrics
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.perception.scores import sharpened
@@ -254,8 +254,9 @@ def test_every_configuration_is_a_place_of_its_own(monkeypatch, tmp_path, capsys
     for file, left in zip(files, places.values(), strict=True):
         file.write_text(PLACE.format(left=left))
     out, picture = tmp_path / "places.json", tmp_path / "worst.png"
-    measured = {"noise": ("clean",), "method": ("network-refined",), "out": out, "picture": picture, "worst": 2}
-    bench_quality.bench_recognition(config=tuple(files), scenes=1, **measured)
+    measured = {"noise": ("clean",), "method": ("network-refined",), "out": out}
+    generated, drawn = quality.GeneratedScenes(tuple(files), 1), quality.WorstPicture(picture, 2)
+    quality.bench_recognition(generated=generated, drawn=drawn, **measured)
     assert [shelf.left for shelf in stood] == list(places.values())
     assert [shelf.left for _, shelf in seen] == list(places.values())
     assert {camera.fx for camera, _ in seen} == {76.2}
@@ -279,7 +280,7 @@ def test_every_configuration_is_a_place_of_its_own(monkeypatch, tmp_path, capsys
 )
 def test_places_that_cannot_be_told_apart_are_refused(config, scenarios, message):
     with pytest.raises(InputError, match=message):
-        bench_quality.bench_recognition(scenarios, config=tuple(map(Path, config)))
+        quality.bench_recognition(scenarios, generated=quality.GeneratedScenes(tuple(map(Path, config))))
 
 
 @pytest.mark.slow

@@ -70,7 +70,7 @@ def test_a_number_of_the_target_that_the_mask_file_does_not_have_is_said(tmp_pat
     save_depth(IMAGES.depth, depth)
     save_mask(IMAGES.mask, mask, 255)
     for number, words in ((200, "no pixel holds the target's number 200"), (-1, ""), (0, "")):
-        images, said = plan._images(depth, None, mask, 255, number)
+        images, said = plan.ImageFiles(depth, mask=mask, target_id=number).load()
         assert images["target_id"] == (0 if number == 0 else -1)
         assert words in " ".join(said)
         assert bool(said) == bool(words)

@@ -16,7 +16,7 @@ from mechsearch_jax.envs.episode.verdicts import Verdict, judge, paper_grasps
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.graspability import GraspConfig
-from mechsearch_jax.problem.problem import target_grasps
+from mechsearch_jax.retrieval import target_grasps
 from mechsearch_jax.workspace.target import Target
 
 

@@ -20,7 +20,7 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 
-from mechsearch_jax.commands import bench, bench_episodes, bench_quality, scenarios, train
+from mechsearch_jax.commands import bench, scenarios, train
 from mechsearch_jax.commands.doctor import doctor, print_config
 from mechsearch_jax.commands.evaluate import evaluate
 from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
@@ -67,7 +67,7 @@ COMMANDS: Commands = {
 GROUPS: Mapping[str, Commands] = {
     "scenarios": scenarios.COMMANDS,
     "train": train.COMMANDS,
-    "bench": {**bench.COMMANDS, **bench_quality.COMMANDS, **bench_episodes.COMMANDS},
+    "bench": bench.COMMANDS,
 }
 
 

@@ -206,14 +206,36 @@ def has_gpu() -> bool:
     return jax.default_backend() != "cpu"
 
 
-OnePolicy = Annotated[str | None, tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE")]
-OneMethod = Annotated[PaperMethod | None, tyro.conf.arg(metavar="{search-for-grasp,search-and-grasp}")]
+@dataclasses.dataclass(frozen=True)
+class OnePolicy:
+    """How it is decided.
+
+    Attributes:
+      method: "search-for-grasp", the default, minds the grasp while it searches, "search-and-grasp" only afterwards.
+      policy: instead of a method, the name of a policy (also random, greedy, mctx), or the import path of another.
+    """
+
+    method: Annotated[
+        PaperMethod | None,
+        tyro.conf.arg(metavar="{search-for-grasp,search-and-grasp}", help_behavior_hint=""),
+    ] = None
+    policy: Annotated[str | None, tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE", help_behavior_hint="")] = None
+
+    def chosen(self, command: str) -> Sequence[str]:
+        """The one policy; see `chosen_policies`."""
+        return chosen_policies(command, self.method and (self.method,), self.policy and (self.policy,))
+
+
+# A parameter of a command, and its default.
+DecidedBy = Annotated[OnePolicy, tyro.conf.arg(name="")]
+USUAL_POLICY = OnePolicy()
+
+
 Scenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO|FOLDER|SET ...")]
 
 GivenShape = Annotated[TargetShape | None, tyro.conf.arg(metavar="{" + ",".join(SHAPES) + "}")]
 SomeScenarios = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[SCENARIO|FOLDER|SET ...]")]
 ConfigFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")]
-ConfigFiles = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE.toml ...")]
 JsonFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE")]
 WeightsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")]
 

@@ -11,7 +11,9 @@ import tyro
 from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
-    from mechsearch_jax.session.searcher import Check
+    from rich.console import Console
+
+    from mechsearch_jax.session.searcher import Check, Searcher
     from mechsearch_jax.session.step import SearchStep
     from mechsearch_jax.workspace.camera import Camera
 
@@ -19,16 +21,84 @@ if TYPE_CHECKING:
 BACKGROUND = 255
 
 
+ImageFile = Annotated[Path | None, tyro.conf.arg(metavar="IMAGE", help_behavior_hint="")]
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageFiles:
+    """The images that are decided from.
+
+    Attributes:
+      depth: depth image: PNG or TIFF of 16 bits in millimetres, or TIFF or .npy of floats in metres.
+      color: colour image, registered to the depth image; the target is seen by its colour.
+      mask: image of whole numbers, one for each object, registered to the depth image; without it the segmentation
+        network tells the objects apart.
+      background: the number in the mask that stands for no object.
+      target_id: the target's number in the mask, where the mask shows it.
+      camera: JSON with the fields of a ROS CameraInfo and T_world_camera; the configuration's camera if not given.
+      example: take the images that ship with the package, and write them to --out, too, as files like yours.
+    """
+
+    depth: ImageFile = None
+    color: ImageFile = None
+    mask: ImageFile = None
+    background: int = BACKGROUND
+    target_id: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json", help_behavior_hint="")] = None
+    example: bool = False
+
+    def check(self) -> None:
+        """Refuse what does not fit together.
+
+        Raises:
+          InputError: something does not.
+        """
+        if self.example == (self.depth is not None):
+            raise InputError("plan: give either --depth IMAGE or --example, not both")
+        if self.example and not self.color is self.mask is self.camera is None:
+            raise InputError(
+                "plan: --example has images and a camera of its own; leave --color, --mask and --camera out"
+            )
+        if self.target_id is not None and self.mask is None:
+            raise InputError("plan: --target-id names a number of a mask; give --mask, too")
+
+    def load(self) -> tuple[dict[str, Any], tuple[str, ...]]:
+        """The arguments of `Searcher.next` from files, and warnings about them.
+
+        Raises:
+          InputError: a file cannot be used.
+        """
+        from mechsearch_jax.images import image_files
+        from mechsearch_jax.images.labels import INSTANCES
+
+        assert self.depth is not None
+        images: dict[str, Any] = {"depth": image_files.load_depth(self.depth)}
+        warnings = ()
+        if self.color is not None:
+            images["colour"] = image_files.load_colour(self.color)
+        if self.mask is not None:
+            images["mask"], numbers = image_files.load_mask(self.mask, self.background)
+            if self.target_id is not None:
+                # A number that the mask does not show: the target is not seen.
+                images["target_id"] = numbers.get(self.target_id, -1)
+                if self.target_id >= 0 and self.target_id not in numbers:
+                    warnings = (
+                        f"{self.mask}: no pixel holds the target's number {self.target_id}, and the target counts as "
+                        "not seen; give the number that the mask has for it, or a negative one where it does not show "
+                        "it",
+                    )
+            elif self.color is None and len(numbers) == INSTANCES:
+                raise InputError(
+                    f"{self.mask}: names {INSTANCES} objects; say with --target-id which is the target, or leave one "
+                    "out"
+                )
+        return images, warnings
+
+
 def plan(
     *,
-    depth: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE")] = None,
-    color: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE")] = None,
-    mask: Annotated[Path | None, tyro.conf.arg(metavar="IMAGE")] = None,
-    background: int = BACKGROUND,
-    target_id: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
-    camera: Annotated[Path | None, tyro.conf.arg(metavar="FILE.json")] = None,
+    images: Annotated[ImageFiles, tyro.conf.arg(name="")] = ImageFiles(),
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None,
-    example: bool = False,
     joints: Annotated[tuple[float, ...], tyro.conf.arg(metavar="RAD ...")] = (),
     state: Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")] = None,
     failed: bool = False,
@@ -38,15 +108,8 @@ def plan(
     """Decide on the next action from images of a real camera, and write its motion.
 
     Args:
-      depth: depth image: PNG or TIFF of 16 bits in millimetres, or TIFF or .npy of floats in metres.
-      color: colour image, registered to the depth image; the target is seen by its colour.
-      mask: image of whole numbers, one for each object, registered to the depth image; without it the segmentation
-        network tells the objects apart.
-      background: the number in the mask that stands for no object.
-      target_id: the target's number in the mask, where the mask shows it.
-      camera: JSON with the fields of a ROS CameraInfo and T_world_camera; the configuration's camera if not given.
+      images: what is decided from.
       config: file of settings of camera, shelf, gripper, target and planner; `mechsearch config` prints an example.
-      example: take the images that ship with the package, and write them to --out, too, as files like yours.
       joints: where the arm is, seven angles; at home if not given.
       state: where the search is kept from call to call. If it is there, the last motion is taken to be over.
       failed: whether that motion failed.
@@ -59,76 +122,53 @@ def plan(
     from mechsearch_jax.envs.cell.loading import searcher_of
     from mechsearch_jax.images.image_files import load_camera
     from mechsearch_jax.problem.cache import keep_compilations
-    from mechsearch_jax.runtime.files import check_writable, is_file
+    from mechsearch_jax.runtime.files import check_writable
 
-    if example == (depth is not None):
-        raise InputError("plan: give either --depth IMAGE or --example, not both")
-    if example and (color is not None or mask is not None or camera is not None):
-        raise InputError("plan: --example has images and a camera of its own; leave --color, --mask and --camera out")
-    if target_id is not None and mask is None:
-        raise InputError("plan: --target-id names a number of a mask; give --mask, too")
+    images.check()
     settings = settings_of(config)
     check_writable(out)
-    if example:
-        images, seen_by = _example(out)
-        missing = ()
+    if images.example:
+        (arguments, camera), warnings = _example(out), ()
     else:
-        assert depth is not None
-        seen_by = settings.workcell.camera if camera is None else load_camera(camera)
-        images, missing = _images(depth, color, mask, background, target_id)
+        camera = settings.workcell.camera if images.camera is None else load_camera(images.camera)
+        arguments, warnings = images.load()
     keep_compilations()
     console = Console(highlight=False)
     with console.status("preparing") as status:
-        searcher = searcher_of(settings, camera=seen_by, seed=seed)
+        searcher = searcher_of(settings, camera=camera, seed=seed)
         check = searcher.check()
-        if state is not None and is_file(state):
-            searcher.load(state)
-            if searcher.moving:
-                searcher.acted(ok=not failed)
-        if searcher.finished:
+        if _finished(searcher, state, failed):
             console.print(f"{state}: the target was taken out; the search is finished", soft_wrap=True)
             return
         status.update("looking and planning; the first time in a workcell this takes minutes")
-        step = searcher.next(**images, joints=joints or None)
-        step = dataclasses.replace(step, warnings=(*missing, *step.warnings))
+        step = searcher.next(**arguments, joints=joints or None)
+        step = dataclasses.replace(step, warnings=(*warnings, *step.warnings))
         status.update("writing")
         files = _write(step, check, out)
         if state is not None:
             searcher.save(state)
+    _report(console, step, check, files)
+
+
+def _finished(searcher: Searcher, state: Path | None, failed: bool) -> bool:
+    """Take up the search of an earlier call, if there is one, after its last motion; whether it is finished."""
+    from mechsearch_jax.runtime.files import is_file
+
+    if state is not None and is_file(state):
+        searcher.load(state)
+        if searcher.moving:
+            searcher.acted(ok=not failed)
+    return searcher.finished
+
+
+def _report(console: Console, step: SearchStep, check: Check, files: list[Path]) -> None:
+    """Print what is to be done, why, and where it is written."""
     for notice in check.notices:
         console.print(f"note: {notice}", soft_wrap=True)
     for warning in dict.fromkeys((*check.warnings, *step.warnings)):
         console.print(f"[yellow]warning[/yellow]: {warning}", soft_wrap=True)
     console.print(f"[bold]{step.kind}[/bold]: {step.reason}", soft_wrap=True)
     console.print("\n".join(str(file) for file in files), soft_wrap=True)
-
-
-def _images(
-    depth: Path, color: Path | None, mask: Path | None, background: int, target_id: int | None
-) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """The arguments of `Searcher.next` from files, and what is to be said of them."""
-    from mechsearch_jax.images import image_files
-    from mechsearch_jax.images.labels import INSTANCES
-
-    images: dict[str, Any] = {"depth": image_files.load_depth(depth)}
-    missing = ()
-    if color is not None:
-        images["colour"] = image_files.load_colour(color)
-    if mask is not None:
-        images["mask"], numbers = image_files.load_mask(mask, background)
-        if target_id is not None:
-            # A number that the mask does not show: the target is not seen.
-            images["target_id"] = numbers.get(target_id, -1)
-            if target_id >= 0 and target_id not in numbers:
-                missing = (
-                    f"{mask}: no pixel holds the target's number {target_id}, and the target counts as not seen; give "
-                    "the number that the mask has for it, or a negative one where it does not show it",
-                )
-        elif color is None and len(numbers) == INSTANCES:
-            raise InputError(
-                f"{mask}: names {INSTANCES} objects; say with --target-id which is the target, or leave one out"
-            )
-    return images, missing
 
 
 def _example(out: Path) -> tuple[dict[str, Any], Camera]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,18 +11,16 @@ import tyro
 
 from mechsearch_jax.commands.options import (
     DEFAULTS,
+    USUAL_POLICY,
+    DecidedBy,
     EpisodeOptions,
     GivenShape,
-    OneMethod,
-    OnePolicy,
-    chosen_policies,
     find_scenario,
 )
 from mechsearch_jax.commands.video import make_film
 from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from rich.console import Console
     from rich.status import Status
 
@@ -29,23 +29,59 @@ if TYPE_CHECKING:
     from mechsearch_jax.envs.recording.narration import Narrator
     from mechsearch_jax.envs.recording.recording import Recorder
     from mechsearch_jax.planner import Problem
+    from mechsearch_jax.problem.settings import Settings
     from mechsearch_jax.workspace.scenario import Scenario
+    from mechsearch_jax.workspace.shelf import Shelf
 
 
-def _check_scene(scenario: str | None, objects: int | None, target: str | None) -> None:
-    """Refuse what does not say one scene."""
-    if (scenario is None) == (objects is None):
-        raise InputError("search: give either a scenario or --objects N, not both")
-    if scenario is not None and target is not None:
-        raise InputError("search: --target is for a generated scenario; a scenario file says itself what its target is")
+@dataclasses.dataclass(frozen=True)
+class Generated:
+    """A scene that is made.
+
+    Attributes:
+      objects: instead of a scenario, generate one with so many objects.
+      target: shape of a generated target; a cylinder, or what the configuration file says, if not given.
+    """
+
+    objects: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    target: Annotated[GivenShape, tyro.conf.arg(help_behavior_hint="")] = None
 
 
-def _save(out: Path, scene: Scenario, episode: Episode, strip: Figure) -> None:
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """What is written beside what is always.
+
+    Attributes:
+      record: also write recording.npz, what moved and what was believed, of which `mechsearch video` makes a film.
+      video: make the film at once, too; it is recorded then.
+    """
+
+    record: bool = False
+    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE.mp4|FILE.webp", help_behavior_hint="")] = None
+
+    def check(self) -> None:
+        """Fail before the work begins, if a film cannot be written.
+
+        Raises:
+          InputError: it cannot.
+        """
+        from mechsearch_jax.runtime.files import check_writable
+        from mechsearch_jax.viz.movie import check_movie_path
+
+        if self.video is not None:
+            check_movie_path(self.video)
+            check_writable(self.video.parent)
+
+
+def _save(out: Path, scene: Scenario, episode: Episode, problem: Problem, narrator: Narrator) -> None:
     """Write what there is of every episode."""
     from mechsearch_jax.envs.episode.records import save_episode
+    from mechsearch_jax.envs.recording.narration import verdict
     from mechsearch_jax.viz.drawing import save_figure
+    from mechsearch_jax.viz.filmstrip import filmstrip
     from mechsearch_jax.workspace.scenario import save_scenario
 
+    strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
     save_figure(strip, out / "filmstrip.png")
     save_scenario(scene, out / "scenario.json")
     save_episode(episode, out / "episode.json")
@@ -93,69 +129,75 @@ def search(
     scenario: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENARIO")] = None,
     /,
     *,
-    objects: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
-    target: GivenShape = None,
-    method: OneMethod = None,
-    policy: OnePolicy = None,
+    generated: Annotated[Generated, tyro.conf.arg(name="")] = Generated(),
+    decides: DecidedBy = USUAL_POLICY,
     seed: int = 0,
     out: Path,
-    record: bool = False,
-    video: Annotated[Path | None, tyro.conf.arg(metavar="FILE.mp4|FILE.webp")] = None,
+    keeps: Annotated[Kept, tyro.conf.arg(name="")] = Kept(),
     options: EpisodeOptions = DEFAULTS,
 ) -> None:
     """Run one episode: look, decide, act, until the target is found, graspable and taken out.
 
     Args:
       scenario: a scenario file, or the name of one that ships with the package or is in a scene set, as c2-4-017.
-      objects: instead of a scenario, generate one with so many objects.
-      target: shape of a generated target; a cylinder, or what the configuration file says, if not given.
-      method: "search-for-grasp", the default, minds the grasp while it searches, "search-and-grasp" only afterwards.
-      policy: instead of a method, the name of a policy (also random, greedy, mctx), or the import path of another.
+      generated: what is generated instead.
+      decides: the policy.
       seed: of the planner, of the environment, and of a generated scenario.
       out: folder for episode.json, filmstrip.png and the scenario.
-      record: also write recording.npz, what moved and what was believed, of which `mechsearch video` makes a film.
-      video: make the film at once, too; it is recorded then.
+      keeps: what else is written.
       options: how the planner decides.
     """
     from rich.console import Console
 
     from mechsearch_jax.envs.episode.episodes import target_of
-    from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable
-    from mechsearch_jax.viz.movie import check_movie_path
-    from mechsearch_jax.workspace.scenario import load_scenario
 
-    _check_scene(scenario, objects, target)
+    if (scenario is None) == (generated.objects is None):
+        raise InputError("search: give either a scenario or --objects N, not both")
+    if scenario is not None and generated.target is not None:
+        raise InputError("search: --target is for a generated scenario; a scenario file says itself what its target is")
     options.only_native("search")
-    (chosen,) = options.methods(chosen_policies("search", method and (method,), policy and (policy,)))
-    settings, workcell = options.settings(), chosen.workcell
-    known = load_scenario(find_scenario(scenario), workcell.shelf) if scenario is not None else None
-    if video is not None:
-        check_movie_path(video)
-        check_writable(video.parent)
+    (chosen,) = options.methods(decides.chosen("search"))
+    make_scene = _scene(scenario, generated, seed, options.settings(), chosen.workcell.shelf)
+    keeps.check()
     check_writable(out)
     keep_compilations()
     console = Console(highlight=False)
     with console.status("preparing") as status:
-        scene = known or ScenarioGenerator.of(settings, target).generate(seed, objects or 0)
+        scene = make_scene()
         console.print(
             f"[bold]{scene.name}[/bold]: {len(scene.objects)} objects hide a {scene.target.shape}; {chosen.name}"
         )
-        problem = workcell.problem(target_of(scene, workcell.target), chosen.problem_config)
+        problem = chosen.workcell.problem(target_of(scene, chosen.workcell.target), chosen.problem_config)
         episode, narrator, recorder = _run(console, status, chosen, scene, problem, seed)
         # Not before: these take long to import.
         from mechsearch_jax.envs.recording.narration import verdict
         from mechsearch_jax.envs.recording.recording import NAME, save_recording
-        from mechsearch_jax.viz.filmstrip import filmstrip
 
         status.update("writing")
-        strip = filmstrip(narrator.frames, problem.camera, problem.shelf, problem.target, verdict(episode))
-        _save(out, scene, episode, strip)
+        _save(out, scene, episode, problem, narrator)
         recording = recorder.recording(problem, verdict(episode))
-        if record or video is not None:
+        if keeps.record or keeps.video is not None:
             save_recording(recording, out / NAME)
     narrator.ended(episode)
     console.print(f"{out / 'episode.json'}\n{out / 'filmstrip.png'}", soft_wrap=True)
-    if video is not None:
-        make_film(recording, video, console)
+    if keeps.video is not None:
+        make_film(recording, keeps.video, console)
+
+
+def _scene(
+    scenario: str | None, generated: Generated, seed: int, settings: Settings, shelf: Shelf
+) -> Callable[[], Scenario]:
+    """What makes the scene; a scenario file is read at once.
+
+    Raises:
+      InputError: the file cannot be used.
+    """
+    from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    if scenario is not None:
+        loaded = load_scenario(find_scenario(scenario), shelf)
+        return lambda: loaded
+    return lambda: ScenarioGenerator.of(settings, generated.target).generate(seed, generated.objects or 0)

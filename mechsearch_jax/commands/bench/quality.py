@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import tyro
 
 from mechsearch_jax.commands.options import (
-    ConfigFiles,
     JsonFile,
     Scenarios,
     SomeScenarios,
@@ -24,6 +24,9 @@ from mechsearch_jax.commands.options import (
 from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.status import Status
+
+    from mechsearch_jax.benchmarks.parts.recognition import Bench, Measured
     from mechsearch_jax.problem.workcell import Workcell
     from mechsearch_jax.workspace.scenario import Scenario
 
@@ -83,36 +86,58 @@ def bench_agreement(
         save_agreement(found, out)
 
 
+@dataclasses.dataclass(frozen=True)
+class WorstPicture:
+    """A picture of the worst answers.
+
+    Attributes:
+      picture: PNG file for the worst answers of a method, beside the truth.
+      worst: how many of them.
+      worst_of: which method's.
+    """
+
+    picture: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    worst: int = 12
+    worst_of: Recogniser = "network-refined"
+
+
+@dataclasses.dataclass(frozen=True)
+class GeneratedScenes:
+    """Scenes that are made.
+
+    Attributes:
+      config: files of settings, one or more; the scenes are generated on the shelf, and looked at by the camera, of
+        each in turn. The defaults if not given.
+      scenes: how many are generated, with a seed that training cannot have; may be 0 if there are scenarios.
+      seed: of the generated scenes, of the noise and of the methods.
+    """
+
+    config: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE.toml ...", help_behavior_hint="")] = ()
+    scenes: int = 40
+    seed: int = 0
+
+
 def bench_recognition(
     scenarios: SomeScenarios = (),
     /,
     *,
-    config: ConfigFiles = (),
-    scenes: int = 40,
-    seed: int = 0,
+    generated: Annotated[GeneratedScenes, tyro.conf.arg(name="")] = GeneratedScenes(),
     noise: tuple[Noise, ...] = ("clean", "gaussian"),
     method: tuple[Recogniser, ...] = get_args(Recogniser),
     ems_scenes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     out: JsonFile = None,
-    picture: JsonFile = None,
-    worst: int = 12,
-    worst_of: Recogniser = "network-refined",
+    drawn: Annotated[WorstPicture, tyro.conf.arg(name="")] = WorstPicture(),
 ) -> None:
     """Compare recognisers, given true masks, with the truth: the network, refinement and the classical EMS.
 
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets, beside the generated scenes.
-      config: files of settings, one or more; the scenes are generated on the shelf, and looked at by the camera, of
-        each in turn. The defaults if not given.
-      scenes: how many are generated, with a seed that training cannot have; may be 0 if there are scenarios.
-      seed: of the generated scenes, of the noise and of the methods.
+      generated: what is generated.
       noise: of the depth image, one or more; "gaussian" is the paper's, 1 mm.
       method: one or more; one that begins with another's answers brings it along.
       ems_scenes: number of scenes, spread evenly over all, for EMS, which is slow; all if not given.
       out: JSON file for the figures and for every object's row.
-      picture: PNG file for the worst answers of a method, beside the truth.
-      worst: how many of them.
-      worst_of: which method's.
+      drawn: what is drawn.
     """
     from rich.console import Console
 
@@ -120,42 +145,52 @@ def bench_recognition(
     from mechsearch_jax.benchmarks.report.tables import recognition_tables, recognition_times_table
     from mechsearch_jax.viz.drawing import save_figure
 
-    at_least_one("bench recognition", worst=worst)
-    check_files(out, picture)
-    places = _places("bench recognition", config, scenarios)
+    at_least_one("bench recognition", worst=drawn.worst)
+    check_files(out, drawn.picture)
+    places = _places("bench recognition", generated.config, scenarios)
     given = images.scenes_of(_loaded(scenarios))
     console = Console(highlight=False)
     with console.status("making scenes") as status:
         forget_kept_compilations()
         benches = {
             name: recognition.shipped_bench(
-                [*images.held_out_scenes(scenes, seed, place.shelf, name), *given],
+                [*images.held_out_scenes(generated.scenes, generated.seed, place.shelf, name), *given],
                 method,
                 tuple(dict.fromkeys(noise)),
-                seed,
+                generated.seed,
                 ems_scenes,
                 place,
             )
             for name, place in places.items()
         }
-        if picture is not None and any(worst_of not in bench.methods for bench in benches.values()):
-            raise InputError(f"bench recognition: --worst-of {worst_of} is not among the methods; add it to --method")
-        parts: dict[str, recognition.Measured] = {}
-        for name, bench in benches.items():
-            total = len(bench.scenes) * len(bench.noises)
-            status.update(f"{name}: compiling")
-            parts[name] = bench.run(lambda done, name=name, total=total: status.update(f"{name}: {done}/{total}"))
-            # A place takes minutes: what is done is kept.
-            if out is not None:
-                recognition.save_recognition(recognition.joined(parts, places), out)
-        measured = recognition.joined(parts, places)
-        if picture is not None:
+        if drawn.picture is not None and any(drawn.worst_of not in bench.methods for bench in benches.values()):
+            raise InputError(
+                f"bench recognition: --worst-of {drawn.worst_of} is not among the methods; add it to --method"
+            )
+        measured = _measured(benches, places, status, out)
+        if drawn.picture is not None:
             status.update("drawing")
-            rows = recognition_figure.worst(measured.rows, worst_of, worst)
-            save_figure(recognition_figure.worst_figure(list(benches.values()), rows), picture)
+            rows = recognition_figure.worst(measured.rows, drawn.worst_of, drawn.worst)
+            save_figure(recognition_figure.worst_figure(list(benches.values()), rows), drawn.picture)
     console.print(recognition_tables(measured))
     if measured.times:
         console.print(recognition_times_table(measured))
+
+
+def _measured(
+    benches: Mapping[str, Bench], places: Mapping[str, Workcell], status: Status, out: Path | None
+) -> Measured:
+    """Measure in each place, and write what is measured after each: one takes minutes."""
+    from mechsearch_jax.benchmarks.parts.recognition import joined, save_recognition
+
+    parts: dict[str, Measured] = {}
+    for name, bench in benches.items():
+        total = len(bench.scenes) * len(bench.noises)
+        status.update(f"{name}: compiling")
+        parts[name] = bench.run(lambda done, name=name, total=total: status.update(f"{name}: {done}/{total}"))
+        if out is not None:
+            save_recognition(joined(parts, places), out)
+    return joined(parts, places)
 
 
 def _places(command: str, files: Sequence[Path], scenarios: Sequence[str]) -> dict[str, Workcell]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 import sys
 from collections.abc import Sequence
@@ -48,19 +49,36 @@ def _nearest(best: Node) -> str:
     return f"{hit} after {len(best.actions)} actions"
 
 
+@dataclasses.dataclass(frozen=True)
+class KnownSearch:
+    """How much is tried in the search of a scene.
+
+    Attributes:
+      sequences: sampled from each world of a round.
+      simulated: so many of them, the best, are executed in a round.
+      worlds: from which sequences are sampled in a round: those nearest to being solved.
+      rounds: of each search, at most.
+      grasps: that are tried out to take the target out of a world.
+      max_steps: actions, the retrieval among them.
+      seed: of the search.
+    """
+
+    sequences: int = 64
+    simulated: int = 32
+    worlds: int = 4
+    rounds: int = 40
+    grasps: int = 8
+    max_steps: int = 30
+    seed: int = 0
+
+
 def bench_ceiling(
     scenarios: SomeScenarios,
     /,
     *,
     out: Path,
     results: Results = (),
-    sequences: int = 64,
-    simulated: int = 32,
-    worlds: int = 4,
-    rounds: int = 40,
-    grasps: int = 8,
-    max_steps: int = 30,
-    seed: int = 0,
+    effort: Annotated[KnownSearch, tyro.conf.arg(name="")] = KnownSearch(),
 ) -> None:
     """Tell what share of scenes can be solved at all; those that no episode solved are searched with everything known.
 
@@ -69,13 +87,7 @@ def bench_ceiling(
       out: folder for a file for every scene that is searched, a picture of each that stays unsolved, and ceiling.json.
         Scenes that have a file of the same code and options are not searched again.
       results: of `evaluate` (folders, .parquet) and stored ones (.json); what was retrieved in any is solvable.
-      sequences: sampled from each world of a round.
-      simulated: so many of them, the best, are executed in a round.
-      worlds: from which sequences are sampled in a round: those nearest to being solved.
-      rounds: of each search, at most.
-      grasps: that are tried out to take the target out of a world.
-      max_steps: actions, the retrieval among them.
-      seed: of the search.
+      effort: how much is tried.
     """
     from rich.console import Console
 
@@ -85,16 +97,14 @@ def bench_ceiling(
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable
 
-    at_least_one("bench ceiling", sequences=sequences, simulated=simulated, worlds=worlds, rounds=rounds)
-    at_least_one("bench ceiling", grasps=grasps, max_steps=max_steps)
+    config = dataclasses.asdict(effort)
+    sequences = config.pop("sequences")
+    at_least_one("bench ceiling", sequences=sequences, **{name: config[name] for name in config if name != "seed"})
     scenes = _scenes(scenarios)
     outcomes = solvability.read_outcomes(results)
     check_writable(out)
     keep_compilations()
-    config = KnownSearchConfig(
-        simulated=simulated, worlds=worlds, rounds=rounds, grasps=grasps, max_steps=max_steps, seed=seed
-    )
-    ceiling = solvability.Ceiling(out, config, sequences)
+    ceiling = solvability.Ceiling(out, KnownSearchConfig(**config), sequences)
     console = Console(highlight=False)
     rows: list[solvability.Row] = []
     with console.status("searching") as status:

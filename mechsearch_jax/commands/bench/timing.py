@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Literal
 
 from mechsearch_jax.commands.options import (
     DEFAULTS,
+    USUAL_POLICY,
+    DecidedBy,
     EpisodeOptions,
     JsonFile,
-    OneMethod,
-    OnePolicy,
     PushModel,
     WeightsFile,
     at_least_one,
     check_files,
-    chosen_policies,
     forget_kept_compilations,
 )
 from mechsearch_jax.runtime.errors import InputError
@@ -78,8 +77,7 @@ def _timing_of(subject: Literal["existence", "graspability"], what: str) -> Call
 
 def bench_plan(
     *,
-    method: OneMethod = None,
-    policy: OnePolicy = None,
+    decides: DecidedBy = USUAL_POLICY,
     objects: int = 8,
     batch: int = 1,
     repeats: int = 10,
@@ -89,8 +87,7 @@ def bench_plan(
     """Time a whole decision: compilation, median and spread.
 
     Args:
-      method: how it is decided; "search-for-grasp" by default.
-      policy: instead of a method, the name of a policy (also random, greedy, mctx), or the import path of another.
+      decides: the policy.
       objects: number of objects in a scene.
       batch: how many scenes at once.
       repeats: number of timed calls.
@@ -100,7 +97,7 @@ def bench_plan(
     from mechsearch_jax.benchmarks.parts import bench as benches
 
     at_least_one("bench plan", repeats=repeats, batch=batch)
-    (chosen,) = options.methods(chosen_policies("bench plan", method and (method,), policy and (policy,)))
+    (chosen,) = options.methods(decides.chosen("bench plan"))
     sizes = options.settings().objects
     _print_timing("plan", out, lambda: benches.bench_plan(objects, chosen, batch, repeats=repeats, sizes=sizes))
 

@@ -1,0 +1,5 @@
+"""`mechsearch bench`: how long the parts take, how good they are, and what whole episodes come to."""
+
+from mechsearch_jax.commands.bench import episodes, quality, timing
+
+COMMANDS = {**timing.COMMANDS, **quality.COMMANDS, **episodes.COMMANDS}
