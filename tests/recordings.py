@@ -8,7 +8,7 @@ from stage import HIDDEN
 from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
 from mechsearch_jax.envs.recording.recording import RecordedStep, Recording, empty_trace
 from mechsearch_jax.envs.recording.sampled import sampled
-from mechsearch_jax.envs.simulators.native import Trace
+from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.world import BODIES, from_scenario, true_superquadrics
 from mechsearch_jax.planner.state import Sequences
 from mechsearch_jax.robot.kinematics import HOME

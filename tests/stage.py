@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions import KINDS, Action, ActionKind, no_action
-from mechsearch_jax.envs.simulators.native import NativeWorld
+from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world.outcome import Failure, Outcome, Overflow
 from mechsearch_jax.envs.world.world import BODIES, TARGET, from_scenario
 from mechsearch_jax.planner import Decision, Sequences

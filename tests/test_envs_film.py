@@ -21,7 +21,7 @@ from mechsearch_jax.envs.recording.recording import (
     load_recording,
     save_recording,
 )
-from mechsearch_jax.envs.simulators.native import Trace
+from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.world import BODIES, TARGET
 from mechsearch_jax.robot.kinematics import HOME, VELOCITY_LIMIT
 from mechsearch_jax.runtime.errors import InputError

@@ -18,7 +18,7 @@ from mechsearch_jax import graspability
 from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.pushing import physics_push
 from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields
-from mechsearch_jax.envs.simulators.native import NativeWorld
+from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world import model, world
 from mechsearch_jax.images.target_pose import target_pose
 from mechsearch_jax.perception import scores

@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float, Int
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.envs.episode.episodes import Moment
 from mechsearch_jax.envs.recording.sampled import Sampled, nothing_sampled, packed, sampled, unpacked
-from mechsearch_jax.envs.simulators.native import Trace
 from mechsearch_jax.envs.simulators.simulator import ARM
+from mechsearch_jax.envs.simulators.trace import Trace
 from mechsearch_jax.envs.world.world import BODIES, World
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics

@@ -1,0 +1,343 @@
+"""One world in C MuJoCo, which steps the robot and the shelf on a core of the CPU.
+
+Only what touches or may touch is simulated: before an action the joints are set to where its approach begins, after it
+to the home configuration. Between actions all bodies are at rest, and the world is their poses alone.
+"""
+
+# The bindings of MuJoCo come without type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mechsearch_jax.actions import Action, Kind, kind_of
+from mechsearch_jax.actions.trajectory import reference_motion
+from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig, controls
+from mechsearch_jax.envs.simulators.trace import Recorder, Trace
+from mechsearch_jax.envs.world import model as models
+from mechsearch_jax.envs.world.outcome import Failure, Outcome
+from mechsearch_jax.envs.world.world import BODIES, TARGET, World, bodies_of, fallen_over, from_scenario, slots
+from mechsearch_jax.robot.kinematics import HOME
+from mechsearch_jax.robot.motion import Reference
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Body, Scenario, rotation_matrix
+from mechsearch_jax.workspace.shelf import Shelf
+
+
+class NativeWorld:
+    """One world in C MuJoCo: the same scenario and actions always give the same result on the same machine.
+
+    Attributes:
+      shelf, camera, config: as given.
+      world: the present state; None before the first `reset` or `load`.
+    """
+
+    def __init__(
+        self,
+        shelf: Shelf | None = None,
+        camera: Camera | None = None,
+        config: SimulatorConfig | None = None,
+        blank: mujoco.MjModel | None = None,
+    ):
+        """Args:
+        shelf, camera, config: the defaults if left out.
+        blank: the compiled model of these, which is not changed; compiled anew if left out.
+        """
+        self.shelf = shelf or Shelf()
+        self.camera = camera or Camera()
+        self.config = config or SimulatorConfig()
+        self.world: World | None = None
+        self._blank = blank or models.compile_model(self.shelf, self.camera, self.config.motion.timestep)
+        self._data = mujoco.MjData(self._blank)
+        self._model = self._blank
+        self._bodies: list[Body | None] = [None] * BODIES
+        self._recorder = Recorder(self._data, self.config.trace_every)
+
+    @property
+    def trace(self) -> Trace:
+        """What happened during the last action."""
+        return self._recorder.trace(self._model)
+
+    def reset(self, scenario: Scenario) -> World:
+        """Start an episode; see `Simulator.reset`.
+
+        Raises:
+          InputError: there are more objects than slots.
+        """
+        return self._begin(slots(scenario), from_scenario(scenario))
+
+    def load(self, world: World) -> World:
+        """Start from a world, everything at rest and the robot at home.
+
+        Args:
+          world: fields without leading axes.
+        """
+        return self._begin(bodies_of(world), jax.tree.map(jnp.asarray, world))
+
+    def execute(self, action: Action) -> Outcome:
+        """Execute a single action, and let the bodies come to rest; see `Simulator.execute`.
+
+        Raises:
+          InputError: its kind is unknown.
+        """
+        kind = kind_of(int(action.kind))
+        self._record()
+        motion = reference_motion(kind, action, self.config.motion)
+        if motion is None:
+            return self._finish(Failure.NONE, True)
+        reference, reachable = motion
+        if not reachable:
+            return self._finish(Failure.UNREACHABLE, True)
+        before, gone = copy.copy(self._data), self._fallen()
+        failure, error, settled = self._perform(kind, reference, int(action.object))
+        if self._recorder.diverged:
+            self._data = before
+            return self._finish(Failure.UNSTABLE, False)
+        if kind.takes_target:
+            return self._finish_retrieval(failure, settled, gone).replace(tracking_error=jnp.float32(error))
+        return self._finish(failure, settled).replace(tracking_error=jnp.float32(error))
+
+    def settle(self) -> Outcome:
+        """Let time pass, with the robot where it is, until everything is at rest or the time for that is over."""
+        self._record()
+        before = copy.copy(self._data)
+        settled = self._come_to_rest()
+        if self._recorder.diverged:
+            self._data = before
+            return self._finish(Failure.UNSTABLE, False)
+        return self._finish(Failure.NONE, settled)
+
+    def scenario(self, name: str) -> Scenario:
+        """The present state as a scenario, its numbers rounded to a micrometre."""
+        bodies: dict[int, Body] = {}
+        for i, body in enumerate(self._bodies):
+            if body is not None:
+                position, quaternion = np.split(self._data.joint(f"body{i}").qpos, [3])
+                place = tuple(round(float(p), 6) for p in position)
+                turn = tuple(round(float(q), 9) for q in quaternion / np.linalg.norm(quaternion))
+                bodies[i] = dataclasses.replace(body, position=place, quaternion=turn)
+        target = bodies.pop(TARGET)
+        return Scenario(name, tuple(bodies.values()), target)
+
+    def place(self, bodies: list[Body | None], friction: float = 1.0, mass: float = 1.0) -> None:
+        """Start from bodies, everything at rest and the robot at home; `world` stays what it was.
+
+        Args:
+          bodies: in their slots.
+          friction, mass: sliding friction of everything, and masses of the bodies, as multiples of what they are.
+        """
+        self._bodies = bodies
+        self._model = models.with_bodies(self._blank, bodies, mass=mass)
+        self._model.geom_friction[:, 0] *= friction
+        self._data = models.initial_state(self._model, bodies)
+        self._go_home()
+
+    def drive(self, controls: Float[np.ndarray, "steps 9"], at_once: bool = False) -> Float[np.ndarray, "steps 9"]:
+        """Step with one row of controls per step from where everything is, and let the bodies come to rest.
+
+        `world` stays what it was.
+
+        Args:
+          controls: of joints [rad] and fingers [m].
+          at_once: set the robot to where the first row says beforehand, rather than move it there.
+
+        Returns:
+          Joints and fingers after each step.
+        """
+        if at_once:
+            self._set_robot(controls[0, :ARM], float(controls[0, ARM]))
+        self._record()
+        states = self._run(np.ascontiguousarray(controls))
+        self._come_to_rest()
+        return states[:, 1 : 1 + ROBOT]
+
+    @property
+    def positions(self) -> Float[np.ndarray, " coordinates"]:
+        """Joints [rad], fingers [m], and position [m] and quaternion of every body, as MuJoCo has them."""
+        return self._data.qpos.copy()
+
+    @property
+    def fallen(self) -> Bool[np.ndarray, " 9"]:
+        """Which bodies are off the board, the target last."""
+        return self._fallen()
+
+    @property
+    def holds_target(self) -> tuple[bool, bool]:
+        """Whether both fingers press on the target, and whether it is outside the shelf."""
+        return self._holds(TARGET), bool(self._data.joint(f"body{TARGET}").qpos[0] < self.shelf.front)
+
+    def _record(self) -> None:
+        """Begin a trace."""
+        self._recorder = Recorder(self._data, self.config.trace_every)
+
+    def _target_lies(self) -> bool:
+        """Whether there is a target that has fallen over."""
+        quaternion = self._data.joint(f"body{TARGET}").qpos[3:]
+        return self._bodies[TARGET] is not None and fallen_over(rotation_matrix(quaternion))
+
+    def _perform(self, kind: Kind, reference: Reference, index: int) -> tuple[Failure, float, bool]:
+        """Run a motion and let everything come to rest: why it failed, the tracking error [rad], and whether all is."""
+        states = self._follow(reference)
+        error = self._tracking_error(states, reference)
+        dropped = kind.holds_object and not self._slip(states, reference, index) < self.config.slip
+        if kind.returns_home:
+            self._go_home()
+        settled = self._come_to_rest()
+        failure = Failure.DROPPED if dropped else Failure.NONE
+        return Failure.HELD_UP if error > self.config.tracking_bound else failure, error, settled
+
+    def _begin(self, bodies: list[Body | None], world: World) -> World:
+        self.place(bodies)
+        self.world = world
+        return world
+
+    def _run(self, controls: np.ndarray) -> np.ndarray:
+        """Step with one row of controls per step; the states after each step."""
+        size = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        state = np.empty(size)
+        mujoco.mj_getState(self._model, self._data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        states = np.empty((1, len(controls), size))
+        mujoco.rollout.rollout(self._model, self._data, state[None], controls[None], state=states)
+        mujoco.mj_setState(self._model, self._data, states[0, -1], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self._data.ctrl[:] = controls[-1]
+        self._recorder.add(states[0], self._diverged())
+        return states[0]
+
+    def _follow(self, reference: Reference) -> np.ndarray:
+        """Put the robot where a reference starts, and run it until its motion is over; the states after each step."""
+        start = np.asarray(reference.start, float)
+        self._set_robot(start[:ARM], float(start[ARM]))
+        return self._run(controls(reference))
+
+    def _tracking_error(self, states: np.ndarray, reference: Reference) -> float:
+        """How far a joint was at most from its reference [rad]."""
+        return float(np.abs(states[:, 1 : 1 + ARM] - np.asarray(reference.q[: len(states)], float)).max())
+
+    def _slip(self, states: np.ndarray, reference: Reference, body: int) -> float:
+        """How far a body has moved in the hand between when it closed and when it was to open [m]."""
+        held = [self._in_gripper(states[int(step) - 1], body) for step in (reference.closed, reference.opens)]
+        return float(np.linalg.norm(held[1] - held[0]))
+
+    def _in_gripper(self, state: np.ndarray, body: int) -> np.ndarray:
+        """Position of a body in the gripper's frame."""
+        scratch = mujoco.MjData(self._model)
+        mujoco.mj_setState(self._model, scratch, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        mujoco.mj_kinematics(self._model, scratch)
+        site = scratch.site("gripper")
+        return site.xmat.reshape(3, 3).T @ (scratch.body(f"body{body}").xpos - site.xpos)
+
+    def _come_to_rest(self) -> bool:
+        """Hold the robot still until the bodies are at rest; whether they are. Their last motion is then stopped."""
+        limit = self.config.rest_speed * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
+        hold = np.tile(self._data.ctrl, (self.config.settle_block, 1))
+        first = 1 + self._model.nq + ROBOT
+        settled = False
+        for _ in range(self.config.settle_steps // self.config.settle_block):
+            states = self._run(hold)
+            speed = np.abs(states[:, first : first + 6 * BODIES]).reshape(-1, BODIES, 6)
+            settled = bool((speed < limit).all())
+            if settled:
+                break
+        self._data.qvel[:] = 0.0
+        return settled
+
+    def _set_robot(self, q: np.ndarray, finger: float) -> None:
+        fingers = np.full(2, max(finger, 0.0))
+        self._data.qpos[:ROBOT] = self._data.ctrl[:] = np.concatenate([q, fingers])
+        self._data.qvel[:ROBOT] = 0.0
+
+    def _go_home(self) -> None:
+        self._set_robot(HOME, 0.0)
+
+    def _holds(self, body: int) -> bool:
+        """Whether both fingers press on a body."""
+        mujoco.mj_forward(self._model, self._data)
+        owner = self._model.geom_bodyid
+        touching = {(owner[c.geom1], owner[c.geom2]) for c in self._data.contact if c.efc_address >= 0}
+        held = self._model.body(f"body{body}").id
+        fingers = (self._model.body(f"{side}_finger").id for side in ("left", "right"))
+        return all((f, held) in touching or (held, f) in touching for f in fingers)
+
+    def _diverged(self) -> bool:
+        """Whether the steps of the last `_run` went wrong; what MuJoCo then makes of the state means nothing."""
+        warnings = (
+            mujoco.mjtWarning.mjWARN_BADQPOS,
+            mujoco.mjtWarning.mjWARN_BADQVEL,
+            mujoco.mjtWarning.mjWARN_BADQACC,
+        )
+        return not np.isfinite(self._data.qpos).all() or any(self._data.warning[w].number for w in warnings)
+
+    def _fallen(self) -> Bool[np.ndarray, " 9"]:
+        """Which bodies have fallen off the board."""
+        position = self._data.qpos[ROBOT:].reshape(BODIES, 7)[:, :3]
+        valid = np.array([body is not None for body in self._bodies])
+        return valid & ((position[:, 0] < self.shelf.front) | (position[:, 2] < self.shelf.board))
+
+    def _retrieval(self, gone: Bool[np.ndarray, " 9"]) -> _Retrieval:
+        """What became of an attempt to take the target out, before which some bodies were gone."""
+        held = self._holds(TARGET)
+        outside = bool(self._data.joint(f"body{TARGET}").qpos[0] < self.shelf.front)
+        fallen = self._fallen() & ~(held & (np.arange(BODIES) == TARGET))
+        lost = (fallen & ~gone).any()
+        checks = ((Failure.MISSED, not held), (Failure.INSIDE, not outside), (Failure.FALLEN, lost))
+        failure = next((code for code, applies in checks if applies), Failure.NONE)
+        return _Retrieval(failure, held, outside, fallen)
+
+    def _finish_retrieval(self, failure: Failure, settled: bool, gone: Bool[np.ndarray, " 9"]) -> Outcome:
+        """Say what became of an attempt to take the target out, before which some bodies were gone."""
+        retrieval = self._retrieval(gone)
+        self._take_over()
+        failure = failure or retrieval.failure
+        return outcome_of(failure, self._recorder.steps, settled, retrieval.fallen, retrieval.held, retrieval.outside)
+
+    def _finish(self, failure: Failure, settled: bool) -> Outcome:
+        """Say what became of anything else."""
+        self._take_over()
+        return outcome_of(failure, self._recorder.steps, settled, self._fallen())
+
+    def _take_over(self) -> None:
+        """Take the world over from the simulation, if anything was simulated."""
+        if self.world is None or not self._recorder.steps:
+            return
+        poses = self._data.qpos[ROBOT:].reshape(BODIES, 7)
+        valid = np.array([body is not None for body in self._bodies])
+        rotation = rotation_matrix(poses[:, 3:])
+        self.world = self.world.replace(
+            position=jnp.where(valid[:, None], jnp.asarray(poses[:, :3], jnp.float32), self.world.position),
+            rotation=jnp.where(valid[:, None, None], jnp.asarray(rotation, jnp.float32), self.world.rotation),
+        )
+
+
+def outcome_of(
+    failure: Failure, steps: int, settled: bool, fallen: np.ndarray, held: bool = False, outside: bool = False
+) -> Outcome:
+    return Outcome(
+        failure=jnp.int32(failure),
+        steps=jnp.int32(steps),
+        settled=jnp.array(settled),
+        fallen=jnp.asarray(fallen),
+        held=jnp.array(held),
+        outside=jnp.array(outside),
+        retrieved=jnp.array(held and failure is Failure.NONE),
+        overflow=jnp.int32(0),
+        tracking_error=jnp.float32(0.0),
+    )
+
+
+class _Retrieval(NamedTuple):
+    """What became of an attempt to take the target out; fields as of `Outcome`."""
+
+    failure: Failure
+    held: bool
+    outside: bool
+    fallen: Bool[np.ndarray, " 9"]
