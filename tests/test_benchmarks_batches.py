@@ -54,7 +54,7 @@ class Stand:
         monkeypatch.setattr(batches, "run_episodes", self)
         monkeypatch.setattr(batches.Workcell, "problem", lambda workcell, target, config: problem)
 
-    def __call__(self, starts, problem, policy, simulator, slots, ended, **rest):
+    def __call__(self, starts, problem, policy, simulator, slots, listeners, settings):
         self.slots.append(slots)
         for place, start in enumerate(starts):
             error = self._fail(start.scenario.name, slots)
@@ -64,7 +64,7 @@ class Stand:
             assert start.max_steps == start.options["max_steps"]
             config = {**start.options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
             facts = (scene.name, len(scene.objects), config, {}, (), 0, 0, False, "not found", scene.content_hash)
-            ended([(place, Episode(*facts))])
+            listeners.ended([(place, Episode(*facts))])
 
 
 def test_every_job_becomes_a_row_with_its_options(problem, tmp_path, files, monkeypatch):
@@ -118,7 +118,7 @@ def test_what_fails_in_a_batch_is_a_row_and_the_others_go_on(problem, tmp_path, 
 class Together(Stand):
     """The same, but all episodes of a batch end at its end, if none of them fails."""
 
-    def __call__(self, starts, problem, policy, simulator, slots, ended, **rest):
+    def __call__(self, starts, problem, policy, simulator, slots, listeners, settings):
         batch = list(starts)
         self.slots.append(len(batch))
         errors = [error for start in batch if (error := self._fail(start.scenario.name, slots))]

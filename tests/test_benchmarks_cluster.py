@@ -96,7 +96,7 @@ class OnImaginedGpus(OnGpus):
         return Batches(self.worlds)
 
 
-def at_once(starts, problem, policy, simulator, slots, ended, **rest):
+def at_once(starts, problem, policy, simulator, slots, listeners, settings):
     """Stands in for `run_episodes`: all episodes are over at once, but for one that fails."""
     for place, start in enumerate(starts):
         scene = start.scenario
@@ -104,7 +104,7 @@ def at_once(starts, problem, policy, simulator, slots, ended, **rest):
             raise ValueError("out of luck")
         config = {**start.options, "target": scene.target.shape, "simulator": simulator.engine, "seed": start.seed}
         facts = (scene.name, len(scene.objects), config, {}, (), 0, slots, False, "not found", scene.content_hash)
-        ended([(place, Episode(*facts))])
+        listeners.ended([(place, Episode(*facts))])
 
 
 class Known(InTurn):

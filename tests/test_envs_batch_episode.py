@@ -11,8 +11,9 @@ from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, idle, push_off, reveal, 
 
 from mechsearch_jax.actions import no_action
 from mechsearch_jax.envs.episode.episode_log import Choice, EpisodeLog, Result, distrust, record
-from mechsearch_jax.envs.episode.episodes import Start, run_episode, run_episodes
+from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
 from mechsearch_jax.envs.episode.policy_numbers import mould
+from mechsearch_jax.envs.episode.pool import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native import NativeSimulator
@@ -35,7 +36,7 @@ WON = Result(
 )
 
 
-def run(problem, scenarios, simulator, slots, policy=grab, seeds=None, **options):
+def run(problem, scenarios, simulator, slots, policy=grab, seeds=None, **listening):
     """The episodes in the order of the scenarios, and how many ended together."""
     found, together = {}, []
 
@@ -46,7 +47,8 @@ def run(problem, scenarios, simulator, slots, policy=grab, seeds=None, **options
             found[place] = episode
 
     starts = [Start(s, seed) for s, seed in zip(scenarios, seeds or [0] * len(scenarios), strict=True)]
-    run_episodes(starts, problem, policy, simulator, slots, ended, max_steps=2, at_once=AT_ONCE, **options)
+    settings = RunSettings(max_steps=2, at_once=AT_ONCE)
+    run_episodes(starts, problem, policy, simulator, slots, Listeners(ended, **listening), settings)
     return [found[i] for i in range(len(scenarios))], together
 
 
@@ -93,7 +95,8 @@ def test_policies_that_differ_in_numbers_share_a_batch_and_what_is_compiled(prob
     policies = [Counting(charge=float(charge)) for charge in range(count)]
     starts = [Start(HIDDEN, 0, policy, 1 + i % 2, {"charge": policy.charge}) for i, policy in enumerate(policies)]
     found = {}
-    run_episodes(starts, problem, policies[0], Stage(), 2, found.update, max_steps=9, at_once=AT_ONCE)
+    settings = RunSettings(max_steps=9, at_once=AT_ONCE)
+    run_episodes(starts, problem, policies[0], Stage(), 2, Listeners(found.update), settings)
     assert Counting.traced == 1
     sizes = {found[i].steps[0].belief_size for i in range(count)}
     assert len(sizes) == 1
@@ -112,10 +115,10 @@ def test_policies_that_differ_in_more_than_numbers_do_not_share_a_batch(problem)
     for other in (first.replace(far=True), first.replace(tilt=jnp.ones(3)), grab):
         starts = [Start(OPEN, 0, first), Start(OPEN, 0, other)]
         with pytest.raises(InputError, match="differ in more than numbers"):
-            run_episodes(starts, problem, first, Stage(), 2, print)
+            run_episodes(starts, problem, first, Stage(), 2, Listeners(print))
     # One after the other they may be anything.
     found = {}
-    run_episodes([Start(OPEN, 0), Start(OPEN, 0, idle)], problem, grab, Stage(), 1, found.update)
+    run_episodes([Start(OPEN, 0), Start(OPEN, 0, idle)], problem, grab, Stage(), 1, Listeners(found.update))
     assert [found[i].retrieved for i in (0, 1)] == [True, False]
 
 

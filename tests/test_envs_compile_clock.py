@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from mechsearch_jax.envs.episode import episodes
+from mechsearch_jax.envs.episode import compile_clock
 from mechsearch_jax.envs.episode.compile_clock import EVENTS, CompileClock
 
 
@@ -49,7 +49,7 @@ def test_a_stage_is_told_without_what_was_compiled_in_it(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     with CompileClock() as compiling:
-        clock = episodes._Clock(2, lambda stage, slots: None, compiling)
+        clock = compile_clock.StageClock(2, lambda stage, slots: None, compiling)
         for stage, rows, compiled, other in (("plan", [0, 1], 8.0, 2.0), ("judge", [1], 0.0, 3.0)):
             with clock(stage, rows):
                 now[0] += compiled

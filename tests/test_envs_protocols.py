@@ -10,8 +10,9 @@ from stage import BOX, CYLINDER, HIDDEN, OPEN, Grab, Stage, push_off, reveal
 
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.envs.camera.snapshot import oracle, true_target_pose
-from mechsearch_jax.envs.episode.episodes import Start, run_episode, run_episodes
+from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
 from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.pool import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.protocols import ALL_FAILED, HIDDEN_AGAIN, OUTSIDE, PROTOCOLS, REACHED
 from mechsearch_jax.envs.episode.verdicts import swept_free
 from mechsearch_jax.envs.world.outcome import Failure
@@ -171,10 +172,9 @@ def test_slots_try_on_their_own(problem):
     scenarios = [dataclasses.replace(HIDDEN, name=name) for name in names] + [OPEN]
     found = {}
     stage = Rewinding(fail=names, trouble=push_off)
-    run_episodes(
-        [Start(s, 0) for s in scenarios], problem, Several(), stage, 3, found.update, max_steps=2, at_once=2,
-        protocol=PUBLISHED,
-    )  # fmt: skip
+    settings = RunSettings(max_steps=2, protocol=PUBLISHED, at_once=2)
+    starts = [Start(s, 0) for s in scenarios]
+    run_episodes(starts, problem, Several(), stage, 3, Listeners(found.update), settings)
     reasons = [found[i].failure for i in range(4)]
     assert reasons == [REACHED, REACHED, ALL_FAILED, REACHED]
     assert [found[i].graspable_step for i in range(4)] == [1, 1, None, 0]

@@ -11,7 +11,8 @@ from stage import HIDDEN, OPEN, SILL, Stage, grab, reveal
 
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.episode import verdicts
-from mechsearch_jax.envs.episode.episodes import Start, run_episode, run_episodes
+from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
+from mechsearch_jax.envs.episode.pool import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.verdicts import Verdict, judge, paper_grasps
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.world.world import from_scenario
@@ -38,7 +39,8 @@ def test_steeper_grasps_reach_over_what_the_papers_do_not(problem):
     alone = [run_episode(0, s, problem, grab, Stage(REVEALING), max_steps=2) for s in scenarios]
     found = {}
     starts = [Start(s, 0) for s in scenarios]
-    run_episodes(starts, problem, grab, Stage(REVEALING), 2, lambda e: found.update(e), max_steps=2, at_once=2)
+    settings = RunSettings(max_steps=2, at_once=2)
+    run_episodes(starts, problem, grab, Stage(REVEALING), 2, Listeners(found.update), settings)
     for episodes in (alone, [found[i] for i in range(3)]):
         steps = [(e.graspable_step, e.paper_graspable_step) for e in episodes]
         assert steps == [(0, 0), (0, None), (1, 1)]

@@ -17,7 +17,7 @@ from mechsearch_jax.belief.belief import possible_space, with_target
 from mechsearch_jax.envs.camera import recognisers, simulated_camera
 from mechsearch_jax.envs.camera.recognisers import recogniser
 from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle, sight_of
-from mechsearch_jax.envs.episode import slots
+from mechsearch_jax.envs.episode import many_slots
 from mechsearch_jax.envs.trials import native
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.images.cloud import thinned_view
@@ -182,12 +182,12 @@ def test_a_look_is_traced_once_for_both(two, name):
 
     world = jax.tree.map(lambda a: np.stack([a, a]), from_scenario(SCENE))
     policy, counted = search_for_grasp(PlannerConfig(sequences=2, horizon=1)), Counted()
-    pools = [slots.ManySlots(problem, policy, counted, world, 2) for problem in two]
+    pools = [many_slots.ManySlots(problem, policy, counted, world, 2) for problem in two]
     # In the beginning only shapes are needed.
     traced.clear()
     keys, rows = jax.random.split(KEY, 2), jnp.arange(2, dtype=jnp.int32)
     for pool, problem in zip(pools, two, strict=True):
-        slots._look.eval_shape(problem, pool._state, world, keys, rows, counted, pool._sight)
+        many_slots._look.eval_shape(problem, pool._state, world, keys, rows, counted, pool._sight)
     assert traced == [name]
 
 

@@ -14,8 +14,9 @@ import jax
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.camera.recognisers import recogniser
-from mechsearch_jax.envs.episode.episodes import Start, run_episodes, target_of
+from mechsearch_jax.envs.episode.episodes import run_episodes, target_of
 from mechsearch_jax.envs.episode.method import EngineName, Method
+from mechsearch_jax.envs.episode.pool import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.trials.named import rehearsal
@@ -157,13 +158,13 @@ class Batches:
             policy_of(method),
             simulator,
             worlds,
-            take,
-            recogniser=recogniser(method.recognition, target),
-            at_once=AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE,
-            busy=self.busy,
-            compiling=self.compiling,
-            protocol=method.terms,
-            trials=trials,
+            Listeners(take, self.busy, self.compiling),
+            RunSettings(
+                recogniser=recogniser(method.recognition, target),
+                protocol=method.terms,
+                trials=trials,
+                at_once=AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE,
+            ),
         )
 
 

@@ -1,8 +1,10 @@
-"""How long this process waits for JAX to compile."""
+"""How long the stages of a step take, and how long this process waits for JAX to compile."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import TracebackType
 
 import jax.monitoring
@@ -45,3 +47,33 @@ class CompileClock:
             start = min(start, inside[0])
         self._spans.append((start, end))
         self.seconds += end - start
+
+
+class StageClock:
+    """Wall time of the stages of a step, shared equally by the slots that took part.
+
+    What JAX compiled meanwhile is apart from them, as "compile".
+    """
+
+    def __init__(self, slots: int, busy: Callable[[str, int], None], compiling: CompileClock) -> None:
+        self._timings: list[dict[str, float]] = [{} for _ in range(slots)]
+        self._busy = busy
+        self._compiling = compiling
+
+    @contextmanager
+    def __call__(self, stage: str, rows: Sequence[int]) -> Iterator[None]:
+        if rows:
+            self._busy(stage, len(rows))
+        start, before = time.perf_counter(), self._compiling.seconds
+        yield
+        took, compiled = time.perf_counter() - start, self._compiling.seconds - before
+        for row in rows:
+            timings = self._timings[row]
+            timings[stage] = round(timings.get(stage, 0.0) + max(took - compiled, 0.0) / len(rows), 6)
+            if compiled:
+                timings["compile"] = round(timings.get("compile", 0.0) + compiled / len(rows), 6)
+
+    def timings(self, row: int) -> dict[str, float]:
+        """Those of a slot since it was last read."""
+        timings, self._timings[row] = self._timings[row], {}
+        return timings

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.status import Status
 
 from mechsearch_jax.actions import ActionKind, kind_of
-from mechsearch_jax.envs.episode.episodes import Moment
+from mechsearch_jax.envs.episode.moments import Moment
 from mechsearch_jax.envs.episode.records import Episode, Step
 from mechsearch_jax.envs.recording import pictures
 from mechsearch_jax.planner import Problem

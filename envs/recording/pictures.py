@@ -13,7 +13,7 @@ from mechsearch_jax.actions import kind_of
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.envs.camera.simulated_camera import Image
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, oracle, true_target_pose
-from mechsearch_jax.envs.episode.episodes import Moment
+from mechsearch_jax.envs.episode.moments import Moment
 from mechsearch_jax.envs.recording.recording import RecordedStep
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.planner import Problem

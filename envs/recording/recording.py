@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mechsearch_jax.actions import Action, no_action
-from mechsearch_jax.envs.episode.episodes import Moment
+from mechsearch_jax.envs.episode.moments import Moment
 from mechsearch_jax.envs.recording.sampled import Sampled, nothing_sampled, packed, sampled, unpacked
 from mechsearch_jax.envs.simulators.simulator import ARM
 from mechsearch_jax.envs.simulators.trace import Trace

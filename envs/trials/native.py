@@ -122,7 +122,7 @@ class NativeTrials:
         return in_order(np.asarray(wanted), self.threads or cores(), make, attempt)
 
     def programs(self, problem: Problem) -> list[Program]:
-        """What is computed with JAX; see `slots.PreparesTrials`."""
+        """What is computed with JAX; see `many_slots.PreparesTrials`."""
         return self.cell_programs(Cell(problem.target, problem.shelf, problem.gripper))
 
     def cell_programs(self, cell: Cell) -> list[Program]:

@@ -77,7 +77,7 @@ class ProcessTrials:
         return results
 
     def programs(self, problem: Problem) -> list[Program]:
-        """The processes, each with what it computes; see `slots.PreparesTrials`."""
+        """The processes, each with what it computes; see `many_slots.PreparesTrials`."""
         cell = _cell(problem)
 
         def begin() -> Callable[[], None]:

@@ -2,7 +2,7 @@
 
 What the planner predicts is quick and rough. A decision therefore holds its alternatives, ranked; trials tell what
 becomes of them, and `choose` takes the first that succeeds. `decide` is the stage for a single scene,
-`envs.episode.slots` has it for many at once, and `envs.trials` simulates.
+`envs.episode.many_slots` has it for many at once, and `envs.trials` simulates.
 """
 
 from __future__ import annotations

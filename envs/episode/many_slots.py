@@ -1,0 +1,345 @@
+"""What the planner knows in several slots, which look and decide together."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from mechsearch_jax.actions import Action, no_action
+from mechsearch_jax.belief.belief import without_grasps
+from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, sight_of
+from mechsearch_jax.envs.episode.episode_log import Choice, chosen, takes_target
+from mechsearch_jax.envs.episode.policy_numbers import as_pytree, mould, numbers, with_numbers
+from mechsearch_jax.envs.episode.slots import Knowledge, knowledge_of, possible_poses_of, swept_free_of
+from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_many, judged_sets
+from mechsearch_jax.envs.world.world import World
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner import Belief, Decision, Policy, Problem, initial_belief, update_belief
+from mechsearch_jax.planner.trials import AsksTwice, TrialResult, Trials, TrialScenes, choose, scenes_of
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.preparing import Program, program
+
+
+@runtime_checkable
+class PreparesTrials(Protocol):
+    """`Trials` that know the programs which they will call."""
+
+    def programs(self, problem: Problem) -> Sequence[Program]:
+        """Those for the scenes of a problem."""
+        ...
+
+
+class Question(NamedTuple):
+    """What a policy is called for.
+
+    Attributes:
+      method: its name; one of a policy that `AsksTwice`, or "__call__".
+      hidden: whether the target is found in none of the slots.
+    """
+
+    method: str
+    hidden: bool = False
+
+
+HIDDEN, FOUND, RETRIEVAL = Question("planned", hidden=True), Question("planned"), Question("retrieval")
+ANYTHING = Question("__call__")
+
+
+class PlannerState(flax.struct.PyTreeNode):
+    """What the planner knows in every slot; fields have a leading axis for the slots."""
+
+    belief: Belief
+    observation: Observation
+    action: Action
+
+
+class ManySlots:
+    """Several slots, looked at and decided upon a fixed number at a time, those that need it only.
+
+    Memory does not grow with the number of slots then. Where there are fewer slots to look at than that number, empty
+    scenes take their places, which cost next to nothing.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        policy: Policy,
+        recogniser: Recogniser,
+        world: World,
+        at_once: int,
+        trials: Trials | None = None,
+    ) -> None:
+        """Args:
+        problem: of all episodes.
+        policy: of all slots that have none of their own.
+        recogniser: must be traceable, as the policy.
+        world: of all slots, or its shapes, for what recognisers make of it.
+        at_once: how many slots are looked at or decided upon in one computation.
+        trials: what tries actions out before one is made; nothing if left out.
+        """
+        self._problem, self._trials = problem, trials
+        self._policy, self._mould = as_pytree(policy), mould(policy)
+        self._recogniser, self._sight = recogniser, sight_of(problem.camera, problem.shelf)
+        self._at_once = at_once
+        self._count = len(world.kind)
+        self._numbers = [numbers(self._policy)] * self._count
+        # Policies that were looked at, by what tells objects apart while they are kept.
+        self._policies: dict[int, tuple[Policy, tuple[np.ndarray, ...]]] = {}
+        one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), world)
+        seen = jax.eval_shape(
+            lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), one
+        )
+        empty = PlannerState(initial_belief(problem), seen, no_action())
+        self._state: PlannerState = jax.tree.map(
+            lambda a: jax.device_put(np.zeros((self._count, *a.shape), a.dtype)), empty
+        )
+
+    def programs(self, world: World) -> list[Program]:
+        """All that is compiled for these slots, the longest first.
+
+        Args:
+          world: of all slots, or its shapes.
+        """
+        rows = jax.ShapeDtypeStruct((self._at_once,), jnp.int32)
+        keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), self._count))
+        own = tuple(jax.ShapeDtypeStruct((self._at_once, *a.shape), a.dtype) for a in numbers(self._policy))
+        few = jax.tree.map(lambda a: jax.ShapeDtypeStruct((self._at_once, *a.shape[1:]), a.dtype), world)
+        active = jax.ShapeDtypeStruct((self._at_once,), bool)
+        done = jax.tree.map(lambda a: jax.ShapeDtypeStruct((self._at_once, *a.shape), a.dtype), no_action())
+        fresh = jax.ShapeDtypeStruct((self._count,), bool)
+        problem, state = self._problem, self._state
+        questions = [HIDDEN, FOUND, RETRIEVAL] if isinstance(self._policy, AsksTwice) else [ANYTHING]
+        calls = [(self._policy, own, problem, state, keys, rows, question) for question in questions]
+
+        def choosing(call: tuple[Any, ...]) -> Callable[[], None] | None:
+            decision, _ = _propose.returns(*call)
+            results = None
+            if self._trials is not None and decision.alternatives is not None:
+                results = jax.ShapeDtypeStruct(decision.alternatives.worth.shape, np.int32)
+            return _choose.begin(decision, results)
+
+        return [
+            *(program("plan", _propose, *call) for call in calls),
+            *(self._trials.programs(problem) if isinstance(self._trials, PreparesTrials) else ()),
+            *(Program("small ones", lambda: False, functools.partial(choosing, call)) for call in calls),
+            program("look", _look, problem, state, world, keys, rows, self._recogniser, self._sight),
+            program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
+            program("small ones", possible_poses_of, problem.poses, state.belief.exists, world),
+            program("small ones", _forget, problem, state, fresh),
+            program("small ones", _note, state, done, rows),
+            program("small ones", _some_worlds, world, rows),
+        ]
+
+    def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
+        """See `Slots`."""
+        self._state = _forget(self._problem, self._state, jax.device_put(np.asarray(fresh)))
+
+    def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
+        """See `Slots`."""
+        for row, policy in policies.items():
+            self._numbers[row] = numbers(self._policy) if policy is None else self._numbers_of(policy)
+
+    def _numbers_of(self, policy: Policy) -> tuple[np.ndarray, ...]:
+        if id(policy) not in self._policies:
+            if mould(policy) != self._mould:
+                raise InputError("run_episodes: policies of one run that differ in more than numbers need runs each")
+            self._policies[id(policy)] = policy, numbers(as_pytree(policy))
+        return self._policies[id(policy)][1]
+
+    def look(self, world: World, keys: Array, rows: Sequence[int]) -> Knowledge:
+        """See `Slots`."""
+        for _, padded in self._chunks(rows):
+            self._state = _look(self._problem, self._state, world, keys, padded, self._recogniser, self._sight)
+        return knowledge_of(self._problem, self._state.belief, world)
+
+    def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
+        """See `Slots`.
+
+        Whether to take a target out is decided only where it is found, and a plan made only where it is not taken out.
+        What is worth trying out is tried in all slots together.
+        """
+        if not isinstance(self._policy, AsksTwice):
+            return self._ask(ANYTHING, keys, rows)
+        there = np.asarray(self._state.belief.found)
+        choices = self._ask(RETRIEVAL, keys, [r for r in rows if there[r]])
+        choices = {r: choice for r, choice in choices.items() if takes_target(choice)}
+        choices |= self._ask(FOUND, keys, [r for r in rows if there[r] and r not in choices])
+        return choices | self._ask(HIDDEN, keys, [r for r in rows if not there[r]])
+
+    def _ask(self, question: Question, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
+        """What the policy answers to a question in chunk slots, after trials; see `_propose`."""
+        chunks = list(self._chunks(rows))
+        proposed = []
+        for chunk, padded in chunks:
+            # Rows beyond the end decide by anything.
+            each = [self._numbers[r] for r in chunk] + [self._numbers[chunk[0]]] * (self._at_once - len(chunk))
+            own = tuple(np.stack(values) for values in zip(*each, strict=True))
+            proposed.append(_propose(self._policy, own, self._problem, self._state, keys, padded, question))
+        choices: dict[int, Choice] = {}
+        for (chunk, padded), (decision, _), results in zip(
+            chunks, proposed, self._tried([len(chunk) for chunk, _ in chunks], proposed), strict=True
+        ):
+            decided = _choose(decision, results)
+            self._state = _note(self._state, decided.action, padded)
+            choice = jax.device_get(decided)
+            choices |= {r: jax.tree.map(lambda a, i=i: a[i], choice) for i, r in enumerate(chunk)}
+        return choices
+
+    def _tried(
+        self, counts: Sequence[int], proposed: Sequence[tuple[Decision, TrialScenes]]
+    ) -> Sequence[Int[np.ndarray, "n k"] | None]:
+        """What becomes of the alternatives of decisions in chunks of slots; None where nothing is tried.
+
+        Args:
+          counts: how many rows of each chunk there are; the others are beyond the end.
+          proposed: decisions and scenes of each chunk.
+        """
+        if self._trials is None or any(decision.alternatives is None for decision, _ in proposed) or not proposed:
+            return [None] * len(proposed)
+        rows = [
+            jax.tree.map(lambda a, count=count: a[:count], jax.device_get((scenes, decision.alternatives)))
+            for count, (decision, scenes) in zip(counts, proposed, strict=True)
+        ]
+        scenes, alternatives = jax.tree.map(lambda *leaves: np.concatenate(leaves), *rows)
+        results = self._trials(self._problem, scenes, alternatives.actions, alternatives.worth)
+        blank = np.full((self._at_once, results.shape[1]), TrialResult.UNKNOWN, np.int32)
+        parts = np.split(results, np.cumsum(counts)[:-1])
+        return [np.concatenate([part, blank[len(part) :]]).astype(np.int32) for part in parts]
+
+    def took(self, actions: Mapping[int, Action]) -> None:
+        """See `Slots`."""
+        if actions:
+            done = jax.tree.map(lambda *leaves: jnp.stack(leaves), *actions.values())
+            self._state = _note(self._state, done, jnp.array(list(actions), jnp.int32))
+
+    def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
+        """See `Slots`."""
+        answers: dict[int, bool] = {}
+        for chunk, padded in self._chunks(rows):
+            free = jax.device_get(_swept_free_many(self._problem, self._state, padded))
+            answers |= dict(zip(chunk, map(bool, free), strict=False))
+        return answers
+
+    def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
+        """See `Slots`."""
+        judged: dict[int, Verdict] = {}
+        for chunk, padded in self._chunks(rows):
+            active = jax.device_put(np.asarray(padded) < self._count)
+            verdicts = judge_many(self._problem, _some_worlds(world, padded), active)
+            judged |= dict(zip(chunk, verdicts, strict=False))
+        return judged
+
+    def _chunks(self, rows: Sequence[int]) -> Iterator[tuple[Sequence[int], Array]]:
+        """Rows, so many at once, and the same padded to a fixed number with rows beyond the end."""
+        for i in range(0, len(rows), self._at_once):
+            chunk = rows[i : i + self._at_once]
+            padded = np.full(self._at_once, self._count, np.int32)
+            padded[: len(chunk)] = chunk
+            yield chunk, jax.device_put(padded)
+
+
+def _strong(tree: Any) -> Any:
+    """The same, with nothing of a weak type: what takes it is compiled once, whatever a policy returns."""
+    return jax.tree.map(lambda a: jax.lax.convert_element_type(a, jnp.result_type(a)), tree)
+
+
+def _some(tree: Any, rows: Int[Array, " n"]) -> Any:
+    """These rows of all leaves; the last one for rows beyond the end."""
+    return jax.tree.map(lambda a: a[jnp.minimum(rows, a.shape[0] - 1)], tree)
+
+
+@kept()
+def _some_worlds(world: World, rows: Int[Array, " n"]) -> World:
+    """The worlds in the slots `rows`, empty ones for rows beyond the end."""
+    here = _some(world, rows)
+    return here.replace(valid=here.valid & (rows < len(world.kind))[:, None])
+
+
+@kept()
+def _forget(problem: Problem, state: PlannerState, fresh: Bool[Array, " slots"]) -> PlannerState:
+    """Let the fresh slots know nothing."""
+    belief, action = jax.tree.map(
+        lambda new, old: jnp.where(fresh.reshape(-1, *[1] * new.ndim), new[None], old),
+        (initial_belief(problem), no_action()),
+        (state.belief, state.action),
+    )
+    return state.replace(belief=belief, action=action)
+
+
+@kept()
+def _note(state: PlannerState, action: Action, rows: Int[Array, " n"]) -> PlannerState:
+    """Keep what was decided in the slots `rows` until the next look."""
+    return state.replace(action=jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state.action, action))
+
+
+@kept(static_argnames=("recogniser",))
+def _look(
+    problem: Problem,
+    state: PlannerState,
+    world: World,
+    keys: Array,
+    rows: Int[Array, " n"],
+    recogniser: Recogniser,
+    sight: Sight,
+) -> PlannerState:
+    """Recognise and update the belief in the slots `rows`, with the sight of the problem's camera."""
+
+    def one(mine, here, key):
+        observation = recogniser(key, Snapshot(problem.camera, problem.shelf, here, sight))
+        belief = update_belief(problem, mine.belief, observation, mine.observation, mine.action)
+        return PlannerState(belief, observation, no_action())
+
+    new = jax.vmap(one)(_some(state, rows), _some_worlds(world, rows), _some(keys, rows))
+    return jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state, new)
+
+
+@kept(static_argnames=("question",))
+def _propose(
+    policy: Policy,
+    own: tuple[Array, ...],
+    problem: Problem,
+    state: PlannerState,
+    keys: Array,
+    rows: Int[Array, " n"],
+    question: Question,
+) -> tuple[Decision, TrialScenes]:
+    """What the policy decides in the slots `rows` before trials, and the scenes to try it in.
+
+    The numbers in `own`, shape (n,) each, are in place of the policy's own. The question is static.
+    """
+
+    def one(values, key, mine):
+        ask = getattr(with_numbers(policy, values), question.method)
+        return _strong((ask(key, problem, mine.belief, mine.observation), scenes_of(mine.belief, mine.observation)))
+
+    mine, active = _some(state, rows), rows < keys.shape[0]
+    # Where the target is not found and can be nowhere, and nothing stands, a decision costs next to nothing.
+    belief = mine.belief.replace(exists=mine.belief.exists & active[:, None], found=mine.belief.found & active)
+    belief = without_grasps(belief) if question.hidden else belief
+    objects = mine.observation.objects
+    objects = objects.replace(valid=objects.valid & active[:, None])
+    seen = mine.observation.replace(objects=objects)
+    return jax.vmap(one)(own, _some(keys, rows), mine.replace(belief=belief, observation=seen))
+
+
+@kept()
+def _choose(decisions: Decision, results: Int[Array, "n k"] | None) -> Choice:
+    """What decisions come down to after trials, of which there may have been none."""
+    if results is not None:
+        decisions = jax.vmap(choose)(decisions, results)
+    return jax.vmap(chosen)(decisions)
+
+
+@kept()
+def _swept_free_many(problem: Problem, state: PlannerState, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
+    """The same in the slots `rows`; False for rows beyond the end."""
+    active = rows < state.belief.found.shape[0]
+    return jax.vmap(lambda mine, active: swept_free_of(problem, mine.observation, active))(_some(state, rows), active)

@@ -1,0 +1,273 @@
+"""The slots in which episodes run side by side, and what happens in a round."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Int, UInt
+
+from mechsearch_jax.envs.camera.snapshot import Recogniser, oracle
+from mechsearch_jax.envs.episode.compile_clock import CompileClock, StageClock
+from mechsearch_jax.envs.episode.episode_log import (
+    Choice,
+    EpisodeLog,
+    Result,
+    distrust,
+    overflow_trouble,
+    record,
+    result_of,
+    takes_target,
+    target_trouble,
+)
+from mechsearch_jax.envs.episode.moments import Moment, Watcher
+from mechsearch_jax.envs.episode.protocols import ALL_FAILED, EpisodeProtocol, Execution, Strict, chosen_actions
+from mechsearch_jax.envs.episode.records import Episode
+from mechsearch_jax.envs.episode.slots import OneSlot, Slots
+from mechsearch_jax.envs.episode.verdicts import Verdict
+from mechsearch_jax.envs.simulators.simulator import Flowing, Simulator
+from mechsearch_jax.envs.world.world import TARGET, World
+from mechsearch_jax.planner import Policy, Problem
+from mechsearch_jax.planner.trials import Trials
+from mechsearch_jax.runtime.compiled import kept
+from mechsearch_jax.workspace.scenario import Scenario
+
+STRICT = Strict()
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """An episode to be run.
+
+    Attributes:
+      scenario: where everything stands at the start.
+      seed: of the planner's and of the environment's random numbers, which are independent of each other.
+      policy, max_steps, options: where they are not None, instead of those of the run. With several slots the policies
+        of a run may differ in numbers alone; see `policy_numbers`.
+    """
+
+    scenario: Scenario
+    seed: int
+    policy: Policy | None = None
+    max_steps: int | None = None
+    options: Mapping[str, Any] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class RunSettings:
+    """How episodes are run and judged.
+
+    Attributes:
+      recogniser: what the policy sees the world through; with several slots it has to be traceable, as the policy.
+      max_steps: actions in an episode; afterwards the target may still be taken out.
+      options: what the records keep of how the episodes were run, beside target, simulator and seed.
+      protocol: how they are run and judged. Who gives another has built the problem by `protocol.problem`.
+      trials: what tries the policy's best actions out before one is made; nothing if left out.
+      at_once: how many slots look or decide in one computation.
+    """
+
+    recogniser: Recogniser = oracle
+    max_steps: int = 10
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    protocol: EpisodeProtocol = STRICT
+    trials: Trials | None = None
+    at_once: int = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class Listeners:
+    """Who is called while episodes are run.
+
+    Attributes:
+      ended: after every round with the episodes that ended in it, if any, and their places among all.
+      busy: at the beginning of every stage ("recognise", "plan", "judge", "simulate"), with the number of slots in it.
+      compiling: with what is being compiled before the first episode, if anything is.
+      watcher: at every step; for one slot only.
+    """
+
+    ended: Callable[[Sequence[tuple[int, Episode]]], None]
+    busy: Callable[[str, int], None] = lambda stage, episodes: None
+    compiling: Callable[[str], None] = lambda text: None
+    watcher: Watcher | None = None
+
+    def stage(self, stage: str, episodes: int) -> None:
+        """Say that a stage begins."""
+        self.busy(stage, episodes)
+        if self.watcher is not None:
+            self.watcher.busy(stage)
+
+
+@dataclasses.dataclass
+class _Slot:
+    """An episode that is running: its place among all, and what is written down of it."""
+
+    place: int
+    start: Start
+    log: EpisodeLog
+
+
+class EpisodePool:
+    """All slots, and what happens in a round."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        problem: Problem,
+        planner: Slots,
+        count: int,
+        settings: RunSettings,
+        listeners: Listeners,
+        compiling: CompileClock,
+    ) -> None:
+        """Args:
+        simulator: with a world for each slot.
+        problem: of all episodes.
+        planner: what the planner knows in every slot.
+        count: of slots; all are free at first.
+        settings: how all episodes are run.
+        listeners: who is called.
+        compiling: how long JAX has compiled.
+        """
+        self._simulator, self._problem, self._planner = simulator, problem, planner
+        self._settings, self._listeners = settings, listeners
+        self._slots: list[_Slot | None] = [None] * count
+        self._clock = StageClock(count, listeners.stage, compiling)
+        # What is being done in the slots that wait for the end of it.
+        self._moving: dict[int, Choice] = {}
+        key = jax.random.key_data(jax.random.key(0))
+        self._keys: UInt[np.ndarray, "slots 2 *words"] = np.zeros((count, 2, *key.shape), key.dtype)
+
+    @property
+    def running(self) -> dict[int, _Slot]:
+        """The episodes that have not ended, by their slots."""
+        return {row: slot for row, slot in enumerate(self._slots) if slot is not None}
+
+    def begin(self, starts: Mapping[int, tuple[int, Start]]) -> None:
+        """Begin episodes, with their places among all, in slots that are free and whose worlds are theirs."""
+        fresh = np.zeros(len(self._slots), bool)
+        for row, (place, start) in starts.items():
+            self._slots[row] = _Slot(place, start, EpisodeLog(start.max_steps or self._settings.max_steps))
+            self._keys[row] = jax.random.key_data(jax.random.split(jax.random.key(start.seed)))
+            fresh[row] = True
+        self._planner.forget(fresh)
+        self._planner.decide_by({row: start.policy for row, (_, start) in starts.items()})
+
+    def round(self) -> list[tuple[int, tuple[int, Episode]]]:
+        """Look, decide and act once in the slots that wait for nothing.
+
+        Returns:
+          The slots whose episodes ended, with their places and records.
+        """
+        world, clock = self._simulator.world, self._clock
+        logs = {row: slot.log for row, slot in self.running.items() if row not in self._moving}
+        assert world is not None
+        steps = [slot.log.index if slot else 0 for slot in self._slots]
+        planner_keys, environment_keys = keys_at(*jax.device_put((self._keys, np.array(steps, np.int32))))
+
+        with clock("recognise", list(logs)):
+            knowledge = self._planner.look(world, environment_keys, list(logs))
+        found, lost = knowledge.found, self._target_troubles(world, list(logs))
+        trouble = {r: reason for r, reason in lost.items() if found[r]}
+        sought = [r for r in logs if found[r] and r not in trouble]
+        # After the last action the target may still be taken out, where it is found.
+        asked = [r for r in logs if r in sought or not (found[r] or logs[r].last)]
+        with clock("plan", asked):
+            choices = self._planner.decide(planner_keys, asked)
+        choices = {r: choice for r, choice in choices.items() if not logs[r].last or takes_target(choice)}
+        with clock("judge", sought):
+            verdicts = self._settings.protocol.judge(self._planner, world, sought)
+
+        trouble |= {r: reason for r, choice in choices.items() if (reason := distrust(choice))}
+        trouble |= self._settings.protocol.ends(self._problem.shelf, world, list(logs), verdicts, choices)
+        for r, log in logs.items():
+            # Where an object has left the board, an episode goes on for what else is to be known of it, no further.
+            verdict = verdicts.get(r, Verdict())
+            if log.spoilt and (verdict.graspable or (r in choices and takes_target(choices[r]))):
+                trouble.setdefault(r, log.spoilt)
+            choice = None if r in trouble else choices.get(r)
+            size = 1 if found[r] else int(knowledge.size[r])
+            truth = None if found[r] or r in lost else bool(knowledge.truth[r])
+            log.decide(record(bool(found[r]), size, verdict, choice, truth, int(knowledge.restarts[r])))
+        return self._act({r: choice for r, choice in choices.items() if r not in trouble}, trouble)
+
+    def _target_troubles(self, world: World, rows: Sequence[int]) -> dict[int, str]:
+        """In which of these slots the target can no longer be taken out, and why."""
+        position, rotation = (a[:, TARGET] for a in jax.device_get((world.position, world.rotation)))
+        reasons = {r: target_trouble(self._problem.shelf, position[r], rotation[r]) for r in rows}
+        return {r: reason for r, reason in reasons.items() if reason}
+
+    def _act(self, choices: Mapping[int, Choice], trouble: Mapping[int, str]) -> list[tuple[int, tuple[int, Episode]]]:
+        """Execute what was decided, and note what came of what is over; returns as `round`."""
+        decided = {r: slot for r, slot in self.running.items() if r not in self._moving}
+        acting = [r for r, slot in decided.items() if slot.log.acts]
+        moment = self._moment(choices)
+        if self._listeners.watcher is not None and moment is not None and acting:
+            self._listeners.watcher.decided(moment)
+        executed: Execution | None = None
+        with self._clock("simulate", [*acting, *self._moving]):
+            if acting or self._moving:
+                executed = self._executed({r: choices[r] for r in acting})
+                others = {r: choice for r, choice in executed.choices.items() if choice is not choices.get(r, choice)}
+                self._planner.took({r: choice.action for r, choice in others.items()})
+                for r, choice in others.items():
+                    decided[r].log.took(choice)
+
+        # Without an action there is nothing to wait for.
+        ends: dict[int, tuple[Result | None, str | None]] = {
+            r: (None, trouble.get(r)) for r in decided if r not in acting
+        }
+        if executed is not None:
+            ends |= {r: _result(executed, r) for r in executed.choices.keys() | executed.stuck}
+        done: list[tuple[int, tuple[int, Episode]]] = []
+        for r, (result, why) in sorted(ends.items()):
+            slot = self.running[r]
+            if slot.log.act(result, why, self._clock.timings(r)):
+                done.append((r, (slot.place, slot.log.episode(slot.start.scenario, self._options(slot.start)))))
+                self._slots[r] = None
+        if self._listeners.watcher is not None and moment is not None:
+            outcome = None if executed is None else jax.tree.map(lambda a: a[0], executed.outcome)
+            self._listeners.watcher.acted(dataclasses.replace(moment, record=decided[0].log.steps[-1], outcome=outcome))
+        return done
+
+    def _executed(self, choices: Mapping[int, Choice]) -> Execution:
+        """Execute what was decided in some slots; what came of it in those whose actions are over."""
+        if not (self._settings.protocol.once and isinstance(self._simulator, Flowing) and len(self._slots) > 1):
+            return self._settings.protocol.execute(self._simulator, choices)
+        if choices:
+            self._simulator.begin(*chosen_actions(choices, len(self._slots)))
+        self._moving |= choices
+        # As many as decide at once, and of few every second one: a decision takes less long than an action.
+        done, outcome = self._simulator.advance(min(self._settings.at_once, (len(self._moving) + 1) // 2))
+        return Execution(outcome, {r: self._moving.pop(r) for r in list(self._moving) if done[r]})
+
+    def _options(self, start: Start) -> dict[str, Any]:
+        """The options of an episode, as its record keeps them."""
+        engine, shape = self._simulator.engine, self._problem.target.shape
+        options = self._settings.options if start.options is None else start.options
+        return {**options, "target": shape, "simulator": engine, "seed": start.seed}
+
+    def _moment(self, choices: Mapping[int, Choice]) -> Moment | None:
+        """What is known in a single slot."""
+        slot = self._planner
+        if not isinstance(slot, OneSlot) or slot.snapshot is None or slot.observation is None:
+            return None
+        log = self.running[0].log
+        decision = slot.decision if 0 in choices else None
+        return Moment(log.index, slot.snapshot, slot.observation, slot.belief, decision, log.steps[-1], None)
+
+
+@kept()
+def keys_at(data: UInt[Array, "slots 2 *words"], steps: Int[Array, " slots"]) -> tuple[Array, Array]:
+    """The planner's and the environment's key of every slot at its present step."""
+    keys, fold = jax.random.wrap_key_data(data), jax.vmap(jax.random.fold_in)
+    return fold(keys[:, 0], steps), fold(keys[:, 1], steps)
+
+
+def _result(executed: Execution, row: int) -> tuple[Result | None, str | None]:
+    """What came of what was executed in a slot, and why its episode cannot go on, if so."""
+    if row in executed.stuck:
+        return None, ALL_FAILED
+    return result_of(executed.choices[row], executed.outcome, row), overflow_trouble(executed.outcome, row)
