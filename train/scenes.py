@@ -217,6 +217,21 @@ def _within(shelf: Shelf, one: Footprint, clearance: float = 0.002) -> Array:
     return on_board & centred.all(axis=-1)
 
 
+def _draw_places(
+    slot: Int[Array, ""], key: Key[Array, ""], shape: _Shape, config: SceneConfig, shelf: Shelf
+) -> tuple[Footprint, Int[Array, " tries"], Bool[Array, ""]]:
+    """Footprints where a body may stand, which body before it each may touch, and whether it is to touch one."""
+    tries = config.placements
+    low = jnp.array([shelf.spawn_x[0], shelf.spawn_y[0]])
+    high = jnp.array([shelf.spawn_x[1], shelf.spawn_y[1]])
+    draws, turns, pick, touch = jax.random.split(key, 4)
+    centre = low[None] + (high - low)[None] * jax.random.uniform(draws, (tries, 2))
+    yaw = jax.random.uniform(turns, (tries,), minval=-jnp.pi, maxval=jnp.pi)
+    places = Footprint(centre, jnp.broadcast_to(shape.half, (tries, 2)), yaw, jnp.broadcast_to(shape.radius, (tries,)))
+    neighbour = jax.random.randint(pick, (tries,), 0, jnp.maximum(slot, 1)) % BODIES
+    return places, neighbour, jax.random.bernoulli(touch, config.touching)
+
+
 def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: Shelf | None = None) -> World:
     """A random scene: bodies that rest on the board and do not overlap.
 
@@ -240,20 +255,6 @@ def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: 
     )
     shapes = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), shapes, target)
     wanted = (jnp.arange(BODIES) < count).at[TARGET].set(jax.random.bernoulli(keys[3], config.target))
-    low = jnp.array([shelf.spawn_x[0], shelf.spawn_y[0]])
-    high = jnp.array([shelf.spawn_x[1], shelf.spawn_y[1]])
-
-    tries = config.placements
-
-    def candidates_of(slot, key, shape):
-        draws, turns, pick, touch = jax.random.split(key, 4)
-        centre = low[None] + (high - low)[None] * jax.random.uniform(draws, (tries, 2))
-        yaw = jax.random.uniform(turns, (tries,), minval=-jnp.pi, maxval=jnp.pi)
-        candidates = Footprint(
-            centre, jnp.broadcast_to(shape.half, (tries, 2)), yaw, jnp.broadcast_to(shape.radius, (tries,))
-        )
-        neighbour = jax.random.randint(pick, (tries,), 0, jnp.maximum(slot, 1)) % BODIES
-        return candidates, neighbour, jax.random.bernoulli(touch, config.touching)
 
     def place(placed, one_body):
         footprints, present = placed
@@ -271,7 +272,8 @@ def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: 
 
     nowhere = Footprint(jnp.zeros((BODIES, 2)), jnp.zeros((BODIES, 2)), jnp.zeros(BODIES), jnp.zeros(BODIES))
     # What is drawn is drawn for all bodies at once: only where they stand depends on those before.
-    drawn = jax.vmap(candidates_of)(jnp.arange(BODIES), jax.random.split(keys[4], BODIES), shapes)
+    draw = jax.vmap(lambda slot, key, shape: _draw_places(slot, key, shape, config, shelf))
+    drawn = draw(jnp.arange(BODIES), jax.random.split(keys[4], BODIES), shapes)
     (footprints, present), _ = jax.lax.scan(
         place, (nowhere, jnp.zeros(BODIES, bool)), (jnp.arange(BODIES), wanted, drawn)
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import flax.struct
 import jax
@@ -402,17 +402,30 @@ def _hand_directions(T_world_gripper: Array, axis: Array) -> tuple[Array, Array]
     return approach, jnp.stack([closing[0] ** 2 - closing[1] ** 2, 2.0 * closing[0] * closing[1]])
 
 
-def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") -> PushGeometry:
-    """The network's input features of a push, in a `frame` of `PushConfig`."""
-    prints, points, T_world_gripper = start.prints, start.points, start.T_world_gripper
-    length = _norm(start.displacement)
-    heading = jnp.where(length > 1e-6, start.displacement / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0]))
-    axis = heading if frame == "push" else jnp.array([1.0, 0.0])
-    framed = functools.partial(_framed, axis)
+class _HandMeeting(NamedTuple):
+    """What the gripper meets on its way; N objects.
 
-    def spread(vector):
-        return jnp.broadcast_to(vector[None], (len(prints.yaw), *vector.shape))
+    Attributes:
+      met: what the objects meet along the heading.
+      direct: after how long a way the gripper reaches each itself [m].
+      reached, carry: as `_reached` says [m].
+      touching: 1 where it touches from the start, down to 0 where it never does, shape (N, 1).
+      contacts: where it first touches, strictly and less so, from each object's foot; 0 where it never does [m].
+      middle, breadth: as `_swept_band` says [m].
+    """
 
+    met: Meetings
+    direct: Float[Array, " n"]
+    reached: Float[Array, " n"]
+    carry: Float[Array, " n"]
+    touching: Float[Array, "n 1"]
+    contacts: list[Float[Array, "n 3"]]
+    middle: Float[Array, " n"]
+    breadth: Float[Array, " n"]
+
+
+def _hand_meeting(start: PushStart, heading: Array, length: Array) -> _HandMeeting:
+    prints, points = start.prints, start.points
     distance, level = pusher_distance(prints, points, heading)
     level &= prints.valid[:, None]
     direct = jnp.min(jnp.where(level, distance, REACH), axis=1)
@@ -421,33 +434,62 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
     touching = jnp.maximum(1.0 - direct / REACH, 0.0)[:, None]
     base = jnp.concatenate([prints.position, prints.low[:, None]], axis=1)
     contacts = [(c - base) * touching for c in _soft_contacts(distance, level, points, heading)]
-    middle, breadth = _swept_band(start, level, heading)
+    return _HandMeeting(met, direct, reached, carry, touching, contacts, *_swept_band(start, level, heading))
+
+
+def _spread(prints: Footprints, vector: Array) -> Array:
+    """The same vector for every object."""
+    return jnp.broadcast_to(vector[None], (len(prints.yaw), *vector.shape))
+
+
+def _vectors(
+    start: PushStart, frame: Literal["push", "world"], hand: _HandMeeting, heading: Array, axis: Array, length: Array
+) -> Float[Array, "n k 2"]:
+    """Planar vectors of each object, along the axis and across it: distances over `_LENGTH`, then directions."""
+    prints, T_world_gripper = start.prints, start.T_world_gripper
+    framed = functools.partial(_framed, axis)
     to_gripper = T_world_gripper[None, :2, 3] - prints.position
     planar = [
         to_gripper,
-        contacts[0][:, :2],
-        contacts[1][:, :2],
-        middle[:, None] * perpendicular(heading)[None],
+        hand.contacts[0][:, :2],
+        hand.contacts[1][:, :2],
+        hand.middle[:, None] * perpendicular(heading)[None],
     ]
-    units = [spread(direction) for direction in _hand_directions(T_world_gripper, axis)]
+    units = [_spread(prints, direction) for direction in _hand_directions(T_world_gripper, axis)]
     if frame == "world":
         back, right, left, front = start.faces
         room = 0.5 * jnp.stack([front - back, right - left])
+        carry = hand.carry
         planar += [prints.position - room[None], carry[:, None] * heading[None], to_gripper + (length * heading)[None]]
-        units += [spread(framed(heading[None])[0])]
-    vectors = jnp.concatenate([framed(jnp.stack(planar, axis=1)) / _LENGTH, jnp.stack(units, axis=1)], axis=1)
+        units += [_spread(prints, framed(heading[None])[0])]
+    return jnp.concatenate([framed(jnp.stack(planar, axis=1)) / _LENGTH, jnp.stack(units, axis=1)], axis=1)
+
+
+def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") -> PushGeometry:
+    """The network's input features of a push.
+
+    Args:
+      start: see there.
+      frame: see `PushConfig`.
+    """
+    prints, T_world_gripper = start.prints, start.T_world_gripper
+    length = _norm(start.displacement)
+    heading = jnp.where(length > 1e-6, start.displacement / jnp.maximum(length, 1e-6), jnp.array([1.0, 0.0]))
+    axis = heading if frame == "push" else jnp.array([1.0, 0.0])
+    hand = _hand_meeting(start, heading, length)
+    vectors = _vectors(start, frame, hand, heading, axis, length)
     lengths = jnp.stack(
         [
             prints.low - start.board,
             prints.high - prints.low,
-            spread(length),
-            direct,
-            reached,
-            carry,
-            jnp.maximum(length - direct, 0.0),
-            contacts[0][:, 2],
-            contacts[1][:, 2],
-            breadth,
+            _spread(prints, length),
+            hand.direct,
+            hand.reached,
+            hand.carry,
+            jnp.maximum(length - hand.direct, 0.0),
+            hand.contacts[0][:, 2],
+            hand.contacts[1][:, 2],
+            hand.breadth,
             T_world_gripper[2, 3] - prints.low,
         ],
         axis=1,
@@ -456,9 +498,9 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
         [
             prints.round.astype(jnp.float32),
             start.tilt,
-            spread(T_world_gripper[2, 2]),
-            touching[:, 0],
-            (reached < length).astype(jnp.float32),
+            _spread(prints, T_world_gripper[2, 2]),
+            hand.touching[:, 0],
+            (hand.reached < length).astype(jnp.float32),
         ],
         axis=1,
     )
@@ -468,11 +510,11 @@ def push_geometry(start: PushStart, frame: Literal["push", "world"] = "push") ->
             even=jnp.concatenate([lengths / _LENGTH, plain, vectors[..., 0], extents.even / _LENGTH], axis=1),
             odd=jnp.concatenate([vectors[..., 1], extents.odd / _LENGTH], axis=1),
         ),
-        pairs=_pairs(prints, met, carry, heading, axis),
+        pairs=_pairs(prints, hand.met, hand.carry, heading, axis),
         walls=walls,
         wall_near=near,
-        carry=carry,
-        heading=framed(heading[None])[0],
+        carry=hand.carry,
+        heading=_framed(axis, heading[None])[0],
         axis=axis,
         round=prints.round,
         valid=prints.valid,
