@@ -281,18 +281,18 @@ class Pairs(NamedTuple):
     found: bool
 
 
-def pairs(candidates: CandidateGrasps, found: Bool[Array, " f"] | None = None) -> Pairs:
+def pairs(candidates: CandidateGrasps, feasible: Bool[Array, " f"] | None = None) -> Pairs:
     """The rows of H.
 
     Args:
       candidates: constants of the problem.
-      found: which grasps of a found target are feasible; the rows are those of the candidates alone if left out.
+      feasible: which grasps of a found target are feasible; if left out, the rows are those of the candidates alone.
     """
     pose, allowed, table = candidates.pair_pose, candidates.pair_valid, candidates.pose_pairs
-    if found is None:
+    if feasible is None:
         return Pairs(pose, allowed, table, len(pose), False)
-    both = jnp.concatenate([pose, jnp.full(found.shape, len(table), jnp.int32)])
-    return Pairs(both, jnp.concatenate([allowed, found]), table, len(pose), True)
+    both = jnp.concatenate([pose, jnp.full(feasible.shape, len(table), jnp.int32)])
+    return Pairs(both, jnp.concatenate([allowed, feasible]), table, len(pose), True)
 
 
 def no_hits(rows: Pairs, capacity: int) -> Bool[Array, "k n"]:
@@ -333,9 +333,9 @@ def _per_pose(reduce: Callable[[Array], Array], rows: Pairs, hits: Bool[Array, "
     """What a function makes of how many objects the grasps of each pose hit: of (*batch, P) numbers, -1 where a grasp
     is not feasible."""
     count = jnp.where(rows.allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), -1)
-    candidates, found = jnp.split(count, [rows.candidates])
-    of_candidates = reduce(jnp.append(candidates, -1)[rows.pose_pairs])
-    return jnp.append(of_candidates, reduce(found)) if rows.found else of_candidates
+    at_candidates, at_found = jnp.split(count, [rows.candidates])
+    values = reduce(jnp.append(at_candidates, -1)[rows.pose_pairs])
+    return jnp.append(values, reduce(at_found)) if rows.found else values
 
 
 def graspability(rows: Pairs, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:

@@ -93,9 +93,9 @@ class ManySlots:
         self._numbers = [numbers(self._policy)] * self._count
         # Policies that were looked at, by what tells objects apart while they are kept.
         self._policies: dict[int, tuple[Policy, tuple[np.ndarray, ...]]] = {}
-        one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), world)
+        shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), world)
         seen = jax.eval_shape(
-            lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), one
+            lambda here: recogniser(jax.random.key(0), Snapshot(problem.camera, problem.shelf, here)), shapes
         )
         empty = PlannerState(initial_belief(problem), seen, no_action())
         self._state: PlannerState = jax.tree.map(
@@ -251,7 +251,7 @@ def _strong(tree: Any) -> Any:
     return jax.tree.map(lambda a: jax.lax.convert_element_type(a, jnp.result_type(a)), tree)
 
 
-def _some(tree: Any, rows: Int[Array, " n"]) -> Any:
+def _rows_of(tree: Any, rows: Int[Array, " n"]) -> Any:
     """These rows of all leaves; the last one for rows beyond the end."""
     return jax.tree.map(lambda a: a[jnp.minimum(rows, a.shape[0] - 1)], tree)
 
@@ -259,7 +259,7 @@ def _some(tree: Any, rows: Int[Array, " n"]) -> Any:
 @kept()
 def _some_worlds(world: World, rows: Int[Array, " n"]) -> World:
     """The worlds in the slots `rows`, empty ones for rows beyond the end."""
-    here = _some(world, rows)
+    here = _rows_of(world, rows)
     return here.replace(valid=here.valid & (rows < len(world.kind))[:, None])
 
 
@@ -292,12 +292,12 @@ def _look(
 ) -> PlannerState:
     """Recognise and update the belief in the slots `rows`, with the sight of the problem's camera."""
 
-    def one(mine, here, key):
+    def look(mine, here, key):
         observation = recogniser(key, Snapshot(problem.camera, problem.shelf, here, sight))
         belief = update_belief(problem, mine.belief, observation, mine.observation, mine.action)
         return PlannerState(belief, observation, no_action())
 
-    new = jax.vmap(one)(_some(state, rows), _some_worlds(world, rows), _some(keys, rows))
+    new = jax.vmap(look)(_rows_of(state, rows), _some_worlds(world, rows), _rows_of(keys, rows))
     return jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state, new)
 
 
@@ -316,18 +316,18 @@ def _propose(
     The numbers in `own`, shape (n,) each, are in place of the policy's own. The question is static.
     """
 
-    def one(values, key, mine):
+    def propose(values, key, mine):
         ask = getattr(with_numbers(policy, values), question.method)
         return _strong((ask(key, problem, mine.belief, mine.observation), scenes_of(mine.belief, mine.observation)))
 
-    mine, active = _some(state, rows), rows < keys.shape[0]
+    mine, active = _rows_of(state, rows), rows < keys.shape[0]
     # Where the target is not found and can be nowhere, and nothing stands, a decision costs next to nothing.
     belief = mine.belief.replace(exists=mine.belief.exists & active[:, None], found=mine.belief.found & active)
     belief = without_grasps(belief) if question.hidden else belief
     objects = mine.observation.objects
     objects = objects.replace(valid=objects.valid & active[:, None])
     seen = mine.observation.replace(objects=objects)
-    return jax.vmap(one)(own, _some(keys, rows), mine.replace(belief=belief, observation=seen))
+    return jax.vmap(propose)(own, _rows_of(keys, rows), mine.replace(belief=belief, observation=seen))
 
 
 @kept()
@@ -342,4 +342,6 @@ def _choose(decisions: Decision, results: Int[Array, "n k"] | None) -> Choice:
 def _swept_free_many(problem: Problem, state: PlannerState, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
     """The same in the slots `rows`; False for rows beyond the end."""
     active = rows < state.belief.found.shape[0]
-    return jax.vmap(lambda mine, active: swept_free_of(problem, mine.observation, active))(_some(state, rows), active)
+    return jax.vmap(lambda mine, active: swept_free_of(problem, mine.observation, active))(
+        _rows_of(state, rows), active
+    )

@@ -173,9 +173,9 @@ class EpisodePool:
         trouble = {r: reason for r, reason in lost.items() if found[r]}
         sought = [r for r in logs if found[r] and r not in trouble]
         # After the last action the target may still be taken out, where it is found.
-        asked = [r for r in logs if r in sought or not (found[r] or logs[r].last)]
-        with clock("plan", asked):
-            choices = self._planner.decide(planner_keys, asked)
+        deciding = [r for r in logs if r in sought or not (found[r] or logs[r].last)]
+        with clock("plan", deciding):
+            choices = self._planner.decide(planner_keys, deciding)
         choices = {r: choice for r, choice in choices.items() if not logs[r].last or takes_target(choice)}
         with clock("judge", sought):
             verdicts = self._settings.protocol.judge(self._planner, world, sought)

@@ -36,8 +36,8 @@ def kind_of(code: int) -> Kind:
     for kind in KINDS.values():
         if kind.code == int(code):
             return kind
-    known = ", ".join(f"{kind.code} ({kind.name})" for kind in KINDS.values())
-    raise InputError(f"action kind {int(code)} is unknown; there are {known}")
+    codes = ", ".join(f"{kind.code} ({kind.name})" for kind in KINDS.values())
+    raise InputError(f"action kind {int(code)} is unknown; there are {codes}")
 
 
 def check_kinds(names: Sequence[str]) -> None:
@@ -46,7 +46,7 @@ def check_kinds(names: Sequence[str]) -> None:
     Raises:
       InputError: there is one.
     """
-    known = [kind.name for kind in SAMPLED_KINDS]
+    sampled = [kind.name for kind in SAMPLED_KINDS]
     for name in names:
-        if name not in known:
-            raise InputError(f"actions: {shown(name)} is unknown; use one or more of {', '.join(known)}")
+        if name not in sampled:
+            raise InputError(f"actions: {shown(name)} is unknown; use one or more of {', '.join(sampled)}")

@@ -66,11 +66,11 @@ def joint_trajectory(problem, action: Action, config: MotionConfig | None = None
     """
     config = config or MotionConfig(gripper=problem.gripper)
     kind = kind_of(int(action.kind))
-    found = reference_motion(kind, action, config)
-    if found is None:
+    motion = reference_motion(kind, action, config)
+    if motion is None:
         still = jnp.float32(HOME)[None]
         return JointTrajectory(jnp.zeros(1), still, jnp.zeros_like(still), jnp.zeros(1))
-    reference, reachable = found
+    reference, reachable = motion
     if not reachable:
         raise InputError(f"{kind.name}: the arm does not reach all of this motion; decide anew")
     steps = int(reference.length)

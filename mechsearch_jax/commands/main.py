@@ -134,21 +134,23 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
     commands = GROUPS[group] if group else COMMANDS
     description = COMMANDS[group].__doc__ if group else "Find a hidden object on a cluttered shelf and take it out."
     rest = list(arguments[1:] if group else arguments)
-    asked = rest[0] if rest else None
-    if asked is not None and asked not in commands and not asked.startswith("-"):
+    name = rest[0] if rest else None
+    if name is not None and name not in commands and not name.startswith("-"):
         raise InputError(
-            f'there is no command "{program} {asked}"; {nearest(asked, commands)} ({program} --help tells more)'
+            f'there is no command "{program} {name}"; {nearest(name, commands)} ({program} --help tells more)'
         )
     # What options there are takes long to find out, and is of no use to other commands.
-    known = {n: _deferred(c) if n == asked else _only_described(c.__doc__) for n, c in commands.items()}
+    parsed = {n: _deferred(c) if n == name else _only_described(c.__doc__) for n, c in commands.items()}
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            command: Any = tyro.extras.subcommand_cli_from_dict(known, prog=program, description=description, args=rest)
+            command: Any = tyro.extras.subcommand_cli_from_dict(
+                parsed, prog=program, description=description, args=rest
+            )
     except SystemExit as end:
         if not end.code:
             raise
-        helpful = f"{program} {asked}" if asked in commands else program
+        helpful = f"{program} {name}" if name in commands else program
         raise InputError(f"{one_line(complaint.getvalue())} ({helpful} --help tells more)") from None
     return command
 

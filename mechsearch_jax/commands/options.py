@@ -144,8 +144,8 @@ def _annotation(option: Option) -> Any:
     kind = Literal[option.choices] if option.choices else option.type
     shown = "{" + ",".join(option.choices) + "}" if option.choices else _METAVARS.get(option.type)
     # What the paper's is, the presets say.
-    said = re.sub(r"; (the paper's .*|not in the paper)$", "", option.help)
-    about = tyro.conf.arg(metavar=shown, help=f"{said}.", help_behavior_hint=_usual(option))
+    text = re.sub(r"; (the paper's .*|not in the paper)$", "", option.help)
+    about = tyro.conf.arg(metavar=shown, help=f"{text}.", help_behavior_hint=_usual(option))
     return Annotated[kind | None, about]
 
 
@@ -154,14 +154,14 @@ def _usual(option: Option) -> str:
     from mechsearch_jax.planner import DEFAULT_PRESET, PRESETS
 
     values = {name: preset().options()[option.name] for name, preset in PRESETS.items()}
-    said = {name: " ".join(map(_short, value)) if isinstance(value, list) else value for name, value in values.items()}
-    usual = said.pop(DEFAULT_PRESET)
+    shown = {name: " ".join(map(_short, value)) if isinstance(value, list) else value for name, value in values.items()}
+    usual = shown.pop(DEFAULT_PRESET)
     others: dict[Any, list[str]] = {}
-    for name, value in said.items():
+    for name, value in shown.items():
         if value != usual:
             others.setdefault(value, []).append(name)
-    told = [f", in preset {' and '.join(names)} {value}" for value, names in others.items()]
-    return f"(default: {usual}{''.join(told)})"
+    exceptions = [f", in preset {' and '.join(names)} {value}" for value, names in others.items()]
+    return f"(default: {usual}{''.join(exceptions)})"
 
 
 def _short(value: Any) -> str:
@@ -360,9 +360,9 @@ def files_of(scenes: Sequence[tuple[Block, int]]) -> list[Path]:
         keep_compilations()
         return track(missing, "generating scenes", console=Console(stderr=True)) if missing else ()
 
-    found = scene_files(scenes, progress=progress)
-    tell_strange(found.strange)
-    return found.files
+    made = scene_files(scenes, progress=progress)
+    tell_strange(made.strange)
+    return made.files
 
 
 def tell_strange(scenes: Sequence[str]) -> None:

@@ -141,8 +141,8 @@ def train_push(
     check_writable(out)
     folder = data or out / "pushes"
     check_writable(folder)
-    with counting("pushes", pushes) as told:
-        task = push_task(generation, folder, PushConfig(**dataclasses.asdict(network)), told)
+    with counting("pushes", pushes) as count:
+        task = push_task(generation, folder, PushConfig(**dataclasses.asdict(network)), count)
     run(task, config, out)
 
 

@@ -126,10 +126,8 @@ def tried(
     if trials is None or alternatives is None:
         return decision
     scene = scenes_of(belief, observation)
-    one: tuple[TrialScenes, Alternatives] = jax.tree.map(
-        lambda a: np.asarray(a)[None], jax.device_get((scene, alternatives))
-    )
-    results = trials(problem, one[0], one[1].actions, one[1].worth)
+    scenes, rows = jax.tree.map(lambda a: np.asarray(a)[None], jax.device_get((scene, alternatives)))
+    results = trials(problem, scenes, rows.actions, rows.worth)
     return choose(decision, jnp.asarray(results[0], jnp.int32))
 
 
@@ -147,10 +145,10 @@ def grasps_to_try(actions: Action, worth: Bool[Array, " k"], now: Superquadrics,
 
 
 @kept()
-def sequences_to_try(every: Sequences, now: Superquadrics, reached: Float[Array, ""]) -> Alternatives:
+def sequences_to_try(sequences: Sequences, now: Superquadrics, reached: Float[Array, ""]) -> Alternatives:
     """The first actions of the best sequences; see `Alternatives`."""
-    first: Action = jax.tree.map(lambda a: a[:TRIES, 0], every.actions)
-    worth = (first.kind != ActionKind.NONE) & jnp.isfinite(every.value[:TRIES])
+    first: Action = jax.tree.map(lambda a: a[:TRIES, 0], sequences.actions)
+    worth = (first.kind != ActionKind.NONE) & jnp.isfinite(sequences.value[:TRIES])
     return Alternatives(first, worth, jnp.arange(len(worth), dtype=jnp.int32), now, reached)
 
 
@@ -177,21 +175,21 @@ def choose(decision: Decision, results: Int[Array, " k"]) -> Decision:
       decision: of a policy.
       results: of them, as `TrialResult`.
     """
-    every, alternatives = decision.sequences, decision.alternatives
+    sequences, alternatives = decision.sequences, decision.alternatives
     if alternatives is None:
         return decision
-    known = jnp.where(alternatives.worth, results, TrialResult.UNKNOWN)
+    results = jnp.where(alternatives.worth, results, TrialResult.UNKNOWN)
     grasps = alternatives.sequence < 0
     takes = decision.action.kind == ActionKind.RETRIEVE
     # Of what would take the target out it only counts whether it does.
-    best = jnp.argmax(jnp.where(grasps & (known < TrialResult.SUCCEEDED), -1, known))
-    succeeds = known[best] == TrialResult.SUCCEEDED
-    does = known[best] > TrialResult.HARMFUL
+    best = jnp.argmax(jnp.where(grasps & (results < TrialResult.SUCCEEDED), -1, results))
+    succeeds = results[best] == TrialResult.SUCCEEDED
+    does = results[best] > TrialResult.HARMFUL
     # What comes after the first that succeeds was not tried.
-    order = jnp.arange(known.shape[0])
-    rejected = alternatives.worth & ~grasps & ((order < best) | ~succeeds) & (known <= TrialResult.HARMFUL)
-    place = jnp.where(grasps, every.value.shape[0], alternatives.sequence)
-    refused = jnp.zeros(every.value.shape, bool).at[place].set(rejected, mode="drop")
+    order = jnp.arange(results.shape[0])
+    rejected = alternatives.worth & ~grasps & ((order < best) | ~succeeds) & (results <= TrialResult.HARMFUL)
+    place = jnp.where(grasps, sequences.value.shape[0], alternatives.sequence)
+    refused = jnp.zeros(sequences.value.shape, bool).at[place].set(rejected, mode="drop")
     planned = _planned(decision, alternatives.now, refused, alternatives.sequence[best], does & ~grasps[best])
     taken = _taken(decision, alternatives, jax.tree.map(lambda a: a[best], alternatives.actions))
     grasped = succeeds & grasps[best]
@@ -206,11 +204,11 @@ def _planned(
     decision: Decision, now: Superquadrics, refused: Bool[Array, " s"], index: Int[Array, ""], does: Bool[Array, ""]
 ) -> Decision:
     """The decision to begin with the first action of a sequence, or to do nothing, without those that are refused."""
-    every = decision.sequences
-    ruled_out = every.replace(
-        actions=every.actions.replace(kind=jnp.where(refused[:, None], ActionKind.NONE, every.actions.kind)),
-        value=jnp.where(refused, jnp.inf, every.value),
-        after=jax.tree.map(lambda a, b: jnp.where(refused.reshape(-1, *[1] * b.ndim), b, a), every.after, now),
+    sequences = decision.sequences
+    ruled_out = sequences.replace(
+        actions=sequences.actions.replace(kind=jnp.where(refused[:, None], ActionKind.NONE, sequences.actions.kind)),
+        value=jnp.where(refused, jnp.inf, sequences.value),
+        after=jax.tree.map(lambda a, b: jnp.where(refused.reshape(-1, *[1] * b.ndim), b, a), sequences.after, now),
     )
     chosen = (jnp.arange(len(refused)) == index) & does
     order = jnp.argsort(jnp.where(chosen, -jnp.inf, ruled_out.value), stable=True)
@@ -228,9 +226,9 @@ def _planned(
 
 def _taken(decision: Decision, alternatives: Alternatives, action: Action) -> Decision:
     """The decision to take the target out with an action."""
-    every = decision.sequences
-    nothing = jax.tree.map(lambda a, b: jnp.broadcast_to(b, a.shape), every.actions, no_action())
-    after = jax.tree.map(lambda a, b: jnp.broadcast_to(b, a.shape), every.after, alternatives.now)
+    sequences = decision.sequences
+    nothing = jax.tree.map(lambda a, b: jnp.broadcast_to(b, a.shape), sequences.actions, no_action())
+    after = jax.tree.map(lambda a, b: jnp.broadcast_to(b, a.shape), sequences.after, alternatives.now)
     return decision.replace(
         action=action,
         value=jnp.float32(0.0),
@@ -239,9 +237,9 @@ def _taken(decision: Decision, alternatives: Alternatives, action: Action) -> De
         predicted=alternatives.now,
         sequences=Sequences(
             actions=nothing,
-            cost=jnp.full_like(every.cost, jnp.nan),
-            value=jnp.full_like(every.value, jnp.inf),
-            length=jnp.ones_like(every.length),
+            cost=jnp.full_like(sequences.cost, jnp.nan),
+            value=jnp.full_like(sequences.value, jnp.inf),
+            length=jnp.ones_like(sequences.length),
             after=after,
         ),
         refused=jnp.int32(0),

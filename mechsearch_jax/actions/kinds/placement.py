@@ -158,16 +158,18 @@ def transfers(
     others = scene.replace(valid=scene.valid & (jnp.arange(scene.capacity) != grasp.object))
     swept, clouds = cloud_index(tables, OPEN, wrist), gripper_clouds(tables).points
 
-    def follows(shared, own, T):
-        (shelf, clouds), (others, q7, swept) = shared, own
+    def follows(shared, scene, T):
+        (shelf, clouds), (others, q7, swept) = shared, scene
         q, reachable, outside = ways_in(T, q7, gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS)
         # Poses 5 cm apart at most.
         touches = jnp.any(arm_hits(q[::2], others)) | jnp.any(arm_hits_shelf(q, shelf))
         touches |= cloud_hits_shelf(shelf, T, taken(clouds, swept[None])[0])
         return reachable & ~touches, q[0], outside
 
-    own = (others, tables.q7[OPEN, wrist], swept)
-    able, q, outside = masked_vmap(follows, ends.wanted, (space.shelf, clouds), own, ends.T_world_gripper, block=32)
+    of_scene = (others, tables.q7[OPEN, wrist], swept)
+    able, q, outside = masked_vmap(
+        follows, ends.wanted, (space.shelf, clouds), of_scene, ends.T_world_gripper, block=32
+    )
     able &= jnp.all(jnp.abs(q - q[:1]) < LARGEST_TRANSFER, axis=-1)
     able &= able[0]
     able &= ~_gripper_meets(space, others, wrist, ends._replace(wanted=able))

@@ -224,15 +224,15 @@ class Push:
         usable = ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None] & space.config.avoid_unseen
         shift = self._displacements(space, n)
 
-        def enters(grippers, own, row):
+        def enters(grippers, scene, row):
             T, shift, gripper, owner = row
-            possible, poses, bodies = own
+            possible, poses, bodies = scene
             way = shift[None] * jnp.linspace(0.0, 1.0, PLACES)[:, None]
             along = [
                 translate(jnp.broadcast_to(pose, (PLACES, 4, 4)), way) for pose in (T, taken(poses, owner[None])[0])
             ]
-            own_clouds = [taken(grippers, gripper[None]), taken(bodies, owner[None])]
-            entered = [cloud_enters(possible, *pair) for pair in zip(along, own_clouds, strict=True)]
+            swept = [taken(grippers, gripper[None]), taken(bodies, owner[None])]
+            entered = [cloud_enters(possible, *pair) for pair in zip(along, swept, strict=True)]
             return jnp.any(entered[0] | entered[1])
 
         rows = (
@@ -241,8 +241,8 @@ class Push:
             jnp.asarray(np.repeat(cloud_index(tables, CLOSED, wrist), d)),
             jnp.asarray(np.repeat(owner, d)),
         )
-        grippers, own = gripper_clouds(tables).points, (possible, make(scene.rotation, scene.position), clouds)
-        return masked_vmap(enters, usable.reshape(-1), grippers, own, rows, block=64).reshape(n, v, d)
+        grippers, of_scene = gripper_clouds(tables).points, (possible, make(scene.rotation, scene.position), clouds)
+        return masked_vmap(enters, usable.reshape(-1), grippers, of_scene, rows, block=64).reshape(n, v, d)
 
     def draft(self, key, space: ActionSpace, scene, possible, ways, drawn: DrawnWay) -> Draft:
         """The push, and the space that it sweeps between its ends."""
@@ -292,11 +292,11 @@ class Push:
         spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
         spoiled |= gripper_meets(space, scene, pushed.scene, action, wrist, moved, pushes & ~spoiled)
 
-        def free(shelf, own, _):
-            return motion_free(shelf, space.gripper, *own)
+        def free(shelf, push, _):
+            return motion_free(shelf, space.gripper, *push)
 
-        own = (scene, pushed.scene, scene.valid & ~moved, action)
-        follows = masked_vmap(free, (pushes & ~spoiled)[None], space.shelf, own, None)[0]
+        push = (scene, pushed.scene, scene.valid & ~moved, action)
+        follows = masked_vmap(free, (pushes & ~spoiled)[None], space.shelf, push, None)[0]
         return Prediction(pushed.scene, moved, ~spoiled & follows)
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]]:
