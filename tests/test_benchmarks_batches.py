@@ -125,7 +125,7 @@ class Together(Stand):
         if errors:
             raise errors[0]
         told = self.slots[:]
-        super().__call__(batch, problem, policy, simulator, slots, ended, **rest)
+        super().__call__(batch, problem, policy, simulator, slots, listeners, settings)
         self.slots = told
 
 
