@@ -340,14 +340,14 @@ def test_the_share_of_what_cannot_be_moved_yet_goes_to_what_is_in_the_way(root):
     n = root.scene.capacity
     given = jax.jit(passed_on)
     for chance in (0.1, 0.5, 0.8):
-        ways = [
+        by_kind = [
             w.replace(reached=rng.random(w.reached.shape) < 0.05, hits=rng.random(w.hits.shape) < chance)
             for w in root.ways
         ]
-        state = root.replace(ways=tuple(ways), available=jnp.asarray(rng.random(n) < 0.8))
+        state = root.replace(ways=tuple(by_kind), available=jnp.asarray(rng.random(n) < 0.8))
         able, share = np.asarray(state.able), rng.random(n)
         ways = [[] for _ in range(n)]
-        for kind, can in zip(ways, able, strict=True):
+        for kind, can in zip(by_kind, able, strict=True):
             for i in range(n):
                 ways[i] += [hits for hits, at in zip(kind.hits[i], kind.reached[i], strict=True) if can[i] and at.any()]
         expected, stuck = (
