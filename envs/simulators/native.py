@@ -1,8 +1,10 @@
-"""The native simulator: many worlds in C MuJoCo, each on a core of the CPU.
+"""The native simulator: many worlds in C MuJoCo, each stepped on a core of the CPU.
 
-simulator = NativeSimulator()
-world = simulator.reset([scenario])    # one world for each scenario
-outcome = simulator.execute(actions)   # an `Action` whose fields have a leading axis for the worlds
+    simulator = NativeSimulator()
+    world = simulator.reset([scenario])    # one world for each scenario
+    outcome = simulator.execute(actions)   # an `Action` whose fields have a leading axis for the worlds
+
+A single world is a `native_world.NativeWorld`.
 """
 
 from __future__ import annotations
