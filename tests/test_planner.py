@@ -158,7 +158,7 @@ def test_the_slots_of_the_published_code_are_chosen_by_one_name(factory):
 
 def test_what_is_in_the_way_of_a_grasp_weighs_as_much_as_is_said(problem):
     belief = planner.initial_belief(problem)
-    rows = pairs(problem.grasps, belief.grasps)
+    rows = pairs(problem.grasps, belief.grasps.feasible)
     hits = jnp.zeros((rows.pose.shape[0], 9), bool).at[:, :2].set(True)
     exists = jnp.arange(problem.poses.shape[0]) % 7 == 0
     state = present_state(problem, belief, superquadric.empty(8), PlannerConfig()).replace(exists=exists, hits=hits)

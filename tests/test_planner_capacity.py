@@ -32,7 +32,7 @@ def test_g_and_j_are_the_same(problem):
     rng = np.random.default_rng(0)
     belief = planner.initial_belief(problem)
     found = belief.replace(found=jnp.array(True))
-    rows = pairs(problem.grasps, belief.grasps)
+    rows = pairs(problem.grasps, belief.grasps.feasible)
     count = problem.poses.shape[0]
     exists, somewhere = jnp.asarray(rng.random(count) < 0.3), jnp.arange(count) == 400
     # Of eight objects and the target; more than there were counted as one more than there can be.
