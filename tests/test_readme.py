@@ -66,6 +66,6 @@ def test_the_lines_of_python_lead_from_images_to_a_joint_trajectory(capsys, monk
     assert np.isfinite(trajectory.position).all()
 
 
-@pytest.mark.parametrize("file", ["LICENSE", "CHANGELOG.md", ".ci/run"])
+@pytest.mark.parametrize("file", ["LICENSE", "CHANGELOG.md", ".ci/run", ".ci/release"])
 def test_files_that_it_names_are_there(file):
     assert (ROOT / file).stat().st_size > 0
