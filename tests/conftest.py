@@ -44,6 +44,7 @@ MAPPINGS = 35_000
 GROUPS = {
     "planning": (
         "test_planner",
+        "test_envs_default_episode",
         "test_planner_moved_target",
         "test_envs_episode",
         "test_envs_batch_episode",
@@ -68,6 +69,9 @@ LONG_FIRST = (
     "test_envs_physics_push",
     "test_existence",
 )
+
+# What was traced is gone afterwards.
+LAST = ("test_program_budget",)
 
 # What is traced stays, and there is much of it: Python looks through all of it for cycles, again and again.
 gc.set_threshold(50_000, 20, 100)
@@ -141,8 +145,8 @@ def pytest_collection_modifyitems(config, items):
         left_out = [i for i in items if i.get_closest_marker("slow") and part_of(i.nodeid, parts) != part]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in set(left_out)]
-    rank = {name: i for i, name in enumerate(LONG_FIRST)}
-    items.sort(key=lambda item: rank.get(Path(item.path).stem, len(rank)))
+    rank = {name: i for i, name in enumerate(LONG_FIRST)} | dict.fromkeys(LAST, len(LONG_FIRST) + 1)
+    items.sort(key=lambda item: rank.get(Path(item.path).stem, len(LONG_FIRST)))
 
 
 @pytest.fixture(scope="session")

@@ -110,6 +110,7 @@ def test_pushes_to_time_are_real_and_among_as_many_objects_as_asked_for(drawn):
 # --- simulating again ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_nudge_moves_what_is_there_by_next_to_nothing(pushes):
     before, after = pushes.before, nudged(pushes).before
     shift = after.position - before.position
@@ -122,6 +123,7 @@ def test_a_nudge_moves_what_is_there_by_next_to_nothing(pushes):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
 
 
+@pytest.mark.slow
 def test_a_push_that_is_simulated_again_ends_the_same(pushes):
     count = len(pushes.object)
     assert count >= GENERATION.pushes
@@ -136,6 +138,7 @@ def test_a_push_that_is_simulated_again_ends_the_same(pushes):
     assert (again.residual == 0).all()
 
 
+@pytest.mark.slow
 def test_a_push_that_the_arm_cannot_make_again_moves_nothing(pushes):
     first = jax.tree.map(lambda a: a[:2], pushes)
     away = first.T_world_gripper.copy()
@@ -148,6 +151,7 @@ def test_a_push_that_the_arm_cannot_make_again_moves_nothing(pushes):
     np.testing.assert_array_equal(again.scene.position[1][valid], first.after.position[1][valid])
 
 
+@pytest.mark.slow
 def test_predictions_that_are_no_numbers_are_refused(pushes):
     first = jax.tree.map(lambda a: a[:2], pushes)
     told = repeated(first, simulator(), 2)
@@ -170,6 +174,7 @@ def test_simulating_is_better_than_guessing(comparison, pushes):
     assert every["no motion"]["still"] == 1.0
 
 
+@pytest.mark.slow
 def test_rows_that_are_asked_for_are_measured_in_their_order(pushes):
     seen = []
     rows = ("quasi-static", "no motion", "quasi-static")
@@ -180,6 +185,7 @@ def test_rows_that_are_asked_for_are_measured_in_their_order(pushes):
     assert few.best == "quasi-static"
 
 
+@pytest.mark.slow
 def test_another_process_reads_the_same_pushes(pushes, folder):
     with np.load(folder / "pushes-000.npz") as archive:
         identity = str(archive["identity"])
@@ -189,6 +195,7 @@ def test_another_process_reads_the_same_pushes(pushes, folder):
     assert repr(generator.push_simulation()) in identity
 
 
+@pytest.mark.slow
 def test_scores_are_written_with_how_they_came_about(measured, weights, tmp_path):
     push.save_push_scores(measured, tmp_path / "new" / "push.json")
     value = json.loads((tmp_path / "new" / "push.json").read_text())

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import types
 
 import jax
 import jax.numpy as jnp
@@ -10,17 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.existence import allowances, closer_image, existence, existence_tables, object_views
 from mechsearch_jax.images.cloud import BLOCK, thinned_view, view
-from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.perception import recogniser as recognising
-from mechsearch_jax.perception import recognition
-from mechsearch_jax.perception.recogniser import Recogniser
-from mechsearch_jax.planner import PlannerConfig, initial_belief, search_for_grasp, update_belief
-from mechsearch_jax.planner.rollout import no_sequences
-from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.runtime.compiled import Kept, keep_in
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace import render
@@ -43,23 +34,6 @@ def recalibrated(camera, turn=1e-6, shift=1e-4):
 
 
 NEW = recalibrated(Camera())
-
-
-def with_camera(problem, camera):
-    """The problem, built for another camera."""
-    tables = existence_tables(camera, problem.shelf, problem.target, problem.config.existence)
-    return problem.replace(camera=camera, existence=tables)
-
-
-@pytest.fixture(scope="module")
-def two(problem):
-    """The problem with one camera, and with the same one calibrated again."""
-    return problem, with_camera(problem, NEW)
-
-
-@pytest.fixture(scope="module")
-def recognisers():
-    return tuple(Recogniser(types.SimpleNamespace(camera=c, shelf=SHELF, target=TARGET)) for c in (Camera(), NEW))
 
 
 def traced_as(tree):
@@ -107,63 +81,6 @@ def test_an_impossible_camera_is_refused_as_before(wrong, message):
     assert str(caught.value) == message
 
 
-def test_all_that_is_jitted_takes_both_cameras_alike(two, recognisers):
-    """So that no program is traced for the second: that of a decision is large, and is not compiled here."""
-    for one, other in (two, recognisers, [r.view for r in recognisers]):
-        assert traced_as(one) == traced_as(other)
-        # What of it is static has to be equal, and data must not be.
-        assert not all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (one, other)), strict=True))
-
-
-def test_a_plan_is_traced_once_for_both_cameras(two):
-    traced = []
-
-    def plan(rollout, key, objects):
-        """Plans nothing, but looks where the target may be."""
-        traced.append("plan")
-        problem = rollout.problem
-        settings, everywhere = problem.config.existence, jnp.ones_like(rollout.belief.exists)
-        views = object_views(problem.existence, problem.camera, objects, None, settings)
-        now = existence(problem.existence, problem.camera, views, everywhere, rollout.belief.allowed, settings)
-        cost, nothing = jnp.sum(now).astype(jnp.float32), no_sequences(rollout.config, objects)
-        return Decision(no_action(), cost, cost, cost, objects, nothing, jnp.int32(0))
-
-    policy = search_for_grasp(PlannerConfig(sequences=2, horizon=1)).replace(plan=plan)
-    belief = initial_belief(two[0])
-    costs = [float(policy(KEY, problem, belief, SEEN).cost) for problem in two]
-    assert traced == ["plan"]
-    assert 0 < costs[0] < len(belief.exists)
-    assert costs[1] == pytest.approx(costs[0], rel=0.1)
-
-
-def cache_size(function):
-    return function.jitted._cache_size() if isinstance(function, Kept) else function._cache_size()
-
-
-def test_a_belief_is_compiled_once_for_both_cameras(two):
-    # Compiled before, as for an episode, whatever ran before.
-    update_belief(two[0], initial_belief(two[0]), SEEN)
-    sizes = [cache_size(f) for f in (initial_belief, update_belief)]
-    beliefs = [update_belief(problem, initial_belief(problem), SEEN) for problem in two]
-    assert [cache_size(f) for f in (initial_belief, update_belief)] == sizes
-    counts = [int(jnp.sum(belief.exists)) for belief in beliefs]
-    assert counts[0] > 0
-    assert counts[1] == pytest.approx(counts[0], rel=0.05)
-
-
-def test_images_are_recognised_by_one_program_for_both_cameras(recognisers):
-    images = example_images()
-    parts = recognising._labelled, recognition.recognise_image
-    first = recognisers[0](KEY, images.depth, mask=images.mask)
-    sizes = [cache_size(part) for part in parts]
-    second = recognisers[1](KEY, images.depth, mask=images.mask)
-    assert [cache_size(part) for part in parts] == sizes
-    np.testing.assert_array_equal(first.objects.valid, second.objects.valid)
-    # The image is the same, and the camera said to be elsewhere: so are the objects.
-    moved = (second.objects.position - first.objects.position)[first.objects.valid]
-    assert 1e-6 < float(jnp.max(jnp.abs(moved))) < 5e-3
-
-
 def test_what_was_kept_on_disk_is_found_for_another_pose(tmp_path):
     traced = []
 
@@ -182,25 +99,26 @@ def test_what_was_kept_on_disk_is_found_for_another_pose(tmp_path):
     assert not np.array_equal(first, second)
 
 
-def test_a_camera_that_is_traced_gives_what_a_constant_does(two):
+def test_a_camera_that_is_traced_gives_what_a_constant_does(problem):
+    settings = problem.config.existence
+    tables = existence_tables(NEW, problem.shelf, problem.target, settings)
+
     def f(camera, tables, scene):
-        settings = two[0].config.existence
         everywhere = jnp.ones(tables.corner.shape[0], bool)
         views = object_views(tables, camera, scene, everywhere, settings)
         closer = closer_image(camera, scene, views, settings)
         allowed = allowances(tables, camera, TARGET, views, closer, settings)
         return existence(tables, camera, views, everywhere, allowed, settings), views.windows
 
-    for problem in two:
-        constant = jax.jit(functools.partial(f, problem.camera))(problem.existence, OBJECTS)
-        traced = jax.jit(f)(problem.camera, problem.existence, OBJECTS)
-        np.testing.assert_array_equal(constant[0], traced[0])
-        np.testing.assert_array_equal(constant[1].corner, traced[1].corner)
-        np.testing.assert_array_equal(constant[1].stride, traced[1].stride)
-        seen = np.isfinite(constant[1].depth) & np.isfinite(traced[1].depth)
-        assert seen.any()
-        assert (seen == np.isfinite(constant[1].depth)).mean() > 0.9999
-        np.testing.assert_allclose(constant[1].depth[seen], traced[1].depth[seen], atol=2e-5)
+    constant = jax.jit(functools.partial(f, NEW))(tables, OBJECTS)
+    traced = jax.jit(f)(NEW, tables, OBJECTS)
+    np.testing.assert_array_equal(constant[0], traced[0])
+    np.testing.assert_array_equal(constant[1].corner, traced[1].corner)
+    np.testing.assert_array_equal(constant[1].stride, traced[1].stride)
+    seen = np.isfinite(constant[1].depth) & np.isfinite(traced[1].depth)
+    assert seen.any()
+    assert (seen == np.isfinite(constant[1].depth)).mean() > 0.9999
+    np.testing.assert_allclose(constant[1].depth[seen], traced[1].depth[seen], atol=2e-5)
 
 
 def test_cameras_of_a_batch_may_differ():

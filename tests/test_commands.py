@@ -245,9 +245,8 @@ def test_what_is_wrong_is_one_line_and_changes_nothing(folder, monkeypatch, caps
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
 
 
-@pytest.mark.parametrize("kind", ["unknown choice", "bad size", "missing file"])
-def test_the_program_says_it_too_outside_the_checkout(folder, kind):
-    arguments, message = WRONG[kind]
+def test_the_program_says_it_too_outside_the_checkout(folder):
+    arguments, message = WRONG["missing file"]
     answer = mechsearch(folder, *arguments)
     assert answer.returncode == 2
     assert answer.stdout == ""

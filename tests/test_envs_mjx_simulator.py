@@ -109,6 +109,7 @@ def test_actions_of_two_kinds_are_mixed_by_world():
     np.testing.assert_array_equal(mixed.T_world_gripper[2], taken.T_world_gripper[2])
 
 
+@pytest.mark.slow
 def test_where_kinds_are_traced_an_unknown_one_fails_in_its_own_row():
     """What the compiled functions make of the kinds, without stepping anything."""
     world = stack(*[from_scenario(scene(BOX))] * 4)
@@ -130,6 +131,7 @@ def test_where_kinds_are_traced_an_unknown_one_fails_in_its_own_row():
     assert not outcome.retrieved.any()
 
 
+@pytest.mark.slow
 def test_a_retrieval_fails_when_the_arm_is_held_up_and_by_what_falls_meanwhile():
     """What the compiled functions make of the states before and after, without stepping anything: in the first world
     nothing happens, then the box falls, then it had fallen before, then the arm is held up, twice in worlds that also

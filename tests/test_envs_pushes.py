@@ -137,6 +137,7 @@ def test_where_there_is_nothing_to_push_nothing_is_drawn(drawn):
 # --- what becomes of it ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_objects_are_displaced_along_the_push(pushes):
     count = len(pushes.object)
     assert count > 15
@@ -151,12 +152,14 @@ def test_objects_are_displaced_along_the_push(pushes):
     assert np.median((along / np.maximum(length - 0.01, 0.01))[upright]) == pytest.approx(1.0, abs=0.35)
 
 
+@pytest.mark.slow
 def test_the_wrist_that_a_push_was_made_with_is_kept(pushes):
     assert pushes.q7.shape == (len(pushes.object),)
     assert np.isin(pushes.q7, push_tables(CONFIG).q7[1]).all()
     assert len(np.unique(pushes.q7)) > 1
 
 
+@pytest.mark.slow
 def test_objects_that_are_far_from_the_push_stay(pushes):
     truth = push_truth(jax.tree.map(jnp.asarray, pushes))
     assert 0.1 < truth.moved[truth.valid].mean() < 0.9
@@ -168,6 +171,7 @@ def test_objects_that_are_far_from_the_push_stay(pushes):
     assert not truth.moved[far].any()
 
 
+@pytest.mark.slow
 def test_pushes_that_follow_each_other_go_on_from_what_was(pushes):
     followed = 0
     for lane in np.unique(pushes.lane):
@@ -180,6 +184,7 @@ def test_pushes_that_follow_each_other_go_on_from_what_was(pushes):
     assert followed >= 3
 
 
+@pytest.mark.slow
 def test_the_same_key_gives_the_same_pushes(pushes):
     again, other = simulated(0, 1), simulated(4, 1)
     first = len(again.object)
@@ -304,6 +309,7 @@ def test_a_turn_by_half_a_turn_is_no_error():
     np.testing.assert_allclose(error, [0.1, 0.0, 3.0 - np.pi], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_truth_costs_nothing_but_its_scale(pushes):
     truth = push_truth(jax.tree.map(jnp.asarray, pushes))
     sure = jnp.where(truth.moved, 30.0, -30.0)
@@ -322,6 +328,7 @@ def test_the_truth_costs_nothing_but_its_scale(pushes):
     assert terms["moves"] > 10
 
 
+@pytest.mark.slow
 def test_what_is_left_out_of_a_push_had_no_part_in_it(pushes):
     task, on_device = task_of(pushes), jax.tree.map(jnp.asarray, pushes)
     start, truth = task.start(on_device), push_truth(on_device)
@@ -349,6 +356,7 @@ def test_what_is_left_out_of_a_push_had_no_part_in_it(pushes):
     assert close > baseline[1] - 0.15
 
 
+@pytest.mark.slow
 def test_poses_are_blurred_and_nothing_else(pushes):
     start = task_of(pushes).start(jax.tree.map(lambda a: jnp.asarray(a[:1]), pushes))
     start = jax.tree.map(lambda a: a[0], start)
@@ -367,6 +375,7 @@ def test_poses_are_blurred_and_nothing_else(pushes):
     np.testing.assert_array_equal(exactly.prints.position, start.prints.position)
 
 
+@pytest.mark.slow
 def test_what_is_sampled_to_learn_from_is_told_blurred(pushes):
     def sampled(blur):
         task = dataclasses.replace(task_of(pushes), blur=blur)
@@ -421,6 +430,7 @@ def test_what_may_have_held_something_in_place_is_never_left_out(gaps, kept):
     assert there.any(axis=0).all()
 
 
+@pytest.mark.slow
 def test_walls_are_set_elsewhere_only_where_nothing_meets_them(pushes):
     task, on_device = task_of(pushes), jax.tree.map(jnp.asarray, pushes)
     start, truth = task.start(on_device), push_truth(on_device)
@@ -444,6 +454,7 @@ def test_walls_are_set_elsewhere_only_where_nothing_meets_them(pushes):
             assert (np.stack([hand, hand + np.asarray(start.displacement)[push]]) @ normal > face).all()
 
 
+@pytest.mark.slow
 def test_a_model_that_knows_the_outcome_scores_best(pushes):
     after = pushes.after
 

@@ -28,6 +28,7 @@ def until_success(results):
     return [row[: first + 1].tolist() for row, first in zip(results, firsts, strict=True)]
 
 
+@pytest.mark.slow
 def test_processes_say_what_this_one_says_also_after_one_of_them_died(problem, rows):
     expected = MODEL(problem, *rows)
     assert TrialResult.HARMFUL in expected
