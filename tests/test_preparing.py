@@ -49,9 +49,10 @@ def test_nothing_is_said_where_everything_is_there():
 
 
 def test_the_block_runs_meanwhile():
-    met = threading.Event()
-    with prepared([program("a", prepare=lambda: met.wait(60))], lambda line: None):
-        met.set()
+    both = threading.Barrier(2, timeout=20)
+    with prepared([program("a", prepare=both.wait)], lambda line: None):
+        both.wait()
+    assert not both.broken
 
 
 def test_what_is_wrong_is_said_by_who_calls_it():
