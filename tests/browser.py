@@ -15,10 +15,10 @@ OPTIONS = (
 )  # fmt: skip
 
 
-def wait_for(asked, seconds=60, pause=0.1):
+def wait_for(condition, seconds=60, pause=0.1):
     """What a function says once it is something."""
     end = time.monotonic() + seconds
-    while not (answer := asked()):
+    while not (answer := condition()):
         assert time.monotonic() < end, "nothing came of it in time"
         time.sleep(pause)
     return answer
@@ -62,8 +62,8 @@ def page(program, address, folder):
     command = [program, *OPTIONS, f"--user-data-dir={folder}", address]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as browser:
         try:
-            told = folder / "DevToolsActivePort"
-            port = wait_for(lambda: told.is_file() and told.read_text().split()[:1])[0]
+            port_file = folder / "DevToolsActivePort"
+            port = wait_for(lambda: port_file.is_file() and port_file.read_text().split()[:1])[0]
 
             def opened():
                 with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=10) as answer:

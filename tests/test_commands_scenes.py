@@ -92,10 +92,10 @@ def test_sets_are_listed(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     cli.parse(["scenarios", "list"])()
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    told = {line[0]: line for line in lines[1:]}
-    assert set(told) == set(scene_sets.SETS)
-    assert told["c2-6"] == ["c2-6", "180", "6", "cylinder", scene_sets.digest(scene_sets.SETS["c2-6"])]
-    assert told["d3"][:5] == ["d3", "80", "4,", "8", "box"]
+    rows = {line[0]: line for line in lines[1:]}
+    assert set(rows) == set(scene_sets.SETS)
+    assert rows["c2-6"] == ["c2-6", "180", "6", "cylinder", scene_sets.digest(scene_sets.SETS["c2-6"])]
+    assert rows["d3"][:5] == ["d3", "80", "4,", "8", "box"]
 
 
 def test_a_set_is_written_into_a_folder_and_nothing_is_overwritten(folder, capsys):

@@ -33,7 +33,7 @@ def folder(tmp_path, monkeypatch):
 def jobs_of(folder, monkeypatch):
     """The jobs that a command line asks for."""
 
-    def asked(*arguments):
+    def collected(*arguments):
         seen = []
 
         def evaluate(jobs, *rest):
@@ -44,10 +44,10 @@ def jobs_of(folder, monkeypatch):
         cli.parse([*arguments, "--workers", "1", "--out", "rows"])()
         return seen
 
-    return asked
+    return collected
 
 
-def told(jobs):
+def settings_of(jobs):
     return [(job.scenario.name, job.method, job.seed) for job in jobs]
 
 
@@ -65,14 +65,14 @@ def test_a_sweep_is_all_combinations(jobs_of):
         )
     }
     assert len(jobs) == len(expected) == 128
-    assert set(told(jobs)) == expected
+    assert set(settings_of(jobs)) == expected
 
 
 def test_a_sweep_of_one_point_is_what_evaluate_runs(jobs_of):
     common = ("one.json", "--gamma", "0.7", "--preset", "paper", "--actions", "push", "--seed", "1")
     swept, evaluated = jobs_of("sweep", *common), jobs_of("evaluate", *common)
     assert [job.key for job in swept] == [job.key for job in evaluated]
-    assert told(jobs_of("sweep", "one.json")) == told(jobs_of("evaluate", "one.json"))
+    assert settings_of(jobs_of("sweep", "one.json")) == settings_of(jobs_of("evaluate", "one.json"))
 
 
 def test_settings_that_come_to_the_same_are_run_once(jobs_of):
@@ -111,7 +111,7 @@ def test_a_file_says_it_all_and_what_is_given_goes_before_it(folder, jobs_of):
         *("--method", "search-and-grasp", "--push-distances", "0.2"),
     )
     fixed |= {"gamma": 0.8, "push_distances": (0.2,)}
-    assert set(told(jobs)) == {
+    assert set(settings_of(jobs)) == {
         ("two", Method("search-and-grasp", standard(move_again=again, **fixed)), 5) for again in (True, False)
     }
 
@@ -162,10 +162,12 @@ def test_what_a_run_would_take_is_told_and_nothing_is_run(folder, capsys):
     cli.parse(
         ["sweep", *common, "--gamma", *gammas, "--guided-fraction", "0", "0.7", "--unseen-contact-penalty", "0", "1"]
     )()
-    said = capsys.readouterr().out
-    assert said.startswith("96 variants, 192 episodes, 0 of them there already, 192 left\n1 compilation of the planner")
-    assert "192 x 8 s in 2 processes" in said
-    assert "assumed" in said
+    output = capsys.readouterr().out
+    assert output.startswith(
+        "96 variants, 192 episodes, 0 of them there already, 192 left\n1 compilation of the planner"
+    )
+    assert "192 x 8 s in 2 processes" in output
+    assert "assumed" in output
     cli.parse(["sweep", *common, "--gamma", "0.5", "1", "--horizon", "2", "3", "--max-steps", "5", "10"])()
     assert "8 variants, 16 episodes, 0 of them there already, 16 left\n2 compilations" in capsys.readouterr().out
     cli.parse(["evaluate", *common, "--shard", "1/2"])()
@@ -178,11 +180,11 @@ def test_an_estimate_is_of_the_rows_that_are_there(folder):
     assert "horizon" not in CONTINUOUS
     methods = [Method(config=standard(gamma=gamma)) for gamma in (0.5, 0.9)]
     jobs = make_jobs(["one.json", "two.json"], methods, (0,))
-    known = {"code": present_code(), "device": versions()["device"]}
+    same_code = {"code": present_code(), "device": versions()["device"]}
     rows = [
         dataclasses.replace(
             jobs[i].failed("no"),
-            **known,
+            **same_code,
             failure=failure,
             planning_seconds=2.0 + i,
             simulation_seconds=1.0,
@@ -192,10 +194,16 @@ def test_an_estimate_is_of_the_rows_that_are_there(folder):
     ]
     with ShardWriter("rows", "me") as writer:
         writer.append(rows)
-    found = estimate(jobs, "rows", 2)
-    assert (found.variants, found.episodes, found.there, found.compilations, found.measured) == (2, 4, 3, 1, 2)
-    assert (found.episode_seconds, found.compile_seconds) == (3.5, 75.0)
-    assert found.hours == pytest.approx((1 * 3.5 / 2 + 75.0) / 3600)
+    estimated = estimate(jobs, "rows", 2)
+    assert (estimated.variants, estimated.episodes, estimated.there, estimated.compilations, estimated.measured) == (
+        2,
+        4,
+        3,
+        1,
+        2,
+    )
+    assert (estimated.episode_seconds, estimated.compile_seconds) == (3.5, 75.0)
+    assert estimated.hours == pytest.approx((1 * 3.5 / 2 + 75.0) / 3600)
     assert estimate(jobs, "rows", 2, retry_errors=True).there == 2
     with ShardWriter("other", "me") as writer:
         writer.append([dataclasses.replace(rows[0], code="other")])

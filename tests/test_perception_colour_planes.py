@@ -110,9 +110,9 @@ def test_clusters_of_a_rendered_image_are_its_bodies(seen):
     assert np.all(labels[~objects] == -1)
     assert labels.max() == 3
     for body in np.unique(truth[objects]):
-        own = truth == body
-        label = np.bincount(labels[own & (labels >= 0)]).argmax()
-        assert np.sum(own & (labels == label)) / np.sum(own | (labels == label)) > 0.98
+        of_body = truth == body
+        label = np.bincount(labels[of_body & (labels >= 0)]).argmax()
+        assert np.sum(of_body & (labels == label)) / np.sum(of_body | (labels == label)) > 0.98
     sizes = np.bincount(labels[labels >= 0])
     assert np.all(np.diff(sizes) <= 0)
     nothing = colour.cluster_by_colour(image, depth, points, np.zeros_like(objects))

@@ -118,9 +118,9 @@ def test_segments_are_the_objects(images, seed, masked):
     segments = np.unique(segmentation[segmentation >= 0])
     assert len(segments) == 4
     for body in np.unique(owners[(owners >= 0) & (owners <= TARGET)]):
-        own = (owners == body) & (depth > 0)
-        label = body if masked else np.bincount(segmentation[own & (segmentation >= 0)]).argmax()
-        overlap = np.sum(own & (segmentation == label)) / np.sum(own | (segmentation == label))
+        of_body = (owners == body) & (depth > 0)
+        label = body if masked else np.bincount(segmentation[of_body & (segmentation >= 0)]).argmax()
+        overlap = np.sum(of_body & (segmentation == label)) / np.sum(of_body | (segmentation == label))
         # What touches the floor or the robot's outline is given up.
         assert overlap > 0.85
         if body == TARGET:

@@ -20,18 +20,18 @@ def visible_points(target, pose, rng, count=120, noise=0.001, side="both"):
     if target.shape == "cylinder":
         angle = rng.uniform(-np.pi, np.pi, 6000)
         normal = np.stack([np.cos(angle), np.sin(angle)], -1)
-        own = a * normal
+        local = a * normal
     else:
         face, t = rng.integers(0, 4, 6000), rng.uniform(-1, 1, 6000)
         normal = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])[face]
-        own = normal * (a, b) + (1 - np.abs(normal)) * (a, b) * t[:, None]
+        local = normal * (a, b) + (1 - np.abs(normal)) * (a, b) * t[:, None]
     R = np.array([[np.cos(pose[2]), -np.sin(pose[2])], [np.sin(pose[2]), np.cos(pose[2])]])
     z = rng.uniform(0, h, 6000) + target.height(SHELF)
-    points = np.column_stack([own @ R.T + pose[:2], z])
+    points = np.column_stack([local @ R.T + pose[:2], z])
     seen = np.einsum("pi,pi->p", normal @ R.T, np.array(CAMERA.position[:2]) - points[:, :2]) > 0
     across = np.array([0.9, -0.43])
     if side != "both":
-        seen &= (own @ R.T) @ np.array([-across[1], across[0]]) * {"left": 1, "right": -1}[side] > 0
+        seen &= (local @ R.T) @ np.array([-across[1], across[0]]) * {"left": 1, "right": -1}[side] > 0
     points = points[seen][:count]
     direction = rng.normal(size=points.shape)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -51,8 +51,8 @@ def test_distance_is_that_to_the_nearest_of_many_surface_points(shape):
     R = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
     grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 81)] * 3, indexing="ij"), -1).reshape(-1, 3)
     inside = np.abs(grid).max(1) <= 1 if shape == "box" else np.hypot(grid[:, 0], grid[:, 1]) <= 1
-    own = grid[inside] * target.half_size
-    solid = np.column_stack([own[:, :2] @ R.T + pose[:2], own[:, 2] + target.height(SHELF)])
+    local = grid[inside] * target.half_size
+    solid = np.column_stack([local[:, :2] @ R.T + pose[:2], local[:, 2] + target.height(SHELF)])
     points = rng.uniform(-0.05, 0.05, (40, 3)) * (1, 1, 2) + [0.6, 0.1, target.height(SHELF)]
     nearest = np.array([np.linalg.norm(solid - p, axis=1).min() for p in points])
     signed = np.asarray(distance(target, SHELF, jnp.float32(pose), jnp.float32(points)))

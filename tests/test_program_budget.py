@@ -97,8 +97,8 @@ def test_a_decision_stays_within_its_budget(monkeypatch, problem, device, target
     finally:
         jax.clear_caches()
     equations, loops = BUDGET[device, target]
-    found = counts.total(), sum(counts[name] for name in LOOPS)
+    counted = counts.total(), sum(counts[name] for name in LOOPS)
     allowed = math.floor(SLACK * equations), loops
-    assert found[0] <= allowed[0] and found[1] <= allowed[1], (  # noqa: PT018
-        f"{found} equations and loops for {device}, {target}, of {allowed}: they may rise only with a measured gain"
+    assert counted[0] <= allowed[0] and counted[1] <= allowed[1], (  # noqa: PT018
+        f"{counted} equations and loops for {device}, {target}, of {allowed}: they may rise only with a measured gain"
     )
