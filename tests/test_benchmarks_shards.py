@@ -15,12 +15,11 @@ from mechsearch_jax.benchmarks.store import claims as claiming
 from mechsearch_jax.benchmarks.store.claims import CLAIMS, Claims
 from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, write_rows
 from mechsearch_jax.benchmarks.store.shards import OPEN, Results, ShardWriter, close_shards_of
-from mechsearch_jax.envs.episode.earlier import EARLIER
 from mechsearch_jax.runtime.errors import InputError
 
 ROW = Row(
     "a", 2, "cylinder", "search-for-grasp", "oracle", 0.9, 3, 30, "push", 0, 1, 2, True, 3, None, 1.5, 0.6,
-    configuration({**EARLIER, "gamma": 0.9}), "00", code="this",
+    configuration({"gamma": 0.9}), "00", code="this",
 )  # fmt: skip
 ROWS = [dataclasses.replace(ROW, seed=seed) for seed in range(10)]
 
@@ -68,18 +67,6 @@ def test_a_line_that_a_kill_cut_short_does_not_count(tmp_path):
     (tmp_path / OPEN / name).write_bytes(b"nonsense\n" + whole)
     with pytest.raises(InputError, match=r"killed-00000\.jsonl: holds a line that is no row"):
         read(tmp_path)
-
-
-def test_an_open_shard_of_an_earlier_version_is_read_by_todays_names(tmp_path):
-    ShardWriter(tmp_path, "killed").append(ROWS[:1])
-    (name,) = open_shards(tmp_path)
-    value = vars(ROW) | {"method": ROW.policy, "actions": "both", "configuration": '{"caution": 0.5}', "later": 1}
-    for lacking in ("policy", "device", "versions"):
-        del value[lacking]
-    (tmp_path / OPEN / name).write_text(json.dumps(value) + "\n")
-    (row,) = read(tmp_path)
-    assert (row.policy, row.actions, row.device) == (ROW.policy, "push+pick-and-place", None)
-    assert json.loads(row.configuration)["unseen_contact_penalty"] == 0.5
 
 
 def test_a_shard_that_was_left_open_is_closed_later(tmp_path):

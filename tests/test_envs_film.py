@@ -53,16 +53,6 @@ def test_a_recording_comes_back_as_it_was_written(tmp_path):
             assert ours.shape == theirs.shape
 
 
-def test_a_recording_of_an_earlier_version_tells_of_no_samples(tmp_path):
-    save_recording(RECORDING, tmp_path / NAME)
-    with np.load(tmp_path / NAME) as file:
-        arrays = {name: array for name, array in file.items() if not name.startswith("sampled.")}
-    np.savez(tmp_path / NAME, **arrays)
-    steps = load_recording(tmp_path / NAME).steps
-    assert [len(step.sampled) for step in steps] == [0, 0, 0]
-    assert steps[0].sampled.after(0, steps[0].scene) is steps[0].scene
-
-
 def cut(arrays):
     arrays["trace.q"] = arrays["trace.q"][:-1]
 

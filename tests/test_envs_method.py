@@ -2,13 +2,11 @@
 
 import dataclasses
 import json
-import math
 
 import pytest
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.envs.episode.earlier import present_options
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.existence import ExistenceConfig
@@ -55,25 +53,6 @@ def test_what_is_no_option_tells_methods_apart_too():
     assert unusual.pop("problem.retrieval.yaws") == 5
     assert set(unusual) == {"problem.retrieval.wrists"}
     assert Method.from_json(json.loads(json.dumps(method.to_json()))) == method
-
-
-def test_what_earlier_files_ran_with_by_default_is_the_default_but_for_what_is_new():
-    earlier = {
-        "method": "search-for-grasp", "gamma": 0.9, "horizon": 3, "sequences": 30, "actions": "both",
-        "criterion": "detector", "push_distances": [0.05, 0.10, 0.15], "caution": 1.0, "topple_charge": 0.0,
-        "push_model": "learned", "focus": 0.7, "max_steps": 10, "recognition": "oracle",
-    }  # fmt: skip
-    then = PRESETS["standard"](
-        cell_reach=(0.5,),
-        closer_look=0,
-        erosion=0.0,
-        reopen=False,
-        push_directions=(math.pi / 2, -math.pi / 2),
-        first_draws=1,
-        move_target=False,
-        rehearsal="none",
-    )
-    assert present_options(earlier) == Method(config=then).options()
 
 
 def test_the_row_of_a_job_is_that_of_its_episode():

@@ -20,7 +20,7 @@ from mechsearch_jax.benchmarks.parts.images import save_rows
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
 from mechsearch_jax.benchmarks.statistics.rates import says
-from mechsearch_jax.benchmarks.store.rows import Row, set_by_retrievals
+from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
@@ -37,8 +37,6 @@ ALPHA = 0.05
 # (benchmarks/results/motion-h200.json, P: 0.10 to 0.13). A change of random numbers alone does the same.
 FLIPS = 0.12
 POWER = 0.8
-# What a reference says since graspable is told apart from retrieved.
-_APART = "graspable_apart_from_retrieved"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,11 +46,11 @@ class Outcome:
     Attributes:
       scenario, content_hash, objects, seed: which episode it is.
       found, graspable, retrieved, steps, failure: as in `Row`, the first two whether there was such a step; None for
-        `graspable` where that is not known (see `Row.graspable_known`).
+        `graspable` where that is not known, as in references of which a retrieval counted as graspable.
     """
 
     scenario: str
-    content_hash: str | None
+    content_hash: str
     objects: int
     seed: int
     found: bool
@@ -77,7 +75,7 @@ class Outcome:
         )
 
     @property
-    def episode(self) -> tuple[str | None, int]:
+    def episode(self) -> tuple[str, int]:
         """What a pair has in common."""
         return self.content_hash, self.seed
 
@@ -206,8 +204,7 @@ def save_reference(rows: Sequence[Row], command: str, path: PathLike) -> None:
         "command": command,
         "code": present_code(),
         "versions": versions(),
-        "configuration": json.loads(rows[0].configuration or "{}"),
-        _APART: True,
+        "configuration": json.loads(rows[0].configuration),
         "retrieved": {str(n): share for n, share in _shares(rows, "retrieved").items()},
         "graspable": {str(n): share for n, share in _shares(rows, "graspable").items()},
     }
@@ -232,8 +229,6 @@ class Reference(NamedTuple):
 def read_reference(path: PathLike) -> Reference:
     """What `save_reference` stored.
 
-    In files of earlier versions a retrieval counted as graspable: whether a retrieved target was is not known.
-
     Raises:
       InputError: the file cannot be read, or is something else.
     """
@@ -247,8 +242,6 @@ def read_reference(path: PathLike) -> Reference:
         raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
     try:
         outcomes = [Outcome(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
-        if not value.get(_APART) and set_by_retrievals(json.dumps(value.get("configuration"))):
-            outcomes = [dataclasses.replace(one, graspable=None) if one.retrieved else one for one in outcomes]
         return Reference(value["code"], outcomes)
     except (TypeError, KeyError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is no reference of bench guard ({error})") from error

@@ -115,7 +115,7 @@ def estimate(jobs: Sequence[Job], out: PathLike, workers: int | None, retry_erro
 def _measured(rows: Sequence[Row], at_once: int) -> tuple[float, float]:
     """Mean seconds of an episode, and of a compilation if as many processes as now waited for each."""
     running = sum(row.planning_seconds + row.simulation_seconds for row in rows) / len(rows)
-    compiled = {_discrete(row.configuration or "{}", row.target) for row in rows}
+    compiled = {_discrete(row.configuration, row.target) for row in rows}
     return running, sum(row.compile_seconds or 0.0 for row in rows) / len(compiled) / at_once
 
 

@@ -10,7 +10,6 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any
 
 from mechsearch_jax.benchmarks.store.rows import OPTIONS, Row, options_of
-from mechsearch_jax.envs.episode.earlier import GONE
 from mechsearch_jax.runtime.errors import InputError, nearest
 
 # A label that is longer does not fit into a table or a picture; variants are numbered then.
@@ -38,7 +37,7 @@ def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dic
     """For each row its variant, and for each variant the policy and the options that differ."""
     variants = list(map(_variant, rows))
     # Thousands of rows have the same few options.
-    each = {variant: {**GONE, **options_of(row)} for variant, row in dict(zip(variants, rows, strict=True)).items()}
+    each = {variant: options_of(row) for variant, row in dict(zip(variants, rows, strict=True)).items()}
     names = sorted({name for options in each.values() for name in options} - {"policy"})
     differing = [name for name in names if len({json.dumps(options.get(name)) for options in each.values()}) > 1]
     parts = {
@@ -149,7 +148,7 @@ def column(rows: Sequence[Row], name: str) -> list[Hashable]:
         options = {option for names in each.values() for option in names}
         raise InputError(f"report: column {name} is unknown; {nearest(name, [VARIANT, *fields, *sorted(options)])}")
     values: dict[Any, Hashable] = {
-        variant: _text(value) if isinstance(value := options.get(name, GONE.get(name)), list) else value
+        variant: _text(value) if isinstance(value := options.get(name), list) else value
         for variant, options in each.items()
     }
     return [values[variant] for variant in variants]

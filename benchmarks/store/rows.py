@@ -15,7 +15,6 @@ from typing import Any, get_args, get_origin, get_type_hints
 import pyarrow
 import pyarrow.parquet
 
-from mechsearch_jax.envs.episode.earlier import RENAMED, present_options
 from mechsearch_jax.envs.episode.records import Episode, Step
 from mechsearch_jax.planner import OPTIONS as PLANNER_OPTIONS
 from mechsearch_jax.runtime.errors import InputError
@@ -39,10 +38,6 @@ EVENTS = (
 ERROR = "error: "
 # Between kinds of action in their column.
 ACTIONS_BETWEEN = "+"
-# Options since which, until rows said `graspable_known`, a retrieval set the step at which the target was graspable.
-_RETRIEVALS_SET_GRASPABLE = ("retrieval_model", "rehearsal")
-# Where the metadata of earlier tables say what ran the episodes.
-_CODE = b"mechsearch_code"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,11 +52,10 @@ class Row:
         joined by "+".
       found_step, graspable_step, retrieved, failure: as in `Episode`.
       steps: number of actions, attempts to take the target out among them.
-      planning_seconds, simulation_seconds: wall time in total, without compilations [s]; with them in files of earlier
-        versions, which do not say `compile_seconds`.
+      planning_seconds, simulation_seconds: wall time in total, without compilations [s].
       configuration: everything that decides about the episode beside its scenario and its seed, as `configuration`
-        writes it; None in files of version 0.1.0, which do not say.
-      content_hash: of the scenario, as in `Episode`; None in files of earlier versions, which do not say.
+        writes it.
+      content_hash: of the scenario, as in `Episode`.
       looks: number of steps at which the target was not found and stood on the board.
       truth_lost: at how many of them f ruled out the candidate pose nearest to the target's true pose.
       truth_lost_step: number of actions before the first of these; None where there was none.
@@ -70,8 +64,8 @@ class Row:
       fallen_step: number of actions after which the first of them was off it; None where none fell.
       held_up: number of actions in which the arm was held up.
       unsettled: number of actions after which something never came to rest.
-      paper_graspable: whether the target could be grasped with the paper's grasps alone at some step; None in files of
-        earlier versions, which do not say.
+      paper_graspable: whether the target could be grasped with the paper's grasps alone at some step; None where that
+        is not known.
       paper_graspable_step: as in `Episode`.
       graspable_known: whether `graspable_step` says anything. False, with None for the step, where a file of an earlier
         version says the step of the retrieval, which then set it whether or not a grasp was free of collisions.
@@ -80,9 +74,8 @@ class Row:
       device: that computed it, as `versions` says it.
       versions: of Python and the libraries, and the machine, as JSON.
 
-    From `looks` to `unsettled` they are None where that is not known: in files of earlier versions, and of an episode
-    that could not be run to its end. The same goes for `compile_seconds`, `device` and `versions`; `code` is None in
-    the very first files alone.
+    From `looks` to `unsettled`, `compile_seconds`, `device` and `versions` are None for an episode that could not be
+    run to its end.
     """
 
     scenario: str
@@ -102,8 +95,8 @@ class Row:
     failure: str | None
     planning_seconds: float
     simulation_seconds: float
-    configuration: str | None = None
-    content_hash: str | None = None
+    configuration: str = "{}"
+    content_hash: str = ""
     looks: int | None = None
     truth_lost: int | None = None
     truth_lost_step: int | None = None
@@ -116,12 +109,12 @@ class Row:
     paper_graspable_step: int | None = None
     graspable_known: bool = True
     compile_seconds: float | None = None
-    code: str | None = None
+    code: str = ""
     device: str | None = None
     versions: str | None = None
 
     @classmethod
-    def of_episode(cls, episode: Episode, code: str | None = None) -> Row:
+    def of_episode(cls, episode: Episode, code: str = "") -> Row:
         """The row of an episode that ran to its end, by the code that ran it."""
         spent = [{"simulate": 0.0, **step.timings} for step in episode.steps]
         libraries = {name: version for name, version in episode.versions.items() if name != "device"}
@@ -138,7 +131,7 @@ class Row:
             simulation_seconds=sum(timings["simulate"] for timings in spent),
             content_hash=episode.content_hash,
             **_event_columns(episode.steps),
-            paper_graspable=_paper_graspable(episode.steps),
+            paper_graspable=any(step.paper_graspable for step in episode.steps),
             paper_graspable_step=episode.paper_graspable_step,
             compile_seconds=sum(timings.get(COMPILING, 0.0) for timings in spent),
             code=code,
@@ -147,7 +140,7 @@ class Row:
         )
 
     @classmethod
-    def failed(cls, scenario: Scenario, options: Mapping[str, Any], reason: str, code: str | None = None) -> Row:
+    def failed(cls, scenario: Scenario, options: Mapping[str, Any], reason: str, code: str = "") -> Row:
         """The row of an episode that could not be run to its end; `options` are as in `Episode.config`."""
         return cls(
             scenario=scenario.name,
@@ -172,8 +165,8 @@ class Row:
 
 
 def _event_columns(steps: Sequence[Step]) -> dict[str, Any]:
-    """The columns `EVENTS`; all None where there are no steps, or they do not say, as those of earlier versions."""
-    if not steps or any(step.restarts is None for step in steps):
+    """The columns `EVENTS`; all None where there are no steps."""
+    if not steps:
         return dict.fromkeys(EVENTS)
     lost = [i for i, step in enumerate(steps) if step.truth_possible is False]
     fell = [i + 1 for i, step in enumerate(steps) if step.fallen]
@@ -181,18 +174,12 @@ def _event_columns(steps: Sequence[Step]) -> dict[str, Any]:
         "looks": sum(step.truth_possible is not None for step in steps),
         "truth_lost": len(lost),
         "truth_lost_step": min(lost, default=None),
-        "restarts": max((step.restarts or 0 for step in steps), default=0),
+        "restarts": max(step.restarts for step in steps),
         "objects_fallen": sum(len(step.fallen or ()) for step in steps),
         "fallen_step": min(fell, default=None),
         "held_up": sum(bool(step.held_up) for step in steps),
         "unsettled": sum(step.at_rest is False for step in steps),
     }
-
-
-def _paper_graspable(steps: Sequence[Step]) -> bool | None:
-    """Whether the paper's grasps would have done at some step; None where steps do not say, as in earlier versions."""
-    said = [step.paper_graspable for step in steps]
-    return None if None in said else any(said)
 
 
 def _option_columns(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -227,8 +214,6 @@ _MORE = {
     EPISODE: pyarrow.string(),
 }
 SCHEMA = pyarrow.schema([*_FIELDS.items(), *_MORE.items()])
-# Every table has these columns; those that came later are None where one lacks them.
-_ALWAYS = frozenset(field.name for field in dataclasses.fields(Row) if field.default is dataclasses.MISSING)
 
 
 def configuration(options: Mapping[str, Any]) -> str:
@@ -241,52 +226,56 @@ def configuration(options: Mapping[str, Any]) -> str:
 
 
 @functools.lru_cache(maxsize=4096)
-def _present(known: str) -> str:
-    """A `Row.configuration` with its options as they are said today.
+def _options(text: str) -> Mapping[str, Any]:
+    """The options that a `Row.configuration` holds.
 
     Raises:
       ValueError: it is not a JSON object.
     """
-    value = json.loads(known)
+    value = json.loads(text)
     if not isinstance(value, dict):
         raise ValueError("not an object")
-    return configuration(present_options(value))
+    return value
+
+
+@functools.lru_cache(maxsize=4096)
+def _canonical(text: str) -> str:
+    """A `Row.configuration` as `configuration` writes it; the same object for the same options.
+
+    Raises:
+      ValueError: it is not a JSON object.
+    """
+    return configuration(_options(text))
 
 
 _named = operator.attrgetter("scenario", "content_hash", *OPTIONS, "seed")
 
 
 def identity(row: Row) -> tuple[Any, ...]:
-    """What tells the rows of a table apart: the scenario, by its name and content, every option and the seed.
-
-    A row that does not say what its scenario held is apart from all that do.
-    """
-    known = None if row.configuration is None else _present(row.configuration)
-    return *_named(row), known
+    """What tells the rows of a table apart: the scenario, by its name and content, every option and the seed."""
+    return *_named(row), _canonical(row.configuration)
 
 
 def episode_key(row: Row) -> str:
     """`KEY_DIGITS` hexadecimal digits that are the same for rows of the same `identity`."""
-    *named, known = identity(row)
-    text = repr((*named, None if known is None else _digest(known)))
+    text = repr((*_named(row), _digest(_canonical(row.configuration))))
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_DIGITS]
 
 
 @functools.lru_cache(maxsize=4096)
-def _digest(known: str) -> str:
-    """Of a configuration, which many rows share."""
-    return hashlib.sha256(known.encode()).hexdigest()
+def _digest(text: str) -> str:
+    """Of a `Row.configuration`, which many rows share."""
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def options_of(row: Row) -> dict[str, Any]:
-    """Every option of a row that is known."""
-    known = {name: getattr(row, name) for name in OPTIONS}
-    actions = row.actions.split(ACTIONS_BETWEEN)
-    return {**present_options(json.loads(row.configuration or "{}")), **known, "actions": actions}
+    """Every option of a row."""
+    columns = {name: getattr(row, name) for name in OPTIONS}
+    return {**_options(row.configuration), **columns, "actions": row.actions.split(ACTIONS_BETWEEN)}
 
 
 def read_rows(path: PathLike) -> list[Row]:
-    """Rows of a Parquet file that `write_rows` wrote, today's or an earlier one, by the present names of options.
+    """Rows of a Parquet file that `write_rows` wrote.
 
     Raises:
       InputError: the file cannot be read or is a table of something else.
@@ -299,22 +288,18 @@ def read_rows(path: PathLike) -> list[Row]:
         raise InputError(f"{path}: cannot be read ({error.strerror or ' '.join(str(error).split())})") from error
     except pyarrow.ArrowException as error:
         raise InputError(f"{path}: is not a Parquet file ({' '.join(str(error).split())})") from error
-    said = table.schema.metadata or {}
-    table = table.rename_columns([RENAMED.get(name, name) for name in table.schema.names])
-    names = [name for name in _FIELDS if name in table.schema.names]
-    if not _ALWAYS.issubset(names):
-        raise InputError(f"{path}: is a table of something else, not of episodes; use another file")
-    columns = table.select(names).to_pydict()
-    if "code" not in columns and (code := said.get(_CODE)) is not None:
-        columns["code"] = [code.decode(errors="replace")] * table.num_rows
+    missing = _FIELDS.keys() - set(table.schema.names)
+    if missing:
+        raise InputError(f"{path}: lacks the column {min(missing)}: it is no table of episodes; use another file")
     try:
-        return [_present_row(dict(zip(columns, values, strict=True))) for values in zip(*columns.values(), strict=True)]
+        columns = table.select(list(_FIELDS)).to_pydict()
+        return [_row(dict(zip(columns, values, strict=True))) for values in zip(*columns.values(), strict=True)]
     except ValueError as error:
         raise InputError(f"{path}: {error}; use another file") from error
 
 
 def parse_row(text: str | bytes) -> Row:
-    """A row from the JSON object of its fields, today's or an earlier one, by the present names of options.
+    """A row from the JSON object of its fields.
 
     Raises:
       ValueError: it is none.
@@ -322,63 +307,23 @@ def parse_row(text: str | bytes) -> Row:
     value = json.loads(text)
     if not isinstance(value, dict):
         raise ValueError("it is not a JSON object")
-    value = {RENAMED.get(name, name): part for name, part in value.items()}
-    missing = _ALWAYS - value.keys()
+    missing = _FIELDS.keys() - value.keys()
     if missing:
         raise ValueError(f"it lacks {min(missing)}")
-    return _present_row({name: part for name, part in value.items() if name in _FIELDS})
+    return _row({name: value[name] for name in _FIELDS})
 
 
-def _present_row(fields: dict[str, Any]) -> Row:
-    """The row of these fields, with its options as they are said today.
+def _row(fields: dict[str, Any]) -> Row:
+    """The row of these fields.
 
     Raises:
       ValueError: its configuration is not a JSON object.
     """
-    fields["actions"] = _present_actions(fields["actions"])
-    known = fields.get("configuration")
-    # A column that a table of another version lacks, or that a table made of several lacks in some of its rows.
-    if fields.get("graspable_known") is None:
-        fields |= _earlier_graspable(fields)
-    if known is not None:
-        try:
-            fields["configuration"] = _present(known)
-        except ValueError as error:
-            raise ValueError(f"the configuration of {fields['scenario']!r} is not a JSON object") from error
-    return Row(**fields)
-
-
-def _earlier_graspable(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """What the fields of an earlier version's row say of whether the target could be grasped."""
-    step, actions = fields["graspable_step"], fields["steps"]
-    numbers = isinstance(step, int) and isinstance(actions, int)
-    by_retrieval = numbers and fields["retrieved"] and step >= actions - 1
-    known = not (by_retrieval and set_by_retrievals(fields.get("configuration")))
-    return {"graspable_known": known, "graspable_step": step if known else None}
-
-
-@functools.lru_cache(maxsize=4096)
-def set_by_retrievals(known: str | None) -> bool:
-    """Whether a retrieval set the graspable step of an earlier version's row with this `Row.configuration`."""
     try:
-        options = json.loads(known or "{}")
-    except ValueError:
-        return False
-    return isinstance(options, dict) and any(name in options for name in _RETRIEVALS_SET_GRASPABLE)
-
-
-@functools.lru_cache(maxsize=4096)
-def _present_actions(actions: str) -> str:
-    """The column `actions` with the kinds as they are said today."""
-    kinds = present_options({"actions": actions})["actions"]
-    return kinds if isinstance(kinds, str) else ACTIONS_BETWEEN.join(kinds)
-
-
-@functools.lru_cache(maxsize=4096)
-def _more(known: str | None) -> Mapping[str, Any]:
-    """The columns `_MORE` that a `Row.configuration` tells."""
-    options = json.loads(known or "{}")
-    return {name: options.get(name) for name in _MORE}
+        fields["configuration"] = _canonical(fields["configuration"])
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"the configuration of {fields['scenario']!r} is not a JSON object") from error
+    return Row(**fields)
 
 
 def write_rows(rows: Sequence[Row], path: PathLike) -> None:
@@ -390,7 +335,10 @@ def write_rows(rows: Sequence[Row], path: PathLike) -> None:
     Raises:
       InputError: the file cannot be written.
     """
-    values = [{**vars(row), **_more(row.configuration), EPISODE: episode_key(row)} for row in rows]
+    values = []
+    for row in rows:
+        options = _options(row.configuration)
+        values.append({**vars(row), **{name: options.get(name) for name in _MORE}, EPISODE: episode_key(row)})
     table = pyarrow.Table.from_pylist(values, schema=SCHEMA)
     with replacing(path) as file:
         pyarrow.parquet.write_table(table, file)

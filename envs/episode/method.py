@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
-from mechsearch_jax.envs.episode.earlier import GONE
 from mechsearch_jax.envs.episode.policy_numbers import mould
 from mechsearch_jax.envs.episode.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.pushing.push_models import push_models
@@ -20,6 +19,8 @@ from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
 
 EngineName = Literal["NativeSimulator", "MjxSimulator"]
+# What the options of an episode hold beside the configuration's.
+_OF_EPISODES = frozenset(("policy", "recognition", "protocol", "simulator", "target", "seed"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,12 +114,12 @@ class Method:
         """The method whose `options` these are; what they do not hold is as in the preset `standard`. It runs natively.
 
         Raises:
-          InputError: a setting is impossible, there is none of a path, or an option is gone.
+          InputError: a setting is impossible, or an option or the path of a setting is unknown.
         """
-        for name, usual in GONE.items():
-            if options.get(name, usual) != usual:
-                raise InputError(f"option {name} is gone: what ran with {options[name]!r} cannot be run again")
         known = {option.name for option in OPTIONS}
+        unknown = [name for name in options if "." not in name and name not in known | _OF_EPISODES]
+        if unknown:
+            raise InputError(f"option {unknown[0]} is unknown to this version: what ran with it cannot be run again")
         config = PRESETS["standard"](**{name: value for name, value in options.items() if name in known})
         parts: dict[str, Any] = {"config": config, "workcell": Workcell()}
         for path, value in options.items():

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from mechsearch_jax.actions import Action, kind_of
-from mechsearch_jax.envs.episode.earlier import present_options
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 
@@ -80,8 +79,7 @@ class Step:
       tracking_error: how far the joint that was farthest from its reference was from it [rad].
       paper_graspable: whether `graspable` holds with the paper's grasps alone: see `verdicts.paper_grasps`.
 
-    From `fallen` to `tracking_error` they are None where nothing was executed, from `truth_possible` on in files of
-    earlier versions.
+    From `fallen` to `tracking_error` they are None where nothing was executed.
     """
 
     belief_size: int
@@ -95,13 +93,13 @@ class Step:
     failure: str | None
     timings: dict[str, float]
     truth_possible: bool | None = None
-    restarts: int | None = None
+    restarts: int = 0
     fallen: tuple[int, ...] | None = None
     target_fallen: bool | None = None
     held_up: bool | None = None
     at_rest: bool | None = None
     tracking_error: float | None = None
-    paper_graspable: bool | None = None
+    paper_graspable: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,9 +117,9 @@ class Episode:
       retrieved: whether the hand took the target out of the shelf and no object fell, neither then nor before.
       failure: why the episode ended without a retrieval; None after one. Where an object left the board, this is the
         reason, with the number of the action.
-      content_hash: of the scenario, see `Scenario.content_hash`; None in files of earlier versions.
+      content_hash: of the scenario, see `Scenario.content_hash`.
       paper_graspable_step: number of actions before it could be grasped with the paper's grasps alone; None where it
-        could not before the episode ended, and in files of earlier versions, whose steps do not say.
+        could not before the episode ended.
     """
 
     scenario: str
@@ -133,7 +131,7 @@ class Episode:
     graspable_step: int | None
     retrieved: bool
     failure: str | None
-    content_hash: str | None = None
+    content_hash: str = ""
     paper_graspable_step: int | None = None
 
 
@@ -149,9 +147,7 @@ def save_episode(episode: Episode, path: PathLike) -> None:
 
 
 def load_episode(path: PathLike) -> Episode:
-    """Read `episode.json`; options of earlier versions are as `earlier.present_options` has them.
-
-    In files of earlier versions a retrieval may have set `graspable_step`: it is read from the steps instead.
+    """Read `episode.json`.
 
     Raises:
       InputError: the file cannot be read or is not the record of an episode.
@@ -163,10 +159,7 @@ def load_episode(path: PathLike) -> Episode:
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON ({' '.join(str(error).split())})") from error
     try:
-        steps = tuple(_step(step) for step in value["steps"])
-        graspable = next((i for i, step in enumerate(steps) if step.graspable), None)
-        config = present_options(value["config"])
-        return Episode(**{**value, "steps": steps, "config": config, "graspable_step": graspable})
+        return Episode(**{**value, "steps": tuple(_step(step) for step in value["steps"])})
     except (TypeError, KeyError) as error:
         raise InputError(f"{path}: is not the record of an episode ({error})") from error
 

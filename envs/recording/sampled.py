@@ -78,14 +78,12 @@ def packed(every: Sequence[Sampled]) -> dict[str, np.ndarray]:
 
 
 def unpacked(arrays: Mapping[str, np.ndarray], steps: int) -> list[Sampled]:
-    """What `packed` packed; nothing for each step of a recording that has none.
+    """What `packed` packed.
 
     Raises:
       ValueError: it is something else.
       KeyError: an array is missing.
     """
-    if "sampled.rows" not in arrays:
-        return [nothing_sampled()] * steps
     rows, foreseen = arrays["sampled.rows"], arrays["sampled.foreseen"]
     _check(arrays, steps, rows, foreseen)
     ends, seen = np.cumsum(rows), np.cumsum(foreseen)

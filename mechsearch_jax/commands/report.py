@@ -44,7 +44,7 @@ def report(
     Columns are those of the results: fields of rows, options, and "method" for the variant.
 
     Args:
-      results: folders of evaluate, folders of those, and Parquet files of earlier versions.
+      results: folders of evaluate, folders of those, and Parquet files of rows.
       out: folder for report.html, which holds everything, report.md, report.tex, CSV and JSON files and pictures; only
         prints if not given.
       rows: columns to group rates by, instead of method and objects; also over all values of the last one.
