@@ -12,7 +12,7 @@ from stage import HIDDEN, OPEN, Stage
 from mechsearch_jax.benchmarks.running import batches
 from mechsearch_jax.benchmarks.running.batches import Batches, fitting_worlds
 from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs
-from mechsearch_jax.benchmarks.running.worker import Worker
+from mechsearch_jax.benchmarks.running.in_turn import InTurn
 from mechsearch_jax.benchmarks.store.rows import identity
 from mechsearch_jax.benchmarks.store.shards import Results
 from mechsearch_jax.envs.episode.method import Method
@@ -243,9 +243,9 @@ def test_96_settings_trace_the_plan_once(tmp_path, files, monkeypatch, how):
     if how == "batch":
         rows = evaluate(jobs, tmp_path / "rows", Batches(worlds=2))
     else:
-        worker = Worker()
+        worker = InTurn()
         worker._simulator = functools.cache(QuickStage)
-        rows = [worker.run(job.path, job.method, job.seed) for job in jobs]
+        rows = [worker.run(job) for job in jobs]
     assert len({identity(row) for row in rows}) == 96
     assert not any(row.is_error for row in rows)
     # A batch has a program for found targets, too.

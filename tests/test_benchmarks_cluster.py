@@ -1,6 +1,5 @@
 """Episodes in the workers of a Ray cluster: rows as of a run on this machine, whichever worker dies."""
 
-import contextlib
 import dataclasses
 import os
 import signal
@@ -11,13 +10,15 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from scripted import is_gone
 from stage import HIDDEN, OPEN
 
 from mechsearch_jax.benchmarks.running import batches, cluster
 from mechsearch_jax.benchmarks.running.batches import Batches
 from mechsearch_jax.benchmarks.running.cluster import MOST_DEATHS, RayCluster, join
-from mechsearch_jax.benchmarks.running.cluster_workers import InTurn, OnCpus, OnGpus
-from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs, present_code
+from mechsearch_jax.benchmarks.running.cluster_workers import OnCpus, OnGpus, Worker
+from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs
+from mechsearch_jax.benchmarks.running.in_turn import InTurn
 from mechsearch_jax.benchmarks.running.processes import ENVIRONMENT, Processes
 from mechsearch_jax.benchmarks.store.rows import episode_key
 from mechsearch_jax.commands.options import EpisodeOptions
@@ -53,9 +54,7 @@ class Script:
                 time.sleep(600)
             if name == "refuse":
                 raise InputError("the weights are missing")
-            code = "mechsearch-jax 9.9 (abc)" if name == "other" else present_code()
-            row = dataclasses.replace(job.failed(""), failure=None, steps=job.seed, code=code)
-            ended([dataclasses.replace(row, gamma=0.123) if name == "confused" else row])
+            ended([dataclasses.replace(job.failed(""), failure=None, steps=job.seed)])
 
     def _seen(self, name):
         try:
@@ -177,8 +176,8 @@ def test_every_job_becomes_one_row_and_no_file_is_needed(ray, tmp_path):
 
 
 @pytest.mark.slow
-def test_jobs_of_dead_and_strange_workers_are_rows_like_the_others(ray, tmp_path):
-    names = ("one", "once", "three", "hang", "five", "other", "confused", "eight")
+def test_jobs_of_dead_workers_are_rows_like_the_others(ray, tmp_path):
+    names = ("one", "once", "three", "hang", "five")
     jobs = jobs_of(tmp_path, *names)
     asked = Counter()
 
@@ -189,8 +188,6 @@ def test_jobs_of_dead_and_strange_workers_are_rows_like_the_others(ray, tmp_path
     assert {row.scenario: row.failure for row in rows} == {
         **dict.fromkeys(names),
         "hang": "error: it took longer than 2 s, and its worker was killed",
-        "other": "error: the worker ran other code: mechsearch-jax 9.9 (abc)",
-        "confused": "error: the worker gave no row of it",
     }
     assert set(asked.values()) == {1}
     # Of what was lost with the worker, each was run again, and nothing that had ended before.
@@ -249,16 +246,6 @@ def test_an_interrupt_ends_all_workers(ray, tmp_path):
         assert is_gone(int(line.split()[1]))
 
 
-def is_gone(pid, patience=10.0):
-    for _ in range(int(patience / 0.1)):
-        with contextlib.suppress(OSError):
-            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z":
-                time.sleep(0.1)
-                continue
-        return True
-    return False
-
-
 def test_cpus_are_shared_evenly():
     machines = [{"CPU": 8.0}, {"CPU": 4.0, "GPU": 1.0}, {"memory": 1.0}]
     for workers, expected, share in ((None, 12, 1), (12, 12, 1), (6, 6, 2), (3, 3, 4), (2, 2, 4), (1, 1, 8)):
@@ -279,17 +266,20 @@ def test_every_gpu_has_a_worker():
         OnGpus().place([{"CPU": 16.0}])
 
 
-def test_chunks_end_small_on_cpus_and_share_a_compilation_on_gpus(tmp_path):
+def test_chunks_are_single_jobs_on_cpus_and_share_a_compilation_on_gpus(tmp_path):
     jobs = jobs_of(tmp_path, "one", "two", "three", seeds=range(10))
-    chunks = OnCpus().chunks(jobs, 2)
-    assert [job for chunk in chunks for job in chunk] == jobs
-    assert [len(chunk) for chunk in chunks] == [4, 4, 4, 4, 4, 3, 2, 2, 1, 1, 1]
+    assert OnCpus().chunks(jobs, 2) == [(job,) for job in jobs]
     other = jobs_of(tmp_path, "one", seeds=range(3), method=Method(config=PRESETS["standard"](horizon=2)))
     chunks = OnGpus().chunks([*jobs, *other], 4)
     assert [len(chunk) for chunk in chunks] == [8, 8, 7, 7, 1, 1, 1]
     assert sorted(job.key for chunk in chunks for job in chunk) == sorted(job.key for job in [*jobs, *other])
     assert all(len({job.method for job in chunk}) == 1 for chunk in chunks)
     assert [len(chunk) for chunk in OnGpus(worlds=2).chunks(jobs, 2)] == [8, 8, 7, 7]
+
+
+def test_a_worker_with_other_code_is_not_started():
+    with pytest.raises(InputError, match=r" has mechsearch-jax 0.*, this machine mechsearch-jax 9.9 \(abc\)"):
+        Worker(OnCpus(), "mechsearch-jax 9.9 (abc)")
 
 
 def test_a_worker_without_a_gpu_is_no_worker_for_batches():
@@ -347,7 +337,7 @@ def test_rows_are_those_of_a_local_run_although_a_worker_was_killed(ray, tmp_pat
 
     def kill(row, tally):
         if not killed:
-            # Of the two, one has ended an episode, and runs the next one of its chunk.
+            # Of the two, one has ended an episode, and is about to run the next one.
             killed.append(min(tmp_path.glob("*.worker"), key=lambda file: file.stat().st_mtime))
             os.kill(int(killed[0].stem), signal.SIGKILL)
 

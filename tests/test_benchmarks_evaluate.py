@@ -3,11 +3,16 @@
 import dataclasses
 import io
 import json
+import signal
 import subprocess
 import sys
+import time
+import types
+from pathlib import Path
 
 import pytest
 from rich.console import Console
+from scripted import is_gone, one_by_one, run
 
 from mechsearch_jax.benchmarks.report import tables
 from mechsearch_jax.benchmarks.report.episode_tables import rates_table
@@ -16,9 +21,9 @@ from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs, pres
 from mechsearch_jax.benchmarks.running.processes import Processes
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.store.rows import episode_key, identity
-from mechsearch_jax.benchmarks.store.shards import OPEN, Results, ShardWriter
+from mechsearch_jax.benchmarks.store.shards import OPEN, Results
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.planner import OPTIONS, PRESETS
+from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime import versions
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
@@ -26,55 +31,19 @@ from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 standard = PRESETS["standard"]
 TARGET = Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
 
-# Stands in for the real worker: says what a scenario's name asks for.
-FAKE = """
-import json, os, pathlib, sys, time
-
-def settings(config, path=""):
-    for name, value in config.items():
-        yield from settings(value, path + name + ".") if isinstance(value, dict) else [(path + name, value)]
-
-names = json.loads(os.environ["OPTIONS"])
-for line in sys.stdin:
-    job = json.loads(line)
-    name = json.loads(pathlib.Path(job["path"]).read_text())["name"]
-    with open(os.environ["LOG"], "a") as log:
-        log.write(name + "\\n")
-    if name == "hang":
-        time.sleep(600)
-    if name == "crash":
-        print("out of luck", file=sys.stderr, flush=True)
-        os._exit(3)
-    method = job["method"]
-    options = {names[path]: value for path, value in settings(method["config"]) if path in names}
-    options.update(policy=method["name"], recognition="oracle", simulator="NativeSimulator")
-    columns = ("policy", "recognition", "gamma", "horizon", "sequences")
-    row = dict({column: options[column] for column in columns}, actions="+".join(options["actions"]), scenario=name,
-               objects=0, target="cylinder", seed=job["seed"], found_step=1, graspable_step=2, retrieved=True, steps=3,
-               failure=None, planning_seconds=1.0, simulation_seconds=0.5, content_hash=os.environ["CONTENT"],
-               code=os.environ["CODE"])
-    row["configuration"] = json.dumps(options, sort_keys=True)
-    if name == "confused":
-        row["gamma"] = 0.123
-    print(json.dumps({"error": "ValueError: no"} if name == "raise" else {"row": row}), flush=True)
-"""
-
 
 @pytest.fixture
 def files(tmp_path):
-    names = ("one", "two", "crash", "raise", "three")
+    names = ("one", "two", "raise", "three")
     for name in names:
         save_scenario(Scenario(name, (), TARGET), tmp_path / f"{name}.json")
     return [tmp_path / f"{name}.json" for name in names]
 
 
-@pytest.fixture
-def command(tmp_path, monkeypatch):
+@pytest.fixture(autouse=True)
+def log(tmp_path, monkeypatch):
     monkeypatch.setenv("LOG", str(tmp_path / "log"))
-    monkeypatch.setenv("CODE", present_code())
-    monkeypatch.setenv("CONTENT", Scenario("any", (), TARGET).content_hash)
-    monkeypatch.setenv("OPTIONS", json.dumps({".".join(option.path): option.name for option in OPTIONS}))
-    return (sys.executable, "-c", FAKE)
+    return tmp_path / "log"
 
 
 def read_rows(folder):
@@ -84,29 +53,17 @@ def read_rows(folder):
 
 
 def ran(tmp_path):
-    return sorted((tmp_path / "log").read_text().split())
+    return sorted(line.split()[0] for line in (tmp_path / "log").read_text().splitlines())
 
 
-def test_all_combinations_become_rows(tmp_path, files, command):
+def test_all_combinations_become_rows(tmp_path, files):
     jobs = make_jobs([files[0], files[1]], [Method(), Method("search-and-grasp")], (0, 1))
-    rows = evaluate(jobs, tmp_path / "rows", Processes(2, command=command))
+    rows = evaluate(jobs, tmp_path / "rows", one_by_one)
     assert len(rows) == len({identity(row) for row in rows}) == 8
     assert sorted(map(identity, read_rows(tmp_path / "rows"))) == sorted(map(identity, rows))
 
 
-def test_failures_are_rows_with_their_reason_and_do_not_end_the_run(tmp_path, files, command):
-    rows = evaluate(make_jobs(files, [Method()], (0,)), tmp_path / "rows", Processes(1, command=command))
-    reasons = {row.scenario: row.failure for row in rows}
-    assert reasons == {
-        "one": None,
-        "two": None,
-        "crash": "error: the worker process ended with status 3: out of luck",
-        "raise": "error: ValueError: no",
-        "three": None,
-    }
-
-
-def test_a_stopped_run_goes_on_where_it_was(tmp_path, files, command):
+def test_a_stopped_run_goes_on_where_it_was(tmp_path, files):
     out = tmp_path / "rows"
     jobs = make_jobs(files, [Method()], (0,))
 
@@ -115,23 +72,21 @@ def test_a_stopped_run_goes_on_where_it_was(tmp_path, files, command):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        evaluate(jobs, out, Processes(1, command=command), ended=stop)
+        evaluate(jobs, out, one_by_one, ended=stop)
     first = read_rows(out)
     assert len(first) == 2
-    rows = evaluate(jobs, out, Processes(1, command=command))
-    assert [row.scenario for row in rows] == ["one", "two", "crash", "raise", "three"]
+    rows = evaluate(jobs, out, one_by_one)
+    assert [row.scenario for row in rows] == ["one", "two", "raise", "three"]
     assert [row for row in read_rows(out) if row in first] == first
     (tmp_path / "log").write_text("")
-    assert evaluate(jobs, out, Processes(1, command=command)) == rows
+    assert evaluate(jobs, out, one_by_one) == rows
     assert ran(tmp_path) == []
 
 
-def test_rows_of_other_options_stay(tmp_path, files, command):
+def test_rows_of_other_options_stay(tmp_path, files):
     out = tmp_path / "rows"
     for gamma in (0.9, 0.5):
-        rows = evaluate(
-            make_jobs(files[:1], [Method(config=standard(gamma=gamma))], (0,)), out, Processes(1, command=command)
-        )
+        rows = evaluate(make_jobs(files[:1], [Method(config=standard(gamma=gamma))], (0,)), out, one_by_one)
         assert [row.gamma for row in rows] == [gamma]
     assert sorted(row.gamma for row in read_rows(out)) == [0.5, 0.9]
 
@@ -148,10 +103,10 @@ def test_rows_of_other_options_stay(tmp_path, files, command):
     ],
     ids=lambda other: next(iter(other)),
 )
-def test_every_option_tells_rows_apart(tmp_path, files, command, other):
+def test_every_option_tells_rows_apart(tmp_path, files, other):
     out = tmp_path / "rows"
     for method in (Method(), Method(config=standard(**other)), Method()):
-        rows = evaluate(make_jobs(files[:1], [method], (0,)), out, Processes(1, command=command))
+        rows = evaluate(make_jobs(files[:1], [method], (0,)), out, one_by_one)
         assert len(rows) == 1
     assert ran(tmp_path) == ["one", "one"]
     both = read_rows(out)
@@ -160,13 +115,12 @@ def test_every_option_tells_rows_apart(tmp_path, files, command, other):
     assert [rates.episodes for rates in summarise(both)] == [1] * 4
 
 
-def test_an_edited_file_of_the_same_name_gets_rows_of_its_own(tmp_path, files, command, monkeypatch):
+def test_an_edited_file_of_the_same_name_gets_rows_of_its_own(tmp_path, files):
     out = tmp_path / "rows"
-    first = evaluate(make_jobs(files[:2], [Method()], (0,)), out, Processes(1, command=command))
+    first = evaluate(make_jobs(files[:2], [Method()], (0,)), out, one_by_one)
     edited = Scenario("one", (), dataclasses.replace(TARGET, position=(0.62, 0.08, 0.4545)))
     save_scenario(edited, files[0])
-    monkeypatch.setenv("CONTENT", edited.content_hash)
-    (row, other) = evaluate(make_jobs(files[:2], [Method()], (0,)), out, Processes(1, command=command))
+    (row, other) = evaluate(make_jobs(files[:2], [Method()], (0,)), out, one_by_one)
     assert ran(tmp_path) == ["one", "one", "two"]
     assert (row.scenario, row.failure, row.content_hash) == ("one", None, edited.content_hash)
     assert other == first[1]
@@ -174,38 +128,28 @@ def test_an_edited_file_of_the_same_name_gets_rows_of_its_own(tmp_path, files, c
     # As it was before, it has its rows still; and how a file is written does not matter.
     save_scenario(Scenario("one", (), TARGET), files[0])
     files[1].write_text(json.dumps(json.loads(files[1].read_text())))
-    assert evaluate(make_jobs(files[:2], [Method()], (0,)), out, Processes(1, command=command)) == first
+    assert evaluate(make_jobs(files[:2], [Method()], (0,)), out, one_by_one) == first
     assert ran(tmp_path) == ["one", "one", "two"]
 
 
-def test_a_file_that_changes_while_it_waits_is_a_failure(tmp_path, files, command, monkeypatch):
-    monkeypatch.setenv("CONTENT", "another")
-    (row,) = evaluate(make_jobs(files[:1], [Method()], (0,)), tmp_path / "rows", Processes(1, command=command))
-    assert row.failure == "error: the worker ran another episode than was asked for: other options, or a changed file"
-
-
-def test_rows_of_other_code_are_not_added_to(tmp_path, files, command, monkeypatch):
+def test_rows_of_other_code_are_not_added_to(tmp_path, files, monkeypatch):
     out = tmp_path / "rows"
-    (row,) = evaluate(make_jobs(files[:1], [Method()], (0,)), out, Processes(1, command=command))
+    (row,) = evaluate(make_jobs(files[:1], [Method()], (0,)), out, one_by_one)
     assert row.code == present_code()
     before = {path.name for path in out.iterdir()}
     monkeypatch.setattr(benchmark, "present_code", lambda: "mechsearch-jax 9.9 (abc)")
     with pytest.raises(InputError, match=r"rows: .* run by mechsearch-jax 0.* is mechsearch-jax 9.9 \(abc\);"):
-        evaluate(make_jobs(files[:2], [Method()], (0,)), out, Processes(1, command=command))
+        evaluate(make_jobs(files[:2], [Method()], (0,)), out, one_by_one)
     assert {path.name for path in out.iterdir()} == before
     assert ran(tmp_path) == ["one"]
 
-    # Rows that do not say what ran them may be anything.
-    with ShardWriter(tmp_path / "unknown", "me") as writer:
-        writer.append([dataclasses.replace(row, code=None)])
-    with pytest.raises(InputError, match="does not say which"):
-        evaluate(make_jobs(files[:1], [Method()], (0,)), tmp_path / "unknown", Processes(1, command=command))
+    def stale(jobs, ended, begin):
+        ended([dataclasses.replace(job.failed("no"), code="mechsearch-jax 9.9 (abc)") for job in jobs if begin(job)])
 
-
-def test_a_worker_of_other_code_is_not_believed(tmp_path, files, command, monkeypatch):
-    monkeypatch.setenv("CODE", "mechsearch-jax 9.9 (abc)")
-    (row,) = evaluate(make_jobs(files[:1], [Method()], (0,)), tmp_path / "rows", Processes(1, command=command))
-    assert row.failure == "error: the worker ran other code: mechsearch-jax 9.9 (abc)"
+    monkeypatch.undo()
+    with pytest.raises(InputError, match=r"a worker ran mechsearch-jax 9.9 \(abc\), this is mechsearch-jax 0"):
+        evaluate(make_jobs(files[:2], [Method()], (0,)), out, stale)
+    assert read_rows(out) == [row]
 
 
 def test_the_code_is_that_of_planner_perception_and_environment(tmp_path, monkeypatch):
@@ -231,19 +175,6 @@ def test_the_code_is_that_of_planner_perception_and_environment(tmp_path, monkey
         before = after
 
 
-def test_a_worker_that_cannot_be_started_makes_rows_too(tmp_path, files):
-    jobs = make_jobs(files[:2], [Method()], (0,))
-    rows = evaluate(jobs, tmp_path / "rows", Processes(1, command=(str(tmp_path / "nothing"),)))
-    assert all("FileNotFoundError" in str(row.failure) for row in rows)
-
-
-def test_a_worker_that_ran_something_else_is_not_believed(tmp_path, command):
-    save_scenario(Scenario("confused", (), TARGET), tmp_path / "confused.json")
-    jobs = make_jobs([tmp_path / "confused.json"], [Method()], (0,))
-    (row,) = evaluate(jobs, tmp_path / "rows", Processes(1, command=command))
-    assert row.failure == "error: the worker ran another episode than was asked for: other options, or a changed file"
-
-
 def test_a_method_that_cannot_be_used_is_told_of_before_any_episode(tmp_path, files):
     for method, message in (
         (Method("guess"), 'policy "guess" is unknown'),
@@ -255,44 +186,36 @@ def test_a_method_that_cannot_be_used_is_told_of_before_any_episode(tmp_path, fi
 
 
 @pytest.mark.parametrize("name", ["rows", "rows.parquet"])
-def test_a_file_is_no_place_for_results(tmp_path, files, command, name):
+def test_a_file_is_no_place_for_results(tmp_path, files, name):
     (tmp_path / "rows").write_text("mine")
     with pytest.raises(InputError, match="results are kept in a folder"):
-        evaluate(make_jobs(files[:1], [Method()], (0,)), tmp_path / name, Processes(1, command=command))
+        evaluate(make_jobs(files[:1], [Method()], (0,)), tmp_path / name, one_by_one)
     assert (tmp_path / "rows").read_text() == "mine"
     assert not (tmp_path / "rows.parquet").exists()
 
 
-def test_an_episode_that_hangs_is_a_row_and_its_worker_is_replaced(tmp_path, files, command):
-    save_scenario(Scenario("hang", (), TARGET), tmp_path / "hang.json")
-    jobs = make_jobs([tmp_path / "hang.json", *files[:2]], [Method()], (0,))
-    rows = evaluate(jobs, tmp_path / "rows", Processes(1, 1.5, command))
-    assert [row.failure for row in rows] == [
-        "error: it took longer than 1.5 s, and its worker was killed", None, None,
-    ]  # fmt: skip
-
-
-def test_errors_are_run_again_if_asked_for(tmp_path, files, command):
+def test_errors_are_run_again_if_asked_for(tmp_path, files):
     out, jobs = tmp_path / "rows", make_jobs(files, [Method()], (0,))
-    before = evaluate(jobs, out, Processes(1, command=command))
+    before = evaluate(jobs, out, one_by_one)
     (tmp_path / "log").write_text("")
-    assert evaluate(jobs, out, Processes(1, command=command)) == before
+    assert evaluate(jobs, out, one_by_one) == before
     assert ran(tmp_path) == []
-    again = evaluate(jobs, out, Processes(1, command=command), retry_errors=True)
-    assert ran(tmp_path) == ["crash", "raise"]
+    again = evaluate(jobs, out, one_by_one, retry_errors=True)
+    assert ran(tmp_path) == ["raise"]
     assert [row.failure for row in again] == [row.failure for row in before]
+
+    def mended(jobs, ended, begin):
+        ended([dataclasses.replace(before[0], scenario=job.scenario.name) for job in jobs if begin(job)])
+
     # One that succeeds takes the place of the error.
-    save_scenario(Scenario("crash", (), TARGET), files[2])
-    command = (*command[:-1], command[-1].replace('"crash"', '"never"'))
-    mended = evaluate(jobs, out, Processes(1, command=command), retry_errors=True)
-    assert [row.failure for row in mended] == [None, None, None, "error: ValueError: no", None]
-    assert len(read_rows(out)) == 5
+    assert [row.failure for row in evaluate(jobs, out, mended, retry_errors=True)] == [None] * 4
+    assert len(read_rows(out)) == 4
 
 
-def test_shards_share_all_episodes_evenly(tmp_path, files, command):
+def test_shards_share_all_episodes_evenly(tmp_path, files):
     jobs = make_jobs(files, [Method()], range(5))
     shards = [shard_of(jobs, k, 3) for k in (1, 2, 3)]
-    assert sorted(map(len, shards)) == [8, 8, 9]
+    assert sorted(map(len, shards)) == [6, 7, 7]
     assert sorted(job.key for shard in shards for job in shard) == sorted(job.key for job in jobs)
     backwards = shard_of(jobs[::-1], 2, 3)
     assert {job.key for job in backwards} == {job.key for job in shards[1]}
@@ -301,21 +224,21 @@ def test_shards_share_all_episodes_evenly(tmp_path, files, command):
         shard_of(jobs, 4, 3)
     # Apart from each other, they come to what one run would have.
     for k, shard in enumerate(shards):
-        rows = evaluate(shard, tmp_path / str(k), Processes(2, command=command))
+        rows = evaluate(shard, tmp_path / str(k), one_by_one)
         assert [episode_key(row) for row in rows] == [job.key for job in shard]
-    assert len(ran(tmp_path)) == 25
+    assert len(ran(tmp_path)) == 20
 
 
-def test_what_ends_elsewhere_meanwhile_is_not_run(tmp_path, files, command):
+def test_what_ends_elsewhere_meanwhile_is_not_run(tmp_path, files):
     out, jobs = tmp_path / "rows", make_jobs(files[:2], [Method()], (0, 1))
-    inner, told = Processes(1, command=command), []
+    told = []
 
     def runner(missing, ended, begin):
         told.append(len(missing))
         if len(told) == 1:
             # Another process takes two of them, and ends both.
-            evaluate([jobs[0], jobs[2]], out, inner)
-        inner(missing, ended, begin)
+            evaluate([jobs[0], jobs[2]], out, one_by_one)
+        one_by_one(missing, ended, begin)
 
     rows = evaluate(jobs, out, runner)
     assert [episode_key(row) for row in rows] == [job.key for job in jobs]
@@ -333,12 +256,12 @@ def test_a_runner_that_loses_an_episode_is_told_of(tmp_path, files):
         evaluate(make_jobs(files[:1], [Method()], (0,)), tmp_path / "rows", runner)
 
 
-def test_progress_and_rates_are_shown(tmp_path, files, command):
+def test_progress_and_rates_are_shown(tmp_path, files):
     screen = io.StringIO()
     console = Console(file=screen, width=100)
     with tables.EpisodeProgress(console, 3) as progress:
-        jobs = make_jobs([files[0], files[1], files[3]], [Method()], (0,))
-        rows = evaluate(jobs, tmp_path / "rows", Processes(1, command=command), ended=progress.ended)
+        jobs = make_jobs(files[:3], [Method()], (0,))
+        rows = evaluate(jobs, tmp_path / "rows", one_by_one, ended=progress.ended)
     console.print(rates_table(rows))
     text = screen.getvalue()
     assert "3/3 raise: error: ValueError: no" in text
@@ -364,15 +287,48 @@ def test_a_policy_of_another_module_reaches_the_worker(tmp_path, files, monkeypa
     assert row.failure == "error: RuntimeError: gamma 0.25 arrived"
 
 
-def test_a_worker_ends_with_its_input_whatever_it_is_doing():
+def test_workers_that_die_hang_or_fail_cost_one_row_each(tmp_path, files):
+    for name in ("crash", "hang"):
+        save_scenario(Scenario(name, (), TARGET), tmp_path / f"{name}.json")
+    names = ("one", "crash", "hang", "raise", "three")
+    jobs = make_jobs([tmp_path / f"{name}.json" for name in names], [Method()], (0,))
+    rows = evaluate(jobs, tmp_path / "rows", Processes(1, 1.5, run))
+    assert {row.scenario: row.failure for row in rows} == {
+        "one": None,
+        "crash": "error: the worker process ended with status 3: out of luck",
+        "hang": "error: it took longer than 1.5 s, and its worker was killed",
+        "raise": "error: ValueError: no",
+        "three": None,
+    }
+    assert ran(tmp_path) == sorted(names)
+
+
+def broken(job):
+    """No worker has this: it is no function of a module that they find."""
+
+
+def test_workers_that_cannot_be_started_end_the_run(tmp_path, files, monkeypatch):
+    broken.__module__ = "nobody.there"
+    monkeypatch.setitem(sys.modules, "nobody", types.ModuleType("nobody"))
+    monkeypatch.setitem(sys.modules, "nobody.there", types.SimpleNamespace(broken=broken))
+    with pytest.raises(InputError, match=r"worker processes end while they start: ModuleNotFoundError: .*nobody"):
+        evaluate(make_jobs(files[:2], [Method()], (0,)), tmp_path / "rows", Processes(2, run=broken))
+    assert read_rows(tmp_path / "rows") == []
+
+
+@pytest.mark.parametrize("how", ["an interrupt", "a kill"])
+def test_workers_end_with_the_run_whatever_they_are_doing(tmp_path, files, how):
+    save_scenario(Scenario("hang", (), TARGET), tmp_path / "hang.json")
     program = (
-        "import sys, time; from mechsearch_jax.benchmarks.running.worker import until_closed; "
-        "next(until_closed(sys.stdin)); print('busy', flush=True); time.sleep(100)"
+        "import sys; from scripted import run; from mechsearch_jax.benchmarks.running.evaluate import *; "
+        "from mechsearch_jax.benchmarks.running.processes import Processes; "
+        "evaluate(make_jobs([sys.argv[1]], [Method()], (0,)), sys.argv[2], Processes(1, run=run))"
     )
-    pipe, command = subprocess.PIPE, [sys.executable, "-c", program]
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
-        process.stdin.write("a job\n")
-        process.stdin.flush()
-        assert process.stdout.readline() == "busy\n"
-        process.stdin.close()
-        assert process.wait(60) == 0
+    command = [sys.executable, "-c", program, str(tmp_path / "hang.json"), str(tmp_path / "rows")]
+    with subprocess.Popen(command, cwd=Path(__file__).parent, stderr=subprocess.DEVNULL) as process:
+        while not (tmp_path / "log").exists() or not (tmp_path / "log").read_text().endswith("\n"):
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT if how == "an interrupt" else signal.SIGKILL)
+    worker = int((tmp_path / "log").read_text().split()[1])
+    assert is_gone(worker)
+    assert read_rows(tmp_path / "rows") == []

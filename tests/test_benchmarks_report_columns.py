@@ -18,7 +18,8 @@ from mechsearch_jax.benchmarks.report.report import Report, ReportOptions
 from mechsearch_jax.benchmarks.report.report_figures import COLOURS, curve_figure, rates_figure, success_figure
 from mechsearch_jax.benchmarks.report.report_files import FILES, OPTIONAL_FILES, write_report
 from mechsearch_jax.benchmarks.report.report_page import blocks
-from mechsearch_jax.benchmarks.running.worker import Worker
+from mechsearch_jax.benchmarks.running.evaluate import make_jobs
+from mechsearch_jax.benchmarks.running.in_turn import InTurn
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, paired
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, column, label_variants, natural
@@ -370,7 +371,8 @@ def test_a_method_is_what_its_options_say():
 @pytest.mark.slow
 def test_an_episode_is_replayed_from_its_row(tmp_path):
     file = example_scenarios()["first-light"]
-    row = Worker().run(str(file), Method(config=PRESETS["standard"](max_steps=1, sequences=5, horizon=1)), 3)
+    (job,) = make_jobs([file], [Method(config=PRESETS["standard"](max_steps=1, sequences=5, horizon=1))], (3,))
+    row = InTurn().run(job)
     assert Method.of_options(options_of(row)).options()["max_steps"] == 1
     assert films.replay(row, load_scenario(file), tmp_path / "film.png") == ""
     assert image.imread(tmp_path / "film.png").std() > 0.05

@@ -1,12 +1,12 @@
 """Who shares a machine keeps its share of the cores busy, and leaves no files behind that nobody asked for."""
 
 import os
-import sys
 
 import jax
 import mujoco
 import numpy as np
 import pytest
+import scripted
 
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs
 from mechsearch_jax.benchmarks.running.processes import Processes
@@ -53,11 +53,11 @@ def test_processes_share_them(monkeypatch, processes, each):
 
 def test_workers_are_told_their_share(monkeypatch):
     monkeypatch.setenv(VARIABLE, "6")
-    tells = (sys.executable, "-c", f"import os, sys; sys.exit('share ' + os.environ['{VARIABLE}'])")
     jobs = make_jobs([example_scenarios()["first-light"]], [Method()], (0, 1))
-    rows = []
-    Processes(4, command=tells)(jobs, rows.extend, lambda job: True)
-    assert [row.failure.endswith("share 3") for row in rows] == [True, True]
+    rows, before = [], dict(os.environ)
+    Processes(4, run=scripted.share)(jobs, rows.extend, lambda job: True)
+    assert [row.failure for row in rows] == ["error: share 3"] * 2
+    assert dict(os.environ) == before
 
 
 def test_a_simulation_that_diverges_leaves_no_log(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pickle
 
 import pytest
 
@@ -28,7 +29,7 @@ METHODS = [
 
 @pytest.mark.parametrize("method", METHODS, ids=["default", "other"])
 def test_a_method_survives_the_way_to_a_worker(method):
-    again = Method.from_json(json.loads(json.dumps(method.to_json())))
+    again = pickle.loads(pickle.dumps(method))
     assert again == method
     assert hash(again) == hash(method)
 
@@ -52,7 +53,7 @@ def test_what_is_no_option_tells_methods_apart_too():
     assert unusual.pop("problem.existence.found_pixels") == 80
     assert unusual.pop("problem.retrieval.yaws") == 5
     assert set(unusual) == {"problem.retrieval.wrists"}
-    assert Method.from_json(json.loads(json.dumps(method.to_json()))) == method
+    assert Method.of_options(method.options()) == method
 
 
 def test_the_row_of_a_job_is_that_of_its_episode():

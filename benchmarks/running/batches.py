@@ -62,8 +62,8 @@ class Batches:
 
     Attributes:
       worlds: how many at the same time; as many as fit the device's memory, within reason, if None.
-      busy: told of every stage and how many episodes are in it.
-      compiling: told of what is being compiled, where anything is.
+      busy: called with every stage and how many episodes are in it.
+      compiling: called with what is being compiled, where anything is.
     """
 
     worlds: int | None = None
@@ -144,13 +144,12 @@ class Batches:
         policy_of, options_of = functools.cache(Method.policy), functools.cache(Method.options)
 
         def start(job: Job) -> Start:
-            own = job.method
-            return Start(job.scenario, job.seed, policy_of(own), own.config.max_steps, options_of(own))
+            policy, max_steps = policy_of(job.method), job.method.config.max_steps
+            return Start(job.scenario, job.seed, policy, max_steps, options_of(job.method))
 
         def take(episodes: Sequence[tuple[int, Episode]]) -> None:
-            own = batch.take(episodes)
-            if own:
-                ended([Row.of_episode(episode, code) for episode in own])
+            if counted := batch.take(episodes):
+                ended([Row.of_episode(episode, code) for episode in counted])
 
         run_episodes(
             map(start, batch.jobs(worlds)),
@@ -210,9 +209,9 @@ class _Batch:
 
     def take(self, episodes: Sequence[tuple[int, Episode]]) -> list[Episode]:
         """Take note of episodes that ended, by their places; those that count."""
-        own = {place: episode for place, episode in episodes if place < len(self._begun)}
-        self._over |= own.keys()
-        return list(own.values())
+        counted = {place: episode for place, episode in episodes if place < len(self._begun)}
+        self._over |= counted.keys()
+        return list(counted.values())
 
     @property
     def running(self) -> list[Job]:

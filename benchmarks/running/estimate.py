@@ -120,8 +120,8 @@ def _measured(rows: Sequence[Row], at_once: int) -> tuple[float, float]:
 
 
 @functools.lru_cache(maxsize=4096)
-def _discrete(known: str, target: str) -> str:
+def _discrete(configuration: str, target: str) -> str:
     """What is compiled, as far as the options tell."""
-    options = json.loads(known)
+    options = json.loads(configuration)
     kept = {name: value for name, value in options.items() if name not in CONTINUOUS and name != "max_steps"}
     return json.dumps([kept, target], sort_keys=True)

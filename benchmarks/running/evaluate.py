@@ -1,6 +1,6 @@
 """Many scenarios, methods and seeds: what is wanted, what is there already, and what becomes of the rest.
 
-How the episodes are run is a slot: `processes.Processes` runs one after the other in several worker processes,
+A list of jobs, a runner and a folder: `processes.Processes` runs one after the other in several worker processes,
 `batches.Batches` many at a time in this one, `cluster.RayCluster` does either on the machines of a cluster. Rows are on
 disk as soon as their episodes have ended, so that a run that was killed goes on where it stopped. `shards` keeps them,
 `claims` divides the work among those who share a folder.
@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib.metadata
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -49,8 +48,8 @@ class Job:
     @property
     def options(self) -> dict[str, Any]:
         """As in `Episode.config`."""
-        asked = {"target": self.scenario.target.shape, "simulator": self.method.engine, "seed": self.seed}
-        return {**_options(self.method), **asked}
+        episode = {"target": self.scenario.target.shape, "simulator": self.method.engine, "seed": self.seed}
+        return {**_options(self.method), **episode}
 
     @functools.cached_property
     def key(self) -> str:
@@ -167,8 +166,9 @@ class Runner(Protocol):
 
         Args:
           jobs: what is wanted.
-          ended: told of every one's row once, of several at a time if they ended together; never from two threads.
-          begin: asked of every job once, right before it is begun, whether it is to be run: another process may have.
+          ended: called with every one's row once, with several at a time if they ended together; in one thread.
+          begin: called with every job once, right before it is begun, says whether it is to be run: another process may
+            have.
         """
         ...
 
@@ -231,9 +231,8 @@ def check_code(results: Results, fresh: Sequence[str]) -> None:
     code = present_code()
     for key in fresh:
         if (row := results.rows[key]).code != code:
-            other = row.code or "other code, it does not say which"
             raise InputError(
-                f"{results.folder}: its episodes were run by {other}, this is {code}; give another folder, "
+                f"{results.folder}: its episodes were run by {row.code}, this is {code}; give another folder, "
                 "or delete this one to run all of them again"
             )
 
@@ -253,8 +252,7 @@ class _Work:
         """Args are as `evaluate` has them; `results` have not been read."""
         self._jobs, self._results, self._claims, self._writer = jobs, results, claims, writer
         self._ended = ended
-        self._lock = threading.Lock()
-        # Episodes of which rows were read that nobody has been told of.
+        # Episodes of which rows were read that `ended` has not been called with.
         self._fresh: list[str] = []
         self._refresh()
         self._fresh.clear()
@@ -281,23 +279,28 @@ class _Work:
         return list(self._left.values())
 
     def begin(self, job: Job) -> bool:
-        """Whether a job is for this process to run; from any thread."""
-        with self._lock:
-            if self._is_over(job.key) or not self._claims.take(job.key):
-                return False
-            # It may have ended elsewhere before it was taken.
-            self._refresh()
-            if self._is_over(job.key):
-                self._claims.release(job.key)
-                return False
-            return True
+        """Whether a job is for this process to run."""
+        if self._is_over(job.key) or not self._claims.take(job.key):
+            return False
+        # It may have ended elsewhere before it was taken.
+        self._refresh()
+        if self._is_over(job.key):
+            self._claims.release(job.key)
+            return False
+        return True
 
     def take(self, rows: Sequence[Row]) -> None:
-        """Keep the rows of episodes that ended."""
-        with self._lock:
-            self._writer.append(rows)
-            for row in rows:
-                self._claims.release(episode_key(row))
+        """Keep the rows of episodes that ended.
+
+        Raises:
+          InputError: a worker ran other code.
+        """
+        foreign = next((row.code for row in rows if row.code != present_code()), None)
+        if foreign is not None:
+            raise InputError(f"a worker ran {foreign}, this is {present_code()}; start again, and leave the code alone")
+        self._writer.append(rows)
+        for row in rows:
+            self._claims.release(episode_key(row))
         self.look()
 
     def check(self) -> None:
@@ -312,14 +315,12 @@ class _Work:
 
     def look(self) -> None:
         """Take note of all that has ended, elsewhere too."""
-        with self._lock:
-            self._refresh()
-            over = [key for key in dict.fromkeys(self._fresh) if key in self._left and self._is_over(key)]
-            self._fresh.clear()
-            rows = [self._results.rows[key] for key in over]
-            for key in over:
-                del self._left[key]
-        for row in rows:
+        self._refresh()
+        over = [key for key in dict.fromkeys(self._fresh) if key in self._left and self._is_over(key)]
+        self._fresh.clear()
+        for key in over:
+            del self._left[key]
+        for row in [self._results.rows[key] for key in over]:
             self._tally = self._tally.plus(row)
             self._ended(row, self._tally)
 

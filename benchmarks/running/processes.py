@@ -1,29 +1,37 @@
 """Episodes one after the other in several worker processes.
 
-Workers are separate programs with one thread each, and their share of the cores for pushes that they simulate: on a
+Workers are programs of their own with one thread each, and their share of the cores for pushes that they simulate: on a
 machine with few cores and no GPU this is faster than sharing all threads, and a worker that dies, or hangs and is
-killed, takes one episode with it, not the run.
+killed, takes one episode with it, not the run. Pebble keeps the workers, in processes that loky starts: with an
+environment of their own, and without the main module.
 """
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import json
+import copy
+import functools
 import os
-import queue
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import loky.backend
+import pebble
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
-from mechsearch_jax.benchmarks.store.rows import Row, identity
+from mechsearch_jax.benchmarks.running.in_turn import InTurn
+from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.problem.cache import keep_compilations
 from mechsearch_jax.runtime.cores import share_of_cores
+from mechsearch_jax.runtime.errors import InputError
 
-WORKER = (sys.executable, "-m", "mechsearch_jax.benchmarks.running.worker")
 # An episode takes seconds, the first of a worker minutes for compilations [s].
 TIME_LIMIT = 3600.0
 # Several processes cannot share a GPU's memory, of which the first takes most.
@@ -33,9 +41,21 @@ ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "JAX_PLATFORMS": "cpu",
 }
+# How often a worker looks whether its parent is still there [s].
+LOOK_EVERY = 1.0
 
 
-@dataclasses.dataclass(frozen=True)
+def run_job(job: Job) -> Row:
+    """The row of a job, run in this process."""
+    return _in_turn().row(job)
+
+
+@functools.cache
+def _in_turn() -> InTurn:
+    return InTurn()
+
+
+@dataclass(frozen=True)
 class Processes:
     """Runs jobs on the CPU, in the native simulator.
 
@@ -43,153 +63,93 @@ class Processes:
       workers: number of processes.
       time_limit: seconds after which an episode, with its compilations, is taken to hang; its worker is killed and
         replaced.
-      command: starts a worker; only tests have another one.
+      run: what a worker does with a job; a function of a module.
     """
 
     workers: int
     time_limit: float = TIME_LIMIT
-    command: Sequence[str] = WORKER
+    run: Callable[[Job], Row] = run_job
 
     def __call__(
         self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
     ) -> None:
-        """Run all jobs; see `evaluate.Runner`."""
-        todo: queue.SimpleQueue[Job] = queue.SimpleQueue()
-        for job in jobs:
-            todo.put(job)
-        results: queue.SimpleQueue[Row | Exception | None] = queue.SimpleQueue()
-        count = min(self.workers, len(jobs))
-        feeders = [_Feeder(self, todo, results, begin, share_of_cores(count)) for _ in range(count)]
-        try:
-            for feeder in feeders:
-                feeder.start()
-            for _ in jobs:
-                result = results.get()
-                if isinstance(result, Exception):
-                    raise result
-                if result is not None:
-                    ended([result])
-        finally:
-            for feeder in feeders:
-                feeder.stop()
+        """Run all jobs; see `evaluate.Runner`.
 
-
-class _Feeder(threading.Thread):
-    """Feeds one worker process with jobs, and starts another one if it dies."""
-
-    def __init__(
-        self,
-        pool: Processes,
-        todo: queue.SimpleQueue[Job],
-        results: queue.SimpleQueue[Row | Exception | None],
-        begin: Callable[[Job], bool],
-        environment: Mapping[str, str],
-    ):
-        """Args:
-        pool: that it is of.
-        todo: where it takes jobs from.
-        results: where it puts a row for each; None for one that is not to be run, an error of the parent instead.
-        begin: see `evaluate.Runner`.
-        environment: variables of the worker, beside `ENVIRONMENT`.
+        Raises:
+          InputError: no worker can be started.
         """
-        super().__init__(daemon=True)
-        self._pool, self._todo, self._results, self._begin = pool, todo, results, begin
-        # What this process can import, a user's policy among it, its workers can.
-        importable = os.pathsep.join(folder for folder in sys.path if folder)
-        self._environment = {**ENVIRONMENT, **environment, "PYTHONPATH": importable}
-        self._process: subprocess.Popen[str] | None = None
-        self._complaints = tempfile.TemporaryFile()  # noqa: SIM115  (lives as long as the workers)
-        self._stopped = False
-
-    def run(self) -> None:
-        while not self._stopped:
+        count = min(self.workers, len(jobs))
+        todo = iter(jobs)
+        running: dict[Future[Row], Job] = {}
+        with tempfile.TemporaryDirectory() as outputs:
+            pool = pebble.ProcessPool(
+                count,
+                initializer=_begin,
+                initargs=(outputs, os.getpid()),
+                context=_context({**ENVIRONMENT, **share_of_cores(count)}),
+            )
             try:
-                job = self._todo.get_nowait()
-            except queue.Empty:
-                return
-            # Were nothing put for a job, it would be waited for for ever.
-            try:
-                begun = self._begin(job)
-            except Exception as error:
-                self._results.put(error)
-                return
-            self._results.put(self._row(job) if begun else None)
+                while True:
+                    while len(running) < count and (job := next(filter(begin, todo), None)):
+                        running[pool.schedule(self.run, (job,), timeout=self.time_limit)] = job
+                    if not running:
+                        return
+                    done, _ = wait(running, return_when=FIRST_COMPLETED)
+                    ended([self._row(running.pop(future), future, Path(outputs)) for future in done])
+            finally:
+                pool.stop()
+                pool.join()
 
-    def _row(self, job: Job) -> Row:
-        """The row of a job, whatever becomes of it."""
+    def _row(self, job: Job, future: Future[Row], outputs: Path) -> Row:
+        """The row of a job that is over.
+
+        Raises:
+          InputError: workers end before they take a job.
+        """
         try:
-            return self._run(job)
+            return future.result()
+        except TimeoutError:
+            return job.failed(f"it took longer than {self.time_limit:g} s, and its worker was killed")
+        except pebble.ProcessExpired as error:
+            reason = _last_line(outputs / str(error.pid))
+            return job.failed(f"the worker process ended with status {error.exitcode}{reason}")
+        except BrokenProcessPool:
+            reasons = [reason for file in outputs.iterdir() if (reason := _last_line(file))]
+            raise InputError(f"worker processes end while they start{reasons[0] if reasons else ''}") from None
         except Exception as error:
             return job.failed_by(error)
 
-    def stop(self) -> None:
-        """End the worker, whatever it is doing."""
-        self._stopped = True
-        if self._process is not None:
-            _kill(self._process)
 
-    def _run(self, job: Job) -> Row:
-        process = self._process
-        if process is None or process.poll() is not None:
-            process = self._process = self._start()
-        assert process.stdin is not None
-        assert process.stdout is not None
-        question = {"path": job.path, "method": job.method.to_json(), "seed": job.seed}
-        hangs = threading.Event()
-
-        def end_it() -> None:
-            hangs.set()
-            _kill(process)
-
-        limit = threading.Timer(self._pool.time_limit, end_it)
-        limit.start()
-        try:
-            process.stdin.write(json.dumps(question) + "\n")
-            process.stdin.flush()
-            line = process.stdout.readline()
-        except BrokenPipeError:
-            line = ""
-        finally:
-            limit.cancel()
-            limit.join()
-        if hangs.is_set():
-            self._process = None
-            return job.failed(f"it took longer than {self._pool.time_limit:g} s, and its worker was killed")
-        if not line:
-            return job.failed(f"the worker process ended with status {process.wait()}{self._last_words()}")
-        answer = json.loads(line)
-        if "row" not in answer:
-            return job.failed(answer["error"])
-        row = Row(**answer["row"])
-        if row.code != present_code():
-            return job.failed(f"the worker ran other code: {row.code}")
-        if identity(row) != identity(job.failed("")):
-            return job.failed("the worker ran another episode than was asked for: other options, or a changed file")
-        return row
-
-    def _start(self) -> subprocess.Popen[str]:
-        self._complaints.seek(0)
-        self._complaints.truncate()
-        # In a session of its own, an interrupt from the keyboard reaches only the parent, which then ends the worker.
-        return subprocess.Popen(
-            self._pool.command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._complaints,
-            text=True,
-            env={**os.environ, **self._environment},
-            start_new_session=True,
-        )
-
-    def _last_words(self) -> str:
-        """The last line that a dead worker wrote to standard error."""
-        self._complaints.seek(0)
-        lines = self._complaints.read().decode(errors="replace").split("\n")
-        return next((f": {line.strip()[:300]}" for line in reversed(lines) if line.strip()), "")
+def _context(environment: Mapping[str, str]) -> Any:
+    """Starts processes with these variables, which no other process gets."""
+    context: Any = copy.copy(loky.backend.get_context("loky"))
+    context.Process = functools.partial(context.Process, env=dict(environment))
+    return context
 
 
-def _kill(process: subprocess.Popen[str]) -> None:
-    """End a worker and what it started, which may hold its streams open; it leads a process group of its own."""
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+def _begin(outputs: str, parent: int) -> None:
+    """Make this process a worker: what it prints goes into a file, and it ends with its parent whatever it is doing."""
+    # A signal that Python handles waits until the library that computes returns.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    output = os.open(Path(outputs) / str(os.getpid()), os.O_WRONLY | os.O_CREAT)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    # Before anybody changes it: what is imported from here on is taken for it.
+    present_code()
+    keep_compilations()
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(LOOK_EVERY)
+    os._exit(1)
+
+
+def _last_line(output: Path) -> str:
+    """The last line that a worker printed, after a colon; empty where there is none."""
+    try:
+        lines = output.read_text(errors="replace").split("\n")
+    except OSError:
+        return ""
+    return next((f": {line.strip()[:300]}" for line in reversed(lines) if line.strip()), "")

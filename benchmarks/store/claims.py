@@ -188,13 +188,13 @@ class Claims:
             yield False
             return
         try:
-            known = os.read(lock, 1000) == _machine().encode()
-            if known:
+            held = os.read(lock, 1000) == _machine().encode()
+            if held:
                 try:
                     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except OSError:
-                    known = False
-            yield known
+                    held = False
+            yield held
         finally:
             os.close(lock)
 

@@ -266,10 +266,10 @@ def result_tables(path: PathLike) -> Iterator[tuple[Path, list[Row]]]:
     if not path.is_dir():
         yield path, read_rows(path)
         return
-    found = list(_tables_in(path))
-    if not found:
+    tables = list(_tables_in(path))
+    if not tables:
         raise InputError(f"{path}: there are no results in this folder or those in it")
-    yield from found
+    yield from tables
 
 
 def _tables_in(folder: Path) -> Iterator[tuple[Path, list[Row]]]:

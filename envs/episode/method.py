@@ -131,19 +131,6 @@ class Method:
         protocol = options.get("protocol", "strict")
         return cls(options["policy"], recognition=options["recognition"], protocol=protocol, **parts)
 
-    def to_json(self) -> dict[str, Any]:
-        """All of it as JSON values, for another process."""
-        return dataclasses.asdict(self)
-
-    @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> Method:
-        """What `to_json` returned, possibly in another process.
-
-        Raises:
-          InputError: a setting is impossible.
-        """
-        return _restored(cls(), value)
-
 
 def _settings(config: Config | Workcell, prefix: str) -> Iterator[tuple[str, Any]]:
     """Every setting, as JSON has it, by its path: "problem.grasps.wrists", after a prefix."""

@@ -77,12 +77,12 @@ class RunOptions:
         """
         self.check(command, simulator)
         site = self.site(command)
-        found = self.workers is not None or (self.batch is None and simulator != "mjx" and not site.has_gpu())
-        if self.time_limit is not None and not found:
+        workers = self.workers is not None or (self.batch is None and simulator != "mjx" and not site.has_gpu())
+        if self.time_limit is not None and not workers:
             raise InputError(
                 f"{command}: --time-limit is for worker processes, not for batches; leave it out, or --workers N"
             )
-        return found
+        return workers
 
     def engine(self, command: str, options: EpisodeOptions) -> EngineName:
         """The simulator that the episodes run in.
@@ -254,7 +254,7 @@ def run_jobs(
     out: Path,
     run: RunOptions,
     simulator: str,
-    told: Callable[[Console, Sequence[Row]], None],
+    show: Callable[[Console, Sequence[Row]], None],
 ) -> None:
     """Run this machine's part of jobs, or only say what that would take.
 
@@ -264,12 +264,15 @@ def run_jobs(
       out: folder of the results.
       run: how they are run.
       simulator: as `EpisodeOptions` has it.
-      told: prints what they came to, where there are any.
+      show: prints what they came to, where there are any.
 
     Raises:
       InputError: something that is given cannot be used.
     """
-    from mechsearch_jax.benchmarks.running.evaluate import shard_of
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.report.tables import EpisodeProgress
+    from mechsearch_jax.benchmarks.running.evaluate import evaluate, shard_of
 
     jobs = shard_of(jobs, *parsed_shard(command, run.shard))
     in_processes = run.in_processes(command, simulator)
@@ -279,29 +282,12 @@ def run_jobs(
         workers = run.workers or cores()
         print(estimate(jobs, out, workers if in_processes else None, run.retry_errors))
         return
-    _run(command, jobs, out, run, in_processes, told)
-
-
-def _run(
-    command: str,
-    jobs: Sequence[Job],
-    out: Path,
-    run: RunOptions,
-    in_processes: bool,
-    told: Callable[[Console, Sequence[Row]], None],
-) -> None:
-    """Run jobs in worker processes, or else in batches."""
-    from rich.console import Console
-
-    from mechsearch_jax.benchmarks.report.tables import EpisodeProgress
-    from mechsearch_jax.benchmarks.running.evaluate import evaluate
-
     console = Console(highlight=False)
     with EpisodeProgress(console, len(jobs)) as progress:
         runner = run.site(command).runner(run, in_processes, progress)
         rows = evaluate(jobs, out, runner, progress.ended, progress.waiting, run.retry_errors)
     if rows:
-        told(console, rows)
+        show(console, rows)
     if errors := sum(row.is_error for row in rows):
         print(
             f"{command}: {errors} of {len(rows)} episodes ended in an error; --retry-errors runs them again",

@@ -153,22 +153,22 @@ def read_sweep(path: Path) -> dict[str, Any]:
                 f"{document.where(table)} is a table, of which a sweep has none; give its settings by config"
             )
     types = {name: Literal[option.choices] if option.choices else option.type for name, option in _options().items()}
-    known = {**_KEYS, "preset": Literal[tuple(PRESETS)], **types}
-    found: dict[str, Any] = {}
+    keys = {**_KEYS, "preset": Literal[tuple(PRESETS)], **types}
+    given: dict[str, Any] = {}
     for key, value in document.tables[""].items():
         where = document.where("", key)
-        if key not in known:
-            raise InputError(f"{where} is unknown; {nearest(key, known)}")
+        if key not in keys:
+            raise InputError(f"{where} is unknown; {nearest(key, keys)}")
         if key in _SINGLE:
-            found[key] = checked(value, known[key], where)
+            given[key] = checked(value, keys[key], where)
             continue
-        is_list = get_origin(known[key]) is tuple
+        is_list = get_origin(keys[key]) is tuple
         several = isinstance(value, list) and (not is_list or any(isinstance(part, list) for part in value))
         values = value if several else [value]
-        found[key] = tuple(
-            checked(one, known[key], f"{where}[{i}]" if several else where) for i, one in enumerate(values)
+        given[key] = tuple(
+            checked(each, keys[key], f"{where}[{i}]" if several else where) for i, each in enumerate(values)
         )
-    return found
+    return given
 
 
 def sweep(
@@ -199,13 +199,13 @@ def sweep(
       run: how the episodes are run.
       options: how the planner decides.
     """
-    told = {} if file is None else read_sweep(file)
+    of_file = {} if file is None else read_sweep(file)
     if method or policy:
-        told = {key: value for key, value in told.items() if key not in ("method", "policy")}
-    policies = chosen_policies("sweep", method or told.get("method"), policy or told.get("policy"))
-    named = {name: told[key] for key, name in _FIELDS.items() if key in told}
-    named |= {key: value for key, value in told.items() if key not in _KEYS}
+        of_file = {key: value for key, value in of_file.items() if key not in ("method", "policy")}
+    policies = chosen_policies("sweep", method or of_file.get("method"), policy or of_file.get("policy"))
+    named = {name: of_file[key] for key, name in _FIELDS.items() if key in of_file}
+    named |= {key: value for key, value in of_file.items() if key not in _KEYS}
     fresh = {key: value for key, value in named.items() if not getattr(options, key)}
     points = dataclasses.replace(options, **fresh).points()
-    chosen = scenarios or told.get("scenarios", ())
-    run_episodes_of("sweep", chosen, points, policies, seed or told.get("seed") or (0,), out, run)
+    chosen = scenarios or of_file.get("scenarios", ())
+    run_episodes_of("sweep", chosen, points, policies, seed or of_file.get("seed") or (0,), out, run)

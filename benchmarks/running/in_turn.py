@@ -1,0 +1,65 @@
+"""Episodes one after the other in this process: what every worker on a CPU does."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+
+from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
+from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.envs.camera.recognisers import recogniser
+from mechsearch_jax.envs.episode.episodes import run_episode, target_of
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.simulators.native import NativeSimulator
+from mechsearch_jax.problem.workcell import Workcell
+
+
+class InTurn:
+    """A `Runner` of one episode at a time, in the native simulator; keeps what episodes have in common."""
+
+    def __init__(self) -> None:
+        self._simulator = functools.cache(_simulator)
+        self._problem = functools.cache(Workcell.problem)
+        self._policy = functools.cache(Method.policy)
+
+    def __call__(
+        self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
+    ) -> None:
+        """Run all jobs; see `evaluate.Runner`."""
+        for job in jobs:
+            if begin(job):
+                ended([self.row(job)])
+
+    def row(self, job: Job) -> Row:
+        """The row of a job, with the reason where its episode fails."""
+        try:
+            return self.run(job)
+        except Exception as error:  # Whatever fails in one episode must not end the run.
+            return job.failed_by(error)
+
+    def run(self, job: Job) -> Row:
+        """Run one episode.
+
+        Raises:
+          InputError: the method cannot be used.
+        """
+        method, scenario = job.method, job.scenario
+        workcell = method.workcell
+        target = target_of(scenario, workcell.target)
+        episode = run_episode(
+            job.seed,
+            scenario,
+            self._problem(workcell, target, method.problem_config),
+            self._policy(method),
+            self._simulator(workcell),
+            recogniser(method.recognition, target),
+            method.config.max_steps,
+            method.options(),
+            protocol=method.terms,
+            trials=method.trials(),
+        )
+        return Row.of_episode(episode, present_code())
+
+
+def _simulator(workcell: Workcell) -> NativeSimulator:
+    return NativeSimulator(shelf=workcell.shelf, camera=workcell.camera)
