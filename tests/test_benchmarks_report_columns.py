@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import itertools
-import json
 import math
 import re
 from html.parser import HTMLParser
@@ -20,7 +19,7 @@ from mechsearch_jax.benchmarks.report.report_files import FILES, OPTIONAL_FILES,
 from mechsearch_jax.benchmarks.report.report_page import blocks
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs
 from mechsearch_jax.benchmarks.running.in_turn import InTurn
-from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, paired
+from mechsearch_jax.benchmarks.statistics.paired import paired
 from mechsearch_jax.benchmarks.statistics.rates import summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, column, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key, options_of, write_rows
@@ -157,27 +156,16 @@ def test_the_seeds_of_a_scene_are_no_pairs_of_their_own():
     # Where pairs are not told apart by their scenes, each of them counts.
     by_seed = goals(base, ["seed"])["retrieved"]
     assert (by_seed.pairs, by_seed.scenes, by_seed.mean) == (3, 3, pytest.approx((1 / 3 + 1 + 1) / 3))
-    # What an episode does not say makes no difference.
-    silent = goals([dataclasses.replace(row, graspable_known=False, graspable_step=None) for row in base])
-    assert silent["graspable"] == silent["graspable_steps"] == PairedDifference.of([], [])
-    assert (silent["graspable"].mean, silent["retrieved"]) == (None, retrieved)
 
 
-def test_a_report_says_which_scenes_were_chosen_on_and_what_is_not_known(tmp_path):
+def test_a_report_says_which_scenes_were_chosen_on(tmp_path):
     names = ("published-4-01", "development-box-4-003", "c2-8-089", "c2-8-090", "mine")
     rows = [dataclasses.replace(WON, scenario=name) for name in names]
-    rows[0] = dataclasses.replace(rows[0], graspable_known=False, graspable_step=None)
     write_report(rows, tmp_path)
     said = re.sub(" +", " ", (tmp_path / "report.md").read_text())
     assert "3 of the 5 episodes are on scenes that settings were chosen on (the published ones," in said
-    assert "An earlier version ran 1 of the episodes, in which a retrieval counted as *graspable*, too" in said
-    line = next(line for line in said.splitlines() if line.startswith("| search-for-grasp | 2 | 5 | 0 |"))
-    assert line.split(" | ")[5] == "-"
-    assert json.loads((tmp_path / "rates.json").read_text())["rates"][0]["graspable"] is None
     write_report(rows[3:], tmp_path)
-    said = (tmp_path / "report.md").read_text()
-    assert "chosen on" not in said
-    assert "An earlier version ran" not in said
+    assert "chosen on" not in (tmp_path / "report.md").read_text()
 
 
 @pytest.mark.parametrize("variants", [2, 96])

@@ -293,12 +293,3 @@ def test_rows_are_summarised_by_method_and_number_of_objects():
     assert (two.found, two.graspable, two.retrieved, two.steps) == (1.0, 0.5, 0.5, 3.0)
     assert two.planning_seconds == pytest.approx(0.5)
     assert [(r.paper_episodes, r.paper_graspable) for r in summary[1:]] == [(0, None), (1, 1.0), (1, 0.0), (2, 0.5)]
-
-
-def test_a_share_of_which_some_episodes_do_not_say_it_is_none():
-    """Those that say it did not retrieve the target, so that they are not like the others."""
-    known = dataclasses.replace(ROW, graspable_step=None, failure="found, but not graspable")
-    unknown = dataclasses.replace(ROW, scenario="other", retrieved=True, graspable_known=False, objects=8)
-    two, eight, every = summarise([known, unknown])
-    assert (two.graspable, eight.graspable, every.graspable) == (0.0, None, None)
-    assert (every.found, every.retrieved, every.graspable_interval, every.graspable_steps) == (1, 0.5, (0, 1), None)

@@ -19,7 +19,6 @@ import scipy.stats
 from mechsearch_jax.benchmarks.parts.images import save_rows
 from mechsearch_jax.benchmarks.running.evaluate import present_code
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
-from mechsearch_jax.benchmarks.statistics.rates import says
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.scenes.scene_sets import SETS, Block
 from mechsearch_jax.runtime.errors import InputError
@@ -68,7 +67,7 @@ class Outcome:
             objects=row.objects,
             seed=row.seed,
             found=row.found_step is not None,
-            graspable=row.graspable_step is not None if says(row, "graspable") else None,
+            graspable=row.graspable_step is not None,
             retrieved=row.retrieved,
             steps=row.steps,
             failure=row.failure,
@@ -198,8 +197,6 @@ def save_reference(rows: Sequence[Row], command: str, path: PathLike) -> None:
     if errors or not rows:
         reason = f"{errors[0].scenario} ended with {errors[0].failure!r}" if errors else "there are no episodes"
         raise InputError(f"bench guard: {reason}; nothing is stored")
-    if not all(says(row, "graspable") for row in rows):
-        raise InputError("bench guard: an earlier version wrote these rows; nothing is stored; use another folder")
     head = {
         "command": command,
         "code": present_code(),

@@ -15,7 +15,7 @@ from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, Figures, PaperTab
 from mechsearch_jax.benchmarks.running.evaluate import Job
 from mechsearch_jax.benchmarks.statistics.intervals import Interval
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
-from mechsearch_jax.benchmarks.statistics.rates import Rates, says, scene_of, step_of, summarise
+from mechsearch_jax.benchmarks.statistics.rates import Rates, scene_of, step_of, summarise
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.runtime.files import PathLike, check_writable, replacing
 
@@ -57,8 +57,7 @@ class Cell:
       objects: number of surrounding objects; None for all.
       episodes: how many there are.
       errors: how many of them could not be run to their end; they count as failures.
-      find, grasp: share of the episodes in which the target was found, and found and graspable; no value of what rows
-        of an earlier version do not say.
+      find, grasp: share of the episodes in which the target was found, and found and graspable.
       find_steps, grasp_steps: number of actions until then, of the episodes that got there.
       paper: what the paper says; None where nothing.
     """
@@ -164,8 +163,7 @@ def _difference(
 ) -> Difference:
     means = {}
     for name, goal in GOALS.items():
-        known = all(says(row, goal) for pair in pairs for row in pair)
-        steps = [(scene_of(row), step_of(row, goal), step_of(other, goal)) for row, other in pairs] if known else []
+        steps = [(scene_of(row), step_of(row, goal), step_of(other, goal)) for row, other in pairs]
         means[name] = _mean_change([(scene, (a is not None) - (b is not None)) for scene, a, b in steps])
         both = [(scene, a - b) for scene, a, b in steps if a is not None and b is not None]
         means[f"{name}_steps"] = _mean_change(both)

@@ -28,9 +28,6 @@ def print_summary(console: Console, summary: Sequence[Rates], key: Key) -> None:
     """Print rates, and what the labels of variants stand for."""
     console.print(summary_table(summary, key))
     console.print("plan, act: seconds per action", style="dim")
-    if any(rates.graspable is None for rates in summary):
-        remark = "graspable -: not known; in an earlier version a retrieval counted as graspable, too"
-        console.print(remark, style="dim", soft_wrap=True)
     if key.numbered:
         console.print()
         for label, short in key.short.items():

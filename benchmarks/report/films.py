@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from mechsearch_jax.benchmarks.running.evaluate import present_code
-from mechsearch_jax.benchmarks.statistics.rates import says
 from mechsearch_jax.benchmarks.statistics.variants import label_variants
 from mechsearch_jax.benchmarks.store.rows import Row, episode_key, options_of
 from mechsearch_jax.runtime.errors import InputError
@@ -185,8 +184,7 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
     )
     save_figure(filmstrip(watcher.frames, problem.camera, problem.shelf, problem.target, verdict(episode)), file)
     again = Row.of_episode(episode)
-    # What an earlier version's row does not say cannot differ.
-    if all(getattr(row, name) == getattr(again, name) for name in _END if says(row, name.removesuffix("_step"))):
+    if all(getattr(row, name) == getattr(again, name) for name in _END):
         return ""
     simulator = options_of(row).get("simulator")
     why = "in another simulator" if simulator != "NativeSimulator" else ""

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from mechsearch_jax.benchmarks.report.films import Film
 from mechsearch_jax.benchmarks.report.report_figures import curve_rates
 from mechsearch_jax.benchmarks.statistics.paired import PAIRED, VariantDifferences, paired
-from mechsearch_jax.benchmarks.statistics.rates import Events, Rates, says, summarise, summarise_events
+from mechsearch_jax.benchmarks.statistics.rates import Events, Rates, summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import Key, canonical, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row, identity
 from mechsearch_jax.benchmarks.store.shards import result_tables
@@ -71,17 +71,6 @@ def chosen_scenes_remark(rows: Sequence[Row]) -> str:
         return ""
     which = "All" if count == len(rows) else f"{count} of the {len(rows)}"
     return f"{which} episodes are on scenes that settings were chosen on ({CHOSEN_ON}): on others rates may be lower."
-
-
-def unknown_graspable_remark(rows: Sequence[Row]) -> str:
-    """A sentence that says of how many episodes it is not known whether the target was graspable; empty if of none."""
-    count = sum(not says(row, "graspable") for row in rows)
-    if not count:
-        return ""
-    return (
-        f"An earlier version ran {count} of the episodes, in which a retrieval counted as *graspable*, too: whether a "
-        'grasp was free is not known of them, and no share that they belong to is told ("-").'
-    )
 
 
 @dataclasses.dataclass(frozen=True)

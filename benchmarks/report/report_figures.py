@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
-from mechsearch_jax.benchmarks.statistics.rates import GOALS, Rates, says, scene_of, step_of, summarise
+from mechsearch_jax.benchmarks.statistics.rates import GOALS, Rates, scene_of, step_of, summarise
 from mechsearch_jax.benchmarks.statistics.variants import Key, canonical, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.runtime.errors import InputError
@@ -35,11 +35,6 @@ def reached(rows: Sequence[Row], goal: str, actions: int) -> list[int]:
     """How many episodes had reached a goal after 0, 1, ..., `actions` actions."""
     after = collections.Counter(step_of(row, goal) for row in rows)
     return list(itertools.accumulate(after[k] for k in range(actions + 1)))
-
-
-def _say(rows: Sequence[Row], goal: str) -> bool:
-    """Whether all of the rows tell if their episodes reached a goal."""
-    return all(says(row, goal) for row in rows)
 
 
 def _plain(axes: Axes) -> None:
@@ -89,7 +84,7 @@ def success_figure(rows: Sequence[Row], baseline: str | None = None) -> Figure:
             axes: Axes = grid[i][j]
             # Not found out anew for every one of a hundred curves.
             axes.set(xlim=(-0.05 * actions, 1.05 * actions), ylim=(-0.03, 1.03))
-            curves = {label: rows for (label, n), rows in groups.items() if n == count and _say(rows, goal)}
+            curves = {label: rows for (label, n), rows in groups.items() if n == count}
             for label in key.short:
                 if label not in shown and (group := curves.get(label)):
                     share = np.array(reached(group, goal, actions)) / len(group)

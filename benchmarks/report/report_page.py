@@ -12,7 +12,6 @@ from mechsearch_jax.benchmarks.report.report import (
     changed_scenarios_remark,
     chosen_scenes_remark,
     failure_reason,
-    unknown_graspable_remark,
 )
 from mechsearch_jax.benchmarks.statistics.intervals import Interval
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
@@ -30,9 +29,7 @@ SHARES = {
 
 def blocks(report: Report) -> list[Block]:
     """The page of a report."""
-    remarks = [
-        remark(report.episodes) for remark in (changed_scenarios_remark, chosen_scenes_remark, unknown_graspable_remark)
-    ]
+    remarks = [remark(report.episodes) for remark in (changed_scenarios_remark, chosen_scenes_remark)]
     return [
         Heading("Results", 1),
         Paragraph(
@@ -178,7 +175,7 @@ def _reasons(report: Report) -> list[Block]:
 def _events(report: Report) -> list[Block]:
     """What happened on the way."""
     if not report.events:
-        return [Paragraph("These episodes do not say: an earlier version ran them, or they ended in errors.")]
+        return [Paragraph("These episodes do not say: they ended in errors.")]
     explanation = Paragraph(
         "Shares of the episodes that say so; *of all looks* is the share of the steps before the target was found at "
         "which f ruled out its true pose."

@@ -289,10 +289,7 @@ class EpisodeProgress:
     def ended(self, row: Row, tally: Tally) -> None:
         """Take note of one more episode, of this process or another, and of what is known of all that are wanted."""
         counts = {"found": tally.found, "graspable": tally.graspable, "retrieved": tally.retrieved}
-        # Episodes of an earlier version do not say it, and those that do are not like the others.
-        counts |= {} if tally.graspable_known == tally.ended else {"graspable": None}
-        shares = {name: "-" if count is None else f"{count / tally.ended:.2f}" for name, count in counts.items()}
-        rates = "  ".join(f"{name} {share}" for name, share in shares.items())
+        rates = "  ".join(f"{name} {count / tally.ended:.2f}" for name, count in counts.items())
         errors = f"  errors {tally.errors}" if tally.errors else ""
         self._bar.update(self._task, completed=tally.ended, total=tally.wanted, description=rates + errors)
         if not self._console.is_terminal:

@@ -132,7 +132,6 @@ class Tally:
     Attributes:
       wanted: how many there are.
       ended, found, graspable, retrieved, errors: how many of them are over, and so on.
-      graspable_known: of how many it is known whether the target was graspable: see `Row`.
     """
 
     wanted: int
@@ -141,7 +140,6 @@ class Tally:
     graspable: int = 0
     retrieved: int = 0
     errors: int = 0
-    graspable_known: int = 0
 
     def plus(self, row: Row) -> Tally:
         """With one more episode."""
@@ -152,7 +150,6 @@ class Tally:
             graspable=self.graspable + (row.graspable_step is not None),
             retrieved=self.retrieved + row.retrieved,
             errors=self.errors + row.is_error,
-            graspable_known=self.graspable_known + row.graspable_known,
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.stats
 
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, by_scene, mean_interval
-from mechsearch_jax.benchmarks.statistics.rates import GOALS, says, step_of
+from mechsearch_jax.benchmarks.statistics.rates import GOALS, step_of
 from mechsearch_jax.benchmarks.statistics.variants import canonical, column, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.runtime.errors import InputError
@@ -111,8 +111,6 @@ def _change(
     goal: str, pairs: Sequence[tuple[Sequence[Row], Sequence[Row]]], scenes: Sequence[Hashable]
 ) -> PairedDifference:
     """The difference in a goal over pairs of episodes that count as one each."""
-    if not all(says(row, goal.removesuffix("_steps")) for pair in pairs for rows in pair for row in rows):
-        return PairedDifference.of([], [])
     values = [(_mean(rows, goal), _mean(base, goal)) for rows, base in pairs]
     differences = [
         (a - b, scene) for (a, b), scene in zip(values, scenes, strict=True) if a is not None and b is not None

@@ -34,14 +34,13 @@ class Rates:
         with the options that tell it from the others (see `label_variants`), and "objects", their number.
       episodes: how many episodes.
       errors: how many of them could not be run to their end; they count as failures.
-      found, graspable, retrieved: shares of them; None for `graspable` where some of them do not say it (see
-        `Row.graspable_known`), since those that do are not like the others.
+      found, graspable, retrieved: shares of them.
       found_interval, graspable_interval, retrieved_interval: what the true shares may be: see `share_interval`.
       paper_episodes: how many of the episodes say whether the target could be grasped with the paper's grasps alone.
       paper_graspable, paper_graspable_interval: share of those in which it could, None where there are none, and what
         the true share may be.
       found_steps, graspable_steps, retrieved_steps: mean number of actions until then, of the episodes that got there;
-        None where none did, or that is not known.
+        None where none did.
       found_steps_interval, graspable_steps_interval, retrieved_steps_interval: what the true means may be: see
         `mean_interval`.
       steps: mean number of actions, attempts to take the target out among them.
@@ -52,7 +51,7 @@ class Rates:
     episodes: int
     errors: int
     found: float
-    graspable: float | None
+    graspable: float
     retrieved: float
     found_interval: Interval
     graspable_interval: Interval
@@ -123,11 +122,6 @@ def scene_of(row: Row) -> tuple[str, str | None]:
     return row.scenario, row.content_hash
 
 
-def says(row: Row, goal: str) -> bool:
-    """Whether a row tells if its episode reached one of `GOALS`: those of earlier versions need not for "graspable"."""
-    return goal != "graspable" or row.graspable_known
-
-
 def summarise(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")) -> list[Rates]:
     """Rates for every combination of what columns say, and for each of all but the last column over all values of it.
 
@@ -163,8 +157,6 @@ def _rates(group: Mapping[str, Hashable], rows: Sequence[Row]) -> Rates:
 def _goal(rows: Sequence[Row], goal: str) -> dict[str, Any]:
     """The fields of `Rates` that belong to a goal."""
     names = goal, f"{goal}_interval", f"{goal}_steps", f"{goal}_steps_interval"
-    if not all(says(row, goal) for row in rows):
-        return dict(zip(names, (None, (0.0, 1.0), None, None), strict=True))
     scenes, steps = list(map(scene_of, rows)), [step_of(row, goal) for row in rows]
     reached = [step is not None for step in steps]
     known_steps = [step for step in steps if step is not None]

@@ -67,8 +67,6 @@ class Row:
       paper_graspable: whether the target could be grasped with the paper's grasps alone at some step; None where that
         is not known.
       paper_graspable_step: as in `Episode`.
-      graspable_known: whether `graspable_step` says anything. False, with None for the step, where a file of an earlier
-        version says the step of the retrieval, which then set it whether or not a grasp was free of collisions.
       compile_seconds: wall time that its steps waited for compilations [s]; in a batch, its share of it.
       code: what ran it, as `evaluate.present_code` says it.
       device: that computed it, as `versions` says it.
@@ -107,7 +105,6 @@ class Row:
     unsettled: int | None = None
     paper_graspable: bool | None = None
     paper_graspable_step: int | None = None
-    graspable_known: bool = True
     compile_seconds: float | None = None
     code: str = ""
     device: str | None = None
@@ -288,9 +285,11 @@ def read_rows(path: PathLike) -> list[Row]:
         raise InputError(f"{path}: cannot be read ({error.strerror or ' '.join(str(error).split())})") from error
     except pyarrow.ArrowException as error:
         raise InputError(f"{path}: is not a Parquet file ({' '.join(str(error).split())})") from error
-    missing = _FIELDS.keys() - set(table.schema.names)
+    missing = set(SCHEMA.names) - set(table.schema.names)
     if missing:
-        raise InputError(f"{path}: lacks the column {min(missing)}: it is no table of episodes; use another file")
+        raise InputError(
+            f"{path}: lacks the column {min(missing)}: it is no table of episodes of this version; use another file"
+        )
     try:
         columns = table.select(list(_FIELDS)).to_pydict()
         return [_row(dict(zip(columns, values, strict=True))) for values in zip(*columns.values(), strict=True)]
