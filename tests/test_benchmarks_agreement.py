@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from mechsearch_jax.actions import ActionKind
-from mechsearch_jax.benchmarks.parts import bench
+from mechsearch_jax.benchmarks.parts import simulation
 from mechsearch_jax.benchmarks.parts.agreement import (
     Agreement,
     Case,
     agreement,
     draw_actions,
     pose_differences,
-    save_agreement,
 )
 from mechsearch_jax.benchmarks.report.tables import agreement_table
 from mechsearch_jax.envs.world.world import from_scenario
@@ -45,12 +44,12 @@ def test_a_cylinder_has_no_spin_but_a_box_has():
     assert spin == pytest.approx([40], abs=0.05)
 
 
-def test_the_summary_counts_what_agrees(tmp_path):
+def test_the_summary_counts_what_agrees():
     far = dataclasses.replace(
         CASE, kind="pick-and-place", position_difference=0.02, batch_failure="dropped", overflow=2
     )
-    found = Agreement((CASE, CASE, far), 1.0, 3.0, VERSIONS)
-    summary = found.summary()
+    result = Agreement((CASE, CASE, far), 1.0, 3.0, VERSIONS)
+    summary = result.summary()
     assert list(summary) == ["push", "pick-and-place", "all"]
     assert summary["push"]["agreeing"] == 1.0
     assert summary["push"]["agreeing_with_spin"] == 0.0
@@ -59,16 +58,15 @@ def test_the_summary_counts_what_agrees(tmp_path):
     assert summary["all"]["same_failure"] == pytest.approx(2 / 3)
     assert summary["all"]["overflowed"] == 1
     assert summary["all"]["native_moved_median"] == pytest.approx(0.1)
-    assert agreement_table(found).row_count == 11
-    save_agreement(found, tmp_path / "found.json")
-    written = json.loads((tmp_path / "found.json").read_text())
+    assert agreement_table(result).row_count == 11
+    written = json.loads(json.dumps(result.value()))
     assert len(written["cases"]) == 3
     assert written["summary"]["all"]["actions"] == 3
 
 
 def test_impossible_numbers_are_refused():
     with pytest.raises(InputError, match="steps 0 must be at least 1"):
-        bench.bench_simulate(2, 0)
+        simulation.bench_simulate(2, 0)
 
 
 @pytest.mark.slow
@@ -77,11 +75,11 @@ def test_actions_that_are_drawn_agree():
     scene = load_scenario(example_scenarios()["first-light"])
     cases = draw_actions([scene], 8, seed=1)
     assert {int(action.kind) for _, action in cases} == {ActionKind.PUSH, ActionKind.PICK_AND_PLACE}
-    found = agreement(cases, nudges=8)
-    assert not any(case.overflow for case in found.cases)
-    assert all(case.native_failure == case.batch_failure for case in found.cases)
-    assert all(case.native_moved > 0.01 for case in found.cases)
-    steady = [case for case in found.cases if case.native_agrees]
+    result = agreement(cases, nudges=8)
+    assert not any(case.overflow for case in result.cases)
+    assert all(case.native_failure == case.batch_failure for case in result.cases)
+    assert all(case.native_moved > 0.01 for case in result.cases)
+    steady = [case for case in result.cases if case.native_agrees]
     assert len(steady) >= 5
     assert all(case.agrees for case in steady)
     with pytest.raises(InputError, match="take more scenes"):
@@ -90,13 +88,13 @@ def test_actions_that_are_drawn_agree():
 
 @pytest.mark.slow
 def test_the_speed_of_the_batch_simulator_is_measured():
-    timing = bench.bench_simulate(2, 20, repeats=1, scenes=1)
+    timing = simulation.bench_simulate(2, 20, repeats=1, scenes=1)
     assert timing.rate == pytest.approx(40 / timing.median)
     assert timing.shapes["overflowed_worlds"] == timing.shapes["diverged_worlds"] == 0
 
 
 @pytest.mark.slow
 def test_the_arm_can_make_all_its_sweeps():
-    controls, start = bench.plough(16, 30)
+    controls, start = simulation.plough(16, 30)
     assert controls.shape == (30, 16, 9)
     np.testing.assert_allclose(controls[0, :, :7], start[:, :7], atol=0.02)

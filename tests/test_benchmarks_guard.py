@@ -133,9 +133,9 @@ def test_the_command_fails_after_a_loss_and_passes_noise(run, capsys):
     with pytest.raises(SystemExit) as end:
         run(changed(BEFORE, 8, 0))
     assert end.value.code == 1
-    told = capsys.readouterr().out
-    assert "lost" in told
-    assert "0.004" in told
+    printed = capsys.readouterr().out
+    assert "lost" in printed
+    assert "0.004" in printed
 
 
 def test_a_reference_in_which_a_retrieval_counts_as_graspable_says_so(run, capsys):
@@ -145,13 +145,13 @@ def test_a_reference_in_which_a_retrieval_counts_as_graspable_says_so(run, capsy
     for row in stored["rows"]:
         row[graspable] = None if row[retrieved] else False
     run.reference.write_text(json.dumps(stored))
-    known = guard.read_reference(run.reference).outcomes
-    assert [one.graspable for one in known] == [None if flag else False for flag in BEFORE]
-    assert [one.measure for one in compare(known, outcomes(BEFORE))] == ["retrieved"]
+    before = guard.read_reference(run.reference).outcomes
+    assert [one.graspable for one in before] == [None if flag else False for flag in BEFORE]
+    assert [one.measure for one in compare(before, outcomes(BEFORE))] == ["retrieved"]
     run(BEFORE)
-    told = " ".join(capsys.readouterr().out.split())
-    assert "graspable: not compared, since in the reference a retrieval counts as graspable, too" in told
-    assert "write a new one with --write" in told
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "graspable: not compared, since in the reference a retrieval counts as graspable, too" in printed
+    assert "write a new one with --write" in printed
 
 
 def test_what_is_no_reference_is_refused(run):

@@ -23,7 +23,7 @@ from mechsearch_jax.networks.push import PushConfig, PushNetwork
 from mechsearch_jax.networks.weights import ARCHITECTURES, save_weights
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.train.loop import TrainConfig
-from mechsearch_jax.train.push import outcome_scores
+from mechsearch_jax.train.push_scores import outcome_scores
 
 CONFIG = PushConfig(width=8, layers=1)
 GENERATION = held_out_generation(pushes=5, worlds=8, rounds=1)
@@ -154,10 +154,10 @@ def test_a_push_that_the_arm_cannot_make_again_moves_nothing(pushes):
 @pytest.mark.slow
 def test_predictions_that_are_no_numbers_are_refused(pushes):
     first = jax.tree.map(lambda a: a[:2], pushes)
-    told = repeated(first, simulator(), 2)
-    spoilt = told.replace(topples=np.where(first.before.valid, np.nan, told.topples))
+    outcomes = repeated(first, simulator(), 2)
+    invalid = outcomes.replace(topples=np.where(first.before.valid, np.nan, outcomes.topples))
     with pytest.raises(InputError, match="not finite numbers"):
-        outcome_scores(spoilt, first)
+        outcome_scores(invalid, first)
 
 
 # --- what comes of it ------------------------------------------------------------------------------------------------
@@ -178,7 +178,7 @@ def test_simulating_is_better_than_guessing(comparison, pushes):
 def test_rows_that_are_asked_for_are_measured_in_their_order(pushes):
     seen = []
     rows = ("quasi-static", "no motion", "quasi-static")
-    few = Bench(GENERATION, rows, make_simulator=simulator).run(pushes, lambda *told: seen.append(told))
+    few = Bench(GENERATION, rows, make_simulator=simulator).run(pushes, lambda *progress: seen.append(progress))
     assert list(few.scores) == ["quasi-static", "no motion"]
     assert seen == [("quasi-static", len(pushes.object)), ("no motion", len(pushes.object))]
     assert few.weights is None
@@ -196,9 +196,8 @@ def test_another_process_reads_the_same_pushes(pushes, folder):
 
 
 @pytest.mark.slow
-def test_scores_are_written_with_how_they_came_about(measured, weights, tmp_path):
-    push.save_push_scores(measured, tmp_path / "new" / "push.json")
-    value = json.loads((tmp_path / "new" / "push.json").read_text())
+def test_scores_are_written_with_how_they_came_about(measured, weights):
+    value = json.loads(json.dumps(measured.value(), allow_nan=False))
     assert value["models"] == measured.scores
     assert value["settings"]["generation"] == dataclasses.asdict(GENERATION)
     assert value["settings"]["simulator"] == "NativeSimulator"
@@ -238,9 +237,9 @@ def rows_of(table):
 
 
 def test_the_tables_show_every_model_and_the_groups_of_the_best():
-    told = Measured(SCORES, None, {"pushes": 4}, {"device": "cpu: cpu"})
-    assert told.best == "quasi-static"
-    group = tables.push_scores_tables(told)
+    measured = Measured(SCORES, None, {"pushes": 4}, {"device": "cpu: cpu"})
+    assert measured.best == "quasi-static"
+    group = tables.push_scores_tables(measured)
     models, distances, objects, _ = group.renderables
     numbers = ["-", "6.00", "0.500", "0.250"]
     assert rows_of(models) == [
@@ -258,24 +257,25 @@ def test_the_tables_show_every_model_and_the_groups_of_the_best():
 
 
 def test_the_learned_model_is_looked_at_closely_if_there_is_one():
-    told = Measured({"learned": {"all": LINE | {"pushed_mm": 99.0}}, **SCORES}, {}, {"pushes": 4}, {"device": "cpu"})
-    assert told.best == "learned"
+    measured = Measured(
+        {"learned": {"all": LINE | {"pushed_mm": 99.0}}, **SCORES}, {}, {"pushes": 4}, {"device": "cpu"}
+    )
+    assert measured.best == "learned"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["learned", "quasi-static", "physics"])
-def test_predicting_is_timed(model, drawn, weights, tmp_path, monkeypatch):
+def test_predicting_is_timed(model, drawn, weights, monkeypatch):
     monkeypatch.setattr(bench, "drawn_pushes", lambda count, objects: jax.tree.map(lambda a: a[:count], drawn))
     timing = bench.bench_predict(model, 3, batch=4, repeats=2, weights=weights if model == "learned" else None)
     assert timing.subject == f"predict: {model}"
     assert timing.rate == pytest.approx(4 / timing.median)
     assert len(timing.seconds) == 2
-    bench.save_timing(timing, tmp_path / "predict.json")
-    value = json.loads((tmp_path / "predict.json").read_text())
+    value = json.loads(json.dumps(timing.value()))
     assert value["predictions_per_second"] == pytest.approx(timing.rate)
     card = json.loads(weights.with_suffix(".json").read_text())
-    known = (value["versions"].get("weights"), value["shapes"].get("parameters"))
-    assert known == ((card["sha256"], card["parameters"]) if model == "learned" else (None, None))
+    about = (value["versions"].get("weights"), value["shapes"].get("parameters"))
+    assert about == ((card["sha256"], card["parameters"]) if model == "learned" else (None, None))
     console = Console(file=io.StringIO(), width=200)
     console.print(tables.timing_table(timing))
     assert "predictions/s" in console.file.getvalue()
@@ -294,15 +294,15 @@ def test_the_batch_simulator_repeats_its_pushes_too(weights, tmp_path):
 @pytest.mark.slow
 def test_the_commands_measure_print_and_write(weights, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    told = ["bench", "push", "--pushes", "6", "--worlds", "2", "--weights", str(weights), "--data", "data"]
-    cli.parse([*told, "--out", "push.json", "--models", "no motion", "learned"])()
+    arguments = ["bench", "push", "--pushes", "6", "--worlds", "2", "--weights", str(weights), "--data", "data"]
+    cli.parse([*arguments, "--out", "push.json", "--models", "no motion", "learned"])()
     printed = capsys.readouterr().out
     assert "learned, by distance" in printed
     value = json.loads((tmp_path / "push.json").read_text())
     assert list(value["models"]) == ["no motion", "learned"]
     assert value["settings"]["pushes"] >= 6
     # The same pushes, read instead of made.
-    cli.parse([*told, "--out", "again.json"])()
+    cli.parse([*arguments, "--out", "again.json"])()
     again = json.loads((tmp_path / "again.json").read_text())
     assert list(again["models"]) == list(push.ROWS)
     assert again["models"]["learned"] == value["models"]["learned"]

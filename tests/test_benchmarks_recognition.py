@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.parts import images, recognition, recognition_figure
-from mechsearch_jax.benchmarks.parts.recognition import Bench, Method, Row
+from mechsearch_jax.benchmarks.parts import images, recognition, recognition_figure, recognition_methods
+from mechsearch_jax.benchmarks.parts.recognition import Bench, Row
+from mechsearch_jax.benchmarks.parts.recognition_methods import Method
 from mechsearch_jax.benchmarks.report import tables
 from mechsearch_jax.commands.bench import quality
 from mechsearch_jax.envs.world.world import true_superquadrics
@@ -28,7 +29,7 @@ TRUTH = sharpened(true_superquadrics(SCENE.world))
 ROW = Row("files", "a", 0, "box", "clean", "network", 500, 0.5, "answered", 0.9, 0.001, True)
 
 
-def told(scene, after=None):
+def method_of(scene, after=None):
     """The method that always gives the same answer."""
     return Method(lambda key, shown, begin: scene, after)
 
@@ -38,13 +39,13 @@ def shifted(key, shown, begin):
 
 
 METHODS = {
-    "truth": told(TRUTH),
+    "truth": method_of(TRUTH),
     "shifted": Method(shifted),
-    "mended": told(TRUTH, after="shifted"),
+    "mended": method_of(TRUTH, after="shifted"),
     "unchanged": Method(lambda key, shown, begin: begin, after="shifted"),
-    "nan": told(TRUTH.replace(rotation=TRUTH.rotation.at[0, 1, 1].set(jnp.nan))),
-    "silent": told(TRUTH.replace(valid=TRUTH.valid.at[0].set(False))),
-    "confused": told(TRUTH.replace(exponents=TRUTH.exponents.at[:, 1].set(1.01 - TRUTH.exponents[:, 1]))),
+    "nan": method_of(TRUTH.replace(rotation=TRUTH.rotation.at[0, 1, 1].set(jnp.nan))),
+    "silent": method_of(TRUTH.replace(valid=TRUTH.valid.at[0].set(False))),
+    "confused": method_of(TRUTH.replace(exponents=TRUTH.exponents.at[:, 1].set(1.01 - TRUTH.exponents[:, 1]))),
 }
 
 
@@ -132,7 +133,7 @@ def test_only_objects_with_enough_pixels_count(bench, measured):
 
 def test_a_file_holds_every_row_and_the_figures_that_follow_from_them(measured, tmp_path):
     path = tmp_path / "recognition.json"
-    recognition.save_recognition(measured, path)
+    images.save_rows(measured.value(), measured.rows, path)
     value = json.loads(path.read_text())
     rows = tuple(recognition.Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"])
     assert rows == measured.rows
@@ -206,7 +207,7 @@ def test_a_comparison_of_nothing_is_refused(wrong, message):
 
 @pytest.mark.parametrize(("slow_scenes", "expected"), [(1, 1), (3, 3), (7, 7), (10, 10), (99, 10), (None, 10)])
 def test_slow_methods_are_measured_on_scenes_spread_over_all(slow_scenes, expected):
-    methods = {"fast": told(TRUTH), "slow": Method(shifted, slow=True)}
+    methods = {"fast": method_of(TRUTH), "slow": Method(shifted, slow=True)}
     bench = Bench([SCENE] * 10, methods, slow_scenes=slow_scenes)
     chosen = [i for i in range(10) if "slow" in bench.methods_for(i)]
     assert len(chosen) == expected
@@ -245,7 +246,7 @@ def test_every_configuration_is_a_place_of_its_own(monkeypatch, tmp_path, capsys
 
     def methods(camera, shelf):
         seen.append((camera, shelf))
-        return {"network": told(TRUTH), "network-refined": told(TRUTH, after="network")}
+        return {"network": method_of(TRUTH), "network-refined": method_of(TRUTH, after="network")}
 
     monkeypatch.setattr(images, "held_out_scenes", scenes)
     monkeypatch.setattr(recognition, "shipped_methods", methods)
@@ -315,7 +316,7 @@ def test_the_classical_method_recognises_what_is_clearly_seen():
     visible = [row for row in measured.rows if row.visible > 0.6]
     assert {row.outcome for row in visible} == {"answered"}
     assert max(row.iou for row in visible) > 0.8
-    points, labels = recognition.some_points(Bench([SCENE], METHODS).image(0, "clean")[1].shown)
+    points, labels = recognition_methods.sampled_points(Bench([SCENE], METHODS).image(0, "clean")[1].shown)
     counts = np.bincount(np.asarray(labels)[np.asarray(labels) >= 0], minlength=8)
     assert counts.max() == recognition.EMS_POINTS
     assert bool(jax.numpy.isfinite(points[labels >= 0]).all())

@@ -75,10 +75,10 @@ def test_brute_force_finds_the_poses_at_which_the_image_shows_too_few_pixels_to_
         assert exists.sum() < cells.sum()
         # Half of them where it exists, half elsewhere.
         rng = np.random.default_rng(0)
-        asked = np.concatenate(
+        chosen = np.concatenate(
             [rng.choice(np.flatnonzero(exists == there), 15, replace=False) for there in (True, False)]
         )
-        for i in asked:
+        for i in chosen:
             x, y, _ = np.asarray(problem.poses[i])
             moved = world.replace(position=world.position.at[TARGET, :2].set(np.array([x, y])))
             pixels = int(target_pixels(Camera(), moved))
@@ -113,20 +113,20 @@ def test_the_nearest_pose_is_near_in_place_and_yaw():
 
 
 def test_a_box_is_looked_at_with_its_own_poses(monkeypatch):
-    asked = []
+    targets = []
 
     class Stop(Exception):
         pass
 
     def refuse(target):
-        asked.append(target)
+        targets.append(target)
         raise Stop
 
     monkeypatch.setattr(scenes, "cached_problem", refuse)
     boxed = dataclasses.replace(HIDDEN, target=dataclasses.replace(BOX, half_size=(0.015, 0.02, 0.05)))
     with pytest.raises(Stop):
         look_at_all({"boxes": [boxed]})
-    assert asked == [Target.box()]
+    assert targets == [Target.box()]
 
 
 def test_figures_are_those_of_the_rows(tmp_path):

@@ -56,15 +56,15 @@ def test_an_object_that_is_not_told_apart_counts_as_nothing(wrong):
 
 def test_overlaps_are_those_of_a_plain_count():
     rng = np.random.default_rng(0)
-    found, truth = rng.integers(-3, 6, (2, 20, 30))
-    told = overlaps(found, truth)
+    segments, truth = rng.integers(-3, 6, (2, 20, 30))
+    iou = overlaps(segments, truth)
     for i in range(TARGET):
-        both, either = np.sum((found == i) & (truth == i)), np.sum((found == i) | (truth == i))
-        assert told[i] == pytest.approx(both / either) if (truth == i).any() else np.isnan(told[i])
+        both, either = np.sum((segments == i) & (truth == i)), np.sum((segments == i) | (truth == i))
+        assert iou[i] == pytest.approx(both / either) if (truth == i).any() else np.isnan(iou[i])
 
 
 def test_results_are_written_with_their_rows(perfect, tmp_path):
-    segmentation.save_segmentation(perfect, tmp_path / "s.json")
+    images.save_rows(perfect.value(), perfect.rows, tmp_path / "s.json")
     value = json.loads((tmp_path / "s.json").read_text())
     assert value["summary"] == perfect.summary()
     rows = [segmentation.Row(**dict(zip(value["columns"], row, strict=True))) for row in value["rows"]]
@@ -93,7 +93,11 @@ def test_the_picture_shows_the_worst_images_first(wrong, tmp_path):
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
-    [({"scenes": []}, "there are no scenes"), ({"noises": ()}, "unknown"), ({"noises": ("fog",)}, '"fog" is unknown')],
+    [
+        ({"scenes": []}, "there are no scenes"),
+        ({"noises": ()}, "at least one noise"),
+        ({"noises": ("fog",)}, '"fog" is unknown'),
+    ],
 )
 def test_a_measurement_of_nothing_is_refused(wrong, message):
     with pytest.raises(InputError, match=message):

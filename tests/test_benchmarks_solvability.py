@@ -23,7 +23,7 @@ from mechsearch_jax.benchmarks.store.rows import write_rows
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.envs.episode.records import ActionRecord
 from mechsearch_jax.envs.known_target.judgement import Judgement
-from mechsearch_jax.envs.known_target.search import Found, KnownSearchConfig, Node
+from mechsearch_jax.envs.known_target.search import KnownSearchConfig, KnownSearchResult, Node
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.runtime.errors import InputError
@@ -43,20 +43,20 @@ def judgement(*hits, feasible=None):
     return Judgement(np.float32(1.0), np.ones(len(hits), bool) if feasible is None else np.array(feasible), rows)
 
 
-def found(start, best=None, actions=None, **changes):
+def result_of(start, best=None, actions=None, **changes):
     """What a search came to, by the judgements of its worlds."""
     world = jax.device_get(from_scenario(TWO))
     begin = Node(world, (), start)
     counts = {name: Counter() for name in ("sampled", "executed", "failed", "retrievals")}
     reached = begin if best is None else Node(world, (PUSH,), best)
-    told = {"actions": actions, "best": reached, "start": begin, "rounds": 3, "simulated": 70}
-    return Found(**{**told, **counts, **changes})
+    fields = {"actions": actions, "best": reached, "start": begin, "rounds": 3, "simulated": 70}
+    return KnownSearchResult(**{**fields, **counts, **changes})
 
 
 def test_episodes_count_by_content_and_by_name_only_where_they_do_not_say(tmp_path):
     table = tmp_path / "rows.parquet"
-    known = dataclasses.replace(EPISODE, configuration="{}", content_hash=TWO.content_hash, retrieved=False)
-    write_rows([known, dataclasses.replace(known, scenario="another name", seed=1, retrieved=True)], table)
+    hashed = dataclasses.replace(EPISODE, configuration="{}", content_hash=TWO.content_hash, retrieved=False)
+    write_rows([hashed, dataclasses.replace(hashed, scenario="another name", seed=1, retrieved=True)], table)
     stored = tmp_path / "stored.json"
     episodes = [{"scenario": "hidden", "retrieved": True}, {"scenario": "two", "retrieved": True}]
     stored.write_text(json.dumps({"runs": [{"episodes": episodes}]}))
@@ -67,7 +67,7 @@ def test_episodes_count_by_content_and_by_name_only_where_they_do_not_say(tmp_pa
 
     assert read_outcomes([table]).of(TWO) == (2, 1)
     with ShardWriter(tmp_path / "folder" / "inside", "me") as writer:
-        writer.append([known])
+        writer.append([hashed])
     assert read_outcomes([tmp_path / "folder"]).of(TWO) == (1, 0)
     assert read_outcomes([stored]).of(TWO) == (1, 1)
     # The scene of that name held something else.
@@ -96,12 +96,12 @@ def test_what_holds_no_episodes_is_refused(tmp_path, text, complaint):
 
 @pytest.fixture
 def ceiling(tmp_path, monkeypatch):
-    """Searches that come to what `answers` says of a scene; `ceiling.asked` tells which were searched."""
+    """Searches that come to what `answers` says of a scene; `ceiling.searched` tells which were searched."""
     ceiling = Ceiling(tmp_path, KnownSearchConfig(rounds=3), 5)
-    ceiling.asked, ceiling.answers = [], {}
+    ceiling.searched, ceiling.answers = [], {}
 
     def known_search(scenario, *rest):
-        ceiling.asked.append(scenario.name)
+        ceiling.searched.append(scenario.name)
         return ceiling.answers[scenario.name]
 
     monkeypatch.setattr(solvability, "known_search", known_search)
@@ -114,12 +114,12 @@ def ceiling(tmp_path, monkeypatch):
 
 def test_only_what_no_episode_solved_is_searched_and_kept(tmp_path, ceiling, monkeypatch):
     ceiling.answers = {
-        "two": found(judgement([0]), judgement([]), (PUSH, PUSH)),
-        "hidden": found(judgement([0])),
+        "two": result_of(judgement([0]), judgement([]), (PUSH, PUSH)),
+        "hidden": result_of(judgement([0])),
     }
     outcomes = Outcomes({}, {"open": (4, 1), "hidden": (4, 0)})
     first = [ceiling.row(scene, outcomes) for scene in (OPEN, TWO, HIDDEN)]
-    assert ceiling.asked == ["two", "hidden"]
+    assert ceiling.searched == ["two", "hidden"]
     assert [(row.solvable, row.episodes, row.retrieved, row.actions) for row in first] == [
         (True, 4, 1, None), (True, 0, 0, 2), (False, 4, 0, None),
     ]  # fmt: skip
@@ -128,7 +128,7 @@ def test_only_what_no_episode_solved_is_searched_and_kept(tmp_path, ceiling, mon
     assert first[1].path == [dataclasses.asdict(PUSH)] * 2
 
     assert [ceiling.row(scene, outcomes) for scene in (OPEN, TWO, HIDDEN)] == first
-    assert ceiling.asked == ["two", "hidden"]
+    assert ceiling.searched == ["two", "hidden"]
     ceiling.row(dataclasses.replace(OPEN, name="two"), Outcomes({}, {"two": (1, 1)}))
     (tmp_path / "hidden.json").write_text("{")
     ceiling.row(HIDDEN, outcomes)
@@ -136,7 +136,7 @@ def test_only_what_no_episode_solved_is_searched_and_kept(tmp_path, ceiling, mon
     ceiling.row(TWO, outcomes)
     other = Ceiling(tmp_path, KnownSearchConfig(rounds=4), 5)
     assert other.settings != ceiling.settings
-    assert ceiling.asked == ["two", "hidden", "hidden", "two"]
+    assert ceiling.searched == ["two", "hidden", "hidden", "two"]
 
 
 def test_shares_are_those_of_the_rows(tmp_path):
@@ -181,8 +181,8 @@ def test_stored_actions_take_the_target_out():
     for row in (row for row in rows if row.path):
         world.reset(scenes[row.content_hash])
         for action in row.path:
-            known = {**action, "kind": codes[action["kind"]], "object": action["object"] or 0}
-            outcome = world.execute(Action(**{name: jnp.array(value) for name, value in known.items()}))
+            fields = {**action, "kind": codes[action["kind"]], "object": action["object"] or 0}
+            outcome = world.execute(Action(**{name: jnp.array(value) for name, value in fields.items()}))
             assert not outcome.fallen.any()
         assert outcome.retrieved, row.scenario
 
@@ -198,13 +198,15 @@ def test_what_is_in_the_way_are_the_least_sets_that_feasible_grasps_hit():
 
 def test_reasons_say_what_is_in_the_way_and_what_could_be_done_to_it():
     nowhere = judgement([0], feasible=[False])
-    assert reason(found(nowhere)).startswith("Arm and shelf allow no grasp of the target, nor of one that was pushed")
-    stuck = reason(found(judgement([1], [0, 1])))
+    assert reason(result_of(nowhere)).startswith(
+        "Arm and shelf allow no grasp of the target, nor of one that was pushed"
+    )
+    stuck = reason(result_of(judgement([1], [0, 1])))
     assert "each of the 2 grasps that arm and shelf allow hits object 1." in stuck
     assert "No action brought it nearer" in stuck
     assert "Object 1 could be neither picked nor pushed." in stuck
     better = reason(
-        found(
+        result_of(
             judgement([0, 1]),
             judgement([1], [2]),
             sampled=Counter({("push", 1): 9, ("push", 2): 3, ("pick-and-place", 2): 4}),
@@ -216,5 +218,7 @@ def test_reasons_say_what_is_in_the_way_and_what_could_be_done_to_it():
     assert "hits object 1, or object 2 (70 actions simulated in 3 rounds)" in better
     assert "Object 1: push 5 times (3 more failed); never pick-and-place." in better
     assert "Object 2: pick-and-place 0 times (0 more failed), push 0 times (0 more failed)." in better
-    failed = reason(found(judgement([1]), judgement([]), retrievals=Counter({"the arm was held up": 3, "missed": 1})))
+    failed = reason(
+        result_of(judgement([1]), judgement([]), retrievals=Counter({"the arm was held up": 3, "missed": 1}))
+    )
     assert "every attempt to take the target out failed: the arm was held up (3 times), missed (1 time)" in failed

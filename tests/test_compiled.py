@@ -332,7 +332,7 @@ SEARCH = """
     problem, policy = cached_problem(target_of(scene)), search_for_grasp(sequences=2, horizon=1)
     with prepared(first_decision(problem, policy, MotionConfig()), print):
         episode = run_episode(0, scene, problem, policy, NativeSimulator(), max_steps=1)
-    names = "update_belief", "_plan", "pixels_in_window", "_told", "_keys_at"
+    names = "update_belief", "_plan", "pixels_in_window", "_sizes_and_truths", "_keys_at"
     print(*(f"{name} {traced.count(name)}" for name in names))
     print([step.action for step in episode.steps], [step.cost for step in episode.steps])
 """
@@ -364,10 +364,10 @@ def test_a_second_start_traces_nothing_that_ran_before(tmp_path):
     assert lines[0].endswith("; 0 of 6 done")
     assert lines[-1] == "compiling; 6 of 6 done"
     # What was prepared is what was called.
-    assert counts == "update_belief 1 _plan 1 pixels_in_window 1 _told 1 _keys_at 1"
+    assert counts == "update_belief 1 _plan 1 pixels_in_window 1 _sizes_and_truths 1 _keys_at 1"
     *lines, counts, second = run(SEARCH, tmp_path)
     assert lines == []
-    assert counts == "update_belief 0 _plan 0 pixels_in_window 0 _told 0 _keys_at 0"
+    assert counts == "update_belief 0 _plan 0 pixels_in_window 0 _sizes_and_truths 0 _keys_at 0"
     assert second == first
 
 

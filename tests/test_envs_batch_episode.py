@@ -38,18 +38,18 @@ WON = Result(
 
 def run(problem, scenarios, simulator, slots, policy=grab, seeds=None, **listening):
     """The episodes in the order of the scenarios, and how many ended together."""
-    found, together = {}, []
+    by_place, together = {}, []
 
     def ended(episodes):
         together.append(len(episodes))
         for place, episode in episodes:
-            assert place not in found
-            found[place] = episode
+            assert place not in by_place
+            by_place[place] = episode
 
     starts = [Start(s, seed) for s, seed in zip(scenarios, seeds or [0] * len(scenarios), strict=True)]
     settings = RunSettings(max_steps=2, at_once=AT_ONCE)
     run_episodes(starts, problem, policy, simulator, slots, Listeners(ended, **listening), settings)
-    return [found[i] for i in range(len(scenarios))], together
+    return [by_place[i] for i in range(len(scenarios))], together
 
 
 def without_times(episode):
@@ -94,18 +94,18 @@ def test_policies_that_differ_in_numbers_share_a_batch_and_what_is_compiled(prob
     Counting.traced, count = 0, 6
     policies = [Counting(charge=float(charge)) for charge in range(count)]
     starts = [Start(HIDDEN, 0, policy, 1 + i % 2, {"charge": policy.charge}) for i, policy in enumerate(policies)]
-    found = {}
+    episodes = {}
     settings = RunSettings(max_steps=9, at_once=AT_ONCE)
-    run_episodes(starts, problem, policies[0], Stage(), 2, Listeners(found.update), settings)
+    run_episodes(starts, problem, policies[0], Stage(), 2, Listeners(episodes.update), settings)
     assert Counting.traced == 1
-    sizes = {found[i].steps[0].belief_size for i in range(count)}
+    sizes = {episodes[i].steps[0].belief_size for i in range(count)}
     assert len(sizes) == 1
-    assert [found[i].steps[0].cost for i in range(count)] == [sizes.copy().pop() + charge for charge in range(count)]
-    assert [len(found[i].steps) for i in range(count)] == [2 + i % 2 for i in range(count)]
-    assert [found[i].config["charge"] for i in range(count)] == list(range(count))
+    assert [episodes[i].steps[0].cost for i in range(count)] == [sizes.copy().pop() + charge for charge in range(count)]
+    assert [len(episodes[i].steps) for i in range(count)] == [2 + i % 2 for i in range(count)]
+    assert [episodes[i].config["charge"] for i in range(count)] == list(range(count))
     for i in (0, 5):
         alone = run_episode(0, HIDDEN, problem, policies[i], Stage(), max_steps=1 + i % 2, options={"charge": i})
-        assert without_times(alone) == without_times(found[i])
+        assert without_times(alone) == without_times(episodes[i])
 
 
 def test_policies_that_differ_in_more_than_numbers_do_not_share_a_batch(problem):
@@ -117,9 +117,9 @@ def test_policies_that_differ_in_more_than_numbers_do_not_share_a_batch(problem)
         with pytest.raises(InputError, match="differ in more than numbers"):
             run_episodes(starts, problem, first, Stage(), 2, Listeners(print))
     # One after the other they may be anything.
-    found = {}
-    run_episodes([Start(OPEN, 0), Start(OPEN, 0, idle)], problem, grab, Stage(), 1, Listeners(found.update))
-    assert [found[i].retrieved for i in (0, 1)] == [True, False]
+    episodes = {}
+    run_episodes([Start(OPEN, 0), Start(OPEN, 0, idle)], problem, grab, Stage(), 1, Listeners(episodes.update))
+    assert [episodes[i].retrieved for i in (0, 1)] == [True, False]
 
 
 def test_a_slot_is_free_for_the_next_as_soon_as_its_episode_ends(problem):
@@ -257,7 +257,7 @@ def test_a_retrieval_does_not_count_once_an_object_has_left_the_board():
     fell = dataclasses.replace(WON, takes_target=False, retrieved=False, final=False, off_board=frozenset({1, TARGET}))
     log.decide(record(False, 9, Verdict(), None))
     assert not log.act(fell, None, {})
-    assert log.spoilt == "an object fell off the board at action 1"
+    assert log.irretrievable == "an object fell off the board at action 1"
     log.decide(record(True, 1, Verdict(), None))
     assert log.act(dataclasses.replace(WON, off_board=frozenset({1, 2})), None, {})
     episode = log.episode(OPEN, {})

@@ -95,13 +95,13 @@ def test_what_is_told_of_an_episode_is_what_its_record_says(problem):
     episode = run(problem, HIDDEN, Stage(reveal, retrievals=Failure.MISSED), watcher=narrator)
     narrator.ended(episode)
     first, *others = console.export_text().split("step 2")
-    told = others[0]
+    narrated = others[0]
     assert f"no target; it can be at {episode.steps[0].belief_size} of 792 poses" in first
     assert f"cost {episode.steps[0].cost:.0f} now" in first
-    assert "the target at x" in told
-    assert "a grasp that takes it out is known" in told
-    assert "failed  retrieval: missed" in told
-    assert told.strip().endswith(verdict(episode))
+    assert "the target at x" in narrated
+    assert "a grasp that takes it out is known" in narrated
+    assert "failed  retrieval: missed" in narrated
+    assert narrated.strip().endswith(verdict(episode))
     assert len(narrator.frames) == len(episode.steps)
     assert [frame.found for frame in narrator.frames] == [False, True, True]
     assert "retrieval: missed" in narrator.frames[1].caption
@@ -214,8 +214,8 @@ def test_every_step_says_whether_the_truth_is_possible(problem):
     assert [step.restarts for step in episode.steps] == [0, 0, 0]
     row = Row.of_episode(dataclasses.replace(episode, config={**METHOD, **episode.config}))
     assert (row.looks, row.truth_lost, row.truth_lost_step, row.restarts) == (3, 2, 1, 0)
-    found = run(problem, HIDDEN, Stage(reveal))
-    assert [step.truth_possible for step in found.steps] == [True, None]
+    episode = run(problem, HIDDEN, Stage(reveal))
+    assert [step.truth_possible for step in episode.steps] == [True, None]
     tipped = run(problem, HIDDEN, Stage(lambda world: reveal(topple(world))), recogniser=blind)
     assert [step.truth_possible for step in tipped.steps] == [True, None, None]
 

@@ -109,18 +109,20 @@ def test_a_recorder_keeps_what_was_shown_and_what_moved():
     simulator = types.SimpleNamespace(traces=[one.trace])
     recorder = Recorder(simulator)
     problem = types.SimpleNamespace(camera=RECORDING.camera, shelf=RECORDING.shelf, target=RECORDING.target)
-    for told in (one, two):
-        frame = recorded_frame(told, RECORDING.camera, RECORDING.shelf)
-        decision = None if told.action is None else types.SimpleNamespace(action=told.action, sequences=SEQUENCES)
-        outcome = None if told.action is None else object()
-        snapshot = types.SimpleNamespace(world=told.world)
+    for recorded in (one, two):
+        frame = recorded_frame(recorded, RECORDING.camera, RECORDING.shelf)
+        decision = (
+            None if recorded.action is None else types.SimpleNamespace(action=recorded.action, sequences=SEQUENCES)
+        )
+        outcome = None if recorded.action is None else object()
+        snapshot = types.SimpleNamespace(world=recorded.world)
         recorder.note.__wrapped__(
             recorder, types.SimpleNamespace(snapshot=snapshot, decision=decision, outcome=outcome), frame
         )
     kept = recorder.recording.__wrapped__(recorder, problem, "how it ended")
     assert [s.title for s in kept.steps] == ["1  push", "2  give up"]
     assert kept.steps[0].trace is one.trace
-    np.testing.assert_array_equal(kept.steps[0].sampled.after(1, told.scene).position, SAMPLED.position[1])
+    np.testing.assert_array_equal(kept.steps[0].sampled.after(1, recorded.scene).position, SAMPLED.position[1])
     assert kept.steps[0].sampled.value.tolist() == [-30.0, -10.0]
     assert kept.steps[0].sampled.cost.tolist() == [90.0, 95.0]
     np.testing.assert_array_equal(kept.steps[0].sampled.single(1).displacement, SAMPLED.action.displacement[1])

@@ -137,8 +137,7 @@ def test_what_cannot_be_generated_is_one_line(made):
     for seed, objects, message in ((0, 9, "objects: 9"), (0, 0, "objects: 0"), (-1, 4, "seed: -1 is negative")):
         with pytest.raises(InputError, match=message):
             made.generate(seed, objects)
-    with pytest.raises(InputError, match='"ball" is unknown'):
-        generator.generate_scenario(0, 4, target="ball")
+
     for config in (GeneratorConfig(attempts=2), GeneratorConfig(attempts=2, anywhere=True, target_placements=20)):
         nowhere = ScenarioGenerator(config=config, graspable=lambda pose: False)
         with pytest.raises(InputError, match="no graspable place is hidden in 2 scenes"):
@@ -153,8 +152,8 @@ def test_an_impossible_configuration_is_one_line(wrong):
 
 def test_what_a_seed_means_does_not_drift(made):
     """The scenes that results and examples were made with."""
-    known = {"cylinder": ("e2611a062532", "0cc21987952b"), "box": ("d10563c0d365", "13611d7bb0a3")}
-    assert (made.generate(0, 4).content_hash, made.generate(3, 7).content_hash) == known[made.target.shape]
+    hashes = {"cylinder": ("e2611a062532", "0cc21987952b"), "box": ("d10563c0d365", "13611d7bb0a3")}
+    assert (made.generate(0, 4).content_hash, made.generate(3, 7).content_hash) == hashes[made.target.shape]
 
 
 def test_separation_is_the_gap_between_outlines():

@@ -24,105 +24,105 @@ from mechsearch_jax.workspace.target import Target
 SCENE = load_scenario(example_scenarios()["first-light"])
 
 
-def found(subject, settings=None):
+def findings_of(subject, settings=None):
     return list(health.examine(subject, health.checks(SCENE, settings or Settings())[subject]))
 
 
 def test_versions_devices_and_simulator_are_named():
-    (versions,) = found("versions")
+    (versions,) = findings_of("versions")
     assert versions.state is State.FINE
     assert f"mechsearch-jax {importlib.metadata.version('mechsearch-jax')}" in versions.says
-    assert "JAX computes on cpu" in found("devices")[0].says
-    assert found("simulator")[0].state is State.FINE
+    assert "JAX computes on cpu" in findings_of("devices")[0].says
+    assert findings_of("simulator")[0].state is State.FINE
 
 
 def test_a_package_that_is_missing_breaks_the_main_job(monkeypatch):
     monkeypatch.setattr(health, "PACKAGES", ("jax", "no-such-package"))
-    broken = found("versions")[-1]
+    broken = findings_of("versions")[-1]
     assert (broken.state, broken.remedy) == (State.BROKEN, "pip install no-such-package")
 
 
 def test_a_gpu_that_jax_does_not_see_is_told(monkeypatch):
     monkeypatch.setattr(health.shutil, "which", lambda name: f"/usr/bin/{name}")
-    assert "mechsearch-jax[gpu]" in found("devices")[-1].remedy
+    assert "mechsearch-jax[gpu]" in findings_of("devices")[-1].remedy
 
 
 def test_the_weights_are_told_with_their_digests(monkeypatch):
-    digests = [finding.says.split()[-1] for finding in found("weights")]
+    digests = [finding.says.split()[-1] for finding in findings_of("weights")]
     assert digests == [weights.shipped_weights(name).card["sha256"][:12] for name in weights.ARCHITECTURES]
 
     def damaged(path, name):
         raise InputError(f"{path}: is not the file that its card describes")
 
     monkeypatch.setattr(weights, "load_weights", damaged)
-    assert {finding.state for finding in found("weights")} == {State.BROKEN}
+    assert {finding.state for finding in findings_of("weights")} == {State.BROKEN}
 
 
 def test_the_caches_are_measured(tmp_path, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
-    (tmp_path / "some").write_bytes(bytes(2_000_000))
-    (whole,) = found("cache")
+    (tmp_path / "file").write_bytes(bytes(2_000_000))
+    (whole,) = findings_of("cache")
     assert whole.says.endswith(f"{tmp_path}, 1 files, 2 MB, writable")
-    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "some"))
-    (broken,) = found("cache")
+    monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "file"))
+    (broken,) = findings_of("cache")
     assert (broken.state, cache.VARIABLE in broken.remedy) == (State.MISSING, True)
     monkeypatch.setenv(cache.VARIABLE, "")
-    assert "every start takes minutes" in found("cache")[0].says
+    assert "every start takes minutes" in findings_of("cache")[0].says
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
-    assert [finding.says.split(":")[0] for finding in found("cache")] == ["problems are not kept", "compilations"]
+    assert [finding.says.split(":")[0] for finding in findings_of("cache")] == ["problems are not kept", "compilations"]
 
 
 def test_a_problem_is_looked_for_in_the_cache(tmp_path, monkeypatch):
     monkeypatch.setenv(cache.VARIABLE, str(tmp_path))
-    assert found("problem")[0].state is State.MISSING
+    assert findings_of("problem")[0].state is State.MISSING
     key = cache._key(cache._parts(target_of(SCENE), None, None, None, None))
     cache._file(tmp_path, key).touch()
-    assert found("problem")[0].state is State.FINE
-    assert found("problem", Settings(Workcell(shelf=Shelf(back=0.8))))[0].state is State.MISSING
+    assert findings_of("problem")[0].state is State.FINE
+    assert findings_of("problem", Settings(Workcell(shelf=Shelf(back=0.8))))[0].state is State.MISSING
 
 
 def cell_of(problem, monkeypatch, settings=None):
-    """What is found of a cell, by subject, whose problem is there already."""
+    """The findings on a cell with a cached problem, by subject."""
     monkeypatch.setattr(Workcell, "problem", lambda self, target=None, config=None: problem)
-    found = health.checks(None, settings or Settings(), cell=True)
-    return {part: list(health.examine(part, found[part])) for part in health.CELL}
+    checks = health.checks(None, settings or Settings(), cell=True)
+    return {part: list(health.examine(part, checks[part])) for part in health.CELL}
 
 
 def test_the_default_cell_is_fine(problem, monkeypatch):
-    found = cell_of(problem, monkeypatch)
-    assert {finding.state for part in found.values() for finding in part} == {State.FINE}
-    assert "sees 100% of the board" in found["camera"][0].says
-    assert "can grasp the target at 95% of its 792" in found["shelf"][0].says
-    assert "recognition and segmentation" in found["networks"][0].says
-    assert "rehearsal physics, push model learned, at most 10 actions" in found["planner"][0].says
+    findings = cell_of(problem, monkeypatch)
+    assert {finding.state for part in findings.values() for finding in part} == {State.FINE}
+    assert "sees 100% of the board" in findings["camera"][0].says
+    assert "can grasp the target at 95% of its 792" in findings["shelf"][0].says
+    assert "recognition and segmentation" in findings["networks"][0].says
+    assert "rehearsal physics, push model learned, at most 10 actions" in findings["planner"][0].says
 
 
 def test_a_cell_that_cannot_work_is_broken(problem, monkeypatch):
     camera = Camera()
     flipped = tuple((a, -b, -c) for a, b, c in camera.rotation)
     away = Settings(Workcell(camera=dataclasses.replace(camera, rotation=flipped)))
-    (told,) = cell_of(problem, monkeypatch, away)["camera"]
-    assert (told.state, "OpenGL" in told.says, "[camera]" in told.remedy) == (State.BROKEN, True, True)
+    (finding,) = cell_of(problem, monkeypatch, away)["camera"]
+    assert (finding.state, "OpenGL" in finding.says, "[camera]" in finding.remedy) == (State.BROKEN, True, True)
 
     wide = Settings(Workcell(target=Target.of("box", (0.06, 0.06, 0.05))))
-    (told,) = cell_of(problem, monkeypatch, wide)["target"]
-    assert (told.state, "0.120 m wide" in told.says) == (State.BROKEN, True)
+    (finding,) = cell_of(problem, monkeypatch, wide)["target"]
+    assert (finding.state, "0.120 m wide" in finding.says) == (State.BROKEN, True)
 
     def nowhere(self, target=None, config=None):
         raise InputError(NOWHERE)
 
     monkeypatch.setattr(Workcell, "problem", nowhere)
-    (told,) = health.examine("shelf", health.checks(None, Settings(), cell=True)["shelf"])
-    assert (told.state, told.says) == (State.BROKEN, NOWHERE)
+    (finding,) = health.examine("shelf", health.checks(None, Settings(), cell=True)["shelf"])
+    assert (finding.state, finding.says) == (State.BROKEN, NOWHERE)
 
 
 def test_a_cell_that_works_less_well_is_doubtful(problem, monkeypatch):
     near = Settings(Workcell(camera=dataclasses.replace(Camera(), fx=1900.0, fy=1900.0)))
-    found = cell_of(problem, monkeypatch, near)
-    assert [finding.state for finding in found["camera"]] == [State.DOUBTFUL, State.FINE]
-    found = cell_of(problem, monkeypatch, Settings(Workcell(camera=Camera().moved((-0.5, 0.27, 0.2)))))
-    assert found["networks"][0].state is State.DOUBTFUL
+    findings = cell_of(problem, monkeypatch, near)
+    assert [finding.state for finding in findings["camera"]] == [State.DOUBTFUL, State.FINE]
+    findings = cell_of(problem, monkeypatch, Settings(Workcell(camera=Camera().moved((-0.5, 0.27, 0.2)))))
+    assert findings["networks"][0].state is State.DOUBTFUL
 
 
 def test_doctor_looks_at_the_cell_that_is_given(problem, monkeypatch, tmp_path, capsys):
@@ -132,9 +132,9 @@ def test_doctor_looks_at_the_cell_that_is_given(problem, monkeypatch, tmp_path, 
     file = tmp_path / "mine.toml"
     file.write_text("[shelf]\nfront = 1.414\nback = 1.788\nspawn_x = [1.45, 1.73]\n")
     cli.parse(["doctor", "--config", str(file)])()
-    told = capsys.readouterr().out
-    assert [line.split()[0] for line in told.splitlines() if line[0] != " "][:3] == ["camera", "target", "shelf"]
-    assert "first-light" not in told
+    printed = capsys.readouterr().out
+    assert [line.split()[0] for line in printed.splitlines() if line[0] != " "][:3] == ["camera", "target", "shelf"]
+    assert "first-light" not in printed
     file.write_text("[camera]\nposition = [3.0, 0.0, 0.6]\n")
     with pytest.raises(SystemExit) as end:
         cli.parse(["doctor", "--config", str(file)])()
@@ -144,7 +144,7 @@ def test_doctor_looks_at_the_cell_that_is_given(problem, monkeypatch, tmp_path, 
 
 def test_what_cannot_be_rendered_is_no_harm(monkeypatch):
     monkeypatch.setattr(health.subprocess, "run", lambda *a, **k: subprocess.CompletedProcess((), 1))
-    assert found("rendering")[0].state is State.MISSING
+    assert findings_of("rendering")[0].state is State.MISSING
 
 
 def test_a_check_that_fails_is_told():
@@ -171,7 +171,7 @@ def test_the_status_says_whether_the_main_job_runs(monkeypatch, capsys, state, s
         assert end.value.code == status
     else:
         command()
-    told = capsys.readouterr().out
-    assert "gone" in told
-    assert "-> install them" in told
-    assert told.splitlines()[-1] == ("nothing can be searched here" if status else "searching works here")
+    printed = capsys.readouterr().out
+    assert "gone" in printed
+    assert "-> install them" in printed
+    assert printed.splitlines()[-1] == ("nothing can be searched here" if status else "searching works here")

@@ -121,10 +121,12 @@ def search(problem, monkeypatch):
 
     def run(sampled, simulator, **changes):
         monkeypatch.setattr(known_search, "sample", lambda search, key, problem, world: sampled)
-        told = lambda *of: run.told.append(of)  # noqa: E731
-        return known_search.known_search(TWO, problem, SEARCH, simulator, dataclasses.replace(config, **changes), told)
+        on_round = lambda *of: run.rounds.append(of)  # noqa: E731
+        return known_search.known_search(
+            TWO, problem, SEARCH, simulator, dataclasses.replace(config, **changes), on_round
+        )
 
-    run.told = []
+    run.rounds = []
     return run
 
 
@@ -133,28 +135,28 @@ LEFT = push(0, y=0.1)
 
 def test_actions_are_joined_until_the_target_is_out(search):
     simulator = Toy()
-    found = search(sequences((-0.5, LEFT), (-0.1, push(1, y=0.05))), simulator)
-    assert [(action.kind, action.object) for action in found.actions] == [("push", 0), ("push", 0), ("retrieve", None)]
-    assert found.rounds == 2
-    assert [number for number, _ in search.told] == [1, 2]
-    assert found.retrievals == Counter({"": 1})
-    assert found.simulated == simulator.pushes + 1
-    assert found.best.world.position[0, 1] == pytest.approx(0.335)
-    assert (found.start.judgement.least, found.best.judgement.least) == (1, 0)
+    result = search(sequences((-0.5, LEFT), (-0.1, push(1, y=0.05))), simulator)
+    assert [(action.kind, action.object) for action in result.actions] == [("push", 0), ("push", 0), ("retrieve", None)]
+    assert result.rounds == 2
+    assert [number for number, _ in search.rounds] == [1, 2]
+    assert result.retrievals == Counter({"": 1})
+    assert result.simulated == simulator.pushes + 1
+    assert result.best.world.position[0, 1] == pytest.approx(0.335)
+    assert (result.start.judgement.least, result.best.judgement.least) == (1, 0)
 
 
 def test_a_whole_sequence_is_executed_and_each_world_of_it_looked_at(search):
-    found = search(sequences((-0.5, LEFT, LEFT, push(1, y=0.05))), Toy())
-    assert (found.rounds, len(found.actions), found.simulated) == (1, 3, 4)
+    result = search(sequences((-0.5, LEFT, LEFT, push(1, y=0.05))), Toy())
+    assert (result.rounds, len(result.actions), result.simulated) == (1, 3, 4)
 
 
 def test_there_are_no_more_actions_than_allowed(search):
     for steps, solved in ((3, True), (2, False), (1, False)):
-        found = search(sequences((-0.5, LEFT, LEFT, LEFT)), Toy(), max_steps=steps)
-        assert (found.actions is not None) is solved
-        assert len(found.best.actions) <= steps - 1
+        result = search(sequences((-0.5, LEFT, LEFT, LEFT)), Toy(), max_steps=steps)
+        assert (result.actions is not None) is solved
+        assert len(result.best.actions) <= steps - 1
     # Where there is no room for any action, no round is spent on it.
-    assert found.rounds == 0
+    assert result.rounds == 0
 
 
 def test_a_world_that_is_lost_is_given_up(search):
@@ -162,31 +164,31 @@ def test_a_world_that_is_lost_is_given_up(search):
         (sequences((-0.5, push(1, x=-0.3), LEFT, LEFT)), Toy()),
         (sequences((-0.5, push(TARGET, y=0.1), LEFT, LEFT)), Toy(tilts=True)),
     ):
-        found = search(sampled, simulator)
-        assert found.actions is None
+        result = search(sampled, simulator)
+        assert result.actions is None
         # Six rounds of one push each: nothing follows one after which something has fallen.
-        assert (found.simulated, found.rounds, len(found.best.actions)) == (6, 6, 0)
+        assert (result.simulated, result.rounds, len(result.best.actions)) == (6, 6, 0)
 
 
 def test_retrievals_that_fail_are_counted_and_solve_nothing(search):
-    found = search(sequences((-0.5, LEFT, LEFT)), Toy(retrieval=Failure.HELD_UP))
-    assert found.actions is None
-    assert set(found.retrievals) == {"the arm was held up"}
-    assert found.best.graspable
+    result = search(sequences((-0.5, LEFT, LEFT)), Toy(retrieval=Failure.HELD_UP))
+    assert result.actions is None
+    assert set(result.retrievals) == {"the arm was held up"}
+    assert result.best.graspable
 
 
 def test_what_cannot_be_acted_upon_ends_when_the_rounds_do(search):
-    found = search(sequences((np.inf, LEFT)), Toy())
-    assert (found.actions, found.rounds, found.simulated, found.sampled) == (None, 6, 0, Counter())
+    result = search(sequences((np.inf, LEFT)), Toy())
+    assert (result.actions, result.rounds, result.simulated, result.sampled) == (None, 6, 0, Counter())
 
 
 def test_what_was_done_is_counted_by_kind_and_object(search):
     rows = ((-0.5, push(1, y=0.02)), (-0.4, push(1, y=0.02)), (-0.2, push(1, y=0.04)))
-    found = search(sequences(*rows), Toy(), rounds=1)
-    assert found.sampled == Counter({("push", 1): 3})
+    result = search(sequences(*rows), Toy(), rounds=1)
+    assert result.sampled == Counter({("push", 1): 3})
     # The same first action is executed once.
-    assert found.executed == Counter({("push", 1): 2})
-    assert not found.failed
+    assert result.executed == Counter({("push", 1): 2})
+    assert not result.failed
 
 
 def node(y, cost, actions=0):
@@ -265,8 +267,8 @@ def test_a_judgement_is_the_planners_own(problem):
 def test_a_hidden_target_is_taken_out(problem):
     search = planner.planning_policy(planner.PlannerConfig(sequences=4, horizon=2), objective=InFullView())
     config = KnownSearchConfig(simulated=4, worlds=1, rounds=4, grasps=2)
-    found = known_search.known_search(HIDDEN, problem, search, NativeSimulator(), config)
-    assert found.actions is not None
-    assert found.actions[-1].kind == "retrieve"
-    assert found.best.graspable
-    assert found.best.world.position.shape == (BODIES, 3)
+    result = known_search.known_search(HIDDEN, problem, search, NativeSimulator(), config)
+    assert result.actions is not None
+    assert result.actions[-1].kind == "retrieve"
+    assert result.best.graspable
+    assert result.best.world.position.shape == (BODIES, 3)

@@ -65,11 +65,11 @@ def test_the_fields_of_every_world_are_those_that_mujoco_computes():
     blank = model.compile_model(Shelf(), Camera())
     scenes = [scene(BOX, BOTTLE), scene(), scene(*[BOTTLE] * 8, target=standing("box", (0.015, 0.02, 0.05), 0.6, 0.1))]
     worlds = stack(*[from_scenario(s) for s in scenes])
-    found = body_fields(blank, worlds.kind, worlds.half_size, worlds.valid)
+    fields = body_fields(blank, worlds.kind, worlds.half_size, worlds.valid)
     for i, start in enumerate(scenes):
         compiled = model.with_bodies(blank, slots(start))
         for name in BodyFields.__dataclass_fields__:
-            value = np.asarray(getattr(found, name)[i])
+            value = np.asarray(getattr(fields, name)[i])
             np.testing.assert_allclose(value, getattr(compiled, name).reshape(value.shape), 2e-6, err_msg=name)
 
 
@@ -91,14 +91,14 @@ def test_commands_say_where_the_arm_would_be_if_nothing_held_it_up():
     start = np.concatenate([q[:, 0], np.zeros((worlds, 1))], axis=1)
     over = [jnp.full(worlds, q.shape[1], jnp.int32)] * 3
     reference = Reference(*(jnp.asarray(a, jnp.float32) for a in (q, velocity, q[..., 0], start)), *over)
-    told = mjx_step.commands(reference)[..., :7]
+    commands = mjx_step.commands(reference)[..., :7]
 
     def one(last, now):
         there = simulator.unhindered(last, now, timestep)
         return there, there
 
-    _, found = jax.lax.scan(one, reference.start[:, :7], jnp.moveaxis(told, 1, 0))
-    np.testing.assert_allclose(jnp.moveaxis(found, 0, 1), q, atol=1e-5)
+    _, followed = jax.lax.scan(one, reference.start[:, :7], jnp.moveaxis(commands, 1, 0))
+    np.testing.assert_allclose(jnp.moveaxis(followed, 0, 1), q, atol=1e-5)
 
 
 def test_actions_of_two_kinds_are_mixed_by_world():
@@ -118,14 +118,14 @@ def test_where_kinds_are_traced_an_unknown_one_fails_in_its_own_row():
     actions = stack(no_action(), sideways(), sideways(), sideways()).replace(kind=kinds)
 
     @jax.jit
-    def told(actions, world):
+    def judged(actions, world):
         data, config = types.SimpleNamespace(**fields), SimulatorConfig()
         task, _ = mjx_step.acting(data, actions, jnp.ones(4, bool), jnp.zeros(9), config)
         progress = mjx_step.begin(task, data)
         in_hand = jnp.ones(4, bool)
         return task.moves, mjx_step.verdicts(Shelf(), config, task, progress, world, data.qpos, in_hand)[1]
 
-    moves, outcome = told(actions, world)
+    moves, outcome = judged(actions, world)
     assert moves.tolist() == [False, False, True, False]
     assert [outcome.reason(i) for i in range(4)] == [None, "unknown", None, "unknown"]
     assert not outcome.retrieved.any()
@@ -146,7 +146,7 @@ def test_a_retrieval_fails_when_the_arm_is_held_up_and_by_what_falls_meanwhile()
     bound = SimulatorConfig().tracking_bound
 
     @jax.jit
-    def told(actions, world):
+    def judged(actions, world):
         data, config = types.SimpleNamespace(ctrl=robot, qpos=before), SimulatorConfig()
         task, _ = mjx_step.acting(data, actions, jnp.ones(count, bool), jnp.zeros(9), config)
         progress = mjx_step.begin(task, data).replace(
@@ -155,7 +155,7 @@ def test_a_retrieval_fails_when_the_arm_is_held_up_and_by_what_falls_meanwhile()
         in_hand = jnp.arange(count) != 4
         return mjx_step.verdicts(Shelf(), config, task, progress, world, after, in_hand)[1]
 
-    outcome = told(actions, world)
+    outcome = judged(actions, world)
     held_up = "the arm was held up"
     assert [outcome.reason(i) for i in range(count)] == [None, "fallen", None, held_up, held_up, "unstable"]
     assert outcome.retrieved.tolist() == [True, False, True, False, False, False]
@@ -186,7 +186,7 @@ def test_what_it_is_given_has_to_fit(sim):
         MjxSimulator.settle(sim)
     with pytest.raises(InputError, match="no scenarios"):
         sim.reset([])
-    with pytest.raises(InputError, match="some of 1 worlds"):
+    with pytest.raises(InputError, match="1 worlds cannot be set in part"):
         sim.load(stack(from_scenario(scene(BOX))), np.array([True]))
     sim.reset([scene(BOX)] * 2)
     with pytest.raises(InputError, match="for 2 worlds"):
@@ -364,13 +364,13 @@ def test_a_hand_touches_a_box_as_it_does_in_the_native_simulator(sim):
         mujoco.mj_fwdPosition(native, data)
         both = np.stack([data.contact.geom1, data.contact.geom2], axis=1)
         here = np.flatnonzero(contacts.contact__worldid[: contacts.nacon[0]] == i)
-        found = (
+        batch_contacts = (
             (both, data.contact.dist, data.contact.frame[:, :3]),
             (contacts.contact__geom[here], contacts.contact__dist[here], contacts.contact__frame[here, 0]),
         )
         # Pairs, distances [mm] and normals of what touches the box, but for the board.
         rows = []
-        for pairs, distance, normal in found:
+        for pairs, distance, normal in batch_contacts:
             of_box = (pairs == box).any(axis=1) & (native.geom_type[pairs] != mujoco.mjtGeom.mjGEOM_PLANE).all(axis=1)
             value = np.concatenate([pairs, 1e3 * distance[:, None], normal], axis=1)[of_box]
             rows.append(value[np.lexsort(value[:, 2::-1].T)])

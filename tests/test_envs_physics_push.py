@@ -115,33 +115,33 @@ def test_alone_it_is_as_in_a_batch(outcome):
 
 
 def test_two_maps_are_one_call(outcome, monkeypatch):
-    simulate, calls = physics_push._simulate, []
+    simulate, calls = physics_push.simulate_pushes, []
 
     def counted(*arguments):
         calls.append(np.shape(arguments[-1]))
         return simulate(*arguments)
 
-    monkeypatch.setattr(physics_push, "_simulate", counted)
+    monkeypatch.setattr(physics_push, "simulate_pushes", counted)
     model = NativePhysics(threads=3)
 
     def one(action):
         return model(SHELF, SCENE, PUSHER, action.T_world_gripper, action.displacement, action.q7)
 
     square = jax.tree.map(lambda a: a.reshape(2, 2, *a.shape[1:]), PUSHES)
-    told = jax.jit(jax.vmap(jax.vmap(one)))(square)
+    twice_mapped = jax.jit(jax.vmap(jax.vmap(one)))(square)
     assert calls == [(2, 2)]
-    flat = jax.tree.map(lambda a: a.reshape(4, *a.shape[2:]), told)
+    flat = jax.tree.map(lambda a: a.reshape(4, *a.shape[2:]), twice_mapped)
     jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-4), flat, outcome)
 
 
 def test_only_the_first_action_of_a_sequence_is_simulated(monkeypatch):
-    simulate, calls = physics_push._simulate, []
+    simulate, calls = physics_push.simulate_pushes, []
 
     def counted(*arguments):
         calls.append(np.shape(arguments[-1]))
         return simulate(*arguments)
 
-    monkeypatch.setattr(physics_push, "_simulate", counted)
+    monkeypatch.setattr(physics_push, "simulate_pushes", counted)
     first, later = NativePhysics(threads=4), QuasiStatic()
 
     # As `plan` does it: a scan over time, and within it a map over sequences.
@@ -169,28 +169,28 @@ def test_an_error_stays_in_its_row(outcome, tmp_path, monkeypatch):
 
     mirror = jnp.diag(jnp.float32([1, 1, -1]))
     scenes = stack(SCENE, spoil("position", jnp.nan), spoil("position", 1e11), spoil("rotation", mirror))
-    told = predicted(scenes)
-    assert np.isinf(told.residual).tolist() == [False, True, True, True]
-    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), told, outcome)
-    assert (told.topples == 0).all()
-    np.testing.assert_array_equal(told.scene.position[1:], scenes.position[1:])
+    result = predicted(scenes)
+    assert np.isinf(result.residual).tolist() == [False, True, True, True]
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), result, outcome)
+    assert (result.topples == 0).all()
+    np.testing.assert_array_equal(result.scene.position[1:], scenes.position[1:])
 
 
 def test_a_push_out_of_reach_fails_and_one_of_no_length_does_nothing(outcome):
     far = PUSHES.T_world_gripper.at[0, 0, 3].add(0.8)
     still = PUSHES.displacement.at[1].set(0.0)
-    told = predicted(copies(SCENE), PUSHES.replace(T_world_gripper=far, displacement=still))
-    assert np.isinf(told.residual).tolist() == [True, False, False, False]
-    np.testing.assert_array_equal(told.scene.position[:2], [SCENE.position] * 2)
-    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[2:], b[2:]), told, outcome)
+    result = predicted(copies(SCENE), PUSHES.replace(T_world_gripper=far, displacement=still))
+    assert np.isinf(result.residual).tolist() == [True, False, False, False]
+    np.testing.assert_array_equal(result.scene.position[:2], [SCENE.position] * 2)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[2:], b[2:]), result, outcome)
 
 
 def test_what_falls_over_is_told(outcome):
     high = push(pose(0.555, 0.058, 0.15, tilt=math.radians(30)), (0.0, 0.1, 0.0))
-    told = predicted(copies(TALL), copies(high))
-    assert (told.residual == 0).all()
-    assert (told.topples[:, 0] == 1).all()
-    assert (told.topples[:, 1:] == 0).all()
+    result = predicted(copies(TALL), copies(high))
+    assert (result.residual == 0).all()
+    assert (result.topples[:, 0] == 1).all()
+    assert (result.topples[:, 1:] == 0).all()
 
 
 def test_shapes_that_overlap_come_to_rest_before_they_are_pushed():
@@ -198,9 +198,9 @@ def test_shapes_that_overlap_come_to_rest_before_they_are_pushed():
     more = [standing("box", (0.03, 0.03, 0.05), 0.7, y) for y in (0.3, 0.3585)]
     overlapping = superquadrics(from_scenario(scene(*START.objects, *more)))
     floating = overlapping.replace(position=overlapping.position.at[2, 2].add(1.5e-3))
-    told = predicted(copies(floating))
-    assert (told.residual == 0).all()
-    moved = np.linalg.norm(told.scene.position - np.asarray(floating.position), axis=-1)
+    result = predicted(copies(floating))
+    assert (result.residual == 0).all()
+    moved = np.linalg.norm(result.scene.position - np.asarray(floating.position), axis=-1)
     assert (moved[:, 2:4] == 0).all()
     assert (moved[:, 0] > 0.03).all()
 
@@ -214,11 +214,11 @@ def test_superquadrics_become_the_nearest_boxes_and_cylinders():
         rotation=rotation,
         valid=jnp.ones(3, bool),
     )
-    found = [body for body in bodies_of(physics_push.bodies(given)) if body is not None]
-    assert [body.shape for body in found] == ["box", "cylinder", "box"]
-    np.testing.assert_allclose(found[0].half_size, (0.03, 0.04, 0.05), rtol=1e-6)
-    np.testing.assert_allclose(found[1].half_size, (math.sqrt(6e-4), math.sqrt(6e-4), 0.06), rtol=1e-6)
-    assert found[2].half_size[2] == pytest.approx(physics_push.THINNEST)
+    nearest = [body for body in bodies_of(physics_push.bodies(given)) if body is not None]
+    assert [body.shape for body in nearest] == ["box", "cylinder", "box"]
+    np.testing.assert_allclose(nearest[0].half_size, (0.03, 0.04, 0.05), rtol=1e-6)
+    np.testing.assert_allclose(nearest[1].half_size, (math.sqrt(6e-4), math.sqrt(6e-4), 0.06), rtol=1e-6)
+    assert nearest[2].half_size[2] == pytest.approx(physics_push.THINNEST)
     back = physics_push.bodies(SCENE)
     assert back.kind[:2].tolist() == [BOX, CYLINDER]
     with pytest.raises(InputError, match="9 bodies, not for 12"):
@@ -246,9 +246,9 @@ def test_missing_weights_are_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(learned_push.importlib.resources, "files", lambda package: tmp_path)
     with pytest.raises(
         InputError, match=r'push model "learned" cannot be used: .*networks/push.* `mechsearch train push`'
-    ) as told:
+    ) as error:
         push_models.own_push_model.__wrapped__("learned")
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.slow
@@ -264,13 +264,13 @@ def test_the_batch_simulator_predicts_what_the_native_one_does(outcome):
 
     actions = jax.tree.map(lambda a: a[rows], PUSHES)
     both = jax.jit(jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(0, None)))
-    told = jax.device_get(both(scenes, actions))
-    assert np.isinf(told.residual).tolist() == [[False] * 2, [True] * 2]
-    gap = np.linalg.norm(told.scene.position[0] - outcome.scene.position[rows], axis=-1)
+    outcomes = jax.device_get(both(scenes, actions))
+    assert np.isinf(outcomes.residual).tolist() == [[False] * 2, [True] * 2]
+    gap = np.linalg.norm(outcomes.scene.position[0] - outcome.scene.position[rows], axis=-1)
     assert (gap < 5e-3).all()
     assert (gap[:, 3:] == 0).all()
-    assert np.linalg.norm(told.scene.position[0, :, 0] - np.asarray(SCENE.position[0]), axis=-1).min() > 10 * STILL
-    np.testing.assert_array_equal(told.scene.position[1], nan.position[None].repeat(2, 0))
+    assert np.linalg.norm(outcomes.scene.position[0, :, 0] - np.asarray(SCENE.position[0]), axis=-1).min() > 10 * STILL
+    np.testing.assert_array_equal(outcomes.scene.position[1], nan.position[None].repeat(2, 0))
 
 
 def seen(problem):
@@ -287,7 +287,7 @@ def pushing(problem):
 
 @pytest.mark.slow
 def test_each_draw_of_a_first_action_is_simulated_once_and_nothing_else(problem, monkeypatch):
-    problem, simulate, calls, redraws_fail = pushing(problem), physics_push._simulate, [], False
+    problem, simulate, calls, redraws_fail = pushing(problem), physics_push.simulate_pushes, [], False
 
     def counted(*arguments):
         simulated = simulate(*arguments)
@@ -296,7 +296,7 @@ def test_each_draw_of_a_first_action_is_simulated_once_and_nothing_else(problem,
         fails = (np.arange(6) == 0) | (len(calls) > 1)
         return simulated.replace(failed=simulated.failed | fails) if redraws_fail else simulated
 
-    monkeypatch.setattr(physics_push, "_simulate", counted)
+    monkeypatch.setattr(physics_push, "simulate_pushes", counted)
     config, later = PlannerConfig(sequences=6, horizon=2), all_push_models.push_models("physics").later
     policy = search_for_grasp(config, push_model=NativePhysics(threads=5), later_push_model=later)
 

@@ -147,8 +147,8 @@ def test_a_target_that_hides_again_is_not_in_sight(problem):
 
     class Sure(Grab):
         def __call__(self, key, problem, belief, observation):
-            found = belief.replace(found=jnp.array(True), found_pose=observation.target_pose)
-            return super().__call__(key, problem, found, observation)
+            found_belief = belief.replace(found=jnp.array(True), found_pose=observation.target_pose)
+            return super().__call__(key, problem, found_belief, observation)
 
     assert run(problem, OPEN, Rewinding(), Sure(), recogniser=shy).failure == HIDDEN_AGAIN
 
@@ -170,17 +170,17 @@ def test_slots_try_on_their_own(problem):
     """As alone: one succeeds at once, one at the third try, one never."""
     names = {"at once": 0, "third": 2, "never": 9}
     scenarios = [dataclasses.replace(HIDDEN, name=name) for name in names] + [OPEN]
-    found = {}
+    episodes = {}
     stage = Rewinding(fail=names, trouble=push_off)
     settings = RunSettings(max_steps=2, protocol=PUBLISHED, at_once=2)
     starts = [Start(s, 0) for s in scenarios]
-    run_episodes(starts, problem, Several(), stage, 3, Listeners(found.update), settings)
-    reasons = [found[i].failure for i in range(4)]
+    run_episodes(starts, problem, Several(), stage, 3, Listeners(episodes.update), settings)
+    reasons = [episodes[i].failure for i in range(4)]
     assert reasons == [REACHED, REACHED, ALL_FAILED, REACHED]
-    assert [found[i].graspable_step for i in range(4)] == [1, 1, None, 0]
+    assert [episodes[i].graspable_step for i in range(4)] == [1, 1, None, 0]
     for i, scenario in enumerate(scenarios[:3]):
         alone = run(problem, scenario, Rewinding(fail=names, trouble=push_off))
-        assert [step.action for step in alone.steps] == [step.action for step in found[i].steps]
+        assert [step.action for step in alone.steps] == [step.action for step in episodes[i].steps]
 
 
 def test_methods_differ_in_their_protocol_and_problem():

@@ -28,7 +28,16 @@ from mechsearch_jax.shapes.box import CODE as BOX
 from mechsearch_jax.shapes.cylinder import CODE as CYLINDER
 from mechsearch_jax.train import push as training
 from mechsearch_jax.train.loop import TrainConfig, train
-from mechsearch_jax.train.push import PushTask, average_precision, model_scores, planar_turn, push_truth
+from mechsearch_jax.train.push import PushTask
+from mechsearch_jax.train.push_scores import (
+    PushTruth,
+    average_precision,
+    model_scores,
+    no_motion,
+    planar_turn,
+    push_truth,
+    turn_error,
+)
 from mechsearch_jax.train.scenes import SceneConfig, random_world
 from mechsearch_jax.workspace.scenario import Body, Scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -79,12 +88,12 @@ def drawn():
 
 @pytest.mark.slow
 def test_pushes_of_all_directions_and_lengths_are_found(drawn):
-    (world, action, found), _ = drawn
-    assert found[world.valid.any(axis=1)].mean() > 0.6
-    assert (action.kind == found).all()
-    assert world.valid[np.arange(128), action.object][found].all()
-    assert (action.object[found] < TARGET).all()
-    along = action.displacement[found]
+    (world, action, possible), _ = drawn
+    assert possible[world.valid.any(axis=1)].mean() > 0.6
+    assert (action.kind == possible).all()
+    assert world.valid[np.arange(128), action.object][possible].all()
+    assert (action.object[possible] < TARGET).all()
+    along = action.displacement[possible]
     length = np.linalg.norm(along, axis=1)
     assert length.min() < 0.06
     assert length.max() > 0.16
@@ -107,10 +116,10 @@ def in_body(world, k, i, points, share=1.0):
 
 @pytest.mark.slow
 def test_the_gripper_starts_beside_the_object_and_inside_of_nothing(drawn):
-    (world, action, found), tables = drawn
+    (world, action, possible), tables = drawn
     pusher = np.asarray(tables.pusher, float)
     gaps = []
-    for k in np.flatnonzero(found)[:60]:
+    for k in np.flatnonzero(possible)[:60]:
         T = action.T_world_gripper[k].astype(float)
         points = pusher @ T[:3, :3].T + T[:3, 3]
         # Superquadrics, against which pushes are tested, lack 7% at the corners.
@@ -127,10 +136,10 @@ def test_the_gripper_starts_beside_the_object_and_inside_of_nothing(drawn):
 
 @pytest.mark.slow
 def test_where_there_is_nothing_to_push_nothing_is_drawn(drawn):
-    (world, action, found), _ = drawn
+    (world, action, possible), _ = drawn
     empty = ~world.valid.any(axis=1)
     assert empty.sum() > 5
-    assert not found[empty].any()
+    assert not possible[empty].any()
     assert (action.kind[empty] == ActionKind.NONE).all()
 
 
@@ -220,9 +229,9 @@ def test_what_has_toppled(kind, before, after, expected):
     # Lying along y, a cylinder rolls about y.
     axis = {"x": "y", "y": "x"}.get(after[0], after[0]) if before and kind == CYLINDER else after[0]
     second = Rotation.from_euler(axis, after[1], degrees=True) * first
-    found = generator.toppled(upright_world(kind, first.as_matrix()), upright_world(kind, second.as_matrix()))
-    assert np.array_equal(found, np.arange(9) == 0) == expected
-    assert found.any() == expected
+    toppled = generator.toppled(upright_world(kind, first.as_matrix()), upright_world(kind, second.as_matrix()))
+    assert np.array_equal(toppled, np.arange(9) == 0) == expected
+    assert toppled.any() == expected
 
 
 def test_a_world_is_simulated_as_its_scenario_is():
@@ -293,8 +302,8 @@ def test_the_planar_turn_is_the_turn_about_the_vertical():
     first = Rotation.random(20, random_state=0).as_matrix()
     yaw = rng.uniform(-3, 3, 20)
     second = Rotation.from_euler("z", yaw[:, None]).as_matrix() @ first
-    found = planar_turn(jnp.float32(first), jnp.float32(second))
-    np.testing.assert_allclose(found, yaw, atol=1e-5)
+    turn = planar_turn(jnp.float32(first), jnp.float32(second))
+    np.testing.assert_allclose(turn, yaw, atol=1e-5)
 
 
 def test_average_precision_is_the_area_by_hand():
@@ -305,7 +314,7 @@ def test_average_precision_is_the_area_by_hand():
 
 
 def test_a_turn_by_half_a_turn_is_no_error():
-    error = training.turn_error(jnp.float32([0.1, np.pi, 3.0]), jnp.float32([0.0, 0.0, 0.0]))
+    error = turn_error(jnp.float32([0.1, np.pi, 3.0]), jnp.float32([0.0, 0.0, 0.0]))
     np.testing.assert_allclose(error, [0.1, 0.0, 3.0 - np.pi], atol=1e-6)
 
 
@@ -339,18 +348,18 @@ def test_what_is_left_out_of_a_push_had_no_part_in_it(pushes):
     assert left_out.sum() > 5
     assert not np.any(left_out & np.asarray(truth.moved))
     # Without them, the same comes of the push, but for what a nudge would change too.
-    some = np.flatnonzero(left_out.any(axis=1))
-    fewer = jax.tree.map(lambda a: a[some], pushes)
-    fewer = fewer.replace(before=fewer.before.replace(valid=np.asarray(kept.valid)[some]))
-    there = np.asarray(kept.valid & truth.moved & ~truth.toppled)[some]
+    shortened = np.flatnonzero(left_out.any(axis=1))
+    fewer = jax.tree.map(lambda a: a[shortened], pushes)
+    fewer = fewer.replace(before=fewer.before.replace(valid=np.asarray(kept.valid)[shortened]))
+    there = np.asarray(kept.valid & truth.moved & ~truth.toppled)[shortened]
 
     def agreement(again):
         outcome = repeated(again, NativeSimulator(2, generator.push_simulation()), WORLDS)
-        gap = np.linalg.norm((outcome.scene.position - pushes.after.position[some])[..., :2], axis=-1)[there]
+        gap = np.linalg.norm((outcome.scene.position - pushes.after.position[shortened])[..., :2], axis=-1)[there]
         return np.median(gap), np.mean(gap < 5e-3)
 
     # That begins at rest, too, where the bodies still moved a little.
-    baseline = agreement(jax.tree.map(lambda a: a[some], pushes))
+    baseline = agreement(jax.tree.map(lambda a: a[shortened], pushes))
     median, close = agreement(fewer)
     assert median < baseline[0] + 5e-4
     assert close > baseline[1] - 0.15
@@ -413,7 +422,7 @@ def row_of_boxes(*gaps):
     moved = jnp.arange(4) == 0
     shift = jnp.where(moved[:, None], jnp.float32([[0.0, 0.05]]), 0.0)
     none = jnp.zeros(4)
-    return start, training.PushTruth(shift, none, moved, none > 0, scene.valid)
+    return start, PushTruth(shift, none, moved, none > 0, scene.valid)
 
 
 @pytest.mark.parametrize(
@@ -461,12 +470,12 @@ def test_a_model_that_knows_the_outcome_scores_best(pushes):
     # The model recognises a push by where the gripper starts.
     def oracle(shelf, scene, pusher, T, displacement, q7):
         row = jnp.argmin(jnp.sum((jnp.asarray(pushes.T_world_gripper)[:, :3, 3] - T[None, :3, 3]) ** 2, axis=1))
-        known = scene.replace(
+        exact = scene.replace(
             position=jnp.asarray(after.position)[row],
             rotation=jnp.asarray(after.rotation)[row],
         )
         over = jnp.asarray(pushes.toppled)[row].astype(jnp.float32)
-        return push_model.PushOutcome(known, known.valid, jnp.zeros(()), jnp.array(True), over)
+        return push_model.PushOutcome(exact, exact.valid, jnp.zeros(()), jnp.array(True), over)
 
     pusher = push_tables(CONFIG).pusher
     best = model_scores(oracle, pushes, pusher, batch=8)["all"]
@@ -475,7 +484,7 @@ def test_a_model_that_knows_the_outcome_scores_best(pushes):
     assert best["pushed_deg"] < 0.05
     assert best["still"] == 1.0
     assert best["topple_ap"] in (None, 1.0)
-    idle = model_scores(training.no_motion, pushes, pusher, batch=8)["all"]
+    idle = model_scores(no_motion, pushes, pusher, batch=8)["all"]
     truth = push_truth(jax.tree.map(jnp.asarray, pushes))
     rows = np.arange(len(pushes.object))
     upright = ~truth.toppled[rows, pushes.object]

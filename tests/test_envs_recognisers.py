@@ -91,10 +91,10 @@ def test_labels_are_float64_geometry(world):
 def test_segments_are_named_after_the_objects_that_they_overlap_most():
     truth = np.full((4, 6), FREE, np.int8)
     truth[:, 0:2], truth[:, 2:4], truth[:, 4:5] = 5, 1, 3
-    found = np.full((4, 6), FREE, np.int8)
-    found[:, 0:2], found[:, 2:3], found[:, 3:4], found[:, 4:5], found[0, 5] = 4, 0, 2, 7, OTHER
-    found[0, 2] = 2
-    named = np.asarray(numbered(jnp.asarray(found), jnp.asarray(truth)))
+    segments = np.full((4, 6), FREE, np.int8)
+    segments[:, 0:2], segments[:, 2:3], segments[:, 3:4], segments[:, 4:5], segments[0, 5] = 4, 0, 2, 7, OTHER
+    segments[0, 2] = 2
+    named = np.asarray(numbered(jnp.asarray(segments), jnp.asarray(truth)))
     assert (named[:, 0:2] == 5).all()
     assert (named[:, 4] == 3).all()
     assert (named[:, 3] == 1).all()
@@ -106,8 +106,8 @@ def test_segments_are_named_after_the_objects_that_they_overlap_most():
 def test_no_segment_is_lost_because_the_truth_knows_no_object_there():
     """Eight segments: that of number 3 shows a target that the detector does not see."""
     truth = np.repeat(np.int8([[0, 1, 2, TARGET, 4, 5, 6, 7]]), 3, axis=0)
-    found = np.repeat(np.int8([[7, 6, 5, 3, 4, 2, 1, 0]]), 3, axis=0)
-    named = np.asarray(numbered(jnp.asarray(found), jnp.asarray(truth)))
+    segments = np.repeat(np.int8([[7, 6, 5, 3, 4, 2, 1, 0]]), 3, axis=0)
+    named = np.asarray(numbered(jnp.asarray(segments), jnp.asarray(truth)))
     np.testing.assert_array_equal(named, np.where(truth == TARGET, 3, truth))
 
 
@@ -148,8 +148,8 @@ def shown():
 @pytest.mark.parametrize(("y", "seen"), [(-0.0335, False), (-0.0403, True)])
 def test_full_is_told_the_targets_pixels_only_where_the_detector_sees_it(world, shown, y, seen):
     x, _, z = SCENE.target.position
-    image, owner, found = shown(moved(world, TARGET, [x, y, z]))
-    assert found == seen
+    image, owner, labelled = shown(moved(world, TARGET, [x, y, z]))
+    assert labelled == seen
     assert (owner == TARGET).sum() > 5
     np.testing.assert_array_equal(image.labels == 8, (owner == TARGET) & seen)
     assert image.of_target.any() == seen
@@ -168,10 +168,10 @@ def test_depth_is_infinite_where_nothing_is_and_nan_where_nothing_was_measured()
     camera = dataclasses.replace(CAMERA, width=3, height=1)
     depth = jnp.float32([[0.8, jnp.inf, 0.9]])
     points = back_project(camera, depth).at[0, 2].set(jnp.nan)
-    found = np.asarray(measured_depth(camera, depth, points))
-    np.testing.assert_allclose(found[0, 0], 0.8, atol=1e-6)
-    assert np.isinf(found[0, 1])
-    assert np.isnan(found[0, 2])
+    measured = np.asarray(measured_depth(camera, depth, points))
+    np.testing.assert_allclose(measured[0, 0], 0.8, atol=1e-6)
+    assert np.isinf(measured[0, 1])
+    assert np.isnan(measured[0, 2])
 
 
 def test_names_stand_for_one_object_each(masks):
@@ -184,7 +184,9 @@ def test_names_stand_for_one_object_each(masks):
 
 @pytest.mark.slow
 def test_without_masks_most_visible_objects_are_told_apart(world):
-    found = recogniser("full", target_of(SCENE))(jax.random.key(0), Snapshot(CAMERA, SHELF, world))
+    recognised = recogniser("full", target_of(SCENE))(jax.random.key(0), Snapshot(CAMERA, SHELF, world))
     truth = sharpened(true_superquadrics(world))
-    overlap = np.asarray(intersection_over_union(truth, found.objects))[np.asarray(truth.valid & found.objects.valid)]
+    overlap = np.asarray(intersection_over_union(truth, recognised.objects))[
+        np.asarray(truth.valid & recognised.objects.valid)
+    ]
     assert (overlap > 0.5).sum() >= 2

@@ -31,17 +31,17 @@ def pixels(scene):
 
 
 def test_the_sets_are_those_of_the_paper():
-    told = {name: [(b.objects, b.scenes, b.target) for b in SETS[name].blocks] for name in WHOLE}
-    assert told["c2"] == [(n, 180, "cylinder") for n in (2, 4, 6, 8)]
-    assert told["d1"] == [(2, 200, "cylinder")]
-    assert told["d2"] == [(n, 75, "cylinder") for n in (4, 8)]
-    assert told["d3"] == [(n, 40, "box") for n in (4, 8)]
+    blocks = {name: [(b.objects, b.scenes, b.target) for b in SETS[name].blocks] for name in WHOLE}
+    assert blocks["c2"] == [(n, 180, "cylinder") for n in (2, 4, 6, 8)]
+    assert blocks["d1"] == [(2, 200, "cylinder")]
+    assert blocks["d2"] == [(n, 75, "cylinder") for n in (4, 8)]
+    assert blocks["d3"] == [(n, 40, "box") for n in (4, 8)]
     assert [SETS[name].scenes for name in ("c2", "c2-6", "d2", "d3-8")] == [720, 180, 150, 40]
     assert {"c2-2", "c2-8", "d2-4", "d3-4", "development-4", "development-box-8"} < set(SETS)
 
 
 def test_scenes_that_settings_were_chosen_on_are_known_by_name():
-    chosen = {b.name: sum(map(scene_sets.is_chosen_on, b.scene_names)) for b in BLOCKS}
+    chosen = {b.name: sum(scene_sets.is_chosen_on(b.scene_name(i)) for i in range(b.scenes)) for b in BLOCKS}
     whole = {b.name: b.scenes for b in BLOCKS if b.name.startswith("development")}
     assert {name: count for name, count in chosen.items() if count} == {
         **whole,
@@ -168,18 +168,18 @@ def quick(monkeypatch):
 def test_files_are_made_once_and_hold_what_is_on_record(tmp_path, monkeypatch, quick):
     block, made, record = quick
     monkeypatch.setenv(cache.VARIABLE, str(tmp_path / "cache"))
-    told = []
+    progressed = []
 
     def progress(missing):
-        told.append(len(missing))
+        progressed.append(len(missing))
         return iter(missing)
 
-    some = scene_files([(block, 2), (block, 0)], progress=progress)
-    assert [file.name for file in some.files] == ["quick-002.json", "quick-000.json"]
-    assert [load_scenario(file).content_hash for file in some.files] == [record[2], record[0]]
+    two = scene_files([(block, 2), (block, 0)], progress=progress)
+    assert [file.name for file in two.files] == ["quick-002.json", "quick-000.json"]
+    assert [load_scenario(file).content_hash for file in two.files] == [record[2], record[0]]
     everything = scene_files([(block, i) for i in range(4)], progress=progress)
     assert made == [2, 0, 1, 3]
-    assert told == [2, 2]
+    assert progressed == [2, 2]
     assert all(tmp_path / "cache" in file.parents for file in everything.files)
     assert everything.strange == []
     # What was damaged, edited or is another scene is made anew.
@@ -196,9 +196,9 @@ def test_files_are_made_once_and_hold_what_is_on_record(tmp_path, monkeypatch, q
 def test_scenes_that_are_not_what_is_on_record_are_told(tmp_path, quick):
     block, _, record = quick
     record[1] = "0123456789ab"
-    found = scene_files([(block, i) for i in range(4)], tmp_path)
-    assert found.strange == ["quick-001"]
-    assert len(found.files) == 4
+    files = scene_files([(block, i) for i in range(4)], tmp_path)
+    assert files.strange == ["quick-001"]
+    assert len(files.files) == 4
 
 
 def test_without_a_cache_files_are_there_while_the_process_is(monkeypatch, quick):

@@ -50,7 +50,7 @@ def begin(objects):
     return scene(*objects, target=TARGET)
 
 
-def known(problem, objects):
+def objects_and_pose(problem, objects):
     """The objects, and the target's pose."""
     world = from_scenario(begin(objects))
     return objects_on_the_board(Snapshot(problem.camera, problem.shelf, world)), true_target_pose(world)
@@ -65,7 +65,7 @@ def stack(*trees):
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
-def told_of(model, problem, seen, at, found, actions, wanted=None):
+def results_of(model, problem, seen, at, found, actions, wanted=None):
     """What becomes of actions in a single scene."""
     belief = dataclasses.replace(initial_belief(problem), found=jnp.array(found), found_pose=at)
     observation = Observation(seen, jnp.array(found), at)
@@ -76,7 +76,7 @@ def told_of(model, problem, seen, at, found, actions, wanted=None):
 
 def world_of(problem, objects):
     """What is simulated of a scene whose target is not found."""
-    seen, at = known(problem, objects)
+    seen, at = objects_and_pose(problem, objects)
     return jax.device_get(native._world(problem.target, problem.shelf, seen, at, jnp.array(False)))
 
 
@@ -110,73 +110,73 @@ def planned(*actions):
 
 def look(problem, objects, found=True):
     """The belief and what is seen."""
-    seen, at = known(problem, objects)
+    seen, at = objects_and_pose(problem, objects)
     observation = Observation(seen, jnp.array(found), at)
     return update_belief(problem, initial_belief(problem), observation), observation
 
 
 @pytest.fixture(scope="module")
-def told(problem):
+def retrievals(problem):
     """What there is to be tried in each scene to take the target out, and what becomes of it."""
-    found = {}
+    rehearsed = {}
     for name, objects in SCENES.items():
-        seen, at = known(problem, objects)
+        seen, at = objects_and_pose(problem, objects)
         tried = worth_trying(problem.target_grasps, seen, at)
-        found[name] = tried, told_of(MODEL, problem, seen, at, True, tried.action, tried.feasible)
-    return found
+        rehearsed[name] = tried, results_of(MODEL, problem, seen, at, True, tried.action, tried.feasible)
+    return rehearsed
 
 
-def test_the_grasps_that_are_tried_differ_and_the_clearest_come_first(problem, told):
-    for name, (tried, _) in told.items():
+def test_the_grasps_that_are_tried_differ_and_the_clearest_come_first(problem, retrievals):
+    for name, (tried, _) in retrievals.items():
         way, q7 = np.asarray(tried.action.T_world_gripper[:, :3, 2]), np.asarray(tried.action.q7)
         assert len(q7) == TRIES
         apart = np.arccos(np.clip(way @ way.T, -1.0, 1.0))
         wrist = np.abs(q7[:, None] - q7[None])
         alike = (apart < ALIKE - 1e-3) & (wrist < ALIKE_WRIST - 1e-3) & ~np.eye(TRIES, dtype=bool)
         assert not alike.any(), name
-        best = best_grasp(problem.target_grasps, *known(problem, SCENES[name]))
+        best = best_grasp(problem.target_grasps, *objects_and_pose(problem, SCENES[name]))
         assert bool(tried.success[0]) == bool(best.success)
-    first = told["open"][0].action.T_world_gripper[0]
-    best = best_grasp(problem.target_grasps, *known(problem, OPEN))
+    first = retrievals["open"][0].action.T_world_gripper[0]
+    best = best_grasp(problem.target_grasps, *objects_and_pose(problem, OPEN))
     np.testing.assert_array_equal(first, best.action.T_world_gripper)
 
 
-def test_what_is_free_to_move_may_be_hit_and_what_is_not_may_not(told):
-    assert (told["loose"][0].hits > 0).all()
-    assert (told["loose"][1] == DONE).any()
-    assert (told["firm"][0].hits > 0).all()
-    assert not (told["firm"][1] == DONE).any()
-    assert told["open"][1][0] == DONE
+def test_what_is_free_to_move_may_be_hit_and_what_is_not_may_not(retrievals):
+    assert (retrievals["loose"][0].hits > 0).all()
+    assert (retrievals["loose"][1] == DONE).any()
+    assert (retrievals["firm"][0].hits > 0).all()
+    assert not (retrievals["firm"][1] == DONE).any()
+    assert retrievals["open"][1][0] == DONE
 
 
-def test_what_the_rehearsal_says_is_what_the_simulator_does(problem, told):
+def test_what_the_rehearsal_says_is_what_the_simulator_does(problem, retrievals):
     world = NativeWorld()
     for name in ("loose", "firm"):
-        tried, said = told[name]
+        tried, results = retrievals[name]
         world.reset(begin(SCENES[name]))
-        first = int(np.argmax(said))
+        first = int(np.argmax(results))
         outcome = world.execute(jax.tree.map(lambda a, i=first: a[i], tried.action))
-        assert bool(outcome.retrieved) == bool(said[first] == DONE)
+        assert bool(outcome.retrieved) == bool(results[first] == DONE)
 
 
 def test_what_throws_an_object_down_does_harm_and_what_is_out_of_reach_fails(problem):
     over, away, aside = pushes()
-    seen, at = known(problem, EDGE)
-    assert told_of(MODEL, problem, seen, at, False, stack(over, away, aside)).tolist() == [HARM, FAILED, DONE]
+    seen, at = objects_and_pose(problem, EDGE)
+    assert results_of(MODEL, problem, seen, at, False, stack(over, away, aside)).tolist() == [HARM, FAILED, DONE]
     # After what succeeds nothing is tried any more, with one thread.
     alone = NativeTrials(threads=1)
-    assert told_of(alone, problem, seen, at, False, stack(aside, over, away)).tolist() == [DONE, UNKNOWN, UNKNOWN]
+    assert results_of(alone, problem, seen, at, False, stack(aside, over, away)).tolist() == [DONE, UNKNOWN, UNKNOWN]
     world = NativeWorld()
     world.reset(begin(EDGE))
     assert np.asarray(world.execute(over).fallen).tolist() == [True] + [False] * 8
 
 
 def test_a_target_that_is_found_must_not_fall_and_one_that_is_not_is_not_there(problem):
-    seen, at = known(problem, OPEN)
+    seen, at = objects_and_pose(problem, OPEN)
     # High against the target, from its side.
     tip = push(pose(0.63, -0.02 - 0.1125, 0.09, tilt=math.radians(30)), (0.0, 0.1, 0.0))
-    assert told_of(MODEL, problem, seen, at, True, stack(tip)).tolist() == [HARM]
-    assert told_of(MODEL, problem, seen, at, False, stack(tip)).tolist() == [DONE]
+    assert results_of(MODEL, problem, seen, at, True, stack(tip)).tolist() == [HARM]
+    assert results_of(MODEL, problem, seen, at, False, stack(tip)).tolist() == [DONE]
 
 
 def made(policy, trials, problem, belief, observation):
@@ -209,9 +209,9 @@ def says(*codes):
     """Trials that say the same of the first actions, whatever they are and whether or not they are wanted."""
 
     def trials(problem, scenes, actions, wanted):
-        told = np.full(wanted.shape, UNKNOWN, np.int32)
-        told[:, : len(codes)] = codes
-        return told
+        results = np.full(wanted.shape, UNKNOWN, np.int32)
+        results[:, : len(codes)] = codes
+        return results
 
     return trials
 
@@ -274,7 +274,7 @@ def test_where_no_grasp_succeeds_one_that_hits_nothing_is_made(problem):
         decision = made(proposes(aside), says(*[FAILED] * TRIES), problem, belief, observation)
         assert int(decision.action.kind) == kind
         if kind == ActionKind.RETRIEVE:
-            plain = best_grasp(problem.target_grasps, *known(problem, objects))
+            plain = best_grasp(problem.target_grasps, *objects_and_pose(problem, objects))
             np.testing.assert_array_equal(decision.action.T_world_gripper, plain.action.T_world_gripper)
 
 
@@ -331,10 +331,10 @@ def test_one_choice_among_grasps_and_actions_is_what_two_in_turn_are(problem, fo
 
 
 def test_what_becomes_of_a_simulation_that_diverges_is_not_known(problem):
-    seen, at = known(problem, EDGE)
+    seen, at = objects_and_pose(problem, EDGE)
     # It does as everything comes to rest, long before the push is over.
     thrown = seen.replace(position=seen.position.at[0, 0].set(1e11))
-    assert told_of(MODEL, problem, thrown, at, False, stack(pushes()[2])).tolist() == [UNKNOWN]
+    assert results_of(MODEL, problem, thrown, at, False, stack(pushes()[2])).tolist() == [UNKNOWN]
     world = NativeWorld()
     world.reset(begin(EDGE))
     world._data.qvel[-1] = 1e12
@@ -345,12 +345,12 @@ def test_what_becomes_of_a_simulation_that_diverges_is_not_known(problem):
 
 
 def test_the_hand_of_the_problem_is_the_one_that_is_tried(problem, monkeypatch):
-    seen, at = known(problem, EDGE)
+    seen, at = objects_and_pose(problem, EDGE)
     heard = []
     monkeypatch.setattr(native, "reference_motion", lambda kind, action, config: heard.append(config.gripper))
     other = problem.replace(gripper=dataclasses.replace(problem.gripper, approach=0.09))
     for here in (problem, other):
-        assert told_of(MODEL, here, seen, at, False, stack(pushes()[2])).tolist() == [FAILED]
+        assert results_of(MODEL, here, seen, at, False, stack(pushes()[2])).tolist() == [FAILED]
     assert heard == [problem.gripper, other.gripper]
 
 
@@ -362,7 +362,7 @@ def several(*scenes):
 
 
 def test_a_scene_that_cannot_be_built_costs_its_own_row_alone(problem, monkeypatch):
-    seen, _ = known(problem, EDGE)
+    seen, _ = objects_and_pose(problem, EDGE)
     built = NativeWorld.place
 
     def place(world, bodies, *args):
@@ -375,19 +375,19 @@ def test_a_scene_that_cannot_be_built_costs_its_own_row_alone(problem, monkeypat
     broken = seen.replace(position=seen.position.at[0, 0].set(jnp.nan))
     mirrored = seen.replace(rotation=seen.rotation.at[0, 0, 0].set(-1.0))
     aside = stack(pushes()[2])
-    said = MODEL(problem, several(other, seen, broken, mirrored), stack(*[aside] * 4), np.ones((4, 1), bool))
-    assert said.tolist() == [[UNKNOWN], [DONE], [UNKNOWN], [UNKNOWN]]
+    results = MODEL(problem, several(other, seen, broken, mirrored), stack(*[aside] * 4), np.ones((4, 1), bool))
+    assert results.tolist() == [[UNKNOWN], [DONE], [UNKNOWN], [UNKNOWN]]
 
 
 def test_friction_and_mass(problem):
-    seen, at = known(problem, EDGE)
+    seen, at = objects_and_pose(problem, EDGE)
     aside = stack(pushes()[2])
     # What is rough holds the hand up, and what is rougher still tips over.
-    for friction, said in ((1.0, DONE), (4.0, FAILED), (20.0, HARM)):
-        assert told_of(NativeTrials(friction=friction), problem, seen, at, False, aside).tolist() == [said]
+    for friction, expected in ((1.0, DONE), (4.0, FAILED), (20.0, HARM)):
+        assert results_of(NativeTrials(friction=friction), problem, seen, at, False, aside).tolist() == [expected]
     scenes = several(seen, seen, seen).replace(friction=np.array([1.0, 4.0, 1.0]), mass=np.array([1.0, 1.0, 30.0]))
-    said = MODEL(problem, scenes, stack(*[aside] * 3), np.ones((3, 1), bool))
-    assert said.tolist() == [[DONE], [FAILED], [FAILED]]
+    expected = MODEL(problem, scenes, stack(*[aside] * 3), np.ones((3, 1), bool))
+    assert expected.tolist() == [[DONE], [FAILED], [FAILED]]
     for wrong in (0.0, -1.0, math.nan):
         with pytest.raises(InputError, match="must be a positive number"):
             NativeTrials(friction=wrong)
@@ -395,7 +395,7 @@ def test_friction_and_mass(problem):
 
 def test_more_objects_than_the_simulator_has_slots_for_are_refused(problem):
     with pytest.raises(InputError, match="slots for 8 objects, not for 9"):
-        told_of(MODEL, problem, empty(9), jnp.zeros(3), False, stack(no_action()))
+        results_of(MODEL, problem, empty(9), jnp.zeros(3), False, stack(no_action()))
 
 
 def test_what_can_be_taken_out_is_and_where_nothing_can_the_search_goes_on(problem):
@@ -415,8 +415,8 @@ def test_a_policy_proposes_the_same_alone_and_mapped_over(problem):
     keys = jax.random.split(jax.random.key(0), len(rows))
     proposed = jax.jit(jax.vmap(lambda *row: policy(row[0], problem, *row[1:])))(keys, beliefs, seen)
     alternatives = proposed.alternatives
-    told = MODEL(problem, scenes_of(beliefs, seen), *jax.device_get((alternatives.actions, alternatives.worth)))
-    mapped = jax.jit(jax.vmap(choose))(proposed, told)
+    results = MODEL(problem, scenes_of(beliefs, seen), *jax.device_get((alternatives.actions, alternatives.worth)))
+    mapped = jax.jit(jax.vmap(choose))(proposed, results)
     for i, (belief, observation) in enumerate(rows):
         alone = decide(policy, MODEL, keys[i], problem, belief, observation)
         assert int(alone.action.kind) == int(mapped.action.kind[i])
@@ -425,16 +425,16 @@ def test_a_policy_proposes_the_same_alone_and_mapped_over(problem):
     assert int(mapped.action.kind[3]) == ActionKind.RETRIEVE
 
 
-def test_of_many_scenes_it_says_the_same_and_nothing_where_it_is_not_wanted(problem, told):
+def test_of_many_scenes_it_says_the_same_and_nothing_where_it_is_not_wanted(problem, retrievals):
     over, away, aside = pushes()
     beliefs, seen = stack(look(problem, EDGE, found=False), look(problem, LOOSE), look(problem, FIRM))
-    grasps = jax.tree.map(lambda a: a[:3], told["loose"][0].action)
+    grasps = jax.tree.map(lambda a: a[:3], retrievals["loose"][0].action)
     actions = stack(stack(over, away, aside), grasps, grasps)
     wanted = np.array([[True, True, True], [True, True, True], [False, False, False]])
-    said = MODEL(problem, scenes_of(beliefs, seen), actions, wanted)
-    assert said[0].tolist() == [HARM, FAILED, DONE]
-    assert int(np.argmax(said[1])) == int(np.argmax(told["loose"][1]))
-    assert said[2].tolist() == [UNKNOWN, UNKNOWN, UNKNOWN]
+    results = MODEL(problem, scenes_of(beliefs, seen), actions, wanted)
+    assert results[0].tolist() == [HARM, FAILED, DONE]
+    assert int(np.argmax(results[1])) == int(np.argmax(retrievals["loose"][1]))
+    assert results[2].tolist() == [UNKNOWN, UNKNOWN, UNKNOWN]
 
 
 def slots_of(problem, policy, trials, rows):
@@ -503,12 +503,12 @@ def test_the_first_that_succeeds_is_the_same_with_any_number_of_threads(threads)
         made.append(row)
         return 10 * row
 
-    said = in_order(np.ones((2, TRIES), bool), threads, make, attempt)
+    results = in_order(np.ones((2, TRIES), bool), threads, make, attempt)
     assert sorted(made) == [0, 1]
-    assert said.argmax(axis=1).tolist() == [3, 6]
-    assert (said.max(axis=1) == DONE).all()
-    assert said[0, :3].tolist() == [FAILED] * 3
-    assert said[1, :6].tolist() == [FAILED] * 6
+    assert results.argmax(axis=1).tolist() == [3, 6]
+    assert (results.max(axis=1) == DONE).all()
+    assert results[0, :3].tolist() == [FAILED] * 3
+    assert results[1, :6].tolist() == [FAILED] * 6
     # The best of both scenes come before what is next.
     assert {tried[0], tried[1]} == {(0, 0), (1, 0)}
     assert threads > 1 or len(tried) == 4 + 7
@@ -527,8 +527,8 @@ def test_what_nobody_waits_for_any_more_is_stopped():
         stopped.append(i)
         return None
 
-    said = in_order(np.ones((1, 3), bool), 2, lambda row: None, attempt)
-    assert (said.tolist(), stopped) == ([[DONE, UNKNOWN, UNKNOWN]], [1])
+    results = in_order(np.ones((1, 3), bool), 2, lambda row: None, attempt)
+    assert (results.tolist(), stopped) == ([[DONE, UNKNOWN, UNKNOWN]], [1])
 
 
 def test_a_scene_is_made_once_and_trying_does_not_change_it(problem):

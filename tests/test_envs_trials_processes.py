@@ -41,9 +41,9 @@ def test_processes_say_what_this_one_says_also_after_one_of_them_died(problem, r
         for dies in (False, True):
             if dies:
                 os.kill(next(iter(trials._pool._processes)), signal.SIGKILL)
-            said = trials(problem, *rows)
-            assert until_success(said) == until_success(expected)
-            assert said[2].tolist() == [TrialResult.UNKNOWN] * 3
+            results = trials(problem, *rows)
+            assert until_success(results) == until_success(expected)
+            assert results[2].tolist() == [TrialResult.UNKNOWN] * 3
     finally:
         trials.close()
 
@@ -61,11 +61,11 @@ def test_of_a_scene_that_ends_its_process_nothing_is_known(problem, rows):
     trials = ProcessTrials(Deadly(), processes=2)
     try:
         with pytest.warns(UserWarning, match="a process died as it tried 3 actions"):
-            said = trials(problem, *rows)
+            results = trials(problem, *rows)
     finally:
         trials.close()
-    assert until_success(said[:1]) == until_success(expected[:1])
-    assert said[1].tolist() == [TrialResult.UNKNOWN] * 3
+    assert until_success(results[:1]) == until_success(expected[:1])
+    assert results[1].tolist() == [TrialResult.UNKNOWN] * 3
 
 
 def test_nothing_begins_where_nothing_is_to_be_tried(problem, rows):

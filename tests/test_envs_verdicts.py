@@ -37,11 +37,11 @@ def test_steeper_grasps_reach_over_what_the_papers_do_not(problem):
     """Alone and in a batch: what stands low and wide before the target leaves only grasps tilted by more than that."""
     scenarios = [OPEN, SILL, HIDDEN]
     alone = [run_episode(0, s, problem, grab, Stage(REVEALING), max_steps=2) for s in scenarios]
-    found = {}
+    successes = {}
     starts = [Start(s, 0) for s in scenarios]
     settings = RunSettings(max_steps=2, at_once=2)
-    run_episodes(starts, problem, grab, Stage(REVEALING), 2, Listeners(found.update), settings)
-    for episodes in (alone, [found[i] for i in range(3)]):
+    run_episodes(starts, problem, grab, Stage(REVEALING), 2, Listeners(successes.update), settings)
+    for episodes in (alone, [successes[i] for i in range(3)]):
         steps = [(e.graspable_step, e.paper_graspable_step) for e in episodes]
         assert steps == [(0, 0), (0, None), (1, 1)]
         assert [[s.paper_graspable for s in e.steps] for e in episodes] == [[True], [False], [False, True]]

@@ -103,13 +103,13 @@ def test_a_step_brings_its_own_decision(viewer, server):
 def test_a_sampled_action_shows_what_was_predicted_of_it(viewer, server):
     viewer.show(0)
     viewer.examine(1)
-    ghost = np.asarray(node(server, "/action/asked/ghost0").vertices)
+    ghost = np.asarray(node(server, "/action/examined/ghost0").vertices)
     middle = (ghost.min(axis=0) + ghost.max(axis=0)) / 2
     np.testing.assert_allclose(middle, SAMPLED.position[1, 0], atol=2e-3)
     assert not node(server, "/action/0").visible
     assert "cost 95" in viewer.text
     viewer.examine(None)
-    assert node(server, "/action/asked/ghost0") is None
+    assert node(server, "/action/examined/ghost0") is None
     assert node(server, "/action/0").visible
     assert "cost 95" not in viewer.text
     best, worst = (np.array(node(server, f"/sampled/0/{k}").color, int) for k in (0, 1))
@@ -120,8 +120,8 @@ def test_a_sampled_action_shows_what_was_predicted_of_it(viewer, server):
 def test_time_goes_on_while_it_is_played_and_ends(viewer):
     viewer.show(viewer.count - 3)
     viewer.play(True)
-    asked = iter([True] * 6)
-    viewer.run(lambda: next(asked, False))
+    moments = iter([True] * 6)
+    viewer.run(lambda: next(moments, False))
     assert viewer.row == viewer.count - 1
     assert not viewer.playing
     viewer.play(True)
@@ -137,7 +137,9 @@ def test_the_pieces_of_the_robot_are_the_solids_of_the_film():
     frames[8], frames[9] = (frames[8].copy() for _ in range(2))
     for frame, side in ((frames[8], 1), (frames[9], -1)):
         frame[:3, 3] += side * opening / 2 * frame[:3, 1]
-    placed = [T[:3, :3] @ solid.position + T[:3, 3] for T, some in zip(frames, pieces, strict=True) for solid in some]
+    placed = [
+        T[:3, :3] @ solid.position + T[:3, 3] for T, solids in zip(frames, pieces, strict=True) for solid in solids
+    ]
     drawn = panda_solids(poses, opening)
     np.testing.assert_allclose(placed, [solid.position for solid in drawn[1:]], atol=1e-6)
     np.testing.assert_allclose(foot[0].position, drawn[0].position)

@@ -52,12 +52,12 @@ def test_segmentation_follows_the_order_of_the_points():
     points = jax.random.uniform(jax.random.key(0), (2, 96, 3)) * 0.2 + jnp.array([[[0.5, 0.0, 0.42]]])
     order = jax.random.permutation(jax.random.key(1), 96)
     network = jax.jit(SegmentationNetwork(SEGMENTATION).apply)
-    told = network({"params": parameters("segmentation")}, points)
+    output = network({"params": parameters("segmentation")}, points)
     turned = network({"params": parameters("segmentation")}, points[:, order])
-    assert told.logits.shape == (2, 2, 96, 10)
-    assert np.allclose(told.logits[:, :, order], turned.logits, atol=1e-3)
-    assert np.allclose(told.centres[:, order], turned.centres, atol=1e-4)
-    assert np.std(told.logits[-1]) > 1e-2
+    assert output.logits.shape == (2, 2, 96, 10)
+    assert np.allclose(output.logits[:, :, order], turned.logits, atol=1e-3)
+    assert np.allclose(output.centres[:, order], turned.centres, atol=1e-4)
+    assert np.std(output.logits[-1]) > 1e-2
 
 
 # The CPU takes the one, a GPU the other.
@@ -103,8 +103,8 @@ def test_the_strongest_neighbour_and_its_gradient_are_those_of_plain_differentia
 
     arguments = (features, offsets, place)
     expected, slopes = jax.jit(jax.value_and_grad(plain, argnums=(0, 1, 2)))(*arguments)
-    told, ours_slopes = jax.jit(jax.value_and_grad(ours, argnums=(0, 1, 2)))(*arguments)
-    assert told == pytest.approx(float(expected), rel=1e-5)
+    value, ours_slopes = jax.jit(jax.value_and_grad(ours, argnums=(0, 1, 2)))(*arguments)
+    assert value == pytest.approx(float(expected), rel=1e-5)
     for a, b in zip(ours_slopes, slopes, strict=True):
         assert np.allclose(a, b, atol=1e-5)
         assert np.abs(b).max() > 0.1
@@ -115,10 +115,10 @@ def test_the_strongest_neighbour_takes_features_of_16_bits():
     features = jax.random.normal(keys[0], (40, 8), jnp.bfloat16)
     offsets, place = jax.random.normal(keys[1], (40, 300, 3)), jnp.ones((3, 8), jnp.bfloat16)
     neighbours = jax.random.randint(keys[2], (40, 300), 0, 40)
-    told = jax.jit(strongest_neighbour)(features, offsets, place, neighbours)
+    strongest = jax.jit(strongest_neighbour)(features, offsets, place, neighbours)
     exact = np.asarray(features, float)[neighbours] + np.asarray(offsets, float).sum(axis=-1, keepdims=True)
-    assert told.dtype == jnp.float32
-    assert np.allclose(told, exact.max(axis=1), atol=1e-5)
+    assert strongest.dtype == jnp.float32
+    assert np.allclose(strongest, exact.max(axis=1), atol=1e-5)
     slopes = jax.jit(jax.grad(lambda *a: jnp.sum(strongest_neighbour(*a, neighbours)), argnums=(0, 1, 2)))(
         features, offsets, place
     )
@@ -156,36 +156,36 @@ def test_the_matched_loss_is_numpys_and_knows_no_numbering(seed):
     labels = rng.choice([OTHER, 0, 2, 5, 8], 120).astype(np.int8)
     logits = rng.normal(size=(120, 10)).astype(np.float32) * 2
     loss = jax.jit(segmentation.segmentation_loss)
-    told = loss(jnp.asarray(logits), jnp.asarray(labels))
+    terms = loss(jnp.asarray(logits), jnp.asarray(labels))
     cross, overlap = numpy_segmentation_loss(logits, labels)
-    assert told["cross_entropy"] == pytest.approx(cross, rel=1e-4)
-    assert told["dice"] == pytest.approx(overlap, rel=1e-4)
+    assert terms["cross_entropy"] == pytest.approx(cross, rel=1e-4)
+    assert terms["dice"] == pytest.approx(overlap, rel=1e-4)
 
     numbers = np.append(rng.permutation(9), OTHER).astype(np.int8)
     instances = np.append(rng.permutation(9), 9)
     for other_logits, other_labels in ((logits, numbers[labels]), (logits[:, instances], labels)):
         again = loss(jnp.asarray(other_logits), jnp.asarray(other_labels))
-        assert again["cross_entropy"] == pytest.approx(float(told["cross_entropy"]), rel=1e-5)
-        assert again["dice"] == pytest.approx(float(told["dice"]), rel=1e-5)
+        assert again["cross_entropy"] == pytest.approx(float(terms["cross_entropy"]), rel=1e-5)
+        assert again["dice"] == pytest.approx(float(terms["dice"]), rel=1e-5)
 
 
 def test_a_right_segmentation_costs_nothing():
     labels = jnp.asarray(np.repeat([0, 1, 4, OTHER], 30), jnp.int8)
     names = jnp.asarray([7, 2, 0, 1, 5, 3, 4, 6, 8, 9])
     logits = 20.0 * jax.nn.one_hot(names[jnp.where(labels == OTHER, 9, labels)], 10)
-    told = jax.jit(segmentation.segmentation_loss)(logits, labels)
-    assert told["cross_entropy"] < 1e-6
-    assert told["accuracy"] == 1.0
-    found = labels_of(logits)
-    overlap, present = segmentation.instance_overlaps(found, labels)
+    terms = jax.jit(segmentation.segmentation_loss)(logits, labels)
+    assert terms["cross_entropy"] < 1e-6
+    assert terms["accuracy"] == 1.0
+    segments = labels_of(logits)
+    overlap, present = segmentation.instance_overlaps(segments, labels)
     assert np.array_equal(present, np.isin(np.arange(9), [0, 1, 4]))
     assert np.allclose(overlap[present], 1.0)
 
 
 def test_overlap_of_instances_counts_points():
     labels = jnp.asarray(np.repeat([0, 1], [60, 40]), jnp.int8)
-    found = jnp.asarray(np.repeat([3, 5, OTHER], [70, 20, 10]), jnp.int8)
-    overlap, present = segmentation.instance_overlaps(found, labels)
+    segments = jnp.asarray(np.repeat([3, 5, OTHER], [70, 20, 10]), jnp.int8)
+    overlap, present = segmentation.instance_overlaps(segments, labels)
     assert np.allclose(overlap[present], [60 / 70, 20 / 40])
 
 
@@ -274,21 +274,21 @@ def test_segments_hold_their_own_points_in_their_frame():
     one = jax.tree.map(lambda a: np.asarray(a[0]), examples.segments)
     labels, points = np.asarray(seen.labels[0]), np.asarray(seen.points[0], float)
     clouds_of = jax.jit(segment_clouds, static_argnums=1)
-    found = clouds_of(jax.random.key(1), task.view.camera, seen.points[0], seen.labels[0])
-    assert found.valid.any()
-    for slot in np.flatnonzero(np.asarray(found.valid)):
-        turn, origin = np.asarray(found.T_world_segment[slot, :3, :3], float), found.T_world_segment[slot, :3, 3]
+    segments = clouds_of(jax.random.key(1), task.view.camera, seen.points[0], seen.labels[0])
+    assert segments.valid.any()
+    for slot in np.flatnonzero(np.asarray(segments.valid)):
+        turn, origin = np.asarray(segments.T_world_segment[slot, :3, :3], float), segments.T_world_segment[slot, :3, 3]
         own = points[labels == slot]
         local = (own - np.asarray(origin)) @ turn
-        mark = np.asarray(found.mark[slot])
+        mark = np.asarray(segments.mark[slot])
         mine = np.isin(mark, (INNER, OUTLINE, HIDDEN_EDGE))
-        assert found.pixels[slot] == len(own)
-        distance = np.abs(np.asarray(found.points[slot])[mine][:, None] - local[None]).max(axis=-1).min(axis=1)
+        assert segments.pixels[slot] == len(own)
+        distance = np.abs(np.asarray(segments.points[slot])[mine][:, None] - local[None]).max(axis=-1).min(axis=1)
         assert distance.max() < 1e-5
         assert mine.sum() >= task.segments.inner + task.segments.edge
         assert origin[2] == pytest.approx(Shelf().board)
         eye = (np.asarray(task.view.camera.position) - np.asarray(origin)) @ turn
-        assert np.allclose(found.camera[slot], eye, atol=1e-5)
+        assert np.allclose(segments.camera[slot], eye, atol=1e-5)
         assert eye[1] == pytest.approx(0.0, abs=1e-5)
         assert eye[0] < 0
         assert np.isin(mark[-task.segments.context :], (CONTEXT, CLEAR)).mean() > 0.9
@@ -304,14 +304,14 @@ def test_recognition_does_not_mind_the_order_of_the_points():
     segments = jax.tree.map(lambda a: a[0], examples.segments)
     order = jax.random.permutation(jax.random.key(0), task.segments.points)
     network = jax.jit(functools.partial(model.apply_network, model.RecognitionNetwork(RECOGNITION)))
-    told = network(parameters("recognition"), segments.points, segments.mark, segments.camera)
+    hypotheses = network(parameters("recognition"), segments.points, segments.mark, segments.camera)
     again = network(parameters("recognition"), segments.points[:, order], segments.mark[:, order], segments.camera)
-    for a, b in zip(jax.tree.leaves(told), jax.tree.leaves(again), strict=True):
+    for a, b in zip(jax.tree.leaves(hypotheses), jax.tree.leaves(again), strict=True):
         assert np.allclose(a, b, atol=1e-4)
-    assert (np.asarray(told.size) > 0).all()
-    assert (np.asarray(told.exponents) >= 0.05).all()
-    assert (np.asarray(told.exponents) <= 1.2).all()
-    cylinders = np.asarray(told.size)[:, IS_ROUND]
+    assert (np.asarray(hypotheses.size) > 0).all()
+    assert (np.asarray(hypotheses.exponents) >= 0.05).all()
+    assert (np.asarray(hypotheses.exponents) <= 1.2).all()
+    cylinders = np.asarray(hypotheses.size)[:, IS_ROUND]
     assert np.array_equal(cylinders[..., 0], cylinders[..., 1])
 
 
@@ -324,8 +324,8 @@ def test_rotation_vectors_are_scipys():
     assert np.allclose(matrices, expected, atol=1e-5)
     back = Rotation.from_matrix(expected).as_rotvec()
     short = np.linalg.norm(back, axis=1) < 3.0
-    told = jax.jit(recognition.rotation_vector)(jnp.asarray(expected, jnp.float32))
-    assert np.allclose(told[short], back[short], atol=1e-4)
+    computed = jax.jit(recognition.rotation_vector)(jnp.asarray(expected, jnp.float32))
+    assert np.allclose(computed[short], back[short], atol=1e-4)
     slope = jax.jit(jax.jacobian(model.rotation_of))(jnp.zeros(3))
     assert np.isfinite(slope).all()
     assert slope[2, 1, 0] == pytest.approx(1.0)
@@ -359,14 +359,14 @@ def test_every_answer_describes_the_same_body(kind):
         rotation = turn.as_matrix()
         half = rng.uniform(0.01, 0.1, 3)
         half[1] = half[0] if kind == CYLINDER else half[1]
-        told = answers(jnp.int32(kind), jnp.asarray(half, jnp.float32), jnp.asarray(rotation, jnp.float32))
-        assert told.right.sum() == 1
-        assert (np.asarray(told.right) <= np.asarray(told.taught)).all()
-        for k in np.flatnonzero(np.asarray(told.taught)):
+        answer = answers(jnp.int32(kind), jnp.asarray(half, jnp.float32), jnp.asarray(rotation, jnp.float32))
+        assert answer.right.sum() == 1
+        assert (np.asarray(answer.right) <= np.asarray(answer.taught)).all()
+        for k in np.flatnonzero(np.asarray(answer.taught)):
             assert IS_ROUND[k] == (kind == CYLINDER)
-            turned = BASE_ROTATIONS[k] @ Rotation.from_rotvec(np.asarray(told.turn[k])).as_matrix()
-            assert same_body(kind, half, rotation, np.asarray(told.half_size[k]), turned)
-        best = np.linalg.norm(told.turn[np.argmax(told.right)])
+            turned = BASE_ROTATIONS[k] @ Rotation.from_rotvec(np.asarray(answer.turn[k])).as_matrix()
+            assert same_body(kind, half, rotation, np.asarray(answer.half_size[k]), turned)
+        best = np.linalg.norm(answer.turn[np.argmax(answer.right)])
         # Level bodies are within half a part of the yaw angles of their hypothesis.
         if np.abs(rotation[2]).max() > 1 - 1e-9:
             assert best < np.pi / 12 + 1e-5
@@ -397,16 +397,18 @@ def test_the_loss_is_equation_7_and_vanishes_at_the_truth(kind):
     local = scenes.surface_points(jax.random.key(0), jnp.int32(kind), half, recognition.SURFACE)
     surface = jnp.einsum("ij,pj->pi", turn, local) + position[None]
     truth = recognition.Truth(jnp.int32(kind), half, position, turn, surface)
-    told = outputs_for(truth)
+    hypotheses = outputs_for(truth)
     loss = jax.jit(recognition.example_loss)
-    terms = loss(told, truth)
+    terms = loss(hypotheses, truth)
     assert terms["correct"] == 1.0
     for name in ("turn", "size", "position"):
         assert terms[name] < 1e-5, name
     # What is left of the surface's is the rounding of edges with an exponent of 0.05: tenths of a millimetre.
     assert terms["surface"] < 0.1
 
-    wrong = told.replace(position=told.position + jnp.array([[0.004, 0.0, 0.0]]), size=told.size * 1.1)
+    wrong = hypotheses.replace(
+        position=hypotheses.position + jnp.array([[0.004, 0.0, 0.0]]), size=hypotheses.size * 1.1
+    )
     terms = loss(wrong, truth)
     winner = int(jnp.argmax(wrong.logit))
     rotation = np.asarray(wrong.rotation[winner], float)
@@ -424,13 +426,13 @@ def test_the_loss_is_equation_7_and_vanishes_at_the_truth(kind):
 
 def test_height_is_told_relative_to_a_body_at_rest():
     zero = jnp.zeros((1, HYPOTHESES, model.OUTPUTS + model.UNCERTAIN))
-    told = jax.jit(model.decode)(zero, zero[..., 0])
-    down = np.abs(np.asarray(told.rotation[0])[:, 2])
-    size = np.asarray(told.size[0])
+    decoded = jax.jit(model.decode)(zero, zero[..., 0])
+    down = np.abs(np.asarray(decoded.rotation[0])[:, 2])
+    size = np.asarray(decoded.size[0])
     for k in range(HYPOTHESES):
         box = down[k] @ size[k]
         round_one = down[k, 2] * size[k, 2] + np.sqrt(1 - min(down[k, 2], 1.0) ** 2) * size[k, 0]
-        assert told.position[0, k, 2] == pytest.approx(round_one if IS_ROUND[k] else box, abs=1e-6)
+        assert decoded.position[0, k, 2] == pytest.approx(round_one if IS_ROUND[k] else box, abs=1e-6)
     slope = jax.jit(jax.grad(lambda o: jnp.sum(model.decode(o, zero[..., 0]).position)))(zero)
     assert np.isfinite(slope).all()
 
@@ -441,10 +443,10 @@ def test_height_is_told_relative_to_a_body_at_rest():
 def test_weights_come_back_as_they_went(tmp_path):
     path = tmp_path / "recognition.npz"
     save_weights(path, "recognition", RECOGNITION, parameters("recognition"), {"seed": 3, "scores": {"a": 0.5}})
-    found = load_weights(path, "recognition")
-    assert found.network.config == RECOGNITION
-    assert found.card["seed"] == 3
-    for a, b in zip(jax.tree.leaves(parameters("recognition")), jax.tree.leaves(found.parameters), strict=True):
+    loaded = load_weights(path, "recognition")
+    assert loaded.network.config == RECOGNITION
+    assert loaded.card["seed"] == 3
+    for a, b in zip(jax.tree.leaves(parameters("recognition")), jax.tree.leaves(loaded.parameters), strict=True):
         assert np.allclose(a, b, rtol=1e-3, atol=1e-6)
         assert b.dtype == jnp.float32
 

@@ -121,8 +121,8 @@ def test_scenes_are_as_configured():
     worlds = draw(jax.random.split(jax.random.key(4), 8))
     assert not worlds.valid[:, 3:].any()
     assert worlds.valid[:, :3].mean() > 0.9
-    assert jax.vmap(scenes.is_known)(worlds)[:, :3].all()
-    assert not jax.vmap(scenes.is_known)(jax.tree.map(lambda a: a * 1.01, worlds))[:, :3].any()
+    assert jax.vmap(scenes.in_catalogue)(worlds)[:, :3].all()
+    assert not jax.vmap(scenes.in_catalogue)(jax.tree.map(lambda a: a * 1.01, worlds))[:, :3].any()
     assert np.allclose(worlds.rotation[..., 2, 2], 1.0)
 
 

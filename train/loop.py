@@ -1,9 +1,8 @@
 """The training loop of every network: seeded, resumable, and never waiting for data.
 
-One dispatch runs several steps in a scan, each of which makes its own scenes: nothing crosses from the host but a key
-and the learning rates. Checkpoints are written beside their place and moved there, so that a kill at any moment leaves
-the last one whole; started again with the same settings, training goes on from it, to the same weights where the length
-is given in steps.
+One dispatch runs several steps in a scan, each of which makes its own scenes: only a key and the learning rates cross
+from the host. Checkpoints are written atomically, so that a kill at any moment leaves the last one whole. Training with
+the same settings resumes from it, and reaches the same weights if its length is given in steps.
 """
 
 from __future__ import annotations
@@ -41,15 +40,15 @@ class TrainConfig:
 
     Attributes:
       seed: of the weights and the scenes; the same seed, settings and machine give the same weights.
-      steps: length in steps, or ...
-      minutes: ... in minutes of training, compilation included and held-out scoring not; exactly one of the two.
+      steps: length in steps; exclusive with `minutes`.
+      minutes: length in minutes of training, with compilation and without held-out scoring.
       batch: scenes in a step.
       rate: the highest learning rate.
-      warm_up: share of the length in which the rate rises to it; it then falls to zero along a cosine.
+      warm_up: share of the length in which the rate rises; it then falls to zero along a cosine.
       decay: weight decay (AdamW).
       clip: largest norm of a gradient.
-      average: the weights that are kept are an exponential average over the last 1 / (1 - average) steps.
-      chunk: steps in one dispatch; the last may do more than the length asks for.
+      average: saved weights are an exponential average over the last 1 / (1 - average) steps.
+      chunk: steps in one dispatch; the last dispatch may exceed the length.
       save_every: seconds between checkpoints.
       held_out: scenes for the scores at the end.
     """
@@ -85,16 +84,16 @@ class TrainConfig:
 
 
 class Task(Protocol):
-    """What is trained."""
+    """A network with its examples, loss and scores."""
 
     @property
     def name(self) -> str:
-        """Of the network."""
+        """The network's name."""
         ...
 
     @property
     def origin(self) -> dict[str, Any]:
-        """Where the examples come from, for the card of the weights."""
+        """The source of the examples, for the card of the weights."""
         ...
 
     def init(self, key: Key[Array, ""]) -> Any:
@@ -106,11 +105,11 @@ class Task(Protocol):
         ...
 
     def loss(self, parameters: Any, examples: Any) -> tuple[Float[Array, ""], Scalars]:
-        """What is to be made small, and scalars worth plotting; pure, called under jit."""
+        """The loss, and scalars worth plotting; pure, called under jit."""
         ...
 
     def scores(self, parameters: Any, scenes: int) -> Scalars:
-        """Scores on so many held-out scenes."""
+        """Scores on held-out scenes."""
         ...
 
     def save(self, path: Path, parameters: Any, card: dict[str, Any]) -> None:
@@ -119,13 +118,13 @@ class Task(Protocol):
 
 
 class TrainState(flax.struct.PyTreeNode):
-    """All that training goes on from.
+    """The state from which training resumes.
 
     Attributes:
       parameters: as trained.
-      averaged: their exponential average, which is what is kept.
+      averaged: their exponential average, which is saved in the end.
       optimiser: its state.
-      step: how many steps were made, int32.
+      step: number of steps so far, int32.
     """
 
     parameters: Any
@@ -143,9 +142,9 @@ def learning_rate(progress: float, config: TrainConfig) -> float:
 
 
 def _optimiser(config: TrainConfig) -> optax.GradientTransformation:
-    """AdamW but for the learning rate; only matrices decay.
+    """AdamW without the learning rate; only matrices decay.
 
-    Moments are of all parameters in one vector: a network has so many small ones that launches for each would count.
+    All parameters are one vector here: separate kernel launches for many small parameters would take long.
     """
     return optax.chain(
         optax.flatten(optax.chain(optax.clip_by_global_norm(config.clip), optax.scale_by_adam(b1=0.9, b2=0.99))),
@@ -161,9 +160,9 @@ def initial_state(task: Task, config: TrainConfig) -> TrainState:
 
 
 def make_steps(task: Task, config: TrainConfig) -> Callable[[TrainState, Float[Array, " chunk"]], Any]:
-    """A jitted function that makes one step for each learning rate it is given.
+    """A jitted function that makes one step for each learning rate.
 
-    It takes the state, whose memory it uses, and the rates; it returns the state and the mean of every scalar.
+    It takes the state, whose memory it reuses, and the rates; it returns the state and the mean of every scalar.
     """
     optimiser = _optimiser(config)
 
@@ -171,13 +170,13 @@ def make_steps(task: Task, config: TrainConfig) -> Callable[[TrainState, Float[A
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)
         examples = task.sample(key, config.batch)
         (loss, scalars), gradient = jax.value_and_grad(task.loss, has_aux=True)(state.parameters, examples)
-        # One bad step must not spoil all that was learnt: a gradient that is not finite is left out.
+        # Steps with a gradient that is not finite are skipped.
         norm = jnp.linalg.norm(ravel_pytree(gradient)[0])
         sound = jnp.isfinite(norm) & jnp.isfinite(loss)
         gradient = jax.tree.map(lambda g: jnp.where(sound, g, 0.0), gradient)
         updates, moments = optimiser.update(gradient, state.optimiser, state.parameters)
         parameters = jax.tree.map(lambda p, u: p - rate * u, state.parameters, updates)
-        # Early on, the average is over what there is so far.
+        # Early on, the average is over the steps so far.
         weight = jnp.minimum(config.average, (1.0 + state.step) / (10.0 + state.step))
         averaged = jax.tree.map(lambda a, p: weight * a + (1.0 - weight) * p, state.averaged, parameters)
         after = TrainState(parameters, averaged, moments, state.step)
@@ -193,7 +192,7 @@ def make_steps(task: Task, config: TrainConfig) -> Callable[[TrainState, Float[A
 
 
 def _identity(task: Task, config: TrainConfig) -> dict[str, Any]:
-    """What has to be the same for training to go on."""
+    """The settings that must be the same for training to resume."""
     settings = dataclasses.asdict(config)
     return {"task": task.name, **{k: v for k, v in settings.items() if k not in ("save_every", "held_out")}}
 
@@ -214,15 +213,15 @@ def save_checkpoint(folder: Path, state: TrainState, identity: dict[str, Any], s
 
 
 def load_checkpoint(folder: Path, state: TrainState, identity: dict[str, Any]) -> tuple[TrainState, float] | None:
-    """The state that a folder's checkpoint holds and the seconds that it took, None where there is none.
+    """The state of a folder's checkpoint and the seconds of training that it took; None without a checkpoint.
 
     Args:
       folder: where training writes.
-      state: one of the same structure.
-      identity: the settings that it has to be of.
+      state: of the same structure.
+      identity: the required settings.
 
     Raises:
-      InputError: it is damaged, or of other settings.
+      InputError: the checkpoint is damaged, or of other settings.
     """
     path = folder / CHECKPOINT
     if not path.exists():
@@ -252,8 +251,8 @@ class Curves:
 
     def __init__(self, path: Path, steps: int):
         """Args:
-        path: of the file; what it holds beyond a step is forgotten, because training repeats it.
-        steps: how many steps were made.
+        path: of the file; lines beyond `steps` are dropped, because training repeats these steps.
+        steps: number of steps so far.
 
         Raises:
           InputError: the file cannot be written.
@@ -275,25 +274,25 @@ class Curves:
 
 
 class Watcher(Protocol):
-    """Is told how training gets on."""
+    """Reports the progress of training."""
 
     def __call__(self, progress: float, step: int, seconds: float, scalars: dict[str, float]) -> None:
-        """Called after each dispatch with the share of the length that is done."""
+        """Called after each dispatch with the completed share of the length."""
         ...
 
 
 def silent(progress: float, step: int, seconds: float, scalars: dict[str, float]) -> None:
-    """The `Watcher` that says nothing."""
+    """The `Watcher` that reports nothing."""
 
 
 def train(task: Task, config: TrainConfig, folder: Path, watcher: Watcher = silent) -> TrainState:
     """Train to the end, from the folder's checkpoint if it holds one.
 
     Args:
-      task: what is trained.
-      config: how.
+      task: the network to train.
+      config: of the training.
       folder: for the checkpoint and the curves.
-      watcher: is told how it gets on.
+      watcher: called after each dispatch.
 
     Raises:
       InputError: the folder holds a checkpoint of other settings, or cannot be written.
@@ -321,7 +320,7 @@ def train(task: Task, config: TrainConfig, folder: Path, watcher: Watcher = sile
         scalars = {name: float(value) for name, value in jax.device_get(scalars).items()}
         step += len(rates)
         seconds = before + time.monotonic() - start
-        # The first dispatch compiles: its pace tells nothing.
+        # The first dispatch includes compilation: its pace is not representative.
         chunks += 1
         pace = (time.monotonic() - began) / len(rates) if chunks > 1 else 0.0
         curves.add({"step": step, "seconds": round(seconds, 2), "rate": float(rates[-1]), **scalars})

@@ -41,7 +41,7 @@ from mechsearch_jax.train.scenes import (
     Capture,
     SceneConfig,
     capture,
-    is_known,
+    in_catalogue,
     noise_names,
     origin,
     random_world,
@@ -53,11 +53,11 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 # Points of the true surface that equation 7 is averaged over.
 SURFACE = 512
-# What sizes, positions and the root of equation 7 are told in [m].
+# Unit of sizes, positions and the root of equation 7 in the loss [m].
 _UNIT = 0.01
-# How far beyond its own part of the yaw angles a hypothesis is still taught [rad].
+# How far beyond its range of yaw angles a hypothesis is still trained [rad].
 _OVERLAP = np.deg2rad(6.0)
-# Exponents that stand for an edge that is sharp, and for a round.
+# Exponents of a sharp edge, and of a round cross-section.
 _SHARP, _ROUND = 0.06, 1.0
 
 
@@ -84,7 +84,7 @@ class Truth(flax.struct.PyTreeNode):
       half_size: [m], (..., 3).
       position: `t_segment_object` [m], (..., 3).
       rotation: `R_segment_object`, (..., 3, 3).
-      surface: points spread over its surface, in the segment's frame [m], (..., 512, 3).
+      surface: uniform points of its surface, in the segment's frame [m], (..., 512, 3).
     """
 
     kind: jax.Array
@@ -95,12 +95,12 @@ class Truth(flax.struct.PyTreeNode):
 
 
 class Example(flax.struct.PyTreeNode):
-    """Segments and what they are segments of; every field has the leading axis of the batch.
+    """Segments and their true bodies; every field has the leading axis of the batch.
 
     Attributes:
-      segments: what the network sees.
-      truth: what it should say.
-      weight: 1, or 0 where there is no segment.
+      segments: the network's input.
+      truth: the true bodies.
+      weight: 1, or 0 if there is no segment.
     """
 
     segments: Segments
@@ -112,9 +112,9 @@ class Answers(flax.struct.PyTreeNode):
     """The right answer of every hypothesis for one true body.
 
     Attributes:
-      turn: rotation vector from the hypothesis' own orientation [rad], (13, 3).
+      turn: rotation vector from the hypothesis' base orientation [rad], (13, 3).
       half_size: along the axes of that description of the body [m], (13, 3).
-      taught: whether the hypothesis is near enough to be taught, (13,).
+      taught: whether the hypothesis is near enough to be trained, (13,).
       right: whether it is the one that should win, (13,).
     """
 
@@ -134,10 +134,10 @@ def rotation_vector(rotation: Float[Array, "*batch 3 3"]) -> Float[Array, "*batc
 
 
 def answers(kind: Int[Array, ""], half_size: Float[Array, "3"], rotation: Float[Array, "3 3"]) -> Answers:
-    """What each hypothesis should say of a body with `R_segment_object = rotation`.
+    """The right answer of each hypothesis for a body with `R_segment_object = rotation`.
 
-    A box is the same under 24 rotations that swap its axes, a cylinder under any about its axis and under half a turn;
-    of the equal descriptions each hypothesis takes the one nearest to its own orientation.
+    A box is the same under 24 rotations that permute its axes, a cylinder under rotations about its axis and under half
+    a turn; of the equal descriptions each hypothesis takes the one nearest to its base orientation.
     """
     base = jnp.asarray(BASE_ROTATIONS)
     relative = matmul(jnp.swapaxes(base, -1, -2), rotation)
@@ -153,9 +153,9 @@ def answers(kind: Int[Array, ""], half_size: Float[Array, "3"], rotation: Float[
     ratio = jnp.where(sine > 1e-6, angle / jnp.maximum(sine, 1e-6), 1.0)
     can_turn = jnp.stack([-axis[:, 1] * ratio, axis[:, 0] * ratio, jnp.zeros_like(ratio)], axis=-1)
 
-    round_ones = jnp.asarray(IS_ROUND)
-    turn = jnp.where(round_ones[:, None], can_turn, box_turn)
-    size = jnp.where(round_ones[:, None], half_size[None], box_size)
+    is_round = jnp.asarray(IS_ROUND)
+    turn = jnp.where(is_round[:, None], can_turn, box_turn)
+    size = jnp.where(is_round[:, None], half_size[None], box_size)
     distance = jnp.linalg.norm(turn, axis=-1)
     fits = jnp.asarray(HYPOTHESIS_KINDS) == kind
     right = jnp.argmin(jnp.where(fits, distance, jnp.inf)) == jnp.arange(HYPOTHESES)
@@ -169,12 +169,12 @@ class RecognitionTask:
 
     Attributes:
       network: sizes of the network.
-      scenes: what scenes look like.
+      scenes: distribution of the scenes.
       segments: how clouds are drawn.
       shelf: the shelf.
       view: which rays are cast.
-      share: examples per scene; of its up to eight objects, so many are taught in the mean.
-      ragged: share of scenes whose labels are ragged, as a segmentation's are.
+      share: mean number of examples per scene, of its up to eight objects.
+      ragged: share of scenes whose labels have ragged borders, as a segmentation's.
       precision: type in which the network computes.
     """
 
@@ -218,7 +218,7 @@ class RecognitionTask:
             rotation=matmul(R_segment_world, objects.rotation),
             surface=rotate(R_segment_world[:, None], surface - origin[:, None]),
         )
-        # Taught is also what shows too little to be scored, but not what shows next to nothing.
+        # Training includes objects that show too little to be scored, but at least a quarter of that.
         taught = segments.valid & objects.valid & worth_seeing(seen, self.view, PIXELS // 4)
         return world, seen, Example(segments, truth, taught.astype(jnp.float32))
 
@@ -231,8 +231,8 @@ class RecognitionTask:
     def loss(self, parameters: Any, examples: Example) -> tuple[Float[Array, ""], dict[str, Any]]:
         segments = examples.segments
         network = RecognitionNetwork(self.network, self.precision)
-        told = apply_network(network, parameters, segments.points, segments.mark, segments.camera)
-        terms = jax.vmap(example_loss)(told, examples.truth)
+        hypotheses = apply_network(network, parameters, segments.points, segments.mark, segments.camera)
+        terms = jax.vmap(example_loss)(hypotheses, examples.truth)
         total = jnp.maximum(jnp.sum(examples.weight), 1.0)
         means = jax.tree.map(lambda a: jnp.sum(a * examples.weight) / total, terms)
         loss = sum((weight * means[name] for name, weight in LOSS_WEIGHTS.items()), jnp.zeros(()))
@@ -257,12 +257,11 @@ LOSS_WEIGHTS = {
 }
 
 
-def example_loss(told: Hypotheses, truth: Truth) -> dict[str, Float[Array, ""]]:
+def example_loss(hypotheses: Hypotheses, truth: Truth) -> dict[str, Float[Array, ""]]:
     """The terms of one example's loss.
 
-    `surface` is the root of equation 7 for the hypothesis that should win, in centimetres: the root, so that objects
-    that are mostly hidden do not drown the others. The other terms lead every hypothesis that is near the truth there
-    directly.
+    `surface` is the root of equation 7 for the hypothesis that should win, in centimetres: the root, so that mostly
+    hidden objects do not dominate. The other terms pull every hypothesis near the truth directly towards it.
     """
     right = answers(truth.kind, truth.half_size, truth.rotation)
     share = right.taught / jnp.maximum(jnp.sum(right.taught), 1)
@@ -270,35 +269,35 @@ def example_loss(told: Hypotheses, truth: Truth) -> dict[str, Float[Array, ""]]:
     def mean(error, unit):
         return jnp.sum(share * jnp.mean(jnp.abs(error) / unit, axis=-1))
 
-    size_error = told.size - right.half_size
-    position_error = told.position - truth.position[None]
+    size_error = hypotheses.size - right.half_size
+    position_error = hypotheses.position - truth.position[None]
     edges = jnp.stack([jnp.full(HYPOTHESES, _SHARP), jnp.where(jnp.asarray(IS_ROUND), _ROUND, _SHARP)], axis=-1)
     errors = jax.lax.stop_gradient(jnp.abs(jnp.concatenate([size_error, position_error], axis=-1)))
-    scale = jnp.exp(told.log_scale)
+    scale = jnp.exp(hypotheses.log_scale)
     winner = jnp.argmax(right.right)
-    one = jax.tree.map(lambda a: a[winner], told)
-    local = rotate(one.rotation.T, truth.surface - one.position[None])
-    radial = superquadric.radial_distance(one.size, one.exponents, local)
+    best = jax.tree.map(lambda a: a[winner], hypotheses)
+    local = rotate(best.rotation.T, truth.surface - best.position[None])
+    radial = superquadric.radial_distance(best.size, best.exponents, local)
     return {
-        "class": optax.softmax_cross_entropy(told.logit, _soft(right)),
-        "correct": (jnp.argmax(told.logit) == winner).astype(jnp.float32),
-        "turn": mean(told.turn - right.turn, 0.1),
+        "class": optax.softmax_cross_entropy(hypotheses.logit, _soft(right)),
+        "correct": (jnp.argmax(hypotheses.logit) == winner).astype(jnp.float32),
+        "turn": mean(hypotheses.turn - right.turn, 0.1),
         "size": mean(size_error, _UNIT),
         "position": mean(position_error, _UNIT),
-        "exponents": mean(told.exponents - edges, 0.1),
-        "scale": jnp.sum(share * jnp.mean(errors / scale + told.log_scale, axis=-1)),
+        "exponents": mean(hypotheses.exponents - edges, 0.1),
+        "scale": jnp.sum(share * jnp.mean(errors / scale + hypotheses.log_scale, axis=-1)),
         "surface": jnp.sqrt(jnp.mean(radial**2) + 1e-10) / _UNIT,
     }
 
 
 def _soft(right: Answers) -> Float[Array, " k"]:
-    """What the probabilities should be: mostly the winner's, the rest spread over those that are as good as it."""
+    """Target probabilities: 0.8 for the winner, the rest spread evenly over the trained hypotheses."""
     near = right.taught / jnp.maximum(jnp.sum(right.taught), 1)
     return 0.8 * right.right + 0.2 * near
 
 
 def tear(key: Key[Array, ""], labels: Int[Array, "h w"], reach: int = 2) -> Int[Array, "h w"]:
-    """Labels with ragged borders: each pixel takes that of one up to `reach` pixels away, if both show objects."""
+    """Labels with ragged borders: each pixel takes the label of one up to `reach` pixels away, if both show objects."""
     height, width = labels.shape
     shift = jax.random.randint(key, (2, height, width), -reach, reach + 1)
     rows = jnp.clip(jnp.arange(height)[:, None] + shift[0], 0, height - 1)
@@ -313,7 +312,7 @@ class _Scored(flax.struct.PyTreeNode):
     right: jax.Array
     share: jax.Array
     counted: jax.Array
-    known: jax.Array
+    catalogue: jax.Array
     sensor: jax.Array
 
 
@@ -321,37 +320,38 @@ class _Scored(flax.struct.PyTreeNode):
 def _score_batch(task: RecognitionTask, parameters: Any, key: Array, batch: int) -> _Scored:
     worlds, seen, examples = jax.vmap(task.scene)(jax.random.split(key, batch))
     flat = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), examples.segments)
-    told = apply_network(RecognitionNetwork(task.network), parameters, flat.points, flat.mark, flat.camera)
-    found = jax.tree.map(lambda a: a.reshape(batch, TARGET, *a.shape[1:]), best_hypothesis(told, flat))
+    hypotheses = apply_network(RecognitionNetwork(task.network), parameters, flat.points, flat.mark, flat.camera)
+    recognised = jax.tree.map(lambda a: a.reshape(batch, TARGET, *a.shape[1:]), best_hypothesis(hypotheses, flat))
     truth = sharpened(true_superquadrics(worlds))
     return _Scored(
-        overlap=intersection_over_union(truth, found),
-        centre=centre_error(truth, found),
-        right=(found.exponents[..., 1] > EDGE) == by_shape(worlds.kind[:, :TARGET], lambda shape: shape.round, jnp),
+        overlap=intersection_over_union(truth, recognised),
+        centre=centre_error(truth, recognised),
+        right=(recognised.exponents[..., 1] > EDGE)
+        == by_shape(worlds.kind[:, :TARGET], lambda shape: shape.round, jnp),
         share=jax.vmap(visible_share)(seen),
         counted=truth.valid & jax.vmap(lambda s: worth_seeing(s, task.view))(seen),
-        known=jax.vmap(is_known)(worlds)[:, :TARGET],
+        catalogue=jax.vmap(in_catalogue)(worlds)[:, :TARGET],
         sensor=jnp.broadcast_to(seen.sensor[:, None], (batch, TARGET)),
     )
 
 
 def held_out_scores(task: RecognitionTask, parameters: Any, scenes: int, batch: int = 32) -> dict[str, Any]:
-    """Scores on scenes of a seed that is never trained on, apart for every kind of noise and of shapes.
+    """Scores on held-out scenes, separately for every kind of noise and of shapes.
 
-    Objects with at least 100 pixels of the full image count; masks are true ones; nothing is refined.
+    They cover objects with at least 100 pixels of the full image, with true masks and without refinement.
     """
-    scored = dataclasses.replace(task, ragged=0.0)
+    clean = dataclasses.replace(task, ragged=0.0)
     key = jax.random.key(HELD_OUT_SEED)
-    parts = [_score_batch(scored, parameters, jax.random.fold_in(key, i), batch) for i in range(-(-scenes // batch))]
-    all_ = jax.tree.map(lambda *a: np.concatenate([np.asarray(x).reshape(-1) for x in a]), *parts)
+    parts = [_score_batch(clean, parameters, jax.random.fold_in(key, i), batch) for i in range(-(-scenes // batch))]
+    scored = jax.tree.map(lambda *a: np.concatenate([np.asarray(x).reshape(-1) for x in a]), *parts)
     result: dict[str, Any] = {}
-    for shapes, known in (("paper's shapes", True), ("random shapes", False)):
+    for shapes, is_catalogue in (("paper's shapes", True), ("random shapes", False)):
         for sensor, noise in enumerate(noise_names(task.scenes)):
-            chosen = all_.counted & (all_.known == known) & (all_.sensor == sensor)
+            chosen = scored.counted & (scored.catalogue == is_catalogue) & (scored.sensor == sensor)
             result[f"{shapes}, {noise}"] = {
-                "all": _summary(all_, chosen),
-                "visible 60% and more": _summary(all_, chosen & (all_.share >= 0.6)),
-                "visible below 30%": _summary(all_, chosen & (all_.share < 0.3)),
+                "all": _summary(scored, chosen),
+                "visible 60% and more": _summary(scored, chosen & (scored.share >= 0.6)),
+                "visible below 30%": _summary(scored, chosen & (scored.share < 0.3)),
             }
     return result
 

@@ -1,4 +1,4 @@
-"""A whole training as the command line runs it: train with a progress line, score on held-out scenes, write weights."""
+"""A training run of the command line: train with a progress line, score on held-out scenes, write weights."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from mechsearch_jax.train.recognition import RecognitionTask
 from mechsearch_jax.train.segmentation import SegmentationTask
 
 TASKS: dict[str, Callable[[], Task]] = {"segmentation": SegmentationTask, "recognition": RecognitionTask}
-# Groups of scores that are printed.
+# Largest number of printed groups of scores.
 SHOWN = 8
-# Seconds between lines where the output is no terminal.
+# Seconds between lines if the output is no terminal.
 _QUIET = 20.0
 
 
 class ProgressLine:
-    """A `Watcher` that shows rate, time left and the loss: as a bar in a terminal, elsewhere as a line now and then."""
+    """A `Watcher` that shows rate, time left and loss: a bar in a terminal, elsewhere a line every `_QUIET` seconds."""
 
     def __init__(self, console: Console, name: str):
         self._console = console
         self._bar = Progress(
             TextColumn(name),
             BarColumn(),
-            TextColumn("{task.percentage:3.0f}%  {task.fields[said]}"),
+            TextColumn("{task.percentage:3.0f}%  {task.fields[status]}"),
             TimeRemainingColumn(),
             console=console,
             disable=not console.is_terminal,
         )
-        self._task = self._bar.add_task(name, total=1.0, said="compiling")
+        self._task = self._bar.add_task(name, total=1.0, status="compiling")
         self._first: tuple[int, float] | None = None
-        self._said = -_QUIET
+        self._printed = -_QUIET
 
     def __enter__(self) -> ProgressLine:
         self._bar.start()
@@ -52,26 +52,31 @@ class ProgressLine:
         self._bar.stop()
 
     def __call__(self, progress: float, step: int, seconds: float, scalars: dict[str, float]) -> None:
-        # The first dispatch compiles and is left out of the rate.
+        # The first dispatch includes compilation and is left out of the rate.
         self._first = self._first or (step, seconds)
         steps, passed = step - self._first[0], seconds - self._first[1]
         rate = f"{steps / passed:.1f} steps/s" if passed > 0 else "compiled"
-        said = f"step {step}, {rate}, loss {scalars['loss']:.4f}"
-        self._bar.update(self._task, completed=progress, said=said)
-        if not self._console.is_terminal and (time.monotonic() - self._said > _QUIET or progress >= 1.0):
+        status = f"step {step}, {rate}, loss {scalars['loss']:.4f}"
+        self._bar.update(self._task, completed=progress, status=status)
+        if not self._console.is_terminal and (time.monotonic() - self._printed > _QUIET or progress >= 1.0):
             left = seconds * (1.0 - progress) / max(progress, 1e-6)
-            self._console.print(f"{100 * progress:.0f}%, {said}, {left:.0f} s left")
-            self._said = time.monotonic()
+            self._console.print(f"{100 * progress:.0f}%, {status}, {left:.0f} s left")
+            self._printed = time.monotonic()
 
 
 @contextlib.contextmanager
-def counting(what: str, wanted: int) -> Iterator[Callable[[int], None]]:
-    """Shows how many of something there are, and the time left, to whoever calls what this gives with the number."""
+def counting(noun: str, wanted: int) -> Iterator[Callable[[int], None]]:
+    """A progress display of a count with the time left; yields the function that sets the count.
+
+    Args:
+      noun: the plural of what is counted.
+      wanted: the final count.
+    """
     console = Console(highlight=False)
-    start = said = time.monotonic()
+    start = printed = time.monotonic()
     first: int | None = None
     bar = Progress(
-        TextColumn(what),
+        TextColumn(noun),
         BarColumn(),
         TextColumn("{task.completed} of {task.total}"),
         TimeRemainingColumn(),
@@ -79,39 +84,39 @@ def counting(what: str, wanted: int) -> Iterator[Callable[[int], None]]:
         disable=not console.is_terminal,
     )
 
-    def told(count: int) -> None:
-        nonlocal said, start, first
+    def on_progress(count: int) -> None:
+        nonlocal printed, start, first
         bar.update(task, completed=count)
         now = time.monotonic()
         if first is None:
-            # Until then programs were compiled, or files read.
+            # The time before was spent compiling programs, or reading files.
             first, start = count, now
-        elif not console.is_terminal and (now - said > _QUIET or count >= wanted):
+        elif not console.is_terminal and (now - printed > _QUIET or count >= wanted):
             left = (now - start) / max(count - first, 1) * max(wanted - count, 0)
-            console.print(f"{count} of {wanted} {what}, {left:.0f} s left")
-            said = now
+            console.print(f"{count} of {wanted} {noun}, {left:.0f} s left")
+            printed = now
 
     with bar:
-        task = bar.add_task(what, total=wanted)
-        yield told
+        task = bar.add_task(noun, total=wanted)
+        yield on_progress
 
 
 def commit() -> str | None:
-    """The commit that this code is at, None where it is in no checkout."""
-    here = Path(__file__).resolve().parent
+    """The commit of this code; None outside a checkout."""
+    folder = Path(__file__).resolve().parent
     try:
-        found = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True)
+        done = subprocess.run(["git", "rev-parse", "HEAD"], cwd=folder, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
-    return found.stdout.strip()
+    return done.stdout.strip()
 
 
 def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
     """Train a network, score it on held-out scenes, and write its weights and card.
 
     Args:
-      task: what is trained.
-      config: how.
+      task: the network to train.
+      config: of the training.
       out: folder for everything.
 
     Returns:
@@ -121,7 +126,7 @@ def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
       InputError: the folder holds another training, or cannot be written.
     """
     keep_compilations()
-    # Random numbers by calls of one kernel, the same numbers: on a GPU, what makes scenes compiles three times as fast.
+    # Draws the same random numbers by calls of one kernel: on a GPU, generating scenes compiles three times as fast.
     jax.config.update("jax_threefry_gpu_kernel_lowering", True)
     console = Console(highlight=False)
     name = task.name
@@ -139,14 +144,14 @@ def run(task: Task, config: TrainConfig, out: Path) -> dict[str, Any]:
         "jax": jax.__version__,
         "scores": None,
     }
-    # The weights are on disk before they are scored: scoring takes a while.
+    # Saved before scoring, which takes a while.
     task.save(out / f"{name}.npz", parameters, card)
     with console.status("scoring on held-out scenes"):
         card = card | {"scores": task.scores(parameters, config.held_out)}
     task.save(out / f"{name}.npz", parameters, card)
-    for what, scores in card["scores"].items():
-        # Where there are many groups, the card has them.
+    for group, scores in card["scores"].items():
+        # If there are many, only the card has them all.
         shown = scores if len(scores) <= SHOWN else {"all": scores["all"]}
-        console.print(f"{what}: {shown}", soft_wrap=True)
+        console.print(f"{group}: {shown}", soft_wrap=True)
     console.print(str(out / f"{name}.npz"), soft_wrap=True)
     return card

@@ -1,4 +1,4 @@
-"""Random scenes: made, ray-cast and turned into images of points on the accelerator, as many at once as wanted."""
+"""Random scenes, generated and ray-cast into images of points on the accelerator; all functions are vmappable."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ from mechsearch_jax.workspace.target import Target
 
 # Steps of `_slide`; each shortens the gap to at most about a third.
 _SLIDES = 8
-# What an object must show of itself in the full image to be worth scoring.
+# Least number of pixels of the full image of an object that is scored.
 PIXELS = 100
-# Codes of the shapes that objects of any size and targets are drawn from: their order decides which random number
-# stands for which. Then the codes and half-extents of the targets and of the paper's objects.
+# Codes of the shapes of objects of random size, in an order that must not change: random numbers index it. Then the
+# targets, and codes and half-extents of the paper's objects.
 _OBJECT_KINDS = np.array([shape_of(name).code for name in ("box", "cylinder")], np.int32)
 _TARGETS = tuple(Target.of(name) for name in ("cylinder", "box"))
-_KNOWN = np.array(
+_CATALOGUE = np.array(
     [(shape_of(name).code, *half) for name, (x, y, z) in CATALOGUE for half in ((x, y, z), (y, x, z))], np.float32
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class SceneConfig:
-    """What scenes look like. Sizes are full sizes [m]; ranges are drawn from evenly on a logarithmic scale.
+    """Distribution of scenes. Sizes are full sizes [m]; ranges are sampled log-uniformly.
 
     Attributes:
-      objects: least and largest number of objects; some may find no room and are left out.
+      objects: least and largest number of objects; objects without room are left out.
       known: share of objects that are one of the paper's eleven.
-      sides: range of the width and depth of what is not round.
+      sides: range of the width and depth of objects that are not round.
       heights: range of heights.
-      diameters: range of the diameter of what is.
+      diameters: range of the diameter of round objects.
       lying: share of objects that lie on their side.
       leaning: share of objects that lean, none of whose faces is level.
       lean: range of the angle by which they lean [rad].
       touching: share of objects that are pushed against another.
-      target: share of scenes in which the camera sees the target, or may: its points are none of an object.
-      placements: how many places are tried at once for an object.
-      noises: each scene's sensor is one of these, drawn evenly.
+      target: share of scenes with a target, whose points belong to no object.
+      placements: number of places that are tried at once for an object.
+      noises: each scene's sensor is one of these, drawn uniformly.
     """
 
     objects: tuple[int, int] = (2, 8)
@@ -84,13 +84,13 @@ class SceneConfig:
 
 
 def origin(config: SceneConfig) -> dict[str, Any]:
-    """What examples from such scenes are, for the card of a network's weights."""
+    """The source of examples from these scenes, for the card of a network's weights."""
     noises = [repr(n) if dataclasses.is_dataclass(n) else getattr(n, "__name__", str(n)) for n in config.noises]
     return {"source": "random scenes, ray-cast as they were needed", **dataclasses.asdict(config), "noises": noises}
 
 
 class Footprint(flax.struct.PyTreeNode):
-    """What bodies cover, seen from above: a rectangle, or a disc where `radius` is not 0.
+    """Footprints of bodies, seen from above: a rectangle, or a disc if `radius` is not 0.
 
     Attributes:
       centre: [m], shape (..., 2).
@@ -112,17 +112,18 @@ def _axes(yaw: Array) -> Array:
 
 
 def gap(a: Footprint, b: Footprint) -> Float[Array, "..."]:
-    """A lower bound of the distance between footprints [m] that is positive where they are apart, else not.
+    """A lower bound of the distance between footprints [m]; positive exactly if they are apart.
 
-    Rectangles by the axis that separates them most, exact where one side faces the other; discs exactly.
+    For rectangles it is the gap along the axis that separates them most, exact if one side faces the other; for discs
+    it is exact.
     """
     offset = b.centre - a.centre
     axes_a, axes_b = _axes(a.yaw), _axes(b.yaw)
 
     def along(axes):
         reach = sum(
-            jnp.sum(jnp.abs(jnp.sum(axes[..., :, None, :] * own[..., None, :, :], axis=-1)) * f.half[..., None, :], -1)
-            for f, own in ((a, axes_a), (b, axes_b))
+            jnp.sum(jnp.abs(jnp.sum(axes[..., :, None, :] * rows[..., None, :, :], axis=-1)) * f.half[..., None, :], -1)
+            for f, rows in ((a, axes_a), (b, axes_b))
         )
         return jnp.max(jnp.abs(jnp.sum(axes * offset[..., None, :], axis=-1)) - reach, axis=-1)
 
@@ -139,7 +140,7 @@ def gap(a: Footprint, b: Footprint) -> Float[Array, "..."]:
 
 
 class _Shape(flax.struct.PyTreeNode):
-    """A body at the origin, its lowest point at height 0: what it is, how it is turned, and what it covers."""
+    """A body at the origin, its lowest point at height 0: shape, orientation and footprint."""
 
     kind: jax.Array
     half_size: jax.Array
@@ -160,18 +161,18 @@ def _tilt(angle: Array) -> Array:
 
 
 def _draw_shape(key: Array, config: SceneConfig) -> _Shape:
-    """A random body, in the frame that its yaw turns."""
+    """A random body, before its yaw is applied."""
     keys = jax.random.split(key, 8)
-    known = jnp.array(_KNOWN)[jax.random.randint(keys[0], (), 0, len(_KNOWN))]
-    is_known = jax.random.bernoulli(keys[1], config.known)
+    of_catalogue = jnp.array(_CATALOGUE)[jax.random.randint(keys[0], (), 0, len(_CATALOGUE))]
+    is_catalogue = jax.random.bernoulli(keys[1], config.known)
     drawn = jnp.asarray(_OBJECT_KINDS)[jax.random.randint(keys[2], (), 0, len(_OBJECT_KINDS))]
-    kind = jnp.where(is_known, known[0].astype(jnp.int32), drawn)
+    kind = jnp.where(is_catalogue, of_catalogue[0].astype(jnp.int32), drawn)
     width, depth = _log_uniform(keys[3], config.sides, (2,)) / 2
     radius = _log_uniform(keys[4], config.diameters) / 2
     height = _log_uniform(keys[5], config.heights) / 2
     is_round = by_shape(kind, lambda shape: shape.round, jnp)
     free = jnp.where(is_round, jnp.stack([radius, radius, height]), jnp.stack([width, depth, height]))
-    half = jnp.where(is_known, known[1:], free)
+    half = jnp.where(is_catalogue, of_catalogue[1:], free)
     pose = jax.random.uniform(keys[6])
     angle = jnp.where(
         pose < config.leaning,
@@ -191,12 +192,12 @@ def _shape(kind: Array, half: Array, rotation: Array) -> _Shape:
 
 
 def _slide(moving: Footprint, other: Footprint) -> Footprint:
-    """The footprint moved towards another until they all but touch; a gap bounds the distance from below."""
+    """The footprint moved towards another until they almost touch; `gap` bounds each step from below."""
 
-    def step(_, one):
-        offset = other.centre - one.centre
-        away = offset / jnp.maximum(jnp.linalg.norm(offset), 1e-6)
-        return one.replace(centre=one.centre + away * jnp.maximum(gap(one, other), 0.0))
+    def step(_, moved):
+        offset = other.centre - moved.centre
+        towards = offset / jnp.maximum(jnp.linalg.norm(offset), 1e-6)
+        return moved.replace(centre=moved.centre + towards * jnp.maximum(gap(moved, other), 0.0))
 
     return jax.lax.fori_loop(0, _SLIDES, step, moving)
 
@@ -205,15 +206,16 @@ def _row(vector: np.ndarray, like: Array) -> Array:
     return jnp.asarray(vector, jnp.float32).reshape(*[1] * (like.ndim - 1), -1)
 
 
-def _within(shelf: Shelf, one: Footprint, clearance: float = 0.002) -> Array:
-    """Whether a footprint lies on the board, and its centre where objects are dropped."""
-    reach = jnp.sum(jnp.abs(jnp.swapaxes(_axes(one.yaw), -1, -2)) * one.half[..., None, :], axis=-1)
-    reach = reach + one.radius[..., None]
-    low, high = one.centre - reach, one.centre + reach
+def _within(shelf: Shelf, footprint: Footprint, clearance: float = 0.002) -> Array:
+    """Whether a footprint lies on the board, and its centre in the area where objects are dropped."""
+    centre = footprint.centre
+    reach = jnp.sum(jnp.abs(jnp.swapaxes(_axes(footprint.yaw), -1, -2)) * footprint.half[..., None, :], axis=-1)
+    reach = reach + footprint.radius[..., None]
+    low, high = centre - reach, centre + reach
     on_board = (low[..., 0] > shelf.front) & (high[..., 0] < shelf.back - clearance)
     on_board &= (low[..., 1] > shelf.right + clearance) & (high[..., 1] < shelf.left - clearance)
     low, high = (np.array(ends) for ends in zip(shelf.spawn_x, shelf.spawn_y, strict=True))
-    centred = (one.centre > _row(low - 0.01, one.centre)) & (one.centre < _row(high + 0.01, one.centre))
+    centred = (centre > _row(low - 0.01, centre)) & (centre < _row(high + 0.01, centre))
     return on_board & centred.all(axis=-1)
 
 
@@ -235,12 +237,12 @@ def _draw_places(
 def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: Shelf | None = None) -> World:
     """A random scene: bodies that rest on the board and do not overlap.
 
-    Bodies find their places one after the other among `config.placements` tries each; one that finds none is left
-    out. What leans is not held by anything: it stands for what physics leaves leaning, without the physics.
+    Bodies are placed in sequence, each at one of `config.placements` random places; a body that fits nowhere is left
+    out. An approximation: leaning bodies are not supported by anything.
 
     Args:
       key: PRNG key.
-      config: what scenes look like; static.
+      config: distribution of scenes; static.
       shelf: the shelf; static.
     """
     config, shelf = config or SceneConfig(), shelf or Shelf()
@@ -262,16 +264,16 @@ def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: 
         beside = jax.vmap(_slide)(candidates, jax.tree.map(lambda a: a[neighbour], footprints))
         touches = touch & present[neighbour]
         candidates = candidates.replace(centre=jnp.where(touches[:, None], beside.centre, candidates.centre))
-        gaps = jax.vmap(lambda one: jax.vmap(lambda other: gap(one, other))(footprints))(candidates)
+        gaps = jax.vmap(lambda candidate: jax.vmap(lambda other: gap(candidate, other))(footprints))(candidates)
         clear = jnp.all((gaps > 0.0) | ~present[None, :], axis=1)
-        fits = clear & jax.vmap(lambda one: _within(shelf, one))(candidates)
+        fits = clear & jax.vmap(lambda candidate: _within(shelf, candidate))(candidates)
         best = jnp.argmax(fits)
-        one = jax.tree.map(lambda a: a[best], candidates)
-        footprints = jax.tree.map(lambda a, b: a.at[slot].set(b), footprints, one)
+        chosen = jax.tree.map(lambda a: a[best], candidates)
+        footprints = jax.tree.map(lambda a, b: a.at[slot].set(b), footprints, chosen)
         return (footprints, present.at[slot].set(fits[best] & wanted)), None
 
     nowhere = Footprint(jnp.zeros((BODIES, 2)), jnp.zeros((BODIES, 2)), jnp.zeros(BODIES), jnp.zeros(BODIES))
-    # What is drawn is drawn for all bodies at once: only where they stand depends on those before.
+    # Random numbers are drawn for all bodies at once: only the places depend on earlier bodies.
     draw = jax.vmap(lambda slot, key, shape: _draw_places(slot, key, shape, config, shelf))
     drawn = draw(jnp.arange(BODIES), jax.random.split(keys[4], BODIES), shapes)
     (footprints, present), _ = jax.lax.scan(
@@ -288,15 +290,15 @@ def random_world(key: Key[Array, ""], config: SceneConfig | None = None, shelf: 
 
 
 class Capture(flax.struct.PyTreeNode):
-    """What a sensor makes of a scene.
+    """A sensor's image of a scene.
 
     Attributes:
-      points: as measured [m], shape (h, w, 3); NaN where nothing was.
+      points: as measured [m], shape (h, w, 3); NaN where nothing was measured.
       labels: int8, shape (h, w): 0 to 7 an object's slot, 8 the target, FREE the shelf, OTHER the shelf
         where noise has lifted it, MISSING nothing.
-      pixels: how many pixels show each object, int32, shape (8,).
-      alone: how many would if it stood there alone.
-      sensor: which of the noises it has.
+      pixels: number of pixels of each object, int32, shape (8,).
+      alone: number of its pixels if it stood there alone.
+      sensor: index of the noise in `SceneConfig.noises`.
     """
 
     points: jax.Array
@@ -309,7 +311,7 @@ class Capture(flax.struct.PyTreeNode):
 def cast_world(
     camera: Camera, shelf: Shelf, world: World
 ) -> tuple[Float[Array, "h w"], Int[Array, "h w"], Int[Array, " bodies"]]:
-    """Depth [m], the slot of the body that is seen (-1 for none), and how many pixels each body has if alone."""
+    """Depth [m], the slot of the visible body (-1 for none), and each body's number of pixels if it were alone."""
     directions = rays(camera)
 
     def nearer(slot, best):
@@ -321,6 +323,11 @@ def cast_world(
     behind = cast_shelf(camera, shelf, directions)
     none = jnp.full(behind.shape, -1, jnp.int8)
     return jax.lax.fori_loop(0, BODIES, nearer, (behind, none, jnp.zeros(BODIES, jnp.int32)))
+
+
+def object_pixels(owner: Int[Array, "h w"]) -> Int[Array, " objects"]:
+    """Number of pixels of each object, from the slots of the visible bodies."""
+    return jnp.sum(owner[..., None] == jnp.arange(TARGET).reshape(1, 1, -1), axis=(0, 1))
 
 
 def capture(
@@ -335,7 +342,7 @@ def capture(
     Args:
       key: PRNG key.
       world: the scene.
-      config: what scenes look like; static.
+      config: distribution of scenes; static.
       shelf: the shelf; static.
       view: which part of the camera's image, by default `shelf_view()`; static.
     """
@@ -349,16 +356,16 @@ def capture(
     return Capture(
         points=points,
         labels=true_labels(points, owner, shelf),
-        pixels=jnp.sum(owner[..., None] == jnp.arange(TARGET).reshape(1, 1, -1), axis=(0, 1)),
+        pixels=object_pixels(owner),
         alone=alone[:TARGET],
         sensor=sensor,
     )
 
 
-def is_known(world: World) -> Bool[Array, " bodies"]:
-    """Which bodies are of the size of one of the paper's eleven objects."""
-    own = jnp.concatenate([world.kind[:, None].astype(jnp.float32), world.half_size], axis=1)
-    return (jnp.abs(own[:, None] - jnp.asarray(_KNOWN)[None]) < 1e-5).all(axis=-1).any(axis=-1)
+def in_catalogue(world: World) -> Bool[Array, " bodies"]:
+    """Which bodies are of the shape and size of one of the paper's eleven objects."""
+    bodies = jnp.concatenate([world.kind[:, None].astype(jnp.float32), world.half_size], axis=1)
+    return (jnp.abs(bodies[:, None] - jnp.asarray(_CATALOGUE)[None]) < 1e-5).all(axis=-1).any(axis=-1)
 
 
 def noise_names(config: SceneConfig) -> list[str]:
@@ -367,14 +374,14 @@ def noise_names(config: SceneConfig) -> list[str]:
 
 
 def visible_share(seen: Capture) -> Float[Array, " objects"]:
-    """Which share of its pixels each object shows; 0 where it has none."""
+    """The share of its pixels that each object shows; 0 if it has none."""
     return jnp.where(seen.alone > 0, seen.pixels / jnp.maximum(seen.alone, 1), 0.0)
 
 
 def surface_points(
     key: Key[Array, ""], kind: Int[Array, ""], half_size: Float[Array, "3"], count: int
 ) -> Float[Array, "count 3"]:
-    """Points spread uniformly over the surface of a body, in its own frame [m]."""
+    """Uniform random points of the surface of a body, in its own frame [m]."""
     faces, flat, sign = jax.random.split(key, 3)
     area = by_shape(kind, lambda shape: shape.areas(half_size, jnp), jnp)
     face = jax.random.categorical(faces, jnp.log(jnp.maximum(area, 1e-12)), shape=(count,))
@@ -384,5 +391,5 @@ def surface_points(
 
 
 def worth_seeing(seen: Capture, view: View, pixels: int = PIXELS) -> Bool[Array, " objects"]:
-    """Which objects show at least so many pixels of the full image."""
+    """Which objects show at least `pixels` pixels of the full image."""
     return seen.pixels * view.stride**2 >= pixels

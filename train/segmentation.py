@@ -26,23 +26,23 @@ from mechsearch_jax.train.loop import HELD_OUT_SEED
 from mechsearch_jax.train.scenes import SceneConfig, capture, noise_names, origin, random_world, worth_seeing
 from mechsearch_jax.workspace.shelf import Shelf
 
-# What a layer's loss counts against the next one's.
+# Weight of a layer's loss relative to the next layer's.
 _EARLIER = 0.5
-# Centres are told in these [m].
+# Unit of centre errors in the loss [m].
 _UNIT = 0.05
 
 
 class Example(flax.struct.PyTreeNode):
-    """Clouds and what they show; every field has the leading axis of the batch.
+    """Labelled clouds; every field has the leading axis of the batch.
 
     Attributes:
       points: in the world [m], (P, 3).
-      labels: of each point the slot of its object, or OTHER, (P,).
+      labels: slot of each point's object, or OTHER, (P,).
       centres: centre of each point's object [m], (P, 3).
-      weight: 1, or 0 where the camera sees no object.
-      objects: how many objects there are, seen or not.
+      weight: 1, or 0 if the camera sees no object.
+      objects: number of objects, seen or not.
       worth: which objects show at least 100 pixels of the full image, (8,).
-      sensor: which noise the points have.
+      sensor: index of the noise in `SceneConfig.noises`.
     """
 
     points: jax.Array
@@ -55,10 +55,10 @@ class Example(flax.struct.PyTreeNode):
 
 
 def match(logits: Float[Array, "p classes"], labels: Int[Array, " p"]) -> Int[Array, " classes"]:
-    """Which of the network's instances each label is matched with, at the least cost in total.
+    """The network's instance that each label is matched with, at the least total cost.
 
-    The cost of a pair is what both terms of `segmentation_loss` would be for it. Labels that no point has are matched
-    with what is left over. The last entry stands for OTHER, which matches itself.
+    The cost of a pair is the sum of both terms of `segmentation_loss` for it. Labels without points get the remaining
+    instances. The last entry stands for OTHER, which matches itself.
     """
     log_probability = jax.nn.log_softmax(logits)[:, :INSTANCES]
     member = (labels[:, None] == jnp.arange(INSTANCES)[None]).astype(jnp.float32)
@@ -79,7 +79,7 @@ def dice(probability: Float[Array, "p a"], member: Float[Array, "p b"]) -> Float
 def segmentation_loss(logits: Float[Array, "p classes"], labels: Int[Array, " p"]) -> dict[str, Float[Array, ""]]:
     """The matched loss of one cloud: mean cross-entropy of its points, mean overlap loss of its objects, and accuracy.
 
-    It is the same however the labels, or the network's instances, are numbered.
+    It is invariant to permutations of the labels and of the network's instances.
     """
     instance = match(logits, labels)
     wanted = instance[jnp.where(labels == OTHER, INSTANCES, labels)]
@@ -101,7 +101,7 @@ class SegmentationTask:
 
     Attributes:
       network: sizes of the network.
-      scenes: what scenes look like.
+      scenes: distribution of the scenes.
       shelf: the shelf.
       view: which rays are cast.
       points: in a cloud.
@@ -127,8 +127,8 @@ class SegmentationTask:
     def scene(self, key: Key[Array, ""]) -> Example:
         """A random scene's cloud.
 
-        The target's points are left out, as the detector's mask leaves them out; points of the shelf that noise has
-        lifted off it are not, and are OTHER.
+        The target's points are left out, as by the detector's mask. Points of the shelf that noise has lifted off it
+        are kept as OTHER.
         """
         worlds, sensing, drawing = jax.random.split(key, 3)
         world = random_world(worlds, self.scenes, self.shelf)
@@ -154,14 +154,14 @@ class SegmentationTask:
         return jax.vmap(self.scene)(jax.random.split(key, batch))
 
     def loss(self, parameters: Any, examples: Example) -> tuple[Float[Array, ""], dict[str, Any]]:
-        told = apply_network(SegmentationNetwork(self.network, self.precision), parameters, examples.points)
-        terms = jax.vmap(jax.vmap(segmentation_loss), in_axes=(0, None))(told.logits, examples.labels)
+        output = apply_network(SegmentationNetwork(self.network, self.precision), parameters, examples.points)
+        terms = jax.vmap(jax.vmap(segmentation_loss), in_axes=(0, None))(output.logits, examples.labels)
         total = jnp.maximum(jnp.sum(examples.weight), 1.0)
         layers = {name: jnp.sum(a * examples.weight[None], axis=1) / total for name, a in terms.items()}
-        error = jnp.abs(told.centres - examples.centres) / _UNIT
+        error = jnp.abs(output.centres - examples.centres) / _UNIT
         of_object = (examples.labels != OTHER)[..., None] * examples.weight[:, None, None]
         centres = jnp.sum(error * of_object) / jnp.maximum(3.0 * jnp.sum(of_object), 1.0)
-        share = _EARLIER ** jnp.arange(len(told.logits))[::-1]
+        share = _EARLIER ** jnp.arange(len(output.logits))[::-1]
         loss = jnp.sum(share * (layers["cross_entropy"] + 2.0 * layers["dice"])) / jnp.sum(share) + centres
         return loss, {name: a[-1] for name, a in layers.items()} | {"centres": centres}
 
@@ -174,44 +174,43 @@ class SegmentationTask:
 
 
 def instance_overlaps(
-    found: Int[Array, " p"], labels: Int[Array, " p"]
+    segments: Int[Array, " p"], labels: Int[Array, " p"]
 ) -> tuple[Float[Array, " instances"], Bool[Array, " instances"]]:
-    """Intersection over union of each true instance's points with those of the segment it is matched with.
+    """Intersection over union of each true instance's points with those of its matched segment.
 
-    Segments are matched so that the sum is largest; one that is missed counts as 0.
+    The matching maximises the sum; an instance without a segment counts as 0.
 
     Returns:
-      The overlaps, and which true instances there are.
+      The overlaps, and which true instances are present.
     """
     instances = jnp.arange(INSTANCES)
-    own = (labels[:, None] == instances[None]).astype(jnp.float32)
-    other = (found[:, None] == instances[None]).astype(jnp.float32)
-    shared = jnp.matmul(own.T, other, precision="highest")
-    union = jnp.sum(own, axis=0)[:, None] + jnp.sum(other, axis=0)[None] - shared
+    truth = (labels[:, None] == instances[None]).astype(jnp.float32)
+    segmented = (segments[:, None] == instances[None]).astype(jnp.float32)
+    shared = jnp.matmul(truth.T, segmented, precision="highest")
+    union = jnp.sum(truth, axis=0)[:, None] + jnp.sum(segmented, axis=0)[None] - shared
     overlap = shared / jnp.maximum(union, 1.0)
-    return overlap[instances, assign(-overlap)], jnp.sum(own, axis=0) > 0
+    return overlap[instances, assign(-overlap)], jnp.sum(truth, axis=0) > 0
 
 
 @functools.partial(jax.jit, static_argnames=("task", "batch"))
 def _score_batch(task: SegmentationTask, parameters: Any, key: Array, batch: int):
     examples = task.sample(key, batch)
-    told = apply_network(SegmentationNetwork(task.network), parameters, examples.points)
-    raw = labels_of(told.logits[-1].reshape(-1, INSTANCES + 1)).reshape(batch, -1)
+    output = apply_network(SegmentationNetwork(task.network), parameters, examples.points)
+    raw = labels_of(output.logits[-1].reshape(-1, INSTANCES + 1)).reshape(batch, -1)
     valid = jnp.broadcast_to(examples.weight[:, None] > 0, raw.shape)
     clean = jax.vmap(clean_up)(examples.points, raw, valid)
     raw, present = jax.vmap(instance_overlaps)(raw, examples.labels)
     clean, _ = jax.vmap(instance_overlaps)(clean, examples.labels)
-    # The target is none of the instances that there are.
+    # `worth` has no entry for the target.
     worth = present & jnp.pad(examples.worth, ((0, 0), (0, INSTANCES - examples.worth.shape[1])))
     return raw, clean, present, worth, examples.objects, examples.sensor
 
 
 def held_out_scores(task: SegmentationTask, parameters: Any, scenes: int, batch: int = 32) -> dict[str, Any]:
-    """Mean instance IoU on scenes of seeds that are never trained on, before and after the clean-up, by the number of
-    objects in a scene and for every kind of noise, with shapes as in training.
+    """Mean instance IoU on held-out scenes, before and after the clean-up, by number of objects and kind of noise.
 
-    It is that of all objects of which the cloud has a point, and apart of those with at least 100 pixels of the full
-    image.
+    Scenes are drawn as in training. Scores are over all objects with a point in the cloud, and over those with at least
+    100 pixels of the full image.
     """
     key = jax.random.key(HELD_OUT_SEED)
     parts = [_score_batch(task, parameters, jax.random.fold_in(key, i), batch) for i in range(-(-scenes // batch))]

@@ -1,7 +1,7 @@
-"""What share of scenes can be solved at all.
+"""The share of scenes that can be solved at all.
 
-A scene that any episode ever solved can be. Only for the rest there is a search with everything known
-(`envs.known_target.search`). What it comes to is kept in one file a scene, so that a run that was killed goes on.
+A scene that any episode has solved is solvable. Only the others are searched with full knowledge
+(`envs.known_target.search`). Each search writes its result to a file, so that a killed run can be continued.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.store.shards import result_tables
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.known_target.judgement import InFullView
-from mechsearch_jax.envs.known_target.search import Found, KnownSearchConfig, Node, known_search
+from mechsearch_jax.envs.known_target.search import KnownSearchConfig, KnownSearchResult, Node, known_search
 from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.planner import PRESETS, Config, planning_policy
@@ -35,19 +35,19 @@ from mechsearch_jax.workspace.scenario import Scenario
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What is known of one scene.
+    """The solvability of one scene.
 
     Attributes:
-      scenario, content_hash: its name, and what it holds.
-      objects: how many surround the target.
-      episodes: how many of the given episodes were of this scene.
-      retrieved: how many of them took the target out.
-      solvable: whether one of them did, or the search.
-      actions: that the search needed, taking the target out among them; None where it did not, or was not needed.
-      rounds, simulated: of the search, and the number of actions that it executed; None where it was not needed.
-      seconds: wall time that it took [s].
-      path: those actions, each with the fields of an `ActionRecord`.
-      reason: why the scene is not known to be solvable; None where it is.
+      scenario, content_hash: of the scene.
+      objects: number of objects around the target.
+      episodes: number of given episodes of this scene.
+      retrieved: number of these that retrieved the target.
+      solvable: whether an episode or the search retrieved the target.
+      actions: number of actions that the search needed, the retrieval included; None if it failed or did not run.
+      rounds, simulated: number of the search's rounds and executed actions; None if it did not run.
+      seconds: wall time of the search [s].
+      path: the search's actions, each with the fields of an `ActionRecord`.
+      reason: why the search failed; None if the scene is solvable.
     """
 
     scenario: str
@@ -66,25 +66,25 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class Outcomes:
-    """How often the target was taken out in episodes: for each scene their number and that of retrievals.
+    """Numbers of episodes and retrievals of scenes.
 
     Attributes:
       by_content: by the content hash of the scene.
-      by_name: by its name, of episodes that do not say what their scene held.
+      by_name: by its name, for episodes without a content hash.
     """
 
     by_content: Mapping[str, tuple[int, int]]
     by_name: Mapping[str, tuple[int, int]]
 
     def of(self, scenario: Scenario) -> tuple[int, int]:
-        """The episodes and the retrievals of a scene."""
-        known = (self.by_content.get(scenario.content_hash, (0, 0)), self.by_name.get(scenario.name, (0, 0)))
-        episodes, retrieved = (sum(counts) for counts in zip(*known, strict=True))
+        """The numbers of episodes and retrievals of a scene."""
+        pairs = (self.by_content.get(scenario.content_hash, (0, 0)), self.by_name.get(scenario.name, (0, 0)))
+        episodes, retrieved = (sum(counts) for counts in zip(*pairs, strict=True))
         return episodes, retrieved
 
 
 def read_outcomes(files: Sequence[PathLike]) -> Outcomes:
-    """What results of `mechsearch evaluate` (folders, Parquet files) and stored ones (JSON) say of scenes.
+    """The outcomes in results of `mechsearch evaluate` (folders, Parquet files) and in stored ones (JSON).
 
     Raises:
       InputError: a file cannot be read, or there are no episodes in it.
@@ -103,12 +103,12 @@ def read_outcomes(files: Sequence[PathLike]) -> Outcomes:
 
 
 def _evaluated(path: PathLike) -> Iterator[tuple[str, str | None, bool]]:
-    """Name and content hash of the scene, and whether the target was taken out, of every episode."""
+    """Scene name, content hash and retrieval of every episode."""
     return ((row.scenario, row.content_hash, row.retrieved) for _, rows in result_tables(path) for row in rows)
 
 
 def _stored(file: PathLike) -> Iterator[tuple[str, str | None, bool]]:
-    """The same of a stored result: its "runs" have "episodes", each an object, or a list in the order of "columns"."""
+    """As `_evaluated`, of a stored result: its "runs" have "episodes", each an object, or a list by "columns"."""
     try:
         value = json.loads(Path(file).read_text(encoding="utf-8"))
     except OSError as error:
@@ -119,24 +119,24 @@ def _stored(file: PathLike) -> Iterator[tuple[str, str | None, bool]]:
     try:
         for run in runs or ():
             names = run.get("columns", value.get("columns", ()))
-            for one in run["episodes"]:
-                episode = one if isinstance(one, dict) else dict(zip(names, one, strict=True))
+            for entry in run["episodes"]:
+                episode = entry if isinstance(entry, dict) else dict(zip(names, entry, strict=True))
                 yield episode["scenario"], episode.get("content_hash"), bool(episode["retrieved"])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file}: is no stored result with episodes ({error})") from error
 
 
 class Ceiling:
-    """Searches scenes with everything known, and keeps what it came to.
+    """Searches scenes with full knowledge, and stores the results.
 
     Attributes:
-      settings: everything that decides about a search, beside its scene.
+      settings: all settings that determine a search's result, beside its scene.
     """
 
     def __init__(self, folder: PathLike, config: KnownSearchConfig, sequences: int) -> None:
         """Args:
-        folder: for a file, and where it failed a picture, for every scene.
-        config: how much is tried.
+        folder: for a file of every searched scene, and a picture if the search failed.
+        config: the budget of a search.
         sequences: sampled from each world of a round.
         """
         self._folder, self._config = Path(folder), config
@@ -150,58 +150,63 @@ class Ceiling:
         self.settings: dict[str, Any] = {**dataclasses.asdict(config), "planner": self._planner.options()}
 
     def row(
-        self, scenario: Scenario, outcomes: Outcomes, told: Callable[[int, Node], None] = lambda round, best: None
+        self, scenario: Scenario, outcomes: Outcomes, on_round: Callable[[int, Node], None] = lambda round, best: None
     ) -> Row:
-        """What is known of a scene; it is searched if no episode solved it and its file does not say.
+        """The solvability of a scene; searched if no episode solved it and no stored result matches.
+
+        Args:
+          scenario: the scene.
+          outcomes: of episodes.
+          on_round: see `known_search`.
 
         Raises:
-          InputError: its file or picture cannot be written.
+          InputError: the file or picture cannot be written.
         """
         episodes, retrieved = outcomes.of(scenario)
         row = Row(scenario.name, scenario.content_hash, len(scenario.objects), episodes, retrieved, retrieved > 0)
-        return row if row.solvable else self._searched(row, scenario, told)
+        return row if row.solvable else self._searched(row, scenario, on_round)
 
-    def _searched(self, row: Row, scenario: Scenario, told: Callable[[int, Node], None]) -> Row:
+    def _searched(self, row: Row, scenario: Scenario, on_round: Callable[[int, Node], None]) -> Row:
         file = self._folder / f"{scenario.name}.json"
-        same = {"content_hash": row.content_hash, "code": present_code(), "settings": self.settings}
-        known = _kept(file, same)
-        if known is None:
+        identity = {"content_hash": row.content_hash, "code": present_code(), "settings": self.settings}
+        columns = _stored_columns(file, identity)
+        if columns is None:
             begin = time.perf_counter()
             problem = self._problem(target_of(scenario), self._planner.problem)
-            found = known_search(scenario, problem, self._policy, self._simulator, self._config, told)
-            known = told_of(found) | {"seconds": round(time.perf_counter() - begin, 1)}
-            if found.actions is None:
-                figure = unsolved.picture(found, problem, scenario.name, str(known["reason"]))
+            result = known_search(scenario, problem, self._policy, self._simulator, self._config, on_round)
+            columns = columns_of(result) | {"seconds": round(time.perf_counter() - begin, 1)}
+            if result.actions is None:
+                figure = unsolved.picture(result, problem, scenario.name, str(columns["reason"]))
                 save_figure(figure, self._folder / f"{scenario.name}.png")
-            save_json({**same, "versions": versions(), "found": known}, file)
-        return dataclasses.replace(row, **known, solvable=known["actions"] is not None)
+            save_json({**identity, "versions": versions(), "found": columns}, file)
+        return dataclasses.replace(row, **columns, solvable=columns["actions"] is not None)
 
 
-def told_of(found: Found) -> dict[str, Any]:
-    """The columns of a row that a search fills."""
+def columns_of(result: KnownSearchResult) -> dict[str, Any]:
+    """The columns of a `Row` that a search fills."""
     return {
-        "actions": None if found.actions is None else len(found.actions),
-        "rounds": found.rounds,
-        "simulated": found.simulated,
-        "path": None if found.actions is None else [dataclasses.asdict(action) for action in found.actions],
-        "reason": None if found.actions is not None else unsolved.reason(found),
+        "actions": None if result.actions is None else len(result.actions),
+        "rounds": result.rounds,
+        "simulated": result.simulated,
+        "path": None if result.actions is None else [dataclasses.asdict(action) for action in result.actions],
+        "reason": None if result.actions is not None else unsolved.reason(result),
     }
 
 
-def _kept(file: Path, same: Mapping[str, Any]) -> dict[str, Any] | None:
-    """What a file says of a search of the same scene by the same code with the same settings; None if nothing."""
+def _stored_columns(file: Path, identity: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The columns in a file of the same scene, code and settings; None without such a file."""
     try:
         value = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    wanted = json.loads(json.dumps(same))
+    wanted = json.loads(json.dumps(identity))
     if not isinstance(value, dict) or {name: value.get(name) for name in wanted} != wanted:
         return None
     return value.get("found")
 
 
 def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """How many scenes can be solved, by their number of objects, and, with None, of all; with Wilson's interval."""
+    """Solvable scenes by number of objects, and of all (None), with Wilson intervals."""
     counts: list[int | None] = [*sorted({row.objects for row in rows}), None]
     lines = []
     for objects in counts:
@@ -226,7 +231,7 @@ def save_ceiling(rows: Sequence[Row], settings: Mapping[str, Any], command: str,
     Args:
       rows: at least one.
       settings: of the searches.
-      command: that asked for them.
+      command: of the run.
       path: of the file.
 
     Raises:

@@ -1,8 +1,7 @@
-"""A guard against losses: a fixed suite of episodes, compared one by one with what they came to before.
+"""A regression guard: a fixed suite of episodes, compared in pairs with stored outcomes.
 
-The suite is run natively with preset `standard`. Every pair of an episode then and now can be the same, a gain or a
-loss; if gains and losses were equally likely, losses would outnumber gains as rarely as the sign test says (exact
-McNemar, one-sided).
+The suite is run natively with preset `standard`. Each pair of a stored and a new episode is equal, a gain or a loss.
+The test is the exact one-sided McNemar (sign) test of the hypothesis that gains and losses are equally likely.
 """
 
 from __future__ import annotations
@@ -26,21 +25,21 @@ from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.versions import versions
 
 REFERENCE = Path(__file__).parents[1] / "results" / "guard-cpu.json"
-# Of each number of objects in the set `development`, in a suite of that many scenes.
+# Number of scenes with each number of objects, from the set `development`, by the size of the suite.
 SUITES: Mapping[int, int] = {40: 10, 80: 20, 160: 40}
 SEED = 0
-# What is compared, and how likely a false alarm is in all: each is tested at its part of it.
+# The compared measures, and the probability of a false alarm in all, which is divided between them.
 MEASURES = ("graspable", "retrieved")
 ALPHA = 0.05
-# Share of episodes that end otherwise with another seed: published scenes, `standard`, retrieved
-# (benchmarks/results/motion-h200.json, P: 0.10 to 0.13). A change of random numbers alone does the same.
+# Share of episodes whose verdict changes with the seed: published scenes, `standard`, retrieved
+# (benchmarks/results/motion-h200.json, P: 0.10 to 0.13). Any change of the random numbers does the same.
 FLIPS = 0.12
 POWER = 0.8
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What an episode of the suite came to.
+    """The outcome of an episode of the suite.
 
     Attributes:
       scenario, content_hash, objects, seed: which episode it is.
@@ -60,7 +59,7 @@ class Outcome:
 
     @classmethod
     def of_row(cls, row: Row) -> Outcome:
-        """What the row of an episode says."""
+        """The outcome in an episode's row."""
         return cls(
             scenario=row.scenario,
             content_hash=row.content_hash,
@@ -75,7 +74,7 @@ class Outcome:
 
     @property
     def episode(self) -> tuple[str, int]:
-        """What a pair has in common."""
+        """The key by which stored and new episodes are paired."""
         return self.content_hash, self.seed
 
 
@@ -85,11 +84,11 @@ class Comparison:
 
     Attributes:
       measure: one of `MEASURES`.
-      pairs: how many episodes.
-      before, now: in how many it held.
-      gains, losses: in how many it holds only now, and held only before.
-      p_value: how likely so large a share of losses is if gains and losses are equally likely.
-      alpha: at which that is significant.
+      pairs: number of episodes.
+      before, now: number of episodes in which it held before, and holds now.
+      gains, losses: number of episodes in which it holds only now, and held only before.
+      p_value: probability of at least so many losses if gains and losses are equally likely.
+      alpha: significance level.
     """
 
     measure: str
@@ -119,7 +118,7 @@ def suite(scenes: int) -> list[tuple[Block, int]]:
 
 
 def sign_test(gains: int, losses: int) -> float:
-    """How likely at least so many losses are among so many changes, if each is a gain or a loss with equal chance."""
+    """Probability of at least so many losses if each change is a gain or a loss with equal probability."""
     changes = gains + losses
     return 1.0 if changes == 0 else float(scipy.stats.binomtest(losses, changes, 0.5, alternative="greater").pvalue)
 
@@ -127,7 +126,7 @@ def sign_test(gains: int, losses: int) -> float:
 def compare(before: Sequence[Outcome], now: Sequence[Outcome]) -> list[Comparison]:
     """How each measure changed from a reference, episode by episode; the reference may hold more episodes.
 
-    A measure that some of the episodes do not say is left out.
+    A measure that is None in any of the episodes is left out.
 
     Raises:
       InputError: there is nothing to compare, or the reference lacks an episode.
@@ -135,8 +134,8 @@ def compare(before: Sequence[Outcome], now: Sequence[Outcome]) -> list[Compariso
     reference = {outcome.episode: outcome for outcome in before}
     missing = [outcome.scenario for outcome in now if outcome.episode not in reference]
     if missing or not now:
-        what = f"{missing[0]} as it is here" if missing else "anything"
-        raise InputError(f"bench guard: the reference does not hold {what}; write a new one with --write")
+        lacking = f"{missing[0]} as it is here" if missing else "anything"
+        raise InputError(f"bench guard: the reference does not hold {lacking}; write a new one with --write")
     changes = []
     for measure in MEASURES:
         pairs = [(getattr(reference[outcome.episode], measure), getattr(outcome, measure)) for outcome in now]
@@ -159,35 +158,35 @@ def compare(before: Sequence[Outcome], now: Sequence[Outcome]) -> list[Compariso
 
 
 def power(pairs: int, loss: float, flips: float = FLIPS, alpha: float = ALPHA / len(MEASURES)) -> float:
-    """How likely a true loss is noticed.
+    """The power of the test: the probability that a true loss is significant.
 
     Args:
-      pairs: how many episodes are compared.
-      loss: by how much the share falls.
-      flips: share of the pairs that differ without it, half of them gains and half losses.
+      pairs: number of compared episodes.
+      loss: decrease of the measure's share.
+      flips: share of pairs that differ without a loss, half of them gains and half losses.
       alpha: significance level of the test.
     """
     gain, lose = flips / 2, flips / 2 + loss
     changes = np.arange(pairs + 1)
     chance = scipy.stats.binom.pmf(changes, pairs, gain + lose)
-    # The least number of losses among so many changes that is significant.
+    # The least significant number of losses for each number of changes.
     needed = scipy.stats.binom.isf(alpha, changes, 0.5) + 1
     noticed = scipy.stats.binom.sf(needed - 1, changes, lose / (gain + lose))
     return float(np.sum(chance * np.where(changes > 0, noticed, 0.0)))
 
 
 def detectable(pairs: int, flips: float = FLIPS) -> float:
-    """The smallest loss, in steps of half a point, that is noticed with a probability of `POWER`."""
+    """The smallest loss, in steps of 0.005, that is significant with probability `POWER`."""
     losses = np.arange(1, int(200 * (1 - flips))) / 200
     return float(next(loss for loss in losses if power(pairs, loss, flips) >= POWER))
 
 
 def save_reference(rows: Sequence[Row], command: str, path: PathLike) -> None:
-    """Store what the suite came to, for later comparisons.
+    """Store the outcomes of the suite for later comparisons.
 
     Args:
       rows: of all episodes.
-      command: that ran them.
+      command: of the run.
       path: of the JSON file.
 
     Raises:
@@ -217,14 +216,14 @@ def _shares(rows: Sequence[Row], measure: str) -> dict[int, float]:
 
 
 class Reference(NamedTuple):
-    """What `save_reference` stored: the code that ran, and what its episodes came to."""
+    """A stored reference: the code that ran, and the outcomes of its episodes."""
 
     code: str
     outcomes: list[Outcome]
 
 
 def read_reference(path: PathLike) -> Reference:
-    """What `save_reference` stored.
+    """Read what `save_reference` stored.
 
     Raises:
       InputError: the file cannot be read, or is something else.

@@ -1,8 +1,8 @@
-"""How well the batch simulator agrees with the native one: random actions executed by both, all in one batch.
+"""Agreement of the batch simulator with the native one on random actions, all executed in one batch.
 
-Agreement is meant of every action by itself (where do all bodies end up?) and of the whole (how far do things move?).
-Some pushes are sensitive to anything: an object that tips, or is squeezed against a wall. How much can be asked for is
-told by the native simulator's agreement with itself when the objects are nudged by a hundredth of a millimetre.
+Agreement is measured for each action (final poses of all bodies) and for the distribution of displacements. Some pushes
+are chaotic: an object tips, or is squeezed against a wall. The upper bound is the native simulator's agreement with
+itself when the objects are nudged by a hundredth of a millimetre.
 """
 
 from __future__ import annotations
@@ -27,12 +27,11 @@ from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import World, from_scenario, true_superquadrics
 from mechsearch_jax.planner import Problem, build_problem
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import PathLike, save_json
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.shapes import by_shape
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Scenario
 
-# What counts as the same final pose [m, degrees].
+# Final poses within these tolerances count as equal [m, degrees].
 NEAR, ALIGNED = 5e-3, 3.0
 # Standard deviation of the nudge, along x and y [m].
 NUDGE = 1e-5
@@ -43,22 +42,22 @@ Measures = dict[str, int | float]
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One action in one scene, as both simulators executed it.
+    """One action in one scene, executed by both simulators.
 
     Attributes:
       scenario, objects: name of the scene, and number of objects in it.
       kind: name of the kind of action.
-      object: index of the object that it is about.
+      object: index of the action's object.
       native_failure, batch_failure: why it was not executed as commanded, or None.
-      native_moved, batch_moved: how far the object was displaced [m].
+      native_moved, batch_moved: displacement of the object [m].
       native_steps, batch_steps: simulated time steps.
-      position_difference: between the final positions of a body, the largest of all bodies [m].
-      rotation_difference: between the final rotations, likewise [degrees]; how far a round body has spun about its axis
-        does not count.
+      position_difference: largest difference of a body's final position [m].
+      rotation_difference: largest difference of a body's final rotation [degrees], without the spin of round bodies
+        about their axes.
       spin_difference: the same with the spin.
       overflow: flags of `outcome.Overflow`.
       nudged_position_difference, nudged_rotation_difference: between the native simulator and itself with the objects
-        nudged, the largest where it was nudged more than once.
+        nudged, the largest of several nudges.
     """
 
     scenario: str
@@ -80,22 +79,22 @@ class Case:
 
     @property
     def agrees(self) -> bool:
-        """Whether all final poses are the same within 5 mm and 3 degrees."""
+        """Whether all final poses are equal within 5 mm and 3 degrees."""
         return self.position_difference <= NEAR and self.rotation_difference <= ALIGNED
 
     @property
     def native_agrees(self) -> bool:
-        """The same of the native simulator with itself, nudged."""
+        """The same for the native simulator and itself, nudged."""
         return self.nudged_position_difference <= NEAR and self.nudged_rotation_difference <= ALIGNED
 
 
 @dataclasses.dataclass(frozen=True)
 class Agreement:
-    """What came of all actions.
+    """Results of all actions.
 
     Attributes:
       cases: one for each action.
-      native_seconds: of all actions, one after the other, with compilation [s].
+      native_seconds: of all actions in sequence, with compilation [s].
       batch_seconds: of all actions at once, with compilation [s].
       versions: as `versions` returns them, with those of MJX and Warp.
     """
@@ -109,6 +108,10 @@ class Agreement:
         """By kind of action and for all: shares, quantiles of the differences [m, degrees] and displacements [m]."""
         rows = {kind.name: [c for c in self.cases if c.kind == kind.name] for kind in KINDS}
         return {name: _summary(cases) for name, cases in {**rows, "all": list(self.cases)}.items() if cases}
+
+    def value(self) -> dict[str, Any]:
+        """As JSON values, with the summary."""
+        return {"summary": self.summary(), **dataclasses.asdict(self)}
 
 
 def _summary(cases: Sequence[Case]) -> Measures:
@@ -133,21 +136,12 @@ def _summary(cases: Sequence[Case]) -> Measures:
         ("batch_moved", batch),
     ):
         value |= {f"{name}_median": float(np.median(sample)), f"{name}_p90": float(np.quantile(sample, 0.9))}
-    # Probability of displacements that differ as much, if both come from one distribution.
+    # p-value of the hypothesis that both displacements are of the same distribution.
     with np.errstate(divide="ignore", invalid="ignore"):
         test: Any = ks_2samp(native, batch, method="asymp")
-    # There is no telling from a single action.
+    # The test means nothing for a single action.
     probability = float(test.pvalue) if len(cases) > 1 else 1.0
     return value | {"displacement_ks": float(test.statistic), "displacement_p_value": probability}
-
-
-def save_agreement(agreement: Agreement, path: PathLike) -> None:
-    """Write an agreement as JSON, with its summary.
-
-    Raises:
-      InputError: the file cannot be written.
-    """
-    save_json({"summary": agreement.summary(), **dataclasses.asdict(agreement)}, path)
 
 
 def generated_scenes(count: int, seed: int = 0) -> list[Scenario]:
@@ -171,10 +165,10 @@ def _sampler(problem: Problem) -> Callable[[Array, World], Action]:
         scene = true_superquadrics(world)
         ways = all_ways(problem.space, scene, nowhere)
 
-        def one(key: Array) -> Action:
+        def draw_single(key: Array) -> Action:
             return sample_action(key, problem.space, scene, nowhere, ways, scene.valid).action
 
-        return jax.vmap(one)(keys)
+        return jax.vmap(draw_single)(keys)
 
     compiled = jax.jit(draw)
     return lambda keys, world: compiled(keys, world, problem)
@@ -183,16 +177,16 @@ def _sampler(problem: Problem) -> Callable[[Array, World], Action]:
 def draw_actions(
     scenes: Sequence[Scenario], count: int, seed: int = 0, tries: int = 16
 ) -> list[tuple[Scenario, Action]]:
-    """Random valid actions in scenes: the scenes in turn, and the kinds of action in turn where there are several.
+    """Random valid actions in scenes, with scenes and kinds of action taken in turn.
 
     Args:
-      scenes: where.
-      count: how many actions.
+      scenes: the scenes.
+      count: number of actions.
       seed: of the random numbers.
-      tries: actions drawn in a scene, from which it contributes.
+      tries: number of actions drawn in a scene, of which the distinct ones are used.
 
     Raises:
-      InputError: the scenes do not have so many.
+      InputError: the scenes do not have so many actions.
     """
     sample = _sampler(build_problem())
     drawn: list[dict[int, list[Action]]] = []
@@ -200,14 +194,14 @@ def draw_actions(
         keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), i), tries)
         actions = jax.device_get(sample(keys, from_scenario(scene)))
         split = [jax.tree.map(lambda leaf, j=j: leaf[j], actions) for j in range(tries)]
-        # Where little is possible, the same push is drawn again and again.
+        # If little is possible, the same push is drawn repeatedly.
         different = list({b"".join(leaf.tobytes() for leaf in jax.tree.leaves(a)): a for a in split}.values())
         drawn.append({kind.code: [action for action in different if action.kind == kind.code] for kind in KINDS})
     cases: list[tuple[Scenario, Action]] = []
     for round_ in range(len(KINDS) * tries):
-        for i, (scene, found) in enumerate(zip(scenes, drawn, strict=True)):
+        for i, (scene, by_kind) in enumerate(zip(scenes, drawn, strict=True)):
             in_turn = [KINDS[(round_ + i + k) % len(KINDS)].code for k in range(len(KINDS))]
-            usable = next((found[code] for code in in_turn if found[code]), [])
+            usable = next((by_kind[code] for code in in_turn if by_kind[code]), [])
             if usable and len(cases) < count:
                 cases.append((scene, usable.pop(0)))
     if len(cases) < count:
@@ -220,13 +214,13 @@ def _angle(cosine: np.ndarray) -> np.ndarray:
 
 
 def pose_differences(a: World, b: World) -> tuple[Float[np.ndarray, " worlds"], ...]:
-    """How far apart the bodies of two states are: the largest distance [m] and angle [degrees] in every world.
+    """The largest differences between the bodies' poses of two states in every world.
 
     Args:
       a, b: the same bodies; fields with a leading axis for the worlds.
 
     Returns:
-      Distances; angles, of what is round between the axes; angles between rotations.
+      Distances [m]; angles [degrees], for round bodies between their axes; angles between rotations [degrees].
     """
     a, b = jax.tree.map(np.asarray, (a, b))
     distance = np.linalg.norm(a.position - b.position, axis=-1)
@@ -247,7 +241,7 @@ def _stack(trees: Sequence[Any]) -> Any:
 
 
 def _native(simulator: NativeWorld, cases: Sequence[tuple[Scenario, Action]]) -> tuple[list[Outcome], World]:
-    """What the native simulator makes of every action: outcomes, and the worlds with a leading axis for the actions."""
+    """The native simulator's outcomes of actions, and the worlds after them with a leading axis for the actions."""
     outcomes, worlds = [], []
     for scene, action in cases:
         simulator.reset(scene)
@@ -257,7 +251,7 @@ def _native(simulator: NativeWorld, cases: Sequence[tuple[Scenario, Action]]) ->
 
 
 def _nudged(scene: Scenario, rng: np.random.Generator) -> Scenario:
-    """The scene with its objects moved by next to nothing."""
+    """The scene with its objects displaced by noise of `NUDGE`."""
     objects = []
     for body in scene.objects:
         x, y = rng.normal(body.position[:2], NUDGE).tolist()
@@ -269,10 +263,10 @@ def agreement(cases: Sequence[tuple[Scenario, Action]], config: MjxConfig | None
     """Execute actions with both simulators; the batch simulator executes them all at once.
 
     Args:
-      cases: scenes, and what to do in them.
-      config: of the batch simulator; the native one takes its `simulator`.
-      nudges: how often the native simulator repeats every action with the objects nudged. Once tells how much the
-        actions agree on average; to tell which of them are sensitive takes several times.
+      cases: scenes and actions.
+      config: of the batch simulator; the native one uses its `simulator`.
+      nudges: number of repetitions of every action by the native simulator with nudged objects. One suffices for the
+        mean agreement; to identify chaotic actions takes several.
 
     Raises:
       InputError: Warp is missing.

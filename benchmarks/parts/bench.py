@@ -1,6 +1,6 @@
-"""How long perception, f, g, predicted pushes, a decision and simulation take, on scenes that the generator made.
+"""Times perception, f, g, predicted pushes, decisions and simulation on generated scenes.
 
-Compilation is timed apart from the steady state.
+Compilation is timed separately from the steady state.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax import planner
 from mechsearch_jax.actions import Action
@@ -27,13 +27,9 @@ from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.pushing.pushes import PushesConfig, draw_push, push_tables
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
-from mechsearch_jax.envs.simulators.mjx_model import MjxConfig
-from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
-from mechsearch_jax.envs.simulators.mjx_step import commands
 from mechsearch_jax.envs.world.world import TARGET, World, from_scenario, true_superquadrics
 from mechsearch_jax.existence import existence, object_views
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import make
 from mechsearch_jax.graspability import grasp_hits, graspability, pairs
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.planner import Belief, Config, Decision, Problem
@@ -41,10 +37,7 @@ from mechsearch_jax.planner import trials as trying
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.problem.settings import Settings
 from mechsearch_jax.problem.workcell import Workcell
-from mechsearch_jax.robot import motion
-from mechsearch_jax.robot.grasp_frames import WRIST_ORIGIN, gripper_rotation
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import PathLike, save_json
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.train.push import push_scenes
 from mechsearch_jax.train.scenes import random_world
@@ -53,20 +46,20 @@ from mechsearch_jax.workspace.object_sizes import ObjectSizes
 from mechsearch_jax.workspace.scenario import MAX_OBJECTS
 from mechsearch_jax.workspace.shelf import Shelf
 
-# What a call does many of; how many is in `Timing.shapes`.
+# Units that a call counts; the number is in `Timing.shapes`.
 COUNTED = ("recognitions", "predictions")
 
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """How long one function takes.
+    """The timing of one function.
 
     Attributes:
       subject: "existence", "graspability", "plan", "perceive: ..." and "predict: ..." with what does it, or "simulate".
       objects: number of objects in the scenes.
-      shapes: sizes that the time depends on; for "simulate" also what was seen of overflows and divergence.
-      compile_seconds: of tracing and compiling [s]; honest only if compilations are not kept on disk.
-      seconds: of every call afterwards, results awaited [s].
+      shapes: sizes that the time depends on; for "simulate" also the numbers of overflowed and diverged worlds.
+      compile_seconds: of tracing and compiling [s]; meaningful only if compilations are not kept on disk.
+      seconds: of every call afterwards, including the wait for results [s].
       versions: as `versions` returns them; for "plan" also the "push model", for "predict: learned" also
         "weights", their SHA-256.
     """
@@ -89,33 +82,24 @@ class Timing:
 
     @property
     def unit(self) -> str | None:
-        """What a call does many of: "steps" (of all worlds together), or one of `COUNTED`; None where nothing is."""
+        """The unit that a call counts: "steps" (of all worlds together), or one of `COUNTED`; None without a unit."""
         return "steps" if self.subject == "simulate" else next((unit for unit in COUNTED if unit in self.shapes), None)
 
     @property
     def rate(self) -> float | None:
-        """How many of its unit are done per second; None where nothing is counted."""
+        """Units per second; None without a unit."""
         if self.unit is None:
             return None
         return self.shapes[self.unit] * self.shapes.get("worlds", 1) / self.median
 
     def value(self) -> dict[str, Any]:
-        """What is written to a file: the fields, the median and the rate."""
+        """The timing as JSON values: the fields, the median and the rate."""
         value = {**dataclasses.asdict(self), "median_seconds": self.median}
         return value if self.rate is None else {**value, f"{self.unit}_per_second": self.rate}
 
 
-def save_timing(timing: Timing, path: PathLike) -> None:
-    """Write a timing as JSON, with its median.
-
-    Raises:
-      InputError: the file cannot be written.
-    """
-    save_json(timing.value(), path)
-
-
 def measure(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repeats: int) -> tuple[float, list[float]]:
-    """Seconds to compile a function for its arguments, and of every call after that.
+    """The time to compile a function for its arguments, and of every call after that [s].
 
     Args:
       function: to be compiled.
@@ -132,7 +116,7 @@ def measure(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repe
 def measure_first(
     function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], repeats: int
 ) -> tuple[float, list[float]]:
-    """The same of a function that compiles what it needs by itself: how much longer its first call takes."""
+    """As `measure`, of a function that compiles by itself: compilation is the excess time of its first call."""
     first = _timed(function, calls, 1)[0]
     seconds = _timed(function, calls, repeats)
     return max(first - statistics.median(seconds), 0.0), seconds
@@ -172,9 +156,9 @@ def bench_part(
     """Time f or g on generated scenes.
 
     Args:
-      subject: what is timed.
+      subject: the timed function.
       objects: number of objects in a scene.
-      settings: of the workcell, of the objects in it, and how the problem is built.
+      settings: of the workcell, its objects, and the problem.
       batch: number of scenes in one call; 1 times the function itself, without a batch axis.
       scenes: number of different scenes, taken in turn.
       repeats: number of timed calls.
@@ -197,18 +181,13 @@ def bench_part(
 
 
 def bench_plan(
-    objects: int,
-    method: Method,
-    batch: int = 1,
-    scenes: int = 5,
-    repeats: int = 20,
-    sizes: ObjectSizes | None = None,
+    objects: int, method: Method, batch: int = 1, scenes: int = 5, repeats: int = 20, sizes: ObjectSizes | None = None
 ) -> Timing:
     """Time a decision on generated scenes, whose targets are not found yet.
 
     Args:
       objects: number of objects in a scene.
-      method: what decides, and with which settings.
+      method: policy and settings.
       batch, scenes, repeats: as in `bench_part`.
       sizes: of the objects; the paper's if None.
 
@@ -226,25 +205,25 @@ def bench_plan(
         return trying.decide(policy, trials, key, problem, belief, seen)
 
     if batch > 1:
-        several = [(problem, *_batch_of(states, batch))]
-        proposed = jax.vmap(propose, in_axes=(None, 0, 0, 0))
+        calls = [(problem, *_batch_of(states, batch))]
+        propose_many = jax.vmap(propose, in_axes=(None, 0, 0, 0))
         if trials is None:
-            compile_seconds, seconds = measure(proposed, several, repeats)
+            compile_seconds, seconds = measure(propose_many, calls, repeats)
         else:
-            compile_seconds, seconds = measure_first(_after_trials(jax.jit(proposed), trials), several, repeats)
+            compile_seconds, seconds = measure_first(_with_trials(jax.jit(propose_many), trials), calls, repeats)
     else:
-        # As in an episode alone: a policy compiles what it needs, and computes only what the belief asks for.
+        # As in a single episode: the policy compiles by itself, and computes only the branch that the belief selects.
         compile_seconds, seconds = measure_first(decide, [(problem, *state) for state in states], repeats)
-    told = versions() | {"push model": method.config.push_model}
-    return Timing("plan", objects, shapes, compile_seconds, tuple(seconds), told)
+    about = versions() | {"push model": method.config.push_model}
+    return Timing("plan", objects, shapes, compile_seconds, tuple(seconds), about)
 
 
-def _after_trials(proposed: Callable[..., Decision], trials: Trials) -> Callable[..., Decision]:
-    """What decides on many scenes after trials."""
+def _with_trials(propose_many: Callable[..., Decision], trials: Trials) -> Callable[..., Decision]:
+    """A function that decides on many scenes after trials of the proposals."""
     choose = jax.jit(jax.vmap(trying.choose))
 
     def decide(problem: Problem, keys: Array, beliefs: Belief, seen: Observation) -> Decision:
-        decisions = proposed(problem, keys, beliefs, seen)
+        decisions = propose_many(problem, keys, beliefs, seen)
         alternatives = decisions.alternatives
         if alternatives is None:
             return decisions
@@ -258,7 +237,7 @@ def _after_trials(proposed: Callable[..., Decision], trials: Trials) -> Callable
 def _states(
     objects: int, config: Config, workcell: Workcell, sizes: ObjectSizes | None, batch: int, scenes: int
 ) -> tuple[Problem, list[tuple[Array, Belief, Observation]], dict[str, int]]:
-    """The problem, what is known and seen at the start of generated scenes with a key each, and the sizes."""
+    """The problem, key, belief and observation at the start of generated scenes, and the sizes."""
     around = {"shelf": workcell.shelf, "camera": workcell.camera, "gripper": workcell.gripper}
     generator = ScenarioGenerator(workcell.target, **around, sizes=sizes)
     problem = planner.build_problem(target=generator.target, **around, config=config.problem)
@@ -274,16 +253,16 @@ def _states(
 
 
 def _batch_of(states: Sequence[Any], batch: int) -> Any:
-    """So many of the states, in turn, with a leading axis."""
+    """`batch` states, taken in turn, with a leading axis."""
     return jax.tree.map(lambda *leaves: jnp.stack([leaves[i % len(states)] for i in range(batch)]), *states)
 
 
 def bench_perceive(
     recognition: RecognitionName, objects: int, batch: int = 1, scenes: int = 5, repeats: int = 20
 ) -> Timing:
-    """Time what makes superquadrics of noisy depth images: cloud, segments, network and refinement.
+    """Time recognition from noisy depth images: cloud, segments, network and refinement.
 
-    The images are ray-cast in the same computation, because that is how the planner's simulated camera comes to them.
+    Ray-casting the images is included, as in the planner's simulated camera.
 
     Args:
       recognition: "masks" or "full".
@@ -314,19 +293,19 @@ def bench_perceive(
 
 
 def drawn_pushes(count: int, objects: int, seed: int = 0, tries: int = 100) -> tuple[World, Action]:
-    """Random pushes that the arm can make, as the push model is trained on, each in a random scene of its own.
+    """Random possible pushes as in the training of the push model, each in a separate random scene.
 
     Args:
-      count: how many.
-      objects: in each scene. One with room for fewer, or in which no push is possible, is drawn anew.
+      count: number of pushes.
+      objects: in each scene. A scene with room for fewer, or without a possible push, is drawn anew.
       seed: of the scenes and the pushes.
-      tries: after so many times `count` scenes it is given up.
+      tries: at most this many times `count` scenes are drawn.
 
     Returns:
       The scenes and the pushes, with a leading axis.
 
     Raises:
-      InputError: the number of objects does not fit, or too few pushes are found.
+      InputError: the number of objects does not fit, or too few pushes are possible.
     """
     if not 1 <= objects <= MAX_OBJECTS:
         raise InputError(f"bench predict: --objects {objects} is not between 1 and {MAX_OBJECTS}")
@@ -336,26 +315,25 @@ def drawn_pushes(count: int, objects: int, seed: int = 0, tries: int = 100) -> t
     def draw(key: Array) -> tuple[World, Action, Array]:
         scene_key, push_key = jax.random.split(key)
         world = random_world(scene_key, scenes, shelf)
-        action, found = draw_push(push_key, world, tables, config, shelf)
-        return world, action, found & (jnp.sum(world.valid[:TARGET]) == objects)
+        action, possible = draw_push(push_key, world, tables, config, shelf)
+        return world, action, possible & (jnp.sum(world.valid[:TARGET]) == objects)
 
-    several = jax.jit(lambda keys: jax.lax.map(draw, keys, batch_size=min(count, 64)))
-    parts, have = [], 0
+    draw_many = jax.jit(lambda keys: jax.lax.map(draw, keys, batch_size=min(count, 64)))
+    parts, total = [], 0
     for i in range(tries):
-        world, action, real = jax.device_get(
-            several(jax.random.split(jax.random.fold_in(jax.random.key(seed), i), count))
-        )
-        parts.append(jax.tree.map(lambda a, real=real: a[real], (world, action)))
-        have += int(real.sum())
-        if have >= count:
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), i), count)
+        world, action, usable = jax.device_get(draw_many(keys))
+        parts.append(jax.tree.map(lambda a, usable=usable: a[usable], (world, action)))
+        total += int(usable.sum())
+        if total >= count:
             return jax.tree.map(lambda *a: jnp.asarray(np.concatenate(a)[:count]), *parts)
-    raise InputError(f"bench predict: only {have} of {count} pushes were possible with {objects} objects; take fewer")
+    raise InputError(f"bench predict: only {total} of {count} pushes were possible with {objects} objects; take fewer")
 
 
 def bench_predict(
     push_model: PushModelName, objects: int, batch: int = 30, repeats: int = 20, weights: Path | None = None
 ) -> Timing:
-    """Time a push model on random pushes, each in a scene of its own, all in one call.
+    """Time a push model on random pushes, each in a separate scene, all in one call.
 
     Args:
       push_model: its name.
@@ -374,99 +352,11 @@ def bench_predict(
     def predict(pusher: Array, scene: Superquadrics, action: Action) -> PushOutcome:
         return model(shelf, scene, pusher, action.T_world_gripper, action.displacement, action.q7)
 
-    # As in a decision, the target is none of the objects.
+    # As in a decision, the target is not among the objects.
     scene = true_superquadrics(world)
     compile_seconds, seconds = measure(jax.vmap(predict, in_axes=(None, 0, 0)), [(pusher, scene, action)], repeats)
-    about = weights_of(model)
+    learned, about = weights_of(model), versions()
     shapes = {"predictions": batch, "capacity": TARGET}
-    if about is not None:
-        shapes["parameters"] = about["parameters"]
-    told = versions() if about is None else {**versions(), "weights": about["sha256"]}
-    return Timing(f"predict: {push_model}", objects, shapes, compile_seconds, tuple(seconds), told)
-
-
-def crowded_worlds(worlds: int, scenes: int = 8, seed: int = 0) -> World:
-    """Many worlds with 8 objects each: generated scenes in turn, in every world with other sizes.
-
-    Args:
-      worlds: how many.
-      scenes: number of generated scenes.
-      seed: of the scenes and of the sizes.
-    """
-    generator = ScenarioGenerator()
-    made = [from_scenario(generator.generate(seed + i, MAX_OBJECTS)) for i in range(min(scenes, worlds))]
-    several: World = jax.tree.map(lambda *leaves: np.stack(leaves)[np.arange(worlds) % len(leaves)], *made)
-    scale = np.random.default_rng(seed).uniform(0.96, 1.0, (worlds, several.kind.shape[1], 1)).astype(np.float32)
-    half = np.asarray(several.half_size)
-    # A smaller body stands lower, if it stands.
-    lower = (1 - scale[..., 0]) * half[..., 2]
-    position = np.asarray(several.position) - lower[..., None] * np.array([0.0, 0.0, 1.0], np.float32)
-    return several.replace(half_size=half * scale, position=position)
-
-
-def plough(worlds: int, steps: int) -> tuple[Float[Array, "steps worlds 9"], Float[Array, "worlds 9"]]:
-    """Controls with which the arm reaches in, sweeps 0.15 m through the objects, and goes out again, to and fro.
-
-    Args:
-      worlds: each sweeps at a depth and a side of its own.
-      steps: number of time steps.
-
-    Returns:
-      The controls, and where the robot begins.
-    """
-    u = jnp.asarray((np.arange(worlds) % 16) / 16.0 + 1 / 32, jnp.float32)
-    position = jnp.stack([0.53 + 0.07 * u, -0.08 + 0.3 * ((5 * u) % 1), jnp.full(worlds, 0.48)], axis=-1)
-    tilt = jnp.full(worlds, np.radians(30), jnp.float32)
-    T = make(gripper_rotation(jnp.zeros(worlds), tilt), position.astype(jnp.float32))
-    shift = jnp.tile(jnp.float32([[0.0, 0.15, 0.0]]), (worlds, 1))
-    build = jax.vmap(lambda T, shift, q7: motion.push_reference(T, shift, q7, motion.MotionConfig()))
-    reference, reachable = build(T, shift, jnp.full(worlds, WRIST_ORIGIN + np.radians(30), jnp.float32))
-    if not reachable.all():
-        raise InputError("bench simulate: the arm cannot make its sweep")
-    told = jnp.swapaxes(commands(reference), 0, 1)[: int(reference.length.max())]
-    # Back along the same way at its end, where the next sweep would begin elsewhere.
-    last = len(told) - 1
-    index = np.arange(steps) % (2 * last)
-    row = np.minimum(index, 2 * last - index)
-    start = jnp.concatenate([reference.start, reference.start[:, -1:]], axis=1)
-    return told[row], start
-
-
-def bench_simulate(
-    worlds: int, steps: int, repeats: int = 5, scenes: int = 8, config: MjxConfig | None = None
-) -> Timing:
-    """Time the batch simulator: 8 objects of other sizes in every world, the arm sweeping through them.
-
-    Args:
-      worlds: how many at once.
-      steps: time steps of a timed call; `Timing.rate` is worlds times steps by the median of the calls.
-      repeats: number of timed calls; each begins with the scenes as generated.
-      scenes: number of generated scenes, which the worlds take in turn.
-      config: of the simulator.
-
-    Raises:
-      InputError: a number is not positive, or Warp is missing.
-    """
-    for name, value in {"worlds": worlds, "steps": steps, "repeats": repeats, "scenes": scenes}.items():
-        if value < 1:
-            raise InputError(f"bench simulate: {name} {value} must be at least 1")
-    simulator = MjxSimulator(config=config)
-    start = crowded_worlds(worlds, scenes)
-    controls, begin = plough(worlds, steps)
-    seconds = []
-    for _ in range(repeats + 1):
-        jax.block_until_ready((simulator.load(start), controls))
-        before = time.perf_counter()
-        outcomes = jax.block_until_ready(simulator.follow(controls, begin))
-        seconds.append(time.perf_counter() - before)
-    first, *rest = seconds
-    shapes = {
-        "worlds": worlds,
-        "steps": steps,
-        "scenes": scenes,
-        "overflowed_worlds": int((outcomes.overflow != 0).sum()),
-        "diverged_worlds": int((outcomes.failure != 0).sum()),
-    }
-    # Warp compiles when its kernels are first launched, so that only the first call's excess tells how long that takes.
-    compile_seconds = max(first - statistics.median(rest), 0.0)
-    return Timing("simulate", MAX_OBJECTS, shapes, compile_seconds, tuple(rest), versions())
+    if learned is not None:
+        shapes["parameters"], about["weights"] = learned["parameters"], learned["sha256"]
+    return Timing(f"predict: {push_model}", objects, shapes, compile_seconds, tuple(seconds), about)

@@ -1,8 +1,8 @@
 """Whole searches from images in a simulated cell, through `Searcher` alone: `mechsearch bench cell`.
 
-One configuration file says what the cell is like. Of each generated scene with a hidden target the searcher sees what a
-camera with noise delivers, and an arm in simulation follows the trajectories that it hands out. Nothing else passes
-between the two; what is true of the scene is only compared with what was recognised.
+A configuration file describes the cell. In each generated scene with a hidden target the searcher gets the images of a
+noisy camera, and a simulated arm follows its trajectories. Nothing else passes between the two; the true scene serves
+only to score the recognised one.
 """
 
 from __future__ import annotations
@@ -35,33 +35,33 @@ from mechsearch_jax.session.step import SearchStep
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.scenario import Scenario, rotation_matrix
 
-# A search is given up after so many looks in a row without a motion.
+# A search ends after this number of consecutive looks without a motion.
 PATIENCE = 3
-# A recognised object that reaches this far into the target's middle is in or on it [m].
+# A recognised object whose centre is this deep inside the target, or vice versa, is a phantom [m].
 INSIDE = 0.005
-# A recognised object whose centre is farther than this from the centre of everything that stands there is none [m].
+# A recognised object whose centre is farther than this from the centres of all bodies is astray [m].
 ASTRAY = 0.06
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What came of one search.
+    """The result of one search.
 
     Attributes:
-      seed, objects: which scene it was.
+      seed, objects: of the scene.
       retrieved: whether the target was taken out and nothing fell off the board.
-      found_step: number of motions before the target was first seen; None where it never was.
-      motions: number of motions that were handed out.
+      found_step: number of motions before the target was first seen; None if it never was.
+      motions: number of planned motions.
       failed: number of motions that the arm could not follow, or that missed the target.
       ended: how it ended, in a few words.
-      phantoms: looks at which an object was recognised in or on a target in sight.
-      undetected: looks at which a target in sight was not detected.
-      astray: looks at which an object was recognised where nothing stands.
+      phantoms: number of looks with an object recognised in or on a target in sight.
+      undetected: number of looks with an undetected target in sight.
+      astray: number of looks with an object recognised where nothing stands.
       idle: reasons of the looks without a motion.
-      warnings: of all looks, and how often each was given.
+      warnings: of all looks, with their numbers.
       actions: kinds of the motions.
-      seconds: that each look and decision took [s].
-      error: the traceback of what was raised; None where nothing was.
+      seconds: of each look and decision [s].
+      error: the traceback of an exception; None without one.
     """
 
     seed: int
@@ -87,16 +87,16 @@ def run_search(
     seed: int,
     objects: int,
     max_motions: int,
-    shown: Callable[[SearchStep], None] = lambda step: None,
+    on_step: Callable[[SearchStep], None] = lambda step: None,
 ) -> Row:
-    """One search, from the first look to its end.
+    """Run one search to its end.
 
     Args:
       searcher: new.
       cell: set up with a scene.
-      seed, objects: which scene it is.
-      max_motions: after so many, a search whose target is not out has failed.
-      shown: called with every step.
+      seed, objects: of the scene.
+      max_motions: largest number of motions.
+      on_step: called with every step.
     """
     found_step, failed, in_a_row = None, 0, 0
     phantoms = undetected = astray = 0
@@ -111,11 +111,11 @@ def run_search(
             begin = time.perf_counter()
             step = searcher.next(*look, joints=cell.joints)
             seconds.append(round(time.perf_counter() - begin, 3))
-            shown(step)
+            on_step(step)
             warnings.update(step.warnings)
             if bool(step.observation.target_visible):
                 found_step = len(actions) if found_step is None else found_step
-            # As the scene is, not as it is recognised: an undetected target may be an object to the searcher.
+            # By the true scene: the searcher may take an undetected target for an object.
             if pixels > found_pixels(cell.workcell.camera):
                 phantoms += any(_in_target(cell, step.observation))
                 undetected += not bool(step.observation.target_visible)
@@ -136,7 +136,7 @@ def run_search(
                 break
             ended = "too many motions"
     except Exception:
-        # An error belongs to its search.
+        # An error ends only its search.
         ended, error = "error", traceback.format_exc()
     return Row(
         seed=seed,
@@ -158,25 +158,25 @@ def run_search(
 
 
 def _in_target(cell: SimulatedCell, observation: Observation) -> list[bool]:
-    """Which recognised objects are in or on the target: one's middle is in the other."""
+    """Which recognised objects are in or on the target: the centre of one is inside the other."""
     truth = cell.scenario("now").target
     half, centre = np.array(truth.half_size), np.array(truth.position)
     objects = observation.objects
-    here = np.asarray(objects.position, float)
-    in_target = _inside(here, centre, rotation_matrix(truth.quaternion), half - INSIDE)
-    holds = [
-        bool(_inside(centre[None], here[i], np.asarray(objects.rotation[i]), np.asarray(objects.size[i]) - INSIDE)[0])
-        for i in range(len(here))
+    positions = np.asarray(objects.position, float)
+    in_target = _inside(positions, centre, rotation_matrix(truth.quaternion), half - INSIDE)
+    contains = [
+        bool(_inside(centre[None], position, np.asarray(rotation), np.asarray(size) - INSIDE)[0])
+        for position, rotation, size in zip(positions, objects.rotation, objects.size, strict=True)
     ]
-    return (np.asarray(objects.valid) & (in_target | np.array(holds))).tolist()
+    return (np.asarray(objects.valid) & (in_target | np.array(contains))).tolist()
 
 
 def _astray(cell: SimulatedCell, observation: Observation) -> list[bool]:
     """Which recognised objects are where nothing stands."""
     scene = cell.scenario("now")
     centres = np.array([body.position for body in (*scene.objects, scene.target)])
-    here = np.asarray(observation.objects.position, float)
-    apart = np.linalg.norm(here[:, None, :2] - centres[None, :, :2], axis=-1).min(axis=1)
+    positions = np.asarray(observation.objects.position, float)
+    apart = np.linalg.norm(positions[:, None, :2] - centres[None, :, :2], axis=-1).min(axis=1)
     return (np.asarray(observation.objects.valid) & (apart > ASTRAY)).tolist()
 
 
@@ -190,12 +190,12 @@ def _inside(
 
 
 def scenes(settings: Settings, objects: Sequence[int], searches: int, seed: int) -> list[tuple[int, Scenario]]:
-    """Scenes with a hidden target in a cell: their seeds, and what stands in them.
+    """Scenes with a hidden target in a cell, with their seeds.
 
-    A seed has the same number of objects in every run, so that parts of a run may be run apart.
+    The number of objects depends on the seed alone, so that a run can be divided.
 
     Raises:
-      InputError: nothing can be hidden there.
+      InputError: no target can be hidden in the cell.
     """
     generator = ScenarioGenerator.of(settings)
     return [(s, generator.generate(s, objects[s % len(objects)])) for s in range(seed, seed + searches)]
@@ -208,32 +208,36 @@ def run_cell(
     searches: int,
     seed: int,
     noise: SensorNoise,
-    progress: Callable[[int, str], None] = lambda done, what: None,
+    on_progress: Callable[[int, str], None] = lambda done, next_search: None,
 ) -> list[Row]:
-    """Searches in the cell of a configuration file; those that have a row in the folder already are not run again.
+    """Run searches in the cell of a configuration file; those with a row in the folder are not run again.
 
     Args:
       config: the file.
-      out: folder for a row and the last picture of every search.
+      out: folder for a row of every search, and pictures of those that failed.
       objects: numbers of objects, taken in turn.
-      searches: how many.
+      searches: number of searches.
       seed: of the first scene; the others follow.
       noise: of the camera.
-      progress: told how many are done, and what comes next.
+      on_progress: called with the number of searches so far, and a description of the next.
 
     Raises:
-      InputError: the file is wrong, its cell cannot work, or the folder holds rows of something else.
+      InputError: the file is wrong, its cell cannot work, or the folder holds rows of another identity.
     """
     settings = load_settings(config)
-    usual = {"config": config.read_text(encoding="utf-8"), "noise": dataclasses.asdict(noise), "code": present_code()}
+    identity = {
+        "config": config.read_text(encoding="utf-8"),
+        "noise": dataclasses.asdict(noise),
+        "code": present_code(),
+    }
     rows = []
-    progress(0, "preparing")
+    on_progress(0, "preparing")
     for number, (scene_seed, scenario) in enumerate(scenes(settings, objects, searches, seed)):
         file = out / f"search-{scene_seed}-{len(scenario.objects)}.json"
         if file.is_file():
-            rows.append(_read_row(file, usual))
+            rows.append(_read_row(file, identity))
             continue
-        progress(number, f"{len(scenario.objects)} objects, seed {scene_seed}")
+        on_progress(number, f"{len(scenario.objects)} objects, seed {scene_seed}")
         steps: list[SearchStep] = []
         cell = SimulatedCell(
             settings.workcell, scenario, noise=noise, target_colour=settings.workcell.colour, seed=scene_seed
@@ -243,15 +247,15 @@ def run_cell(
         if steps and not row.retrieved:
             for step in steps:
                 step.picture.savefig(out / f"search-{scene_seed}-{step.index}.png")
-        save_json({**usual, "row": dataclasses.asdict(row)}, file)
+        save_json({**identity, "row": dataclasses.asdict(row)}, file)
         rows.append(row)
-    progress(searches, "done")
+    on_progress(searches, "done")
     return rows
 
 
-def _read_row(file: Path, usual: dict[str, Any]) -> Row:
+def _read_row(file: Path, identity: dict[str, Any]) -> Row:
     value = read_json(file)
-    if any(value.get(name) != said for name, said in usual.items()):
+    if any(value.get(name) != expected for name, expected in identity.items()):
         raise InputError(f"{file}: is of another configuration, noise or code; give an empty folder with --out")
     row = value["row"]
     tuples = {name: tuple(row[name]) for name in ("idle", "actions", "seconds")}
@@ -259,7 +263,7 @@ def _read_row(file: Path, usual: dict[str, Any]) -> Row:
 
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """Counts over all searches; the interval is `rates.wilson`'s, every search being of a scene of its own."""
+    """Counts over all searches; the interval is Wilson's, since every search has a different scene."""
     retrieved = sum(row.retrieved for row in rows)
     steady = [second for row in rows for second in row.seconds[1:]]
     return {
@@ -284,8 +288,8 @@ def cell_table(rows: Sequence[Row]) -> Table:
     for name in ("seed", "objects", "found after", "motions", "failed", "phantoms", "ended"):
         table.add_column(name, justify="left" if name == "ended" else "right", no_wrap=True)
     for row in rows:
-        found = "-" if row.found_step is None else str(row.found_step)
-        numbers = (row.seed, row.objects, found, row.motions, row.failed, row.phantoms)
+        found_after = "-" if row.found_step is None else str(row.found_step)
+        numbers = (row.seed, row.objects, found_after, row.motions, row.failed, row.phantoms)
         table.add_row(*map(str, numbers), row.ended)
     counts = summary(rows)
     low, high = counts["retrieved_interval"]

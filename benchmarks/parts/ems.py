@@ -1,12 +1,12 @@
-"""A classical recogniser to compare with: probabilistic superquadric recovery, one segment at a time.
+"""A classical recogniser as a baseline: probabilistic superquadric recovery, one segment at a time.
 
-Our own implementation of the method of W. Liu, Y. Wu, S. Ruan and G. Chirikjian, "Robust and accurate superquadric
-recovery: a probabilistic approach", CVPR 2022: points are Gaussian about the surface or uniform outliers;
-expectation-maximisation alternates between the odds of each point and a few steps of weighted least squares in the
-eleven parameters; and because several superquadrics look alike from few points (other axes as the third, or turned by
-an eighth with another second exponent), it tries those in turn where it converges and goes on from a better one.
+An independent implementation of W. Liu, Y. Wu, S. Ruan and G. Chirikjian, "Robust and accurate superquadric recovery: a
+probabilistic approach", CVPR 2022. Points are Gaussian about the surface or uniform outliers. Expectation-maximisation
+alternates between the odds of each point and a few steps of weighted least squares in the eleven parameters. Several
+superquadrics look alike from few points (with another third axis, or turned by an eighth with another second exponent):
+where it converges, it tries these in turn and continues from a better one.
 
-It sees a segment's points and nothing else: no shelf, no rays, no training.
+It uses a segment's points alone: no shelf, no rays, no training.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from mechsearch_jax.runtime.errors import InputError
 
 EXPONENTS = (0.05, 2.0)
 LEAST_POINTS = 11
-# A mean square distance at which there is nothing to be improved, relative to the square of the scale.
+# Mean square distance that counts as exact, relative to the square of the scale.
 EXACT = 1e-7
 
 
 @dataclasses.dataclass(frozen=True)
 class EmsConfig:
-    """Settings of the recovery; lengths are relative to the segment's own scale, the root mean square radius.
+    """Settings of the recovery; lengths are relative to the segment's scale, the root mean square radius.
 
     Attributes:
       outliers: prior probability that a point is an outlier.
       sigma: standard deviation of the Gaussian at the start.
-      iterations: at most so many of expectation-maximisation, over all restarts.
+      iterations: largest number of iterations of expectation-maximisation, over all restarts.
       tolerance: relative change of the cost below which it has converged.
       evaluations: evaluations of the distances in one maximisation.
-      switches: how often it may go on from a similar superquadric.
-      largest: largest half-extent, relative to that of the points' bounding box: what points do not bound would grow
-        without end.
+      switches: largest number of switches to a similar superquadric.
+      largest: largest half-extent, relative to that of the points' bounding box; without it, extents that no points
+        bound would grow indefinitely.
     """
 
     outliers: float = 0.2
@@ -95,7 +95,7 @@ def _radial(shape: Recovered, points: np.ndarray) -> np.ndarray:
 
 
 def _radial_jacobian(shape: Recovered, points: np.ndarray) -> np.ndarray:
-    """Derivatives of `_radial` in log half-extents, exponents, centre and a turn about the shape's own axes."""
+    """Derivatives of `_radial` in log half-extents, exponents, centre and a rotation vector in the shape's frame."""
     local = (points - shape.position) @ shape.rotation
     x, y, z = np.maximum(np.abs(local.T) / shape.size[:, None], 1e-9)
     p, r = 2.0 / shape.exponents[1], 2.0 / shape.exponents[0]
@@ -115,7 +115,7 @@ def _radial_jacobian(shape: Recovered, points: np.ndarray) -> np.ndarray:
 
 
 def _start(points: np.ndarray) -> Recovered:
-    """An ellipsoid along the principal axes, as long as all but the outermost points reach."""
+    """An ellipsoid along the principal axes that spans all but the outermost points."""
     centre = points.mean(axis=0)
     _, axes = np.linalg.eigh(np.cov(points.T))
     axes = axes * np.linalg.det(axes)
@@ -126,7 +126,7 @@ def _start(points: np.ndarray) -> Recovered:
 
 
 def _maximise(shape: Recovered, points: np.ndarray, weight: np.ndarray, limit: float, evaluations: int) -> Recovered:
-    """A few steps of weighted least squares in half-extents, exponents, centre and a turn of the rotation."""
+    """A few steps of weighted least squares in half-extents, exponents, centre and rotation."""
     root = np.sqrt(weight)
 
     def unpacked(x):
@@ -139,7 +139,7 @@ def _maximise(shape: Recovered, points: np.ndarray, weight: np.ndarray, limit: f
     high = [np.log(limit)] * 3 + [EXPONENTS[1]] * 2 + [np.inf] * 6
     x = np.concatenate([np.log(shape.size), shape.exponents, shape.position, np.zeros(3)])
     x = np.clip(x, np.array(low) + 1e-9, np.array(high) - 1e-9)
-    # The derivative of a turn is exact at no turn; the turns of a few steps are small.
+    # The derivative of the rotation vector is exact at zero; those of a few steps are small.
     result = least_squares(
         lambda x: root * _radial(unpacked(x), points),
         x,
@@ -152,7 +152,7 @@ def _maximise(shape: Recovered, points: np.ndarray, weight: np.ndarray, limit: f
 
 
 def _similar(shape: Recovered) -> Iterator[Recovered]:
-    """Superquadrics that look much alike: another axis as the third, and a turn by an eighth in the plane."""
+    """Similar superquadrics: with another third axis, and turned by an eighth in the plane."""
     size, (e1, e2) = shape.size, shape.exponents
     for order in ((1, 2, 0), (2, 0, 1)):
         yield dataclasses.replace(
@@ -160,7 +160,7 @@ def _similar(shape: Recovered) -> Iterator[Recovered]:
         )
     turned = shape.rotation @ Rotation.from_euler("z", 45, degrees=True).as_matrix()
     mean = (size[0] + size[1]) / 2
-    # A square turned by an eighth is the other one of |x| + |y| = 1 and max(|x|, |y|) = 1, its half-extent scaled.
+    # A turn by an eighth maps the square |x| + |y| = 1 to max(|x|, |y|) = 1 and vice versa, with a scaled half-extent.
     side = mean * ((1 - 2**0.5) * e2 + 2**0.5)
     yield dataclasses.replace(
         shape, size=np.array([side, side, size[2]]), exponents=np.array([e1, 2.0 - e2]), rotation=turned
@@ -168,7 +168,7 @@ def _similar(shape: Recovered) -> Iterator[Recovered]:
 
 
 def _expect(shape: Recovered, points: np.ndarray, sigma: float, volume: float, outliers: float):
-    """Odds that each point belongs to the surface; and the weighted mean square of the distances."""
+    """Odds that each point belongs to the surface, and the weighted mean square of the distances."""
     square = _radial(shape, points) ** 2
     inlier = (1.0 - outliers) * np.exp(-square / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma) ** 3
     odds = inlier / (inlier + outliers / volume + 1e-300)
@@ -180,11 +180,11 @@ def recover(points: Float[np.ndarray, "n 3"], config: EmsConfig | None = None) -
     """The superquadric of a segment's points.
 
     Args:
-      points: [m], at least 11 of them, which do not lie on a line.
+      points: at least 11, not collinear [m].
       config: the default if None.
 
     Raises:
-      InputError: there are too few points, or some are not finite.
+      InputError: there are too few points, or a point is not finite.
     """
     config = config or EmsConfig()
     points = np.asarray(points, float)
@@ -212,8 +212,8 @@ def recover(points: Float[np.ndarray, "n 3"], config: EmsConfig | None = None) -
     for _ in range(config.switches):
         budget = max(config.iterations - shape.iterations, 3)
         # A similar shape is compared by what it becomes after the same number of steps.
-        others = [climb(dataclasses.replace(s, cost=np.inf), 3 * sigma, budget) for s in _similar(shape)]
-        best, best_sigma = min(others, key=lambda pair: _score(pair[0], points, sigma, volume, config))
+        climbed = [climb(dataclasses.replace(s, cost=np.inf), 3 * sigma, budget) for s in _similar(shape)]
+        best, best_sigma = min(climbed, key=lambda pair: _score(pair[0], points, sigma, volume, config))
         if _score(best, points, sigma, volume, config) >= _score(shape, points, sigma, volume, config):
             break
         shape, sigma = best, best_sigma
@@ -232,15 +232,15 @@ def _score(shape: Recovered, points: np.ndarray, sigma: float, volume: float, co
 def recover_scene(
     points: Float[np.ndarray, "p 3"], labels: Int[np.ndarray, " p"], capacity: int, config: EmsConfig | None = None
 ) -> Superquadrics:
-    """Superquadrics of all segments of a cloud, in the slots of their labels; absent where there are too few points."""
+    """Superquadrics of all segments of a cloud, in the slots of their labels; absent with too few points."""
     segments = [points[(labels == k) & np.isfinite(points).all(axis=1)] for k in range(capacity)]
-    found = [recover(segment, config) if len(segment) >= LEAST_POINTS else None for segment in segments]
+    shapes = [recover(segment, config) if len(segment) >= LEAST_POINTS else None for segment in segments]
     absent = Recovered(np.full(3, 1e-3), np.ones(2), np.zeros(3), np.eye(3), np.inf, 0)
-    filled = [shape or absent for shape in found]
+    filled = [shape or absent for shape in shapes]
     return Superquadrics(
         **{
             field: jnp.asarray(np.stack([getattr(shape, field) for shape in filled]), jnp.float32)
             for field in ("size", "exponents", "position", "rotation")
         },
-        valid=jnp.array([shape is not None for shape in found]),
+        valid=jnp.array([shape is not None for shape in shapes]),
     )

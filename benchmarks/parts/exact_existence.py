@@ -1,6 +1,6 @@
-"""f by brute force: what a target would show is counted at the camera's full resolution, without any margin.
+"""f by brute force: the visible pixels of a target are counted at the camera's full resolution, without any margin.
 
-The measure for `existence`, which looks at a coarse image and at five places of a cell.
+The reference for `existence`, which uses a coarse image and five places of a cell.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from mechsearch_jax.planner import Problem
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.target import Target
 
-# Places along each side of a cell, its edges among them.
+# Places along each side of a cell, its edges included.
 SIDE = 5
 
-# They take seconds, and are the same for every scene.
+# Cached, since they take seconds and are the same for every scene.
 _tables = functools.cache(existence_tables)
 
 
@@ -39,7 +39,8 @@ class FullResolution(ExistenceConfig):
     """Every pixel of the camera counts, and every overlap.
 
     Attributes:
-      side: a target is tried at so many places along each side of its cell, in a square grid; 1 is the middle alone.
+      side: number of places along each side of a cell at which a target is tried, in a square grid; 1 is the middle
+        alone.
     """
 
     downscale: int = 1
@@ -74,12 +75,12 @@ def _possible(
 
 
 def exact_existence(problem: Problem, scene: Superquadrics, side: int = SIDE) -> Bool[Array, " x"]:
-    """The candidate poses whose cell holds a place where the target would be hidden and overlap nothing.
+    """The candidate poses whose cell contains a place where the target would be hidden and overlap nothing.
 
     Args:
-      problem: says the camera, the shelf and the target.
+      problem: of the camera, the shelf and the target.
       scene: the objects, fields (N, ...).
-      side: how many places of a cell are looked at along each side; 1 is the candidate pose alone.
+      side: number of places along each side of a cell; 1 is the candidate pose alone.
     """
     config = FullResolution(side=side)
     tables = _tables(problem.camera, problem.shelf, problem.target, config)

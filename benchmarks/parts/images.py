@@ -1,4 +1,4 @@
-"""Images that perception is measured on: scenes that no training has seen, looked at through each of the sensors."""
+"""Images on which perception is measured: held-out scenes through each of the sensors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mechsearch_jax.images.noise import NoiseModel, RandomDirection, TimeOfFligh
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.train.loop import HELD_OUT_SEED
-from mechsearch_jax.train.scenes import cast_world, random_world
+from mechsearch_jax.train.scenes import PIXELS, cast_world, object_pixels, random_world
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
@@ -29,11 +29,11 @@ NOISES: Mapping[str, NoiseModel] = {"clean": no_noise, "gaussian": RandomDirecti
 
 
 class Shown(flax.struct.PyTreeNode):
-    """What methods see of a scene.
+    """The input of a method.
 
     Attributes:
-      points: as measured, in the world [m], shape (h, w, 3); NaN where nothing was.
-      labels: the true masks, as `envs.camera.recognisers.true_labels` has them, shape (h, w).
+      points: as measured, in the world [m], shape (h, w, 3); NaN where nothing was measured.
+      labels: the true masks, as `envs.camera.recognisers.true_labels`, shape (h, w).
       depth: of the points along the camera's axis [m], shape (h, w); infinite where nothing is, NaN where nothing was
         measured.
     """
@@ -44,12 +44,12 @@ class Shown(flax.struct.PyTreeNode):
 
 
 class Look(flax.struct.PyTreeNode):
-    """An image of a scene, and how much of its objects it shows.
+    """An image of a scene, and the visibility of its objects.
 
     Attributes:
       shown: the image.
-      pixels: of the full image that show each object, int32, shape (8,).
-      visible: that number over the one that there would be if the object stood alone, shape (8,).
+      pixels: number of pixels of the full image that show each object, int32, shape (8,).
+      visible: that number divided by the one without any other objects, shape (8,).
     """
 
     shown: Shown
@@ -63,8 +63,8 @@ class Scene:
 
     Attributes:
       name: of the scenario, or of a generated scene.
-      source: "held-out", or the name of a camera and shelf, if generated; else "files".
-      world: where everything stands.
+      source: "held-out", or the name of a workcell, if generated; else "files".
+      world: the true state.
     """
 
     name: str
@@ -73,13 +73,13 @@ class Scene:
 
 
 def held_out_scenes(count: int, seed: int = 0, shelf: Shelf | None = None, source: str = "held-out") -> list[Scene]:
-    """Random scenes as in training, of a seed that training refuses.
+    """Random scenes as in training, with a seed that training refuses.
 
     Args:
-      count: how many.
+      count: number of scenes.
       seed: of the scenes.
-      shelf: what they stand on; the default if None.
-      source: what they are called.
+      shelf: of the scenes; the default if None.
+      source: of the scenes.
 
     Raises:
       InputError: the numbers do not fit.
@@ -97,7 +97,7 @@ def scenes_of(scenarios: Sequence[Scenario]) -> list[Scene]:
     """Scenes from scenario files.
 
     Raises:
-      InputError: two have the same name, so that results could not be told apart.
+      InputError: two have the same name, so that their results could not be distinguished.
     """
     names = [scenario.name for scenario in scenarios]
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -112,13 +112,14 @@ def look(key: Key[Array, ""], camera: Camera, shelf: Shelf, world: World, noise:
 
     Args:
       key: PRNG key of the noise.
-      camera: of which `stride` is the distance of neighbouring rays in the full image, in pixels; static.
+      camera: static.
       shelf, noise: static.
       world: the scene.
+      stride: distance of neighbouring rays in the full image, in pixels; static.
     """
     depth, owner, alone = cast_world(camera, shelf, world)
     points = noise(key, camera, depth)
-    pixels = jnp.sum(owner[..., None] == jnp.arange(TARGET).reshape(1, 1, -1), axis=(0, 1))
+    pixels = object_pixels(owner)
     return Look(
         Shown(points, true_labels(points, owner, shelf), measured_depth(camera, depth, points)),
         pixels * stride**2,
@@ -129,31 +130,53 @@ def look(key: Key[Array, ""], camera: Camera, shelf: Shelf, world: World, noise:
 def image_of(
     scenes: Sequence[Scene], index: int, noise: str, seed: int, view: View, shelf: Shelf
 ) -> tuple[Key[Array, ""], Look]:
-    """A key for what is measured, and the image of a scene; the same on every call.
+    """A key for the measured method, and the image of a scene; the same on every call.
 
     Args:
-      scenes: of which one is looked at.
-      index: which.
+      scenes: all scenes.
+      index: of the scene.
       noise: name of the sensor.
       seed: of the noise and the key.
       view: which rays are cast.
-      shelf: what the scenes stand on.
+      shelf: of the scenes.
     """
     key = jax.random.fold_in(jax.random.key(seed), list(NOISES).index(noise))
     sensing, rest = jax.random.split(jax.random.fold_in(key, index))
     return rest, look(sensing, view.camera, shelf, scenes[index].world, NOISES[noise], view.stride)
 
 
-def named(noise: NoiseModel) -> str:
-    """A sensor with its settings, as results name it."""
-    return getattr(noise, "__name__", repr(noise))
+def check_images(command: str, scenes: Sequence[Scene], noises: Sequence[str]) -> None:
+    """Check the scenes and the names of sensors that a command measures on.
+
+    Raises:
+      InputError: there are no scenes, or no noise, or a noise is unknown.
+    """
+    if not scenes:
+        raise InputError(f"{command}: there are no scenes; give --scenes, or scenario files")
+    if not noises:
+        raise InputError(f"{command}: give at least one noise")
+    unknown = next((name for name in noises if name not in NOISES), None)
+    if unknown is not None:
+        raise InputError(f'{command}: noise "{unknown}" is unknown; use {", ".join(NOISES)}')
+
+
+def image_settings(scenes: Sequence[Scene], noises: Sequence[str], seed: int) -> dict[str, Any]:
+    """The settings of measurements on images, for results."""
+    sources = [scene.source for scene in scenes]
+    return {
+        "held_out_scenes": len(sources) - sources.count("files"),
+        "scenario_files": sources.count("files"),
+        "noises": {name: getattr(NOISES[name], "__name__", repr(NOISES[name])) for name in noises},
+        "seed": seed,
+        "least_pixels": PIXELS,
+    }
 
 
 def save_rows(value: dict[str, Any], rows: Sequence[Any], path: PathLike) -> None:
-    """Write figures as JSON, and below them one line for every row, from which they follow.
+    """Write results as JSON, with one line for every row.
 
     Args:
-      value: the figures.
+      value: everything but the rows.
       rows: dataclasses of one kind; at least one.
       path: of the file.
 

@@ -1,9 +1,8 @@
-"""How well push models predict what pushes do, on pushes in scenes that no training has seen.
+"""Accuracy of push models on simulated pushes in held-out scenes.
 
-Random pushes are simulated in scenes of a seed that training refuses, and every model is told each of them. Two rows
-are there to compare with: "no motion" predicts nothing, and "nudged" is the same simulation once more, from where the
-push began but with the bodies a hundredth of a millimetre elsewhere. A model that is told where they are with larger
-errors than that can hardly do better, not even by simulating.
+Random pushes are simulated in scenes of a seed that training refuses, and every model predicts them. Two baselines
+bound the scores: "no motion" predicts no motion, and "nudged" repeats the simulation with the bodies displaced by a
+hundredth of a millimetre. No model whose input has larger errors than that can be expected to do better.
 """
 
 from __future__ import annotations
@@ -30,27 +29,27 @@ from mechsearch_jax.envs.world.world import superquadrics
 from mechsearch_jax.geometry.transforms import translate
 from mechsearch_jax.networks.weights import load_weights
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import PathLike, save_json
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.train.loop import HELD_OUT_SEED
-from mechsearch_jax.train.push import no_motion, outcome_scores, predictions, push_scenes, random_pushes
+from mechsearch_jax.train.push import push_scenes, random_pushes
+from mechsearch_jax.train.push_scores import no_motion, outcome_scores, predictions
 from mechsearch_jax.train.run import commit
 
 RowName = Literal["no motion", "quasi-static", "learned", "physics", "nudged"]
 ROWS: tuple[str, ...] = get_args(RowName)
-# The row that is no model.
+# The row that is not a model.
 NUDGED: RowName = "nudged"
 
 
 def named_model(name: str, weights: Path | None = None) -> PushModel:
-    """The push model of a name, that which a plan uses for first actions; also the one that predicts nothing.
+    """The push model of a name, as a plan uses it for first actions, or `no_motion`.
 
     Args:
       name: "no motion", "quasi-static", "learned" or "physics".
       weights: of the learned model; the shipped ones if None.
 
     Raises:
-      InputError: there is none of that name, its weights are missing or damaged, or Warp cannot be imported.
+      InputError: there is no model of that name, its weights are missing or damaged, or Warp cannot be imported.
     """
     if name == "no motion":
         return no_motion
@@ -60,7 +59,7 @@ def named_model(name: str, weights: Path | None = None) -> PushModel:
 
 
 def weights_of(model: PushModel) -> dict[str, Any] | None:
-    """SHA-256 and number of parameters of a learned model's weights; None if it is no learned one."""
+    """SHA-256 and number of parameters of a learned model's weights; None for other models."""
     if not isinstance(model, LearnedPush) or model.path is None:
         return None
     parameters = load_weights(model.path, NAME).parameters
@@ -68,11 +67,11 @@ def weights_of(model: PushModel) -> dict[str, Any] | None:
 
 
 def held_out_generation(pushes: int, worlds: int, seed: int = 0, rounds: int = Generation.rounds) -> Generation:
-    """Pushes that are made as for training, but for how many objects there are, of a seed that training refuses.
+    """Settings of pushes as in training, except for the number of objects, with a seed that training refuses.
 
     Args:
       pushes, worlds, rounds: as in `Generation`.
-      seed: which of those seeds.
+      seed: added to the first such seed.
 
     Raises:
       InputError: the numbers do not fit.
@@ -87,12 +86,12 @@ def held_out_generation(pushes: int, worlds: int, seed: int = 0, rounds: int = G
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """What came of it.
+    """Results of a comparison.
 
     Attributes:
       scores: for each row the groups of `train.push.outcome_scores`.
-      weights: as `weights_of` tells of the learned model; None if it was not measured.
-      settings: how the pushes were made.
+      weights: `weights_of` the learned model; None if it was not measured.
+      settings: of the pushes.
       versions: as `versions` returns them.
     """
 
@@ -103,12 +102,22 @@ class Measured:
 
     @property
     def best(self) -> str:
-        """The learned model, or else the one whose pushed objects end nearest to where they should."""
+        """The learned model, or else the model with the least error of pushed objects."""
         if "learned" in self.scores:
             return "learned"
         models = [name for name in self.scores if name != NUDGED] or list(self.scores)
         errors = {name: self.scores[name]["all"]["pushed_mm"] for name in models}
         return min(models, key=lambda name: np.inf if errors[name] is None else errors[name])
+
+    def value(self) -> dict[str, Any]:
+        """All groups of all rows as JSON values, with settings and versions."""
+        return {
+            "settings": self.settings,
+            "commit": commit(),
+            "versions": self.versions,
+            "weights": self.weights,
+            "models": self.scores,
+        }
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -117,9 +126,9 @@ class Bench:
 
     Attributes:
       generation: of the pushes; see `held_out_generation`.
-      rows: what is compared, of `ROWS`.
+      rows: to compare, of `ROWS`.
       weights: of the learned model; the shipped ones if None.
-      make_simulator: simulates the pushes; `envs.pushing.pushes.engine` if left out.
+      make_simulator: makes the simulator of the pushes; `envs.pushing.pushes.engine` if None.
     """
 
     generation: Generation
@@ -135,53 +144,53 @@ class Bench:
             raise InputError(f'bench push: model "{unknown}" is unknown; use {", ".join(ROWS)}')
         if self.weights is not None and "learned" not in self.rows:
             raise InputError('bench push: --weights is for the model "learned"; add it to --models or leave it out')
-        # What cannot be used is to be told of before anything is simulated.
+        # Unusable models raise before anything is simulated.
         _ = self.models
 
     @functools.cached_property
     def models(self) -> dict[str, PushModel]:
-        """What predicts: the rows without "nudged"."""
+        """The push models: all rows except "nudged"."""
         return {name: named_model(name, self.weights) for name in dict.fromkeys(self.rows) if name != NUDGED}
 
     @property
     def gpu(self) -> bool:
-        """Whether the pushes are simulated on a GPU: where there is one."""
+        """Whether the pushes are simulated on a GPU: if there is one."""
         return jax.default_backend() != "cpu"
 
     @functools.cached_property
     def simulator(self) -> Simulator:
-        """What simulates the pushes."""
+        """The simulator of the pushes."""
         return (self.make_simulator or functools.partial(generator.engine, self.gpu))()
 
-    def pushes(self, folder: Path, told: Callable[[int], None] = lambda pushes: None) -> Pushes:
-        """The pushes; those that lie in a folder already are read, the others simulated and put there.
+    def pushes(self, folder: Path, on_progress: Callable[[int], None] = lambda pushes: None) -> Pushes:
+        """The pushes; read from a folder if they exist there, else simulated and written to it.
 
         Args:
           folder: for the pushes.
-          told: is told how many there are.
+          on_progress: called with the number of pushes so far.
 
         Raises:
-          InputError: what lies in the folder is damaged or was made otherwise, it cannot be written, no push was
-            possible, or Warp cannot be imported.
+          InputError: a file in the folder is damaged or was generated otherwise, the folder cannot be written, no push
+            was possible, or Warp cannot be imported.
         """
-        return random_pushes(self.generation, folder, self.gpu, push_scenes(), told, lambda: self.simulator)
+        return random_pushes(self.generation, folder, self.gpu, push_scenes(), on_progress, lambda: self.simulator)
 
-    def run(self, pushes: Pushes, told: Callable[[str, int], None] = lambda row, pushes: None) -> Measured:
-        """Compare predictions with what the simulation made of pushes.
+    def run(self, pushes: Pushes, on_progress: Callable[[str, int], None] = lambda row, pushes: None) -> Measured:
+        """Compare predictions with the simulated outcomes of pushes.
 
         Args:
           pushes: of `pushes`.
-          told: is told of each row how many pushes are done.
+          on_progress: called with the name of a row and its number of completed pushes.
         """
         pusher = push_tables(PushesConfig()).pusher
         scores = {}
         for name in dict.fromkeys(self.rows):
-            seen = functools.partial(told, name)
+            progress = functools.partial(on_progress, name)
             if name == NUDGED:
                 moved = nudged(pushes, self.generation.seed)
-                outcome = repeated(moved, self.simulator, self.generation.worlds, seen)
+                outcome = repeated(moved, self.simulator, self.generation.worlds, progress)
             else:
-                outcome = predictions(self.models[name], pushes, pusher, told=seen)
+                outcome = predictions(self.models[name], pushes, pusher, on_progress=progress)
             scores[name] = outcome_scores(outcome, pushes)
         config, scenes = PushesConfig(), push_scenes()
         settings = {
@@ -198,7 +207,7 @@ class Bench:
 
 
 def nudged(pushes: Pushes, seed: int = 0) -> Pushes:
-    """Pushes that begin with the bodies moved along x and y by next to nothing, as in `benchmarks.parts.agreement`."""
+    """The pushes with bodies displaced along x and y by noise of `NUDGE`."""
     before = pushes.before
     shift = np.random.default_rng(seed).normal(0.0, NUDGE, before.position.shape) * [1.0, 1.0, 0.0]
     moved = np.where(before.valid[..., None], before.position + shift, before.position).astype(np.float32)
@@ -206,45 +215,45 @@ def nudged(pushes: Pushes, seed: int = 0) -> Pushes:
 
 
 def repeated(
-    pushes: Pushes, simulator: Simulator, worlds: int, told: Callable[[int], None] = lambda pushes: None
+    pushes: Pushes, simulator: Simulator, worlds: int, on_progress: Callable[[int], None] = lambda pushes: None
 ) -> PushOutcome:
-    """What becomes of pushes if each is simulated by itself from where it began.
+    """The simulated outcomes of pushes, each from its recorded start.
 
     Args:
-      pushes: on the host; what became of them does not matter.
+      pushes: on the host; their recorded outcomes are ignored.
       simulator: simulates them.
-      worlds: so many at once.
-      told: is told how many are done.
+      worlds: number of worlds at once.
+      on_progress: called with the number of completed pushes.
 
     Returns:
-      Fields with a leading axis for the pushes, on the host. One that fails moves nothing; its residual is infinite.
+      Fields with a leading axis for the pushes, on the host. A push that fails moves nothing; its residual is infinite.
     """
     count = len(pushes.object)
     parts = []
     for start in range(0, count, worlds):
-        # As many worlds in the last batch as in the others, in which nothing is done.
+        # The last batch is padded with worlds in which nothing is done.
         index = start + np.arange(worlds)
-        some: Pushes = jax.tree.map(lambda a, index=index: jnp.asarray(a[np.minimum(index, count - 1)]), pushes)
-        simulator.load(some.before)
-        outcomes = simulator.execute(_actions(some), jnp.asarray(index < count))
+        batch: Pushes = jax.tree.map(lambda a, index=index: jnp.asarray(a[np.minimum(index, count - 1)]), pushes)
+        simulator.load(batch.before)
+        outcomes = simulator.execute(_actions(batch), jnp.asarray(index < count))
         after = simulator.world
         assert after is not None
         failed = ~outcomes.took_place | (outcomes.overflow != 0)
-        over = (toppled(some.before, after) | outcomes.fallen) & some.before.valid & ~failed[:, None]
-        before, after = superquadrics(some.before), superquadrics(after)
+        over = (toppled(batch.before, after) | outcomes.fallen) & batch.before.valid & ~failed[:, None]
+        before, after = superquadrics(batch.before), superquadrics(after)
         scene = before.replace(
             position=jnp.where(failed[:, None, None], before.position, after.position),
             rotation=jnp.where(failed[:, None, None, None], before.rotation, after.rotation),
         )
         outcome = PushOutcome(
             scene=scene,
-            moved=some.before.valid & ~failed[:, None],
+            moved=batch.before.valid & ~failed[:, None],
             residual=jnp.where(failed, jnp.inf, 0.0),
             resolved=~failed,
             topples=over.astype(jnp.float32),
         )
         parts.append(jax.tree.map(lambda a, index=index: np.asarray(a)[index < count], outcome))
-        told(min(start + worlds, count))
+        on_progress(min(start + worlds, count))
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
 
@@ -258,19 +267,3 @@ def _actions(pushes: Pushes) -> Action:
         q7=pushes.q7,
         opening=jnp.zeros(len(pushes.object)),
     )
-
-
-def save_push_scores(measured: Measured, path: PathLike) -> None:
-    """Write all groups of all rows as JSON, with how they came about.
-
-    Raises:
-      InputError: the file cannot be written.
-    """
-    value = {
-        "settings": measured.settings,
-        "commit": commit(),
-        "versions": measured.versions,
-        "weights": measured.weights,
-        "models": measured.scores,
-    }
-    save_json(value, path)

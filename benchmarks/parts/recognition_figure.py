@@ -25,21 +25,21 @@ def worst(rows: Sequence[Row], method: str, count: int) -> list[Row]:
     """The `count` answers of a method with the least intersection over union, the worst first.
 
     Raises:
-      InputError: there are none.
+      InputError: there are none, or the count is below 1.
     """
-    own = sorted((row for row in rows if row.method == method), key=lambda row: row.iou)
-    if not own or count < 1:
+    ranked = sorted((row for row in rows if row.method == method), key=lambda row: row.iou)
+    if not ranked or count < 1:
         raise InputError(
             f"bench recognition: there are no {count} answers of {method} to draw; measure it, count from 1"
         )
-    return own[:count]
+    return ranked[:count]
 
 
 def worst_figure(benches: Sequence[Bench], rows: Sequence[Row]) -> Figure:
     """Answers beside the truth: for each a part of the depth image, and the segment's points from above.
 
     Args:
-      benches: where the rows come from.
+      benches: of which the rows are results.
       rows: one panel each.
     """
     places = {(scene.source, scene.name): (bench, i) for bench in benches for i, scene in enumerate(bench.scenes)}
@@ -49,9 +49,9 @@ def worst_figure(benches: Sequence[Bench], rows: Sequence[Row]) -> Figure:
     grid = figure.subfigures(lines, columns, squeeze=False)
     for row, panel in zip(rows, grid.reshape(-1), strict=False):
         bench, i = places[row.source, row.scene]
-        image, found, _ = bench.answers(i, row.noise)
+        image, answers, _ = bench.answers(i, row.noise)
         truth = sharpened(true_superquadrics(bench.scenes[i].world))
-        both = {"true": truth, "recognised": found[row.method]}
+        both = {"true": truth, "recognised": answers[row.method]}
         drawn = {name: _slot(scene, row.object) for name, scene in both.items()}
         if row.outcome != "answered":
             del drawn["recognised"]
@@ -67,31 +67,30 @@ def _slot(scene: Superquadrics, index: int) -> Superquadrics:
 
 def _draw_panel(panel: Any, row: Row, shown: Shown, camera: Camera, drawn: Mapping[str, Superquadrics]) -> None:
     """The camera's view and the view from above, for one object."""
-    depth, own = np.asarray(shown.depth), np.asarray(shown.labels) == row.object
+    depth, mask = np.asarray(shown.depth), np.asarray(shown.labels) == row.object
     panel.suptitle(
         f"{row.scene}, object {row.object} ({row.shape})\n{row.noise}, {row.visible:.0%} visible: IoU {row.iou:.2f}",
         fontsize=8.5, color=drawing.INK,
     )  # fmt: skip
     view, above = panel.subplots(2, 1, height_ratios=(1.25, 1.0))
-    in_view = {name: drawing.outlines_in_view(one, camera)[0] for name, one in drawn.items()}
-    from_above = {
-        name: 1e3 * outline[:, ::-1] for name, one in drawn.items() if (outline := drawing.outlines(one)[0]) is not None
-    }
+    in_view = {name: drawing.outlines_in_view(shape, camera)[0] for name, shape in drawn.items()}
+    outlines_above = {name: drawing.outlines(shape)[0] for name, shape in drawn.items()}
+    from_above = {name: 1e3 * outline[:, ::-1] for name, outline in outlines_above.items() if outline is not None}
 
-    rows, columns = np.nonzero(own)
+    rows, columns = np.nonzero(mask)
     corners = np.concatenate([np.stack([columns, rows], axis=1), *(o for o in in_view.values() if o is not None)])
     low, high = corners.min(axis=0) - 6, corners.max(axis=0) + 6
     middle, half = (low + high) / 2, max(*(high - low)) / 2
     near = np.where(np.isfinite(depth), depth, np.nan)
-    part = near[own] if own.any() else near
+    part = near[mask] if mask.any() else near
     view.imshow(near, cmap="gray", vmin=np.nanmin(part) - 0.15, vmax=np.nanmax(part) + 0.15, interpolation="nearest")
-    tint = np.zeros((*own.shape, 4))
-    tint[own] = (*drawing.rgb(drawing.ACTION), 0.35)
+    tint = np.zeros((*mask.shape, 4))
+    tint[mask] = (*drawing.rgb(drawing.ACTION), 0.35)
     view.imshow(tint, interpolation="nearest")
     view.set_xlim(middle[0] - half, middle[0] + half)
     view.set_ylim(middle[1] + half, middle[1] - half)
 
-    points = 1e3 * np.asarray(shown.points)[own][:, :2]
+    points = 1e3 * np.asarray(shown.points)[mask][:, :2]
     above.scatter(points[:, 1], points[:, 0], s=1.5, color=drawing.ACTION, linewidths=0, label="the object's points")
     for axes, outlines in ((view, in_view), (above, from_above)):
         for name, outline in outlines.items():

@@ -1,7 +1,6 @@
-"""What scenes are like at their start: where the target can be, and how much the camera sees of it and of the objects.
+"""Statistics of scenes at their start: where the target can be, and how much of target and objects is visible.
 
-Made to compare sets of scenes with each other, as generated ones with published ones. Nothing is recognised: shapes and
-poses are the true ones.
+They compare sets of scenes, such as generated with published ones, using the true shapes and poses.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from mechsearch_jax.problem.cache import cached_problem
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.versions import versions
-from mechsearch_jax.train.scenes import PIXELS, cast_world
+from mechsearch_jax.train.scenes import PIXELS, cast_world, object_pixels
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import FOUND_PIXELS
 from mechsearch_jax.workspace.scenario import Scenario
@@ -40,23 +39,24 @@ from mechsearch_jax.workspace.target import Target
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What one scene is like.
+    """Statistics of one scene.
 
     Attributes:
-      source: the folder or set that it is of.
-      scenario, content_hash: its name, and what it holds.
-      objects: how many surround the target.
+      source: its folder or set.
+      scenario, content_hash: of the scenario.
+      objects: number of objects around the target.
       target: its shape.
       possible: number of candidate poses where the target can be, the size of f.
-      candidates: how many there are.
-      truth_possible: whether the target can be at the candidate pose that is nearest to its own.
-      target_pixels: of the full image that show the target.
-      target_share: that number over the one that there would be if it stood alone.
-      visible: how many objects show at least 100 pixels of themselves.
-      objects_share: mean over the objects of what each shows of the pixels that it would show if it stood alone.
-      exact_cells: number of poses whose cell holds a place where a target is hidden, by brute force; None if not asked.
-      exact_missed: how many of these f lacks.
-      exact_poses: number of poses that are such places themselves.
+      candidates: number of candidate poses.
+      truth_possible: whether the target can be at the candidate pose nearest to its true one.
+      target_pixels: number of pixels of the full image that show the target.
+      target_share: that number divided by the one without any objects.
+      visible: number of objects that show at least 100 pixels.
+      objects_share: mean over the objects of the visible share of their pixels.
+      exact_cells: number of poses whose cell contains a place where a target is hidden, by brute force; None if not
+        computed.
+      exact_missed: number of these cells that f lacks.
+      exact_poses: number of poses where a target is hidden, by brute force.
     """
 
     source: str
@@ -78,19 +78,17 @@ class Row:
 
 @jax.jit
 def _possible(problem: Problem, world: World) -> Array:
-    """f of the first look, as if the target were hidden also where it is not."""
+    """f of the first look, as if the target were hidden even if it is not."""
     unseen = Observation(true_superquadrics(world), jnp.array(False), jnp.zeros(3))
     return update_belief(problem, initial_belief(problem), unseen).exists
 
 
 @functools.partial(jax.jit, static_argnames=("shelf",))
 def _seen(shelf: Shelf, world: World) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
-    """Pixels of the full image that show each object, and those that it would show alone; every second row and column
-    counted for all."""
+    """Number of pixels of the full image that show each object, and without other objects, from a thinned image."""
     view = shelf_view(shelf=shelf)
     _, owner, alone = cast_world(view.camera, shelf, world)
-    pixels = jnp.sum(owner[..., None] == jnp.arange(TARGET).reshape(1, 1, -1), axis=(0, 1))
-    return pixels * view.stride**2, alone[:TARGET] * view.stride**2
+    return object_pixels(owner) * view.stride**2, alone[:TARGET] * view.stride**2
 
 
 def nearest_pose(target: Target, shelf: Shelf, pose: Float[np.ndarray, " 3"]) -> int:
@@ -105,27 +103,27 @@ def nearest_pose(target: Target, shelf: Shelf, pose: Float[np.ndarray, " 3"]) ->
 def look_at(
     source: str, scenario: Scenario, problem: Problem, camera: Camera, shelf: Shelf, exact: bool = False
 ) -> Row:
-    """What a scene is like.
+    """The statistics of a scene.
 
     Args:
-      source: what to call where it comes from.
+      source: name of its folder or set.
       scenario: the scene.
       problem: built for its target.
       camera, shelf: static.
-      exact: whether to look at f by brute force, too.
+      exact: whether to compute f by brute force, too.
     """
     world = from_scenario(scenario)
     only_target = world.replace(valid=jnp.arange(TARGET + 1) == TARGET)
     exists = np.asarray(_possible(problem, world))
     pixels, alone = (np.asarray(a)[: len(scenario.objects)] for a in _seen(shelf, world))
-    shown, whole = (int(target_pixels(camera, one)) for one in (world, only_target))
+    shown, whole = (int(target_pixels(camera, bodies)) for bodies in (world, only_target))
     body = scenario.target
     yaw = 2 * np.arctan2(body.quaternion[3], body.quaternion[0])
     truth = nearest_pose(problem.target, shelf, np.array([*body.position[:2], yaw]))
-    counted = {}
+    by_brute_force = {}
     if exact:
         cells, poses = (np.asarray(exact_existence(problem, true_superquadrics(world), side)) for side in (SIDE, 1))
-        counted = {
+        by_brute_force = {
             "exact_cells": int(cells.sum()),
             "exact_missed": int((cells & ~exists).sum()),
             "exact_poses": int(poses.sum()),
@@ -143,19 +141,21 @@ def look_at(
         target_share=round(shown / max(whole, 1), 4),
         visible=int((pixels >= PIXELS).sum()),
         objects_share=round(float(np.mean(pixels / np.maximum(alone, 1))), 4) if len(pixels) else 1.0,
-        **counted,
+        **by_brute_force,
     )
 
 
 def look_at_all(
-    sources: Mapping[str, Sequence[Scenario]], watcher: Callable[[int], None] = lambda done: None, exact: bool = False
+    sources: Mapping[str, Sequence[Scenario]],
+    on_progress: Callable[[int], None] = lambda done: None,
+    exact: bool = False,
 ) -> list[Row]:
-    """What the scenes of several sources are like.
+    """The statistics of the scenes of several sources.
 
     Args:
-      sources: scenes by the name of where they come from.
-      watcher: is told how many are done.
-      exact: whether to look at f by brute force, too, which takes seconds a scene.
+      sources: scenes by the name of their folder or set.
+      on_progress: called with the number of scenes so far.
+      exact: whether to compute f by brute force, too, which takes seconds per scene.
 
     Raises:
       InputError: a target cannot be grasped.
@@ -166,12 +166,12 @@ def look_at_all(
     for source, scenarios in sources.items():
         for scenario in scenarios:
             rows.append(look_at(source, scenario, problems(target_of(scenario)), camera, shelf, exact))
-            watcher(len(rows))
+            on_progress(len(rows))
     return rows
 
 
 def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Figures for each source and number of objects, in the rows' order of sources."""
+    """Figures for each source, in the rows' order, and number of objects."""
     groups: dict[tuple[str, int], list[Row]] = {}
     for row in rows:
         groups.setdefault((row.source, row.objects), []).append(row)
@@ -205,7 +205,7 @@ def _figures(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _by_brute_force(rows: Sequence[Row]) -> dict[str, Any]:
-    """Figures of the scenes in which f was found by brute force, too; nothing if there are none."""
+    """Figures of scenes with f by brute force, too; empty if there are none."""
     if not rows:
         return {}
     cells, missed, poses = (sum(getattr(row, f"exact_{name}") for row in rows) for name in ("cells", "missed", "poses"))
@@ -218,7 +218,7 @@ def _by_brute_force(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def save_scenes(rows: Sequence[Row], path: PathLike) -> None:
-    """Write the figures and all rows as JSON.
+    """Write figures and rows as JSON.
 
     Raises:
       InputError: there are no rows, or the file cannot be written.

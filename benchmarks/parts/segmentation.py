@@ -1,8 +1,8 @@
-"""How well the objects of depth images are told apart, on scenes that no training has seen.
+"""Accuracy of the segmentation of depth images, on held-out scenes.
 
-What is judged is the image as the planner's `full` mode labels it: the cloud is drawn, segmented, cleaned up and spread
-over the pixels. A segment is compared with the object that it overlaps most, one each; an object that none is left
-for counts as 0.
+Images are labelled as in the planner's `full` mode: the cloud is sampled, segmented, cleaned up and spread over the
+pixels. Segments are matched one to one with the objects that they overlap most; an object without a segment counts
+as 0.
 """
 
 from __future__ import annotations
@@ -17,35 +17,33 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from mechsearch_jax.benchmarks.parts.images import NOISES, Look, Scene, image_of, named, save_rows
+from mechsearch_jax.benchmarks.parts.images import Look, Scene, check_images, image_of, image_settings
 from mechsearch_jax.envs.camera.recognisers import Labeller, Segmenter
 from mechsearch_jax.envs.camera.simulated_camera import is_found
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.networks.weights import shipped_weights
 from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.versions import versions
 from mechsearch_jax.train.scenes import PIXELS
 from mechsearch_jax.viz import drawing
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Colours of up to eight objects, told apart with red-green blindness too.
+# Colours of up to eight objects, distinguishable with red-green blindness.
 _COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#ee8866", "#8c8c8c")
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """How well one object was told apart.
+    """The segmentation of one object.
 
     Attributes:
-      source, scene, object: which object of which scene.
-      objects: in the scene, seen or not.
+      source, scene, object: the object.
+      objects: number of objects in the scene, seen or not.
       noise: name of the sensor.
-      pixels: of the full image that show it.
-      visible: that number over the one that there would be if it stood alone.
-      iou: of its pixels with those of its segment.
+      pixels, visible: as in `Look`.
+      iou: intersection over union of its pixels with those of its segment.
     """
 
     source: str
@@ -60,13 +58,13 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class Measured:
-    """What came of it.
+    """Results of a run.
 
     Attributes:
       rows: one for every visible object of every image.
       seconds: for each image, the time to label it [s].
-      compile_seconds: of the first call, less the median of the others [s].
-      settings: what scenes, noises and seed they come from.
+      compile_seconds: of the first call, minus the median of the others [s].
+      settings: scenes, noises and seed.
       versions: as `versions` returns them.
     """
 
@@ -80,19 +78,19 @@ class Measured:
         """Mean intersection over union by source, noise and number of objects in the scene (None: of all)."""
         lines = []
         for source, noise in dict.fromkeys((row.source, row.noise) for row in self.rows):
-            own = [row for row in self.rows if (row.source, row.noise) == (source, noise)]
-            for count in (*sorted({row.objects for row in own}), None):
-                chosen = [row for row in own if count in (None, row.objects)]
-                enough = [row.iou for row in chosen if row.pixels >= PIXELS]
+            group = [row for row in self.rows if (row.source, row.noise) == (source, noise)]
+            for count in (*sorted({row.objects for row in group}), None):
+                chosen = [row for row in group if count in (None, row.objects)]
+                scored = [row.iou for row in chosen if row.pixels >= PIXELS]
                 lines.append(
                     {
                         "source": source,
                         "noise": noise,
                         "objects": count,
                         "scenes": len({row.scene for row in chosen}),
-                        "counted": len(enough),
-                        "iou_mean": float(np.mean(enough)) if enough else None,
-                        "missed": sum(iou < 0.5 for iou in enough),
+                        "counted": len(scored),
+                        "iou_mean": float(np.mean(scored)) if scored else None,
+                        "missed": sum(iou < 0.5 for iou in scored),
                         "visible": len(chosen),
                         "iou_mean_visible": float(np.mean([row.iou for row in chosen])),
                     }
@@ -100,7 +98,7 @@ class Measured:
         return lines
 
     def value(self) -> dict[str, Any]:
-        """What is written to a file, without the rows."""
+        """As JSON values, without the rows."""
         return {
             "settings": self.settings,
             "versions": self.versions,
@@ -112,14 +110,14 @@ class Measured:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Bench:
-    """Scenes to segment; everything that is needed to repeat any part of it.
+    """A measurement on scenes; it can repeat any part of a run.
 
     Attributes:
-      scenes: what is segmented.
+      scenes: to segment.
       noises: names of `images.NOISES`.
-      seed: of the noise and of the points that are drawn.
-      labeller: what segments; the shipped network if None.
-      shelf: what the scenes stand on.
+      seed: of the noise and of the sampled points.
+      labeller: segments the images; the shipped network if None.
+      shelf: of the scenes.
     """
 
     scenes: Sequence[Scene]
@@ -129,17 +127,13 @@ class Bench:
     shelf: Shelf = dataclasses.field(default_factory=Shelf)
 
     def __post_init__(self):
-        if not self.scenes:
-            raise InputError("bench segmentation: there are no scenes; give --scenes, or scenario files")
-        unknown = next((name for name in self.noises if name not in NOISES), None)
-        if unknown is not None or not self.noises:
-            raise InputError(f'bench segmentation: noise "{unknown}" is unknown; use {", ".join(NOISES)}')
+        check_images("bench segmentation", self.scenes, self.noises)
 
-    def run(self, watcher: Callable[[int], None] = lambda done: None) -> Measured:
+    def run(self, on_progress: Callable[[int], None] = lambda done: None) -> Measured:
         """Segment everything.
 
         Args:
-          watcher: told after every image how many are done.
+          on_progress: called after every image with the number of images so far.
 
         Raises:
           InputError: the shipped weights are missing or damaged.
@@ -150,23 +144,16 @@ class Bench:
         seconds: list[float] = []
         for noise in self.noises:
             for index, scene in enumerate(self.scenes):
-                image, found, spent = self._label(label, index, noise)
-                rows += _rows(scene, noise, image, found)
+                image, labels, spent = self._label(label, index, noise)
+                rows += _rows(scene, noise, image, labels)
                 seconds.append(spent)
-                watcher(len(seconds))
-        sources = [scene.source for scene in self.scenes]
-        settings = {
-            "held_out_scenes": sources.count("held-out"),
-            "scenario_files": sources.count("files"),
-            "noises": {name: named(NOISES[name]) for name in self.noises},
-            "seed": self.seed,
-            "least_pixels": PIXELS,
-        }
+                on_progress(len(seconds))
         compiling = max(first - statistics.median(seconds), 0.0)
+        settings = image_settings(self.scenes, self.noises, self.seed)
         return Measured(tuple(rows), tuple(seconds), compiling, settings, versions())
 
     def images(self, choice: Sequence[tuple[int, str]]) -> list[tuple[Look, np.ndarray]]:
-        """Some images, by scene's place and noise, with the labels that were found."""
+        """Images, chosen by a scene's index and a noise, with their segmentation."""
         label = self._compiled()
         return [self._label(label, index, noise)[:2] for index, noise in choice]
 
@@ -176,7 +163,7 @@ class Bench:
         def label(key, image, target_seen):
             labels = image.shown.labels
             of_target = (labels == TARGET) & target_seen
-            # Small segments are judged, too.
+            # Small segments are scored, too.
             return labeller(key, self.shelf, image.shown.points, of_target, labels, 0.0)
 
         return jax.jit(label)
@@ -185,20 +172,20 @@ class Bench:
         key, image = image_of(self.scenes, index, noise, self.seed, shelf_view(shelf=self.shelf), self.shelf)
         seen = jax.block_until_ready((image, is_found(Camera(), self.scenes[index].world)))[1]
         start = time.perf_counter()
-        found = jax.block_until_ready(label(key, image, seen))
-        return image, np.asarray(found), time.perf_counter() - start
+        labels = jax.block_until_ready(label(key, image, seen))
+        return image, np.asarray(labels), time.perf_counter() - start
 
 
-def overlaps(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Intersection over union of each object's pixels with those of the segment of its number; NaN where unseen."""
+def overlaps(labels: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Intersection over union of each object's pixels with those of the segment of its number; NaN if unseen."""
     objects = np.arange(TARGET)[:, None]
-    one, other = found.reshape(1, -1) == objects, truth.reshape(1, -1) == objects
-    union = (one | other).sum(axis=1)
-    return np.where(other.any(axis=1), (one & other).sum(axis=1) / np.maximum(union, 1), np.nan)
+    segments, masks = labels.reshape(1, -1) == objects, truth.reshape(1, -1) == objects
+    union = (segments | masks).sum(axis=1)
+    return np.where(masks.any(axis=1), (segments & masks).sum(axis=1) / np.maximum(union, 1), np.nan)
 
 
-def _rows(scene: Scene, noise: str, image: Look, found: np.ndarray) -> list[Row]:
-    iou = overlaps(found, np.asarray(image.shown.labels))
+def _rows(scene: Scene, noise: str, image: Look, labels: np.ndarray) -> list[Row]:
+    iou = overlaps(labels, np.asarray(image.shown.labels))
     pixels, visible, valid = jax.device_get((image.pixels, image.visible, scene.world.valid[:TARGET]))
     return [
         Row(
@@ -215,20 +202,11 @@ def _rows(scene: Scene, noise: str, image: Look, found: np.ndarray) -> list[Row]
     ]
 
 
-def save_segmentation(measured: Measured, path: PathLike) -> None:
-    """Write the figures and all rows as JSON.
-
-    Raises:
-      InputError: the file cannot be written.
-    """
-    save_rows(measured.value(), measured.rows, path)
-
-
 def worst_figure(bench: Bench, rows: Sequence[Row], count: int) -> Figure:
-    """The images whose objects of at least 100 pixels are told apart worst: true masks beside those found.
+    """The images with the least mean overlap of objects of at least 100 pixels: true masks beside segments.
 
     Raises:
-      InputError: there are none.
+      InputError: there are none, or the count is below 1.
     """
     shares: dict[tuple[str, str, str], list[float]] = {}
     for row in rows:
@@ -243,12 +221,12 @@ def worst_figure(bench: Bench, rows: Sequence[Row], count: int) -> Figure:
     lines = -(-len(order) // columns)
     figure = Figure(figsize=(4.2 * columns, 4.1 * lines), layout="constrained")
     panels = figure.subfigures(lines, columns, squeeze=False).reshape(-1)
-    for key, (image, found), panel in zip(order, images, panels, strict=False):
+    for key, (image, segments), panel in zip(order, images, panels, strict=False):
         truth = np.asarray(image.shown.labels)
         panel.suptitle(
             f"{key[1]}, {key[2]}: mean IoU {statistics.mean(shares[key]):.2f}", fontsize=9, color=drawing.INK
         )
-        for axes, labels, name in zip(panel.subplots(2, 1), (truth, found), ("true", "found"), strict=True):
+        for axes, labels, name in zip(panel.subplots(2, 1), (truth, segments), ("true", "found"), strict=True):
             _draw(axes, np.asarray(image.shown.depth), labels)
             axes.set_ylabel(name, fontsize=8, color=drawing.MUTED)
     return figure

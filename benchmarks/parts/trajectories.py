@@ -1,4 +1,4 @@
-"""Whole trajectories of many random actions: do they keep the limits, and does a simulated arm follow them?
+"""Checks whole trajectories of many random actions: whether they keep the limits, and a simulated arm follows them.
 
 python -m mechsearch_jax.benchmarks.parts.trajectories SCENES --out trajectories.json [--actions 500] [--speed 1.0]
 """
@@ -37,7 +37,7 @@ from mechsearch_jax.runtime.files import save_json
 from mechsearch_jax.session.whole_trajectory import Setting, whole_trajectory
 from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
-# Of the actions so many are retrievals; from a scene with at most so many objects, at most so many of them.
+# Share of retrievals among the actions; largest numbers of objects, and of retrievals, in a scene with retrievals.
 RETRIEVALS, FEW_OBJECTS, PER_SCENE = 0.24, 3, 4
 TRIES = 12
 
@@ -46,13 +46,13 @@ Case = tuple[Scenario, Action]
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What came of one action.
+    """The trajectory of one action.
 
     Attributes:
-      scenario, action: of what.
-      refused: why there is no trajectory, or None; the other fields are then None.
-      seconds: that making it took [s].
-      duration, velocity, acceleration, jerk, position_margin, clearance, straight, ends_at_home: its `Report`.
+      scenario, action: name of the scene, and code of the kind of action.
+      refused: why there is no trajectory, or None; if refused, the fields after `seconds` are None.
+      seconds: of planning the trajectory [s].
+      duration, velocity, acceleration, jerk, position_margin, clearance, straight, ends_at_home: of its `Report`.
       within: whether it keeps all limits.
       tip_error: largest distance of the simulated tip from the commanded one in free motion [m].
     """
@@ -77,20 +77,21 @@ def draw_cases(problem: Problem, scenes: Sequence[Scenario], count: int) -> list
     """Random possible actions of all kinds: pushes, pick-and-places, and retrievals from scenes with fewer objects.
 
     Raises:
-      InputError: the scenes do not have so many.
+      InputError: the scenes do not have so many actions.
     """
     retrievals = round(RETRIEVALS * count)
     cases = draw_actions(scenes, count - retrievals, tries=TRIES)
-    found: list[Case] = []
+    retrieval_cases: list[Case] = []
     for i, scene in enumerate(scenes):
         thinned = dataclasses.replace(scene, objects=scene.objects[i % 2 :: 2][:FEW_OBJECTS])
         choice = retrievals_of(problem, from_scenario(thinned), 40)
         possible = np.flatnonzero(choice.success)
         for j in possible[:: max(1, len(possible) // PER_SCENE)][:PER_SCENE]:
-            found.append((thinned, jax.tree.map(lambda a, j=j: a[j], choice.action)))
-    if len(found) < retrievals:
-        raise InputError(f"trajectories: {len(scenes)} scenes have only {len(found)} retrievals; take more scenes")
-    return cases + found[:retrievals]
+            retrieval_cases.append((thinned, jax.tree.map(lambda a, j=j: a[j], choice.action)))
+    if len(retrieval_cases) < retrievals:
+        available = len(retrieval_cases)
+        raise InputError(f"trajectories: {len(scenes)} scenes have only {available} retrievals; take more scenes")
+    return cases + retrieval_cases[:retrievals]
 
 
 class Follower:
@@ -98,7 +99,7 @@ class Follower:
 
     def __init__(self, setting: Setting, timestep: float):
         """Args:
-        setting: whose shelf it is.
+        setting: of the shelf and the camera.
         timestep: of the trajectories [s].
         """
         self._model = models.compile_model(setting.shelf, setting.camera, timestep)
@@ -107,11 +108,11 @@ class Follower:
         """Joint angles of the simulated arm after each step [rad]."""
         data = models.initial_state(self._model, [None] * BODIES)
         fingers = trajectory.width[:, None] / 2
-        # The integrator takes the stiffness from the positions before a step, not after it: an arm that is told where
-        # it will be then, as `simulator.controls` does, is one time step ahead, 4 mm at full speed.
+        # The integrator applies the stiffness at the positions before a step: with commands for the positions after it,
+        # as in `simulator.controls`, the arm is one time step ahead, 4 mm at full speed.
         velocity = np.diff(trajectory.position, axis=0) / trajectory.time[1]
-        told = trajectory.position[:-1] + LAG * velocity
-        controls = np.concatenate([told, fingers[1:], fingers[1:]], axis=1)
+        arm = trajectory.position[:-1] + LAG * velocity
+        controls = np.concatenate([arm, fingers[1:], fingers[1:]], axis=1)
         data.qpos[:ARM], data.qpos[ARM:ROBOT] = trajectory.position[0], fingers[0]
         size = mujoco.mj_stateSize(self._model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         state, states = np.empty(size), np.empty((1, len(controls), size))
@@ -129,7 +130,7 @@ class Follower:
 
 
 def measure(setting: Setting, cases: Sequence[Case], speed: float = 1.0) -> list[Row]:
-    """Make and follow the trajectory of every case; what is refused is a row that says why."""
+    """Plan and follow the trajectory of every case."""
     follower: Follower | None = None
     rows = []
     for scene, action in cases:
@@ -145,18 +146,9 @@ def measure(setting: Setting, cases: Sequence[Case], speed: float = 1.0) -> list
             continue
         seconds, report = time.perf_counter() - begin, trajectory.report()
         follower = follower or Follower(setting, float(trajectory.time[1]))
-        told: dict[str, Any] = dataclasses.asdict(report)
-        rows.append(
-            Row(
-                scene.name,
-                kind,
-                None,
-                seconds,
-                **told,
-                within=report.within(),
-                tip_error=follower.tip_error(trajectory),
-            )
-        )
+        fields: dict[str, Any] = dataclasses.asdict(report)
+        tip_error = follower.tip_error(trajectory)
+        rows.append(Row(scene.name, kind, None, seconds, **fields, within=report.within(), tip_error=tip_error))
     return rows
 
 
@@ -190,9 +182,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scenes = [load_scenario(path) for path in sorted(options.scenes.glob("*.json"))]
     problem = build_problem()
     rows = measure(problem, draw_cases(problem, scenes, options.actions), options.speed)
-    found = summary(rows)
-    save_json({"summary": found, "rows": [dataclasses.asdict(row) for row in rows]}, options.out)
-    print("\n".join(f"{name}: {value}" for name, value in found.items()))
+    figures = summary(rows)
+    save_json({"summary": figures, "rows": [dataclasses.asdict(row) for row in rows]}, options.out)
+    print("\n".join(f"{name}: {value}" for name, value in figures.items()))
 
 
 if __name__ == "__main__":

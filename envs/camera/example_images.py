@@ -25,7 +25,7 @@ LOST = 0.005
 
 
 def sensed_images(scenario: Scenario, camera: Camera | None = None, seed: int = SEED) -> Images:
-    """What a depth camera with noise delivers of a scenario, with the true mask.
+    """Images of a scenario by a noisy depth camera, with the true mask.
 
     Args:
       scenario: what stands on the shelf.

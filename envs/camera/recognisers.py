@@ -1,10 +1,12 @@
-"""Recognisers: what the planner sees the simulated world through, from its truth to nothing but a depth image.
+"""Recognisers of the simulated world, from the true state to nothing but a depth image.
 
-`oracle` knows the true shapes and poses. The others are shown the depth image of a camera with the noise of a sensor,
-and make superquadrics of it as `perception.recogniser.Recogniser` does: `masks` is told which pixels are whose, and
-which show nothing at all, `full` has to segment them too. Whether the target is seen is the detector's word, for all of
-them; where it is, only the oracle is told. Which pixels are the target's, `full` is told if the detector sees it; as
-long as it does not, they are to it those of one more object.
+- `oracle` returns the true shapes and poses.
+- `masks` receives a noisy depth image with the true segmentation, and with the pixels that show nothing marked.
+- `full` receives the noisy depth image alone and segments it.
+
+`masks` and `full` fit superquadrics as `perception.recogniser.Recogniser` does. For all three the detector decides
+whether the target is seen; only the oracle gets the target's pose. `full` gets the target's pixels once the detector
+sees the target; until then they look to it like those of one more object.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# In a thinned image a thing may seem to have so many times the pixels that it has.
+# A thinned image may overestimate an object's number of pixels by this factor.
 SAMPLED = 1.5
 
 RecognitionName = Literal["oracle", "masks", "full"]
@@ -45,8 +47,13 @@ RecognitionName = Literal["oracle", "masks", "full"]
 def true_labels(
     points: Float[Array, "h w 3"], owner: Int[Array, "h w"], shelf: Shelf, margin: float = MARGIN
 ) -> Int[Array, "h w"]:
-    """Labels of an image whose pixels show the slots `owner`, as `observe` has them: objects' slots, TARGET, and what
-    `images.labels` has for the rest. What is measured near the shelf counts as the shelf, whatever it is.
+    """Labels of an image: objects' slots, TARGET, or a label of `images.labels`; points near the shelf count as shelf.
+
+    Args:
+      points: in the world [m]; NaN where nothing was measured.
+      owner: the slot that each pixel shows, as `Image.segmentation`.
+      shelf: may be traced.
+      margin: distance from the shelf within which a point counts as shelf [m].
     """
     body = jnp.where((owner >= 0) & (owner <= TARGET), owner, OTHER)
     labels = jnp.where(above_board(shelf, points, margin), body, FREE)
@@ -71,16 +78,16 @@ class Labeller(Protocol):
           key: PRNG key.
           shelf: may be traced.
           points: in the world [m]; NaN where nothing was measured.
-          of_target: where the detector sees the target; nowhere as long as it does not.
-          masks: the true labels; a labeller that should not know them takes no more from them than the numbers that
-            objects go by, so that what is done to an object can be judged.
-          unseen: of how few pixels the detector does not find the target.
+          of_target: where the detector sees the target; False everywhere until it does.
+          masks: the true labels; a labeller that must not use them takes only the objects' numbers from them, so that
+            the effect of an action on an object can be judged.
+          unseen: a target of at most this many pixels is not detected.
         """
         ...
 
 
 def true_masks(key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array, unseen: float) -> Array:
-    """The `Labeller` that is told everything."""
+    """The `Labeller` that returns the true labels."""
     return masks
 
 
@@ -88,8 +95,7 @@ def true_masks(key: Array, shelf: Shelf, points: Array, of_target: Array, masks:
 class Segmenter:
     """The `Labeller` that segments the image with a network, and names the segments after the true objects.
 
-    What shows so little of itself that it may be the target is no object to it: it would rule out the target where the
-    target is.
+    Segments small enough to be an undetected target become OTHER: as objects they would rule out the target's own pose.
 
     Attributes:
       weights: of the segmentation network.
@@ -98,31 +104,31 @@ class Segmenter:
     weights: Weights
 
     def __call__(self, key: Array, shelf: Shelf, points: Array, of_target: Array, masks: Array, unseen: float) -> Array:
-        found = NetworkSegmenter.of(self.weights)(key, shelf, points, of_target)
-        return numbered(large_segments(found, SAMPLED * unseen), masks)
+        segments = NetworkSegmenter.of(self.weights)(key, shelf, points, of_target)
+        return numbered(large_segments(segments, SAMPLED * unseen), masks)
 
 
-def numbered(found: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "h w"]:
-    """Segments, numbered 0 to 7, renamed after the true objects that they overlap most, one each; none is lost.
+def numbered(segments: Int[Array, "h w"], masks: Int[Array, "h w"]) -> Int[Array, "h w"]:
+    """Segments, numbered 0 to 7, renumbered one to one after the true objects that they overlap most; none is lost.
 
-    A planner does not care for the names; but the simulator's notes on whether the picked object slipped do.
+    The planner does not depend on the numbers, but the simulator's check whether a picked object slipped does.
     """
     slots = jnp.arange(TARGET)
-    own = (found.reshape(-1)[:, None] == slots[None]).astype(jnp.float32)
+    segmented = (segments.reshape(-1)[:, None] == slots[None]).astype(jnp.float32)
     truth = (masks.reshape(-1)[:, None] == slots[None]).astype(jnp.float32)
-    # With nothing shared, a segment still gets one of the slots of objects that nobody sees.
-    name = assign(-jnp.matmul(own.T, truth))
-    return jnp.where(found >= 0, name[jnp.maximum(found, 0)], found).astype(jnp.int8)
+    # A segment without overlap still gets the slot of an object that no segment matches.
+    name = assign(-jnp.matmul(segmented.T, truth))
+    return jnp.where(segments >= 0, name[jnp.maximum(segments, 0)], segments).astype(jnp.int8)
 
 
 def large_segments(labels: Int[Array, "h w"], pixels: float) -> Int[Array, "h w"]:
-    """Labels in which segments, numbered from 0, that have no more than so many pixels are OTHER."""
+    """Labels with segments, numbered from 0, of at most `pixels` pixels set to OTHER."""
     small = jnp.sum(labels.reshape(-1)[:, None] == jnp.arange(INSTANCES)[None], axis=0) <= pixels
     return jnp.where((labels >= 0) & small[labels], OTHER, labels).astype(jnp.int8)
 
 
 class Depth(Protocol):
-    """Says how deep a measured image is."""
+    """Derives the depth image that shapes are fitted to."""
 
     def __call__(
         self, camera: Camera, depth: Float[Array, "h w"], points: Float[Array, "h w 3"]
@@ -132,21 +138,21 @@ class Depth(Protocol):
 
 
 def only_measured(camera: Camera, depth: Array, points: Array) -> Array:
-    """The `Depth` that takes nothing from the truth: where nothing was measured, nothing is known."""
+    """The `Depth` of the measured points alone: NaN where nothing was measured."""
     return depth_of(camera, points)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImageRecogniser:
-    """The `Recogniser` that sees a depth image. What it recognises has the edges of `superquadric.standard_edges`.
+    """The `Recogniser` that sees a depth image. Recognised shapes have the edges of `superquadric.standard_edges`.
 
     Attributes:
-      target: its known shape.
+      target: its shape.
       labeller: says which pixels show which object.
       weights: of the recognition network.
       noise: of the depth sensor.
       refinement: how recognised shapes are refined.
-      depth: of the image; by default it is known, as with true masks, where there is nothing at all.
+      depth: derives the depth image; the default also marks where the true image shows nothing, as true masks do.
     """
 
     target: Target
@@ -177,16 +183,16 @@ def labelled(
     target_seen: Bool[Array, ""],
     unseen: float,
 ) -> LabelledImage:
-    """What a recogniser makes shapes of: the part of the image that shows the shelf, as measured, with labels.
+    """The labelled image that a recogniser fits shapes to: the part that shows the shelf, as measured.
 
     Args:
       keys: of the noise, and of the labeller.
       recogniser: static.
       view: which rays of a camera are cast.
-      shelf: what they see.
+      shelf: the shelf in the image.
       world: the true state.
-      target_seen: whether the detector sees the target; where it does not, nothing is said of its pixels.
-      unseen: of how few pixels of the view the detector does not find the target; static.
+      target_seen: whether the detector sees the target; if not, the image marks no pixels as the target's.
+      unseen: a target of at most this many pixels of the view is not detected; static.
     """
     image = observe(view.camera, world, shelf)
     points = recogniser.noise(keys[0], view.camera, image.depth)
@@ -202,10 +208,10 @@ def recogniser(name: str, target: Target) -> Recogniser:
 
     Args:
       name: "oracle", "masks" or "full".
-      target: its known shape.
+      target: whose shape is given.
 
     Raises:
-      InputError: there is none of that name, or its weights are missing or damaged.
+      InputError: there is no recogniser of that name, or its weights are missing or damaged.
     """
     if name not in get_args(RecognitionName):
         raise InputError(f'recognition "{name}" is unknown; use {", ".join(get_args(RecognitionName))}')

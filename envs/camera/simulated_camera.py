@@ -55,8 +55,9 @@ class Image(flax.struct.PyTreeNode):
     """An image of the shelf.
 
     Attributes:
-      depth: along the camera's axis [m], shape (h, w); infinite where nothing is.
-      segmentation: what is seen, int8, shape (h, w): -1 nothing, 0 to 7 an object's slot, 8 the target, 9 the shelf.
+      depth: along the camera's axis [m], shape (h, w); infinite where a ray hits nothing.
+      segmentation: what a pixel shows, int8, shape (h, w): -1 nothing, 0 to 7 an object's slot, 8 the target, 9 the
+        shelf.
       colour: red, green and blue in 0 to 1, shape (h, w, 3).
     """
 
@@ -74,13 +75,13 @@ def _local(rotation: Array, vector: Array) -> list[Array]:
 def cast_body(
     camera: Camera, world: World, slot: Array | int, directions: Float[Array, "*pixels 3"]
 ) -> Float[Array, "*pixels"]:
-    """Depth of one body along rays from the camera [m]; infinite where it is not.
+    """Depth of one body along rays from the camera [m]; infinite where a ray misses it.
 
     Args:
       camera: where the rays start.
       world: the bodies.
-      slot: which of them.
-      directions: as `pixel_rays` gives them, so that they are of unit depth.
+      slot: the body's.
+      directions: of unit depth, as `pixel_rays` returns them.
     """
     origin = _local(world.rotation[slot], jnp.array(camera.position) - world.position[slot])
     direction = _local(world.rotation[slot], directions)
@@ -92,7 +93,7 @@ def cast_body(
 def _cast_bodies(
     camera: Camera, world: World, directions: Float[Array, "*pixels 3"]
 ) -> tuple[Float[Array, "*pixels"], Int[Array, "*pixels"]]:
-    """Depth along each ray and the slot of the first body that it meets; infinity and -1 where there is none."""
+    """Depth along each ray and the slot of the first body that it hits; infinity and -1 where it hits none."""
 
     def nearer(i, best):
         depth, owner = best
@@ -110,7 +111,7 @@ def _cast_bodies(
 
 
 def cast_shelf(camera: Camera, shelf: Shelf, directions: Float[Array, "*pixels 3"]) -> Float[Array, "*pixels"]:
-    """Depth of the empty shelf along rays from the camera [m]; infinite where it is not."""
+    """Depth of the empty shelf along rays from the camera [m]; infinite where a ray misses it."""
     depth = jnp.full(directions.shape[:-1], jnp.inf, directions.dtype)
     for low, high in shelf_corners(shelf).values():
         centre, half = ([sign(a, b) / 2 for a, b in zip(high, low, strict=True)] for sign in (add, sub))
@@ -121,7 +122,7 @@ def cast_shelf(camera: Camera, shelf: Shelf, directions: Float[Array, "*pixels 3
 
 
 def _normals(camera: Camera, shelf: Shelf, world: World, directions: Array, depth: Array, owner: Array) -> Array:
-    """Outward normals in the world, found from where on its body, or in the shelf, each point lies."""
+    """Outward normals in the world, from each point's place on its body or in the shelf."""
     flat = depth.shape
     directions, depth, owner = directions.reshape(-1, 3), depth.reshape(-1), owner.reshape(-1)
     point = jnp.array([camera.position]) + directions * jnp.where(jnp.isfinite(depth), depth, 0.0)[:, None]
@@ -170,7 +171,7 @@ def observe(camera: Camera, world: World, shelf: Shelf | None = None) -> Image:
 def target_window(camera: Camera) -> int:
     """Side of a window of a camera's image that holds a 0.1 m tall target anywhere on the shelf, in pixels.
 
-    Not for a traced camera. A camera that was calibrated again nearly always has the same.
+    The camera must not be traced. Recalibrating a camera hardly ever changes the window.
     """
     side = math.ceil(0.36 * max(camera.fx, camera.fy) / WINDOW_BLOCK) * WINDOW_BLOCK
     return min(side, max(camera.width, camera.height))
@@ -179,12 +180,12 @@ def target_window(camera: Camera) -> int:
 def target_pixels(camera: Camera, world: World, window: int | None = None) -> Int[Array, ""]:
     """How many pixels of the target the camera sees: those of `observe`, counted in a window around the target only.
 
-    The shelf hides nothing of what stands on it from this camera and is left out.
+    The shelf is left out: it hides none of the bodies on it from this camera.
 
     Args:
       camera: the camera.
       world: the bodies.
-      window: side of the window; `target_window` if left out, which for a traced camera it must not be.
+      window: side of the window; `target_window` if None; required for a traced camera.
     """
     return pixels_in_window(camera, world, window or target_window(camera))
 
@@ -207,5 +208,5 @@ def is_found(camera: Camera, world: World, window: int | None = None) -> Bool[Ar
     Args:
       camera, world, window: as of `target_pixels`.
     """
-    # Of no weak type, so that what takes it is compiled once.
+    # Not weakly typed, so that functions that take it are compiled once.
     return jnp.asarray(target_pixels(camera, world, window) > found_pixels(camera), bool)

@@ -1,4 +1,4 @@
-"""What may be known of the shelf at one moment, and the recogniser that knows it all."""
+"""The shelf at one moment as recognisers see it, and the recogniser that returns the true state."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 
 class Sight(flax.struct.PyTreeNode):
-    """What of a camera's sight of a shelf decides about shapes, found on the host, where both are known.
+    """The part of a camera's view of a shelf that array shapes depend on, computed on the host.
 
     Attributes:
-      view: see `thinned_view`; None of a camera that does not look into all of the shelf.
+      view: see `thinned_view`; None if the camera does not see all of the shelf.
       window: see `target_window`; static.
     """
 
@@ -34,23 +34,23 @@ class Sight(flax.struct.PyTreeNode):
 
 
 def sight_of(camera: Camera, shelf: Shelf) -> Sight:
-    """What recognisers have to know beforehand where camera and shelf are traced. Not to be called with such."""
+    """The `Sight` that recognisers need where camera and shelf are traced; the arguments here must not be traced."""
     try:
         view = thinned_view(camera, shelf)
     except InputError:
-        # Who only asks what is true needs none.
+        # The oracle needs no view.
         view = None
     return Sight(view, target_window(camera))
 
 
 @dataclasses.dataclass(frozen=True)
 class Snapshot:
-    """The shelf at one moment, as the camera can see it; images are ray-cast only when they are asked for.
+    """The shelf at one moment, as the camera can see it; images are ray-cast lazily.
 
     Attributes:
       camera, shelf: of the problem.
-      world: the true state, for a recogniser that may know it.
-      sight: of camera and shelf; to be given where they are traced.
+      world: the true state.
+      sight: of camera and shelf; required where they are traced.
     """
 
     camera: Camera
@@ -78,19 +78,19 @@ class Snapshot:
 
     @functools.cached_property
     def target_seen(self) -> Bool[Array, ""]:
-        """Whether the detector finds the target in the image; much cheaper than the image."""
+        """Whether the detector finds the target in the image; much cheaper than casting the image."""
         return is_found(self.camera, self.world, None if self.sight is None else self.sight.window)
 
 
 @runtime_checkable
 class Recogniser(Protocol):
-    """Turns what the camera sees into what the planner plans with. For batches it has to be traceable by JAX."""
+    """Turns what the camera sees into an observation for the planner; must be traceable by JAX to run in batches."""
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation: ...
 
 
 def oracle(key: Array, snapshot: Snapshot) -> Observation:
-    """The `Recogniser` that knows the true shapes and poses, of the target once the detector sees it. Needs no key."""
+    """The `Recogniser` of the true shapes and poses; the target's once the detector sees it. Ignores the key."""
     return Observation(objects_on_the_board(snapshot), snapshot.target_seen, true_target_pose(snapshot.world))
 
 

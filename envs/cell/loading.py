@@ -4,8 +4,8 @@
 
     searcher = load_searcher("mine.toml")
 
-What a configuration names (rehearsal, push model) is made here: it may need the simulator, which the planner's own part
-of the package does not know.
+Rehearsal and push model of the configuration are built here, since they may need the simulator, which the planner must
+not import.
 """
 
 from __future__ import annotations
@@ -37,20 +37,20 @@ def load_searcher(
     keep: bool = True,
     **options: Any,
 ) -> Searcher:
-    """A `Searcher` with the workcell and all planner's options of a configuration file.
+    """A `Searcher` with the workcell and all planner options of a configuration file.
 
-    It plans as `mechsearch search` does with that file: with the push model that it names, with its rehearsal, and with
-    its `max_steps`. Compiled functions and the problem are kept on disk, so that the next process starts in seconds.
+    It plans as `mechsearch search` does with that file, including its push model, rehearsal and `max_steps`. Compiled
+    functions and the problem are kept on disk, so that the next process starts in seconds.
 
     Args:
-      path: of the file; all defaults if left out.
-      camera: in the place of the file's, such as one of `images.image_files.load_camera`.
-      policy: what decides, by its name or import path, as `--policy` of the command line.
-      preset: in the place of the file's.
+      path: of the file; all defaults if None.
+      camera: replaces the file's, for example one of `images.image_files.load_camera`.
+      policy: name or import path, as `--policy` of the command line.
+      preset: replaces the file's.
       seed: of all random numbers.
       recogniser, trajectories: as for a `Searcher`.
       keep: whether this process keeps what it compiles from now on; see `keep_compilations`.
-      **options: of the planner by name, which go before the file's, such as `rehearsal="none"`.
+      **options: planner options that override the file's, such as `rehearsal="none"`.
 
     Raises:
       InputError: the file cannot be used, an option is impossible, or the camera does not see the shelf.
@@ -71,11 +71,11 @@ def load_searcher(
 def searcher_of(
     settings: Settings, *, camera: Camera | None = None, policy: str = "search-for-grasp", **arguments: Any
 ) -> Searcher:
-    """A `Searcher` with all that settings say.
+    """A `Searcher` of settings.
 
     Args:
-      settings: what a configuration file says.
-      camera, policy: as of `load_searcher`.
+      settings: of a configuration file.
+      camera, policy: as for `load_searcher`.
       **arguments: of a `Searcher`: seed, recogniser, trajectories.
 
     Raises:

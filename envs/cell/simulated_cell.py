@@ -1,15 +1,15 @@
-"""A robot cell in simulation, as a robot programmer has one: a camera to look with, an arm that follows trajectories.
+"""A simulated robot cell with the interface of a real one: a camera takes images, an arm follows trajectories.
 
     cell = SimulatedCell(workcell, scenario)
     step = searcher.next(*cell.look(), joints=cell.joints)
     searcher.acted(ok=cell.follow(step.trajectory).ok)
 
-It stands in for the real cell in front of a `Searcher`. Images come from MuJoCo's ray-casting of the simulated scene,
-with the robot in it, and from a pinhole model written out here: nothing of the package's own camera is involved. The
-whole trajectory is simulated, the ways through free space included.
+It replaces the real cell for a `Searcher`. Images come from MuJoCo's ray-casting of the simulated scene with the robot,
+through a pinhole model of this module: the package's own camera is not involved. The whole trajectory is simulated,
+including the motions through free space.
 
-Approximations: an arm that is held up follows its trajectory to the end all the same, and says so afterwards. What is
-gripped is gripped harder than the trajectory says by the fingers' stiffness times half its width, up to 20 N.
+Approximations: an arm that is held up follows its trajectory to the end and reports it afterwards. The grip force
+exceeds the trajectory's by the fingers' stiffness times half the object's width, up to 20 N.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -33,7 +33,7 @@ from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Scenario
 
-# Colours of the objects' slots, the shelf, the robot and what is behind: none of a strong hue but the target's own.
+# Colours of the objects' slots, the shelf, the robot and the background: only the target's has a strong hue.
 OBJECT_COLOURS: tuple[tuple[float, float, float], ...] = (
     (0.55, 0.55, 0.58),
     (0.72, 0.62, 0.45),
@@ -47,23 +47,23 @@ OBJECT_COLOURS: tuple[tuple[float, float, float], ...] = (
 SHELF_COLOUR = (0.80, 0.76, 0.70)
 ROBOT_COLOUR = (0.93, 0.93, 0.95)
 BACKGROUND_COLOUR = (0.85, 0.87, 0.90)
-# Towards the light, and the share of it that reaches every surface.
+# Direction towards the light, and the share of light that reaches every surface.
 LIGHT, AMBIENT = (-0.55, -0.35, 0.76), 0.5
-# What the pixels show beside the slots of bodies.
+# Owners of pixels beside the slots of bodies.
 SHELF, ROBOT_LINK, NOTHING = BODIES, BODIES + 1, -1
 # The model's groups of geometries that the camera sees: robot, boards and bodies, not the planes that contacts use.
 SHOWN_GROUPS = np.array([1, 1, 0, 1, 0, 0], np.uint8)
 # Rays end here [m].
 FARTHEST = 10.0
-# A trajectory has to begin where the arm is, to this [rad].
+# Largest distance of a joint from where a trajectory begins [rad].
 START_TOLERANCE = 0.02
-# Fingers that are farther apart than this after they closed hold something [m].
+# Closed fingers that are farther apart than this hold something [m].
 HOLDING = 0.004
 
 
 @dataclasses.dataclass(frozen=True)
 class SensorNoise:
-    """How the camera's images differ from what is there; normal noise, of every pixel by itself.
+    """Noise of the camera's images: normal, independent for every pixel.
 
     Attributes:
       depth: standard deviation of the depth [m].
@@ -81,7 +81,7 @@ class SensorNoise:
 
 
 class Look(NamedTuple):
-    """What the camera delivers: the first arguments of `Searcher.next`.
+    """Images of the camera: the first arguments of `Searcher.next`.
 
     Attributes:
       depth: along the camera's z [m], shape (H, W); 0 where nothing was measured.
@@ -93,15 +93,14 @@ class Look(NamedTuple):
 
 
 class Followed(NamedTuple):
-    """What came of a trajectory.
+    """Result of a trajectory.
 
     Attributes:
-      ok: what a robot's controller knows: no joint left its reference by more than the trajectory's bounds, and after a
-        retrieval the closed fingers hold something.
-      tracking_error: how far the joint that was farthest from its reference was from it [rad].
-      fallen: indices in the scenario of the objects that left the board, the target's is `TARGET`; never one that is
-        in the hand.
-      retrieved: whether the target is in the closed hand, outside the shelf, and nothing has left the board since the
+      ok: success as a robot's controller would report it: no joint left its reference by more than the trajectory's
+        bounds, and after a retrieval the closed fingers hold something.
+      tracking_error: largest distance of a joint from its reference [rad].
+      fallen: scenario indices of the objects that left the board, `TARGET` for the target; never an object in the hand.
+      retrieved: whether the target is in the closed hand outside the shelf, and nothing has left the board since the
         cell was set up.
     """
 
@@ -148,7 +147,7 @@ class SimulatedCell:
         self._world.reset(scenario)
         self._world.drive(np.zeros((1, ROBOT)) + self._control(np.array(workcell.arm.home), 0.0), at_once=True)
         blank = models.compile_model(workcell.shelf, workcell.camera)
-        # As large as the bodies are, where contacts need them a little smaller.
+        # Full size for pictures; contact geometry is a little smaller.
         self._seen = models.with_bodies(blank, self._bodies, skin=0.0)
         self._owner = np.array([*(_owner(blank.geom(i).name) for i in range(blank.ngeom)), NOTHING])
 
@@ -159,16 +158,11 @@ class SimulatedCell:
 
     @property
     def fallen(self) -> Bool[np.ndarray, " 9"]:
-        """Which bodies have left the board, the target last."""
+        """Whether each body has left the board, the target last."""
         return self._world.fallen
 
-    @property
-    def body_positions(self) -> Float[np.ndarray, "9 3"]:
-        """Where the bodies' centres are in the robot's frame, the target's last [m]."""
-        return self._world.positions[ROBOT:].reshape(BODIES, 7)[:, :3].copy()
-
     def scenario(self, name: str) -> Scenario:
-        """What stands where now."""
+        """The present scene."""
         return self._world.scenario(name)
 
     def look(self) -> Look:
@@ -186,7 +180,7 @@ class SimulatedCell:
         )
 
     def target_pixels(self) -> int:
-        """How many pixels of the target the camera sees."""
+        """Number of pixels of the target that the camera sees."""
         return int(np.sum(self._cast()[2] == TARGET))
 
     def follow(self, trajectory: RobotTrajectory) -> Followed:
@@ -216,7 +210,7 @@ class SimulatedCell:
         )
 
     def _control(self, arm: Float[np.ndarray, " 7"], width: float, force: float = 0.0) -> Float[np.ndarray, " 9"]:
-        """What the actuators are given; the fingers' are springs, which are drawn further together to grip."""
+        """Commands of the actuators; the fingers' are springs, which are drawn further together to grip."""
         finger = width / 2 - force / models.FINGER_STIFFNESS
         return np.concatenate([arm, [finger, finger]])
 
@@ -234,27 +228,14 @@ class SimulatedCell:
         geom, distance = np.full(len(rays), -1, np.int32), np.zeros(len(rays))
         normal = np.zeros(3 * len(rays))
         eye, unit, groups = np.array(camera.position), (rays / length[:, None]).ravel(), SHOWN_GROUPS
-        mujoco.mj_multiRay(
-            self._seen,
-            data,
-            eye,
-            unit,
-            groups,
-            1,
-            -1,
-            geom,
-            distance,
-            normal,
-            len(rays),
-            FARTHEST,
-        )
+        mujoco.mj_multiRay(self._seen, data, eye, unit, groups, 1, -1, geom, distance, normal, len(rays), FARTHEST)
         shape = (camera.height, camera.width)
         depth = np.where(geom >= 0, distance / length, np.inf)
         return depth.reshape(shape), normal.reshape(*shape, 3), self._owner[geom].reshape(shape)
 
 
 def _owner(geometry: str) -> int:
-    """Whose a geometry of the model is: a body's slot, the shelf's or the robot's."""
+    """Owner of a geometry of the model: a body's slot, the shelf or the robot."""
     slot = geometry.lstrip("abcdefghijklmnopqrstuvwxyz")
     if slot.isdigit() and geometry:
         return int(slot)

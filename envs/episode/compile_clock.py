@@ -1,4 +1,4 @@
-"""How long the stages of a step take, and how long this process waits for JAX to compile."""
+"""Measures how long the stages of a step take, and how long this process waits for JAX to compile."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from types import TracebackType
 
 import jax.monitoring
 
-# What JAX tells of tracing, lowering and compiling, or of reading what was compiled before.
+# Prefix of JAX's events for tracing, lowering and compiling, and for reading compiled programs from disk.
 EVENTS = "/jax/core/compile/"
 
 
 class CompileClock:
-    """Wall time that JAX has spent on compiling, from tracing on, since the clock was started.
+    """Wall time that JAX has spent on compiling, tracing included, since the clock was started.
 
-    What happens inside of something else, as one function is traced while another is, counts once.
+    Nested spans, such as tracing one function while tracing another, count once.
 
     Attributes:
       seconds: so far [s].
@@ -36,7 +36,7 @@ class CompileClock:
         jax.monitoring.unregister_event_duration_listener(self._took)
 
     def _took(self, event: str, duration_secs: float, **details: str | int) -> None:
-        """Take note of a span that ends now."""
+        """Add a span that ends now."""
         if not event.startswith(EVENTS):
             return
         end = time.perf_counter()
@@ -52,7 +52,7 @@ class CompileClock:
 class StageClock:
     """Wall time of the stages of a step, shared equally by the slots that took part.
 
-    What JAX compiled meanwhile is apart from them, as "compile".
+    Time that JAX spent on compiling meanwhile is kept separately as "compile".
     """
 
     def __init__(self, slots: int, busy: Callable[[str, int], None], compiling: CompileClock) -> None:
@@ -74,6 +74,6 @@ class StageClock:
                 timings["compile"] = round(timings.get("compile", 0.0) + compiled / len(rows), 6)
 
     def timings(self, row: int) -> dict[str, float]:
-        """Those of a slot since it was last read."""
+        """The timings of a slot since they were last read."""
         timings, self._timings[row] = self._timings[row], {}
         return timings

@@ -1,4 +1,4 @@
-"""What is written down of an episode while it runs, and the verdicts on it."""
+"""The log of a running episode, and the reasons for which it ends."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 
 class Choice(flax.struct.PyTreeNode):
-    """What a policy decided, without the sequences that it did not choose.
+    """A policy's decision without the sequences that it did not choose.
 
     Attributes:
       action, cost, predicted_cost: of the `Decision`.
-      sequences: how many sequences it was chosen from.
-      refused: how many more began with what did harm in a rehearsal.
-      others: the first actions of all of these, the best first, of kind NONE after the last; None where not known.
+      sequences: number of sequences that it was chosen from.
+      refused: number of further sequences whose first action did harm in a trial.
+      others: the first actions of all sequences, the best first, of kind NONE after the last; None if not kept.
     """
 
     action: Action
@@ -43,32 +43,32 @@ class Choice(flax.struct.PyTreeNode):
 
 @kept()
 def chosen(decision: Decision) -> Choice:
-    """What a decision comes down to."""
+    """The `Choice` of a decision."""
     count = jnp.sum(jnp.isfinite(decision.sequences.value))
     others = jax.tree.map(lambda a: a[:, 0], decision.sequences.actions)
     return Choice(decision.action, decision.cost, decision.predicted_cost, count, decision.refused, others)
 
 
 def takes_target(choice: Choice) -> bool:
-    """Whether the chosen action is to take the target out."""
+    """Whether the chosen action is a retrieval."""
     return kind_of(int(choice.action.kind)).takes_target
 
 
 def distrust(choice: Choice) -> str | None:
-    """Why a choice must not be acted upon; None if it may."""
+    """Why a choice must not be executed; None if it may."""
     numbers = [choice.cost, *jax.tree.leaves(choice.action)]
     return None if all(np.all(np.isfinite(n)) for n in numbers) else "error: the decision is not finite"
 
 
 def target_trouble(shelf: Shelf, position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"]) -> str | None:
-    """Why a target at this pose can no longer be taken out as the planner knows it; None if it can."""
+    """Why a target at this pose can no longer be retrieved; None if it can."""
     if position[0] < shelf.front or position[2] < shelf.board:
         return "the target fell off the board"
     return "the target fell over" if fallen_over(rotation) else None
 
 
 def overflow_trouble(outcome: Outcome, i: int) -> str | None:
-    """What was too small for the contacts of world `i`; None if nothing was."""
+    """An error that names the buffers that overflowed with contacts of world `i`; None without overflow."""
     flags = Overflow(int(outcome.overflow[i]))
     if flags is Overflow.NONE:
         return None
@@ -78,14 +78,14 @@ def overflow_trouble(outcome: Outcome, i: int) -> str | None:
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What the simulator said of what was decided, in the words of a record.
+    """The simulator's outcome of a decision, in the words of a record.
 
     Attributes:
-      failure: why it was not carried out as chosen; None if it was.
-      takes_target: whether it was an attempt to take the target out.
-      retrieved: whether that succeeded and nothing fell meanwhile.
-      final: whether trying once more would not mend it.
-      off_board: bodies that are off the board now, since then or before.
+      failure: why the action was not carried out as chosen; None if it was.
+      takes_target: whether it was a retrieval.
+      retrieved: whether a retrieval succeeded and nothing fell meanwhile.
+      final: whether another attempt cannot succeed.
+      off_board: bodies that are off the board after the action.
       held_up, at_rest, tracking_error: as in `Step`.
     """
 
@@ -100,9 +100,9 @@ class Result:
 
 
 def result_of(choice: Choice, outcome: Outcome, i: int) -> Result:
-    """What came of the action in world `i`."""
+    """The result of the action in world `i`."""
     code, takes = Failure(int(outcome.failure[i])), takes_target(choice)
-    # The same grasp stays out of reach, what fell stays off the board, and a target that is out cannot be taken out.
+    # The grasp stays out of reach, a fallen body stays off the board, and a target outside cannot be taken out again.
     final = code in (Failure.UNREACHABLE, Failure.FALLEN) or bool(outcome.held[i] & outcome.outside[i])
     return Result(
         failure=failure_of(choice, outcome, i),
@@ -132,13 +132,13 @@ def record(
     truth_possible: bool | None = None,
     restarts: int | None = None,
 ) -> Step:
-    """A step as it is decided: what comes of it is filled in later.
+    """The record of a step when it is decided; its results are filled in later.
 
     Args:
       found: whether the target has been found.
       belief_size: number of poses where it can be.
       verdict: on the true state.
-      choice: None where nothing is done.
+      choice: None if nothing is done.
       truth_possible, restarts: as in `Step`.
     """
     cost = predicted = action = None
@@ -166,23 +166,23 @@ def record(
 
 
 def _expected(choice: Choice) -> float | None:
-    """The cost that is expected after a choice, if any is: a policy need not say."""
+    """The predicted cost after a choice; None if the policy predicts none."""
     return float(choice.predicted_cost) if np.isfinite(choice.predicted_cost) else None
 
 
 class EpisodeLog:
-    """The steps of an episode that is running, and the verdicts on them.
+    """The steps of a running episode, and the verdicts on them.
 
-    At every step `decide` notes what was known and decided, and then `act` what came of it.
+    At every step `decide` records belief and decision, and then `act` the result.
 
     Attributes:
-      steps: those that are over, and the one that was decided.
-      spoilt: why the target cannot be retrieved any more, whatever is done: an object has left the board; None before.
+      steps: so far, the decided one included.
+      irretrievable: why no retrieval counts any more: an object has left the board; None as long as none has.
     """
 
     def __init__(self, max_steps: int) -> None:
         self.steps: list[Step] = []
-        self.spoilt: str | None = None
+        self.irretrievable: str | None = None
         self._off_board: frozenset[int] = frozenset()
         self._max_steps = max_steps
         self._index = 0
@@ -194,21 +194,21 @@ class EpisodeLog:
 
     @property
     def index(self) -> int:
-        """Number of the present step: how many steps came before it."""
+        """Index of the present step, from 0."""
         return self._index
 
     @property
     def last(self) -> bool:
-        """Whether at the present step only a retrieval is allowed any more."""
+        """Whether only a retrieval is allowed at the present step."""
         return self._index == self._max_steps
 
     @property
     def acts(self) -> bool:
-        """Whether an action was decided upon."""
+        """Whether the present step has an action."""
         return self.steps[-1].action is not None
 
     def decide(self, step: Step) -> Step:
-        """Note what is known and decided at the present step."""
+        """Record belief and decision of the present step."""
         if self.steps:
             self.steps[-1] = dataclasses.replace(self.steps[-1], observed_cost=step.cost)
         if step.found and self._found_step is None:
@@ -221,32 +221,32 @@ class EpisodeLog:
         return step
 
     def took(self, choice: Choice) -> None:
-        """Note that another action was executed than the one that was decided upon."""
+        """Record that another action was executed than the decided one."""
         self.steps[-1] = dataclasses.replace(
             self.steps[-1], action=record_action(choice.action), predicted_cost=_expected(choice)
         )
 
     def act(self, result: Result | None, trouble: str | None, timings: dict[str, float]) -> bool:
-        """Note what came of the decision; whether the episode ends with it.
+        """Record the result of the decision; returns whether the episode ends with it.
 
         Args:
-          result: of what was executed; None where nothing was.
-          trouble: why the episode cannot go on, unless it was a success; None if it can.
+          result: of the executed action; None if nothing was executed.
+          trouble: why the episode cannot continue unless the result is a success; None if it can.
           timings: of the step's stages [s].
         """
         self.steps[-1] = dataclasses.replace(self.steps[-1], timings=timings)
         if result is not None:
             self._note(result)
         error = trouble is not None and trouble.startswith("error")
-        self._retrieved = result is not None and result.retrieved and not error and self.spoilt is None
+        self._retrieved = result is not None and result.retrieved and not error and self.irretrievable is None
         self._failure = None if self._retrieved else trouble or self._end(result is not None and result.final)
-        if self._failure and self.spoilt and not error:
-            self._failure = self.spoilt
+        if self._failure and self.irretrievable and not error:
+            self._failure = self.irretrievable
         self._index += 1
         return self._retrieved or self._failure is not None
 
     def _note(self, result: Result) -> None:
-        """Write down what came of what was executed."""
+        """Record the result of the executed action."""
         left = result.off_board - self._off_board
         self._off_board |= result.off_board
         objects = tuple(sorted(left - {TARGET}))
@@ -259,9 +259,9 @@ class EpisodeLog:
             at_rest=result.at_rest,
             tracking_error=result.tracking_error,
         )
-        if objects and self.spoilt is None:
+        if objects and self.irretrievable is None:
             blamed = "retrieval: " if result.takes_target else ""
-            self.spoilt = f"{blamed}an object fell off the board at action {self._index + 1}"
+            self.irretrievable = f"{blamed}an object fell off the board at action {self._index + 1}"
 
     def _end(self, final: bool) -> str | None:
         """Why an episode without a retrieval ends here; None if it goes on.
@@ -271,16 +271,16 @@ class EpisodeLog:
         """
         step = self.steps[-1]
         if final:
-            return step.failure or self.spoilt
-        # Nothing is left to be learned: it is known whether the target could be grasped, and it will not be retrieved.
-        if self.spoilt and self._graspable_step is not None:
-            return self.spoilt
+            return step.failure or self.irretrievable
+        # Both verdicts are decided: the target was graspable, and it cannot be retrieved.
+        if self.irretrievable and self._graspable_step is not None:
+            return self.irretrievable
         if not self.last:
             return None
         return step.failure or ("found, but not graspable" if step.found else "not found")
 
     def episode(self, scenario: Scenario, options: dict[str, Any]) -> Episode:
-        """The record of the episode, which has ended."""
+        """The record of the ended episode."""
         return Episode(
             scenario=scenario.name,
             objects=len(scenario.objects),

@@ -1,17 +1,17 @@
 """The closed loop: look, recognise, update the belief, propose, try, choose, act; many episodes at once, or one alone.
 
 Each episode has a slot. All slots look, decide and act together; an episode that ends leaves its slot to the next one,
-so that short episodes do not wait for long ones. The random numbers of an episode are its own: what it decides depends
-neither on its slot nor on its neighbours. An episode alone is a pool of one slot, which calls the functions of a single
-scene, and which can be watched.
+so that short episodes do not wait for long ones. Each episode has its own random numbers: its decisions depend neither
+on its slot nor on its neighbours. A single episode is a pool of one slot, which calls the functions of a single scene
+and accepts a watcher.
 
-Three verdicts are passed on an episode, all on the true state: `graspable` (the target is found and a collision-free
-grasp exists), `paper_graspable` (a collision-free one among the paper's grasps) and `retrieved` (the hand took it out
-of the shelf, and no object fell, neither then nor before). A retrieval does not make a target graspable: a grasp that
-touches something may take it out where no collision-free one exists. An action that fails costs a step and leaves the
-world as it made it. Once an object has left the board nothing can be retrieved any more: the episode goes on until the
-target is found and graspable, or would be taken out, and takes nothing out. An episode ends with its retrieval,
-graspable or not, and none goes on for the sake of `paper_graspable`.
+An episode gets three verdicts, all on the true state: `graspable` (the target is found and a collision-free grasp
+exists), `paper_graspable` (a collision-free one among the paper's grasps) and `retrieved` (the hand took it out of the
+shelf, and no object fell, neither then nor before). A retrieval does not imply `graspable`: a grasp that touches
+something may succeed where no collision-free one exists. An action that fails costs a step and leaves the world as it
+made it. Once an object has left the board no retrieval counts: the episode continues until the target is found and
+graspable, or the policy decides on a retrieval, which is not executed. An episode ends with its retrieval, graspable or
+not, and does not continue for the sake of `paper_graspable`.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from mechsearch_jax.workspace.target import Target
 
 
 def target_of(scenario: Scenario, usual: Target | None = None) -> Target:
-    """The target of a scenario as the planner knows it: its shape, and how finely it is searched.
+    """The planner's description of a scenario's target: its shape and the resolution of its candidate poses.
 
     Args:
-      scenario: says what the target is.
-      usual: searched as finely as the scenario's is to be; the default target if None.
+      scenario: the shape's source.
+      usual: the resolution's source; the default target if None.
     """
     return (usual or Target()).resized(scenario.target.shape, scenario.target.half_size)
 
@@ -63,14 +63,14 @@ def run_episode(
     protocol: EpisodeProtocol = STRICT,
     trials: Trials | None = None,
 ) -> Episode:
-    """Run one episode to its end, whatever that is.
+    """Run one episode to its end.
 
     Args:
       seed: see `Start`.
-      scenario: where everything stands at the start.
+      scenario: the scene at the start.
       problem, policy, simulator: see `run_episodes`. Neither the policy nor the recogniser need be traceable.
       recogniser, max_steps, options, protocol, trials: see `RunSettings`.
-      watcher: called at every step.
+      watcher: follows every step.
     """
     episodes: list[tuple[int, Episode]] = []
     settings = RunSettings(recogniser, max_steps, options or {}, protocol, trials)
@@ -91,17 +91,17 @@ def run_episodes(
     """Run episodes to their ends, many at a time.
 
     With several slots everything is compiled before the first of them begins; see `session.preparing.prepare`. In a
-    simulator that can, `Flowing`, slots do not wait for each other: those that have acted look and decide again, while
-    what the others do goes on afterwards.
+    `Flowing` simulator slots do not wait for each other: those whose action is over look and decide again, while the
+    actions of the others continue.
 
     Args:
       starts: the episodes.
       problem: built for the target of all their scenarios.
       policy: decides; it takes the target out by an action of kind RETRIEVE.
-      simulator: executes the actions; reset first.
-      slots: how many episodes run at the same time, at most.
-      listeners: who is called, with the places of episodes in `starts`.
-      settings: how they are run; the defaults if left out.
+      simulator: executes the actions; it is reset first.
+      slots: largest number of episodes that run at the same time.
+      listeners: what is called.
+      settings: how episodes are run; the defaults if None.
 
     Raises:
       InputError: there is no slot, a watcher is given for several, the policy decides on an unknown kind of action, or
@@ -116,9 +116,9 @@ def run_episodes(
         return
     if listeners.watcher is not None and len(first) > 1:
         raise InputError(f"run_episodes: a watcher looks on at one slot, not at {len(first)}")
-    planner = _planner_slots(first, problem, policy, simulator, settings, listeners)
+    planner_slots = _planner_slots(first, problem, policy, simulator, settings, listeners)
     with CompileClock() as clock:
-        pool = EpisodePool(simulator, problem, planner, len(first), settings, listeners, clock)
+        pool = EpisodePool(simulator, problem, planner_slots, len(first), settings, listeners, clock)
         pool.begin(dict(enumerate(first)))
         while pool.running:
             done = pool.round()
@@ -138,7 +138,7 @@ def _planner_slots(
     settings: RunSettings,
     listeners: Listeners,
 ) -> Slots:
-    """What the planner knows in the slots of the first episodes, for which the simulator is reset; all is compiled."""
+    """The planner's slots of the first episodes, for which the simulator is reset and everything is compiled."""
     count, recogniser = len(first), settings.protocol.recogniser(settings.recogniser)
     scenarios = [start.scenario for _, start in first]
     if count == 1:
@@ -147,25 +147,25 @@ def _planner_slots(
     shapes: World = jax.tree.map(
         lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), from_scenario(scenarios[0])
     )
-    planner = ManySlots(problem, policy, recogniser, shapes, min(settings.at_once, count), settings.trials)
-    # Before anything is compiled in vain.
-    planner.decide_by({row: start.policy for row, (_, start) in enumerate(first)})
-    with prepared(batch_programs(planner, simulator, shapes), listeners.compiling):
+    planner_slots = ManySlots(problem, policy, recogniser, shapes, min(settings.at_once, count), settings.trials)
+    # Raises before anything is compiled in vain.
+    planner_slots.decide_by({row: start.policy for row, (_, start) in enumerate(first)})
+    with prepared(batch_programs(planner_slots, simulator, shapes), listeners.compiling):
         simulator.reset(scenarios)
-    return planner
+    return planner_slots
 
 
-def batch_programs(planner: ManySlots, simulator: Simulator, world: World) -> list[Program]:
-    """All that is compiled for several slots, in the order in which it is to be lowered.
+def batch_programs(planner_slots: ManySlots, simulator: Simulator, world: World) -> list[Program]:
+    """All programs of several slots, in the order in which they are lowered.
 
     Args:
-      planner: what the planner knows in every slot.
+      planner_slots: of the planner.
       simulator: see `run_episodes`.
       world: of all slots, or its shapes.
     """
-    deciding, *seeing = planner.programs(world)
+    deciding, *seeing = planner_slots.programs(world)
     simulating = simulator.programs(world) if isinstance(simulator, Prepares) else []
-    kernels = [each for each in simulating if each.name == "kernels"]
+    kernels = [task for task in simulating if task.name == "kernels"]
     keys = jax.ShapeDtypeStruct((len(world.kind), 2, *jax.random.key_data(jax.random.key(0)).shape), np.uint32)
     stepping = program("small ones", keys_at, keys, jax.ShapeDtypeStruct((len(world.kind),), np.int32))
-    return [*kernels, deciding, *(each for each in simulating if each not in kernels), *seeing, stepping]
+    return [*kernels, deciding, *(task for task in simulating if task not in kernels), *seeing, stepping]

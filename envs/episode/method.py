@@ -1,4 +1,4 @@
-"""What decides about an episode beside its scenario and its seed."""
+"""The method of an episode: everything that determines it beside its scenario and its seed."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ _OF_EPISODES = frozenset(("policy", "recognition", "protocol", "simulator", "tar
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A policy with all of its settings, what it sees the world through, and what steps the world; hashable.
+    """A policy with all its settings, a recogniser, a simulator, a workcell and a protocol; hashable.
 
     Attributes:
       name: of the policy, as `planner.policy_factory` takes it: one of `planner.POLICIES`, or the import path of
         another, as "my_lab.policies:Mine".
-      config: every setting of the problem and of the policy, one preset's worth.
+      config: every setting of the problem and of the policy.
       recognition: name of the recogniser.
       engine: name of the simulator.
-      workcell: what stands around the objects, and how finely a target is searched.
-      protocol: name of how its episodes are run and judged, one of `protocols.PROTOCOLS`.
+      workcell: of the episodes; its target sets the resolution of candidate poses.
+      protocol: how its episodes are run and judged, one of `protocols.PROTOCOLS`.
     """
 
     name: str = "search-for-grasp"
@@ -47,36 +47,34 @@ class Method:
     def policy(self) -> Policy:
         """The policy, with the models that the configuration names.
 
-        What it proposes is tried out by `trials`, between its decision and what is done.
+        Its proposals are tried by `trials` before an action is executed.
 
         Raises:
           InputError: there is no such policy, or its push model cannot be used.
         """
         first, later = push_models(self.config.push_model, self.workcell.shelf)
         return policy_factory(self.name)(
-            self.config.planner,
-            push_model=first,
-            later_push_model=later,
-            tries=self.config.rehearsal != "none",
+            self.config.planner, push_model=first, later_push_model=later, tries=self.config.rehearsal != "none"
         )
 
     def trials(self) -> Trials | None:
-        """What tries the policy's best actions out before one is made; None where nothing does."""
+        """The trials of the policy's best actions; None without a rehearsal."""
         return rehearsal(self.config.rehearsal)
 
     @property
     def terms(self) -> EpisodeProtocol:
-        """How its episodes are run and judged."""
+        """The protocol of its episodes."""
         return PROTOCOLS[self.protocol]
 
     @property
     def problem_config(self) -> ProblemConfig:
-        """How the problem is built that its episodes are run with."""
+        """The settings of its episodes' problem."""
         return self.terms.problem(self.config.problem)
 
     def mould(self) -> Hashable:
-        """What is compiled for episodes of one target: the same for methods that differ in numbers of their policies,
-        such as gamma, or in the number of steps alone.
+        """A key of the programs compiled for episodes of one target.
+
+        It is equal for methods that differ only in numbers of their policies, such as gamma, or in the number of steps.
 
         Raises:
           InputError: as `policy`.
@@ -96,9 +94,11 @@ class Method:
         recogniser(self.recognition, self.workcell.target)
 
     def options(self) -> dict[str, Any]:
-        """What tells this method from others, flat and as JSON values: policy, recognition, protocol, every option of
-        the configuration by its name, and other settings that are not the preset `standard`'s, or not the usual
-        workcell's, by their path."""
+        """The options that identify this method, flat and as JSON values.
+
+        They are policy, recognition, protocol, every option of the configuration by its name, and by their paths all
+        other settings that differ from the preset `standard` or from the default workcell.
+        """
         named = {".".join(option.path) for option in OPTIONS}
         pairs = ((self.config, PRESETS["standard"](), ""), (self.workcell, Workcell(), "workcell."))
         unusual: dict[str, Any] = {}
@@ -106,8 +106,8 @@ class Method:
             usual = dict(_settings(standard, prefix))
             settings = _settings(config, prefix)
             unusual |= {path: value for path, value in settings if value != usual[path] and path not in named}
-        told = {"policy": self.name, "recognition": self.recognition, "protocol": self.protocol}
-        return {**told, **self.config.options(), **unusual}
+        identity = {"policy": self.name, "recognition": self.recognition, "protocol": self.protocol}
+        return {**identity, **self.config.options(), **unusual}
 
     @classmethod
     def of_options(cls, options: Mapping[str, Any]) -> Method:
@@ -116,11 +116,11 @@ class Method:
         Raises:
           InputError: a setting is impossible, or an option or the path of a setting is unknown.
         """
-        known = {option.name for option in OPTIONS}
-        unknown = [name for name in options if "." not in name and name not in known | _OF_EPISODES]
+        option_names = {option.name for option in OPTIONS}
+        unknown = [name for name in options if "." not in name and name not in option_names | _OF_EPISODES]
         if unknown:
             raise InputError(f"option {unknown[0]} is unknown to this version: what ran with it cannot be run again")
-        config = PRESETS["standard"](**{name: value for name, value in options.items() if name in known})
+        config = PRESETS["standard"](**{name: value for name, value in options.items() if name in option_names})
         parts: dict[str, Any] = {"config": config, "workcell": Workcell()}
         for path, value in options.items():
             first, *rest = path.split(".")
@@ -133,7 +133,7 @@ class Method:
 
 
 def _settings(config: Config | Workcell, prefix: str) -> Iterator[tuple[str, Any]]:
-    """Every setting, as JSON has it, by its path: "problem.grasps.wrists", after a prefix."""
+    """Every setting as a JSON value, by its path after a prefix, such as "problem.grasps.wrists"."""
 
     def inside(value: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
         for name, part in value.items():
@@ -146,7 +146,7 @@ def _settings(config: Config | Workcell, prefix: str) -> Iterator[tuple[str, Any
 
 
 def _with_setting(settings: Any, path: Sequence[str], value: Any) -> Any:
-    """Settings with another value, as JSON has it, at a path.
+    """Settings with another JSON value at a path.
 
     Raises:
       InputError: it is impossible, or there is no such path.
@@ -154,14 +154,13 @@ def _with_setting(settings: Any, path: Sequence[str], value: Any) -> Any:
     first, *rest = path
     if not hasattr(settings, first):
         raise InputError(f"setting {'.'.join(path)} is unknown to this version")
-    here = getattr(settings, first)
-    new = _with_setting(here, rest, value) if rest else _restored(here, value)
+    part = getattr(settings, first)
+    new = _with_setting(part, rest, value) if rest else _restored(part, value)
     return dataclasses.replace(settings, **{first: new})
 
 
 def _restored(like: Any, value: Any) -> Any:
-    """What `dataclasses.asdict` and JSON made of something like `like`: dataclasses from dictionaries, tuples from
-    lists."""
+    """The inverse of `dataclasses.asdict` and JSON for values of the types in `like`."""
     if dataclasses.is_dataclass(like):
         return type(like)(**{name: _restored(getattr(like, name), part) for name, part in value.items()})
     if isinstance(value, list | tuple):

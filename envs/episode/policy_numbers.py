@@ -1,7 +1,7 @@
-"""The numbers among a policy's leaves: what may differ between the slots of one computation.
+"""The numbers among a policy's leaves, which may differ between the slots of one computation.
 
-A policy is a pytree. Its structure, what is static in it, and its arrays decide what is compiled, and are shared by all
-slots; every number, such as a discount, is data that each slot has its own of.
+A policy is a pytree. Its structure, static fields and arrays determine the compiled program and are shared by all
+slots; numbers, such as a discount, are data of each slot.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mechsearch_jax.planner import Policy
 
 
 def as_pytree(policy: Policy) -> Any:
-    """A policy as an argument of a jitted function: a plain function is a pytree without leaves, if it is told so."""
+    """A policy as an argument of a jitted function: a plain function becomes a pytree without leaves."""
     return jax.tree_util.Partial(policy) if jax.tree_util.all_leaves([policy]) else policy
 
 
@@ -40,7 +40,7 @@ def with_numbers(policy: Any, values: Sequence[Any]) -> Any:
 
 
 def mould(policy: Policy) -> Hashable:
-    """What is compiled for a policy: the same for those that differ in numbers alone, which may share a batch."""
+    """A key of a policy's compiled program: equal for policies that differ in numbers alone and may share a batch."""
     leaves, tree = jax.tree.flatten(as_pytree(policy))
     return tree, tuple(map(_mould, leaves))
 
@@ -49,6 +49,6 @@ def _mould(leaf: Any) -> Hashable:
     if _is_number(leaf):
         return np.asarray(leaf).dtype.kind
     if isinstance(leaf, np.ndarray | jax.Array):
-        told = np.asarray(jax.random.key_data(leaf) if jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
-        return str(leaf.dtype), leaf.shape, hashlib.sha256(told.tobytes()).hexdigest()
+        data = np.asarray(jax.random.key_data(leaf) if jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf)
+        return str(leaf.dtype), leaf.shape, hashlib.sha256(data.tobytes()).hexdigest()
     return leaf

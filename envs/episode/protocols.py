@@ -24,7 +24,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 ProtocolName = Literal["strict", "published-code"]
 
-# Why an episode under `PublishedCode` ends, beside those of `EpisodeLog`.
+# Reasons for which an episode under `PublishedCode` ends, beside those of `EpisodeLog`.
 REACHED = "graspable: nothing is taken out by this protocol"
 HIDDEN_AGAIN = "the target is hidden again"
 OUTSIDE = "something is outside the shelf"
@@ -32,12 +32,12 @@ ALL_FAILED = "every action that was tried failed"
 
 
 class Execution(NamedTuple):
-    """What became of the decisions of a round.
+    """The execution of a round's decisions.
 
     Attributes:
       outcome: in all worlds, on the host; of the last action that was tried.
-      choices: what was executed in each slot.
-      stuck: the slots in which nothing could be; their worlds are as before.
+      choices: the executed choice of each slot.
+      stuck: the slots in which every action failed; their worlds are as before.
     """
 
     outcome: Outcome
@@ -52,14 +52,14 @@ class EpisodeProtocol(Protocol):
     def name(self) -> ProtocolName: ...
 
     def problem(self, config: ProblemConfig) -> ProblemConfig:
-        """How the problem is built that episodes are run with, from how the method builds it."""
+        """The settings of the episodes' problem, from the method's."""
         ...
 
     def recogniser(self, inner: Recogniser) -> Recogniser:
-        """What the policy sees the world through, from the method's own."""
+        """The policy's recogniser, from the method's."""
         ...
 
-    def judge(self, known: Slots, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
+    def judge(self, slots: Slots, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
         """The verdicts in slots where the target has been found."""
         ...
 
@@ -71,22 +71,22 @@ class EpisodeProtocol(Protocol):
         verdicts: Mapping[int, Verdict],
         choices: Mapping[int, Choice],
     ) -> dict[int, str]:
-        """In which slots the episode ends before anything is executed, and why."""
+        """The slots whose episode ends before anything is executed, with the reasons."""
         ...
 
     @property
     def once(self) -> bool:
-        """Whether what was decided is executed once, whatever becomes of it."""
+        """Whether a decision is executed only once, even if it fails."""
         ...
 
     def execute(self, simulator: Simulator, choices: Mapping[int, Choice]) -> Execution:
-        """Execute what was decided, in one slot at least."""
+        """Execute the choices of at least one slot."""
         ...
 
 
 @dataclasses.dataclass(frozen=True)
 class Strict:
-    """Every action counts, whatever becomes of it, and the target has to be taken out."""
+    """Every action counts, even if it fails, and the target has to be taken out."""
 
     name: ProtocolName = "strict"
     once: bool = True
@@ -97,9 +97,9 @@ class Strict:
     def recogniser(self, inner: Recogniser) -> Recogniser:
         return inner
 
-    def judge(self, known: Slots, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
+    def judge(self, slots: Slots, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
         """On the true state."""
-        return known.judge(world, rows)
+        return slots.judge(world, rows)
 
     def ends(self, shelf, world, rows, verdicts, choices) -> dict[int, str]:
         return {}
@@ -110,28 +110,28 @@ class Strict:
 
 @dataclasses.dataclass(frozen=True)
 class PublishedCode:
-    """What the authors' code does.
+    """The protocol of the authors' code.
 
-    The sampled first actions are tried best first; where one fails, or something leaves the board, the world is set
-    back and the next is tried, all within one step. An episode fails where all have failed, and where something is
-    outside the shelf as a step begins. It succeeds where the target is in sight, and at some candidate grasp what
-    gripper and target sweep meets neither the recognised objects nor the shelf; nothing is taken out. The target's true
-    pose is known once it is found.
+    The sampled first actions are tried best first; if one fails, or something leaves the board, the world is set back
+    and the next is tried, all within one step. An episode fails if all have failed, or if something is outside the
+    shelf at the beginning of a step. It succeeds if the target is in sight, and the sweep of gripper and target at some
+    candidate grasp hits neither the recognised objects nor the shelf; nothing is taken out. A found target's true pose
+    is observed.
     """
 
     name: ProtocolName = "published-code"
     once: bool = False
 
     def problem(self, config: ProblemConfig) -> ProblemConfig:
-        """A found target has the candidates' grasps, and no others."""
+        """A found target is grasped with the candidates' grasps only."""
         return dataclasses.replace(config, retrieval=config.grasps)
 
     def recogniser(self, inner: Recogniser) -> Recogniser:
         return WithTruePose(inner)
 
-    def judge(self, known: Slots, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
-        """`graspable` as said above; `paper_graspable` on the true state, as always."""
-        free, strict = known.swept_free(rows), known.judge(world, rows)
+    def judge(self, slots: Slots, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
+        """`graspable` as defined by this protocol; `paper_graspable` on the true state."""
+        free, strict = slots.swept_free(rows), slots.judge(world, rows)
         return {r: Verdict(free[r], strict[r].paper_graspable) for r in rows}
 
     def ends(
@@ -162,8 +162,8 @@ class PublishedCode:
             stuck = {r for r in bad if r not in left}
             taken = {r: choice for r, choice in (taken | left).items() if r not in stuck}
             if left:
-                now = _executed(simulator, left)
-                outcome = _where(np.isin(np.arange(count), list(left)), now, outcome)
+                latest = _executed(simulator, left)
+                outcome = _where(np.isin(np.arange(count), list(left)), latest, outcome)
         return Execution(outcome, taken, frozenset(choices.keys() - taken.keys()))
 
 
@@ -172,7 +172,7 @@ PROTOCOLS: Mapping[str, EpisodeProtocol] = {"strict": Strict(), "published-code"
 
 @dataclasses.dataclass(frozen=True)
 class WithTruePose:
-    """A `Recogniser` that says where the target truly is, whenever it is seen."""
+    """A `Recogniser` that replaces the pose of a seen target by the true one."""
 
     inner: Recogniser
 
@@ -181,13 +181,13 @@ class WithTruePose:
 
 
 def _executed(simulator: Simulator, choices: Mapping[int, Choice]) -> Outcome:
-    """What the simulator says of actions in some worlds."""
+    """The outcomes of choices; worlds without a choice do nothing."""
     assert simulator.world is not None
     return jax.device_get(simulator.execute(*chosen_actions(choices, len(simulator.world.kind))))
 
 
 def chosen_actions(choices: Mapping[int, Choice], count: int) -> tuple[Action, Array]:
-    """The actions of all of so many worlds, and which of them were chosen."""
+    """The actions of `count` worlds, NONE without a choice, and which worlds have a choice."""
     actions: Action = jax.tree.map(
         lambda a: np.broadcast_to(a, (count, *np.shape(a))).copy(), jax.device_get(no_action())
     )
@@ -198,25 +198,25 @@ def chosen_actions(choices: Mapping[int, Choice], count: int) -> tuple[Action, A
 
 
 def _is_bad(choice: Choice, outcome: Outcome, row: int) -> bool:
-    """Whether an action is taken back; where the simulator's buffers were too small, nothing is."""
+    """Whether an action is undone; never if the simulator's buffers overflowed."""
     failed = int(outcome.failure[row]) != Failure.NONE or int(choice.action.kind) == ActionKind.NONE
     return (failed or bool(np.any(outcome.fallen[row]))) and not int(outcome.overflow[row])
 
 
 def _has(choice: Choice, rank: int) -> bool:
-    """Whether there is a next best action of so high a rank, counted from 0; none comes after doing nothing."""
+    """Whether there is an action of this rank, from 0 for the best; none follows a choice to do nothing."""
     kinds = np.zeros(0) if choice.others is None else np.asarray(choice.others.kind)
     nothing = int(choice.action.kind) == ActionKind.NONE
     return not nothing and rank < len(kinds) and int(kinds[rank]) != ActionKind.NONE
 
 
 def _next(choice: Choice, rank: int) -> Choice:
-    """The action of a rank in place of the best one; what it is expected to cost was not kept."""
+    """The choice with the action of a rank instead of the best one; its predicted cost is not known."""
     return choice.replace(
         action=jax.tree.map(lambda a: a[rank], choice.others), predicted_cost=np.float32(np.nan), others=None
     )
 
 
 def _where(rows: np.ndarray, new: Outcome, old: Outcome) -> Outcome:
-    """One outcome in some worlds, another in the others."""
+    """The new outcome in the worlds `rows`, the old one in the others."""
     return jax.tree.map(lambda a, b: np.where(rows.reshape(-1, *[1] * (np.ndim(a) - 1)), a, b), new, old)

@@ -16,11 +16,11 @@ from mechsearch_jax.runtime.files import PathLike, replacing
 
 @dataclasses.dataclass(frozen=True)
 class ActionRecord:
-    """An action as a file keeps it; fields as in `mechsearch_jax.actions.Action`.
+    """An action in a file; fields as in `mechsearch_jax.actions.Action`.
 
     Attributes:
       kind: name of a registered kind: "push", "pick-and-place", "retrieve", "none", ...
-      object: index of the object in the scenario; None where the action moves none, for example for a retrieval.
+      object: index of the object in the scenario; None if the action moves no object, for example for a retrieval.
       T_world_gripper, T_world_place: rows of the 4 x 4 poses [m].
       displacement: [m].
       q7: [rad].
@@ -37,7 +37,7 @@ class ActionRecord:
 
 
 def record_action(action: Action) -> ActionRecord:
-    """A single action, as a file keeps it.
+    """The record of a single action.
 
     Raises:
       InputError: its kind is unknown.
@@ -56,27 +56,27 @@ def record_action(action: Action) -> ActionRecord:
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """What was known at one step of an episode, what was done, and what came of it.
+    """One step of an episode: belief, decision and result.
 
     Attributes:
       belief_size: number of candidate poses where the target can still be.
       found: whether the target has been found, and may still be where it was seen last.
       graspable: whether it has been found and a collision-free grasp of it exists in the true state.
-      cost: J of the observed state; None where nothing was planned.
-      action: what the robot did; None if the episode ended here.
-      predicted_cost: J that the plan expects right after the action; None where nothing was planned or expected.
+      cost: J of the observed state; None if nothing was planned.
+      action: of the robot; None if the episode ended here.
+      predicted_cost: predicted J after the action; None if nothing was planned or predicted.
       observed_cost: J at the next observation; None if there was none.
-      sequences: number of valid action sequences that the plan was chosen from.
+      sequences: number of valid action sequences from which the plan was chosen.
       failure: why the action could not be carried out as planned; None if it was.
-      timings: wall time of each stage [s]; "compile", where anything was compiled, is in no other.
+      timings: wall time of each stage [s], each without compilation, which is "compile" if there was any.
       truth_possible: whether f holds the candidate pose that is nearest to the target's true pose; None once the target
         is found, and where it has fallen, so that no candidate is near its pose.
-      restarts: how often f had become empty and was started anew.
-      fallen: indices in the scenario of the objects that left the board in this step; () where none did.
-      target_fallen: whether the target did; never one that is in the hand.
+      restarts: how often f has become empty and was started anew.
+      fallen: indices in the scenario of the objects that left the board in this step.
+      target_fallen: whether the target did; False while it is in the hand.
       held_up: whether the arm was held up: see `SimulatorConfig.tracking_bound`.
       at_rest: whether everything came to rest after the action; False also where the simulation diverged.
-      tracking_error: how far the joint that was farthest from its reference was from it [rad].
+      tracking_error: largest distance of a joint from its reference [rad].
       paper_graspable: whether `graspable` holds with the paper's grasps alone: see `verdicts.paper_grasps`.
 
     From `fallen` to `tracking_error` they are None where nothing was executed.
@@ -113,7 +113,7 @@ class Episode:
       versions: as `versions` returns them.
       steps: one for each observation.
       found_step: number of actions before the target was found; None where it never was.
-      graspable_step: number of actions before a step said `graspable`, whatever was retrieved; None where none did.
+      graspable_step: number of actions before the first `graspable` step, retrieved or not; None if there was none.
       retrieved: whether the hand took the target out of the shelf and no object fell, neither then nor before.
       failure: why the episode ended without a retrieval; None after one. Where an object left the board, this is the
         reason, with the number of the action.
@@ -165,7 +165,7 @@ def load_episode(path: PathLike) -> Episode:
 
 
 def _step(value: dict[str, Any]) -> Step:
-    """A step from what a file keeps of it."""
+    """A step from its JSON values."""
     action, fallen = value["action"], value.get("fallen")
     return Step(
         **{

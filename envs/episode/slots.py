@@ -1,8 +1,8 @@
-"""What the planner knows in the slots of an episode pool, and how it looks, decides and is judged there.
+"""The planner's state in the slots of an episode pool, and how it looks, decides and is judged there.
 
-`OneSlot` calls the functions of a single scene, `many_slots.ManySlots` maps them over so many slots at a time. They
-cannot be the same: mapped over, both branches of a condition are computed, and what is outside of any transformation
-need not be traceable.
+`OneSlot` calls the functions of a single scene, `many_slots.ManySlots` maps them over a fixed number of slots at a
+time. They are separate because `vmap` computes both branches of a condition and requires that policy and recogniser are
+traceable.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from mechsearch_jax.runtime.compiled import kept
 
 
 @dataclasses.dataclass(frozen=True)
-class Knowledge:
-    """What is known of the target in every slot after a look; S of them.
+class BeliefSummary:
+    """The belief about the target in each of S slots after a look.
 
     Attributes:
       found: whether it is found, shape (S,).
-      size: at how many candidate poses it can be.
-      truth: whether it can be at the one that is nearest to its true pose.
+      size: number of candidate poses where it can be.
+      truth: whether it can be at the candidate pose nearest to its true pose.
       restarts: how often f was started anew.
     """
 
@@ -46,22 +46,22 @@ class Knowledge:
 
 
 class Slots(Protocol):
-    """What the planner knows in every slot; S of them."""
+    """The planner's state in S slots."""
 
     def forget(self, fresh: Bool[np.ndarray, " slots"]) -> None:
-        """Let the fresh slots know nothing."""
+        """Reset the fresh slots to the initial belief."""
         ...
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
-        """Let slots decide by policies of their own from now on; None stands for the policy of all.
+        """Set the policies of slots; None stands for the pool's policy.
 
         Raises:
           InputError: a policy cannot decide together with the others: it differs from them in more than numbers.
         """
         ...
 
-    def look(self, world: World, keys: Array, rows: Sequence[int]) -> Knowledge:
-        """Recognise and update the belief in some slots; what is known then in all of them.
+    def look(self, world: World, keys: Array, rows: Sequence[int]) -> BeliefSummary:
+        """Recognise and update the belief in the slots `rows`; the beliefs of all slots.
 
         Args:
           world: the true state, fields (S, ...).
@@ -71,20 +71,19 @@ class Slots(Protocol):
         ...
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
-        """What the policy decides in some slots; `keys` are the planner's, one for each slot."""
+        """The policy's choices in the slots `rows`; `keys` are the planner's, one for each slot."""
         ...
 
     def took(self, actions: Mapping[int, Action]) -> None:
-        """Let some slots know that something else is done than they decided."""
+        """Set the actions of slots that execute another one than they decided."""
         ...
 
     def swept_free(self, rows: Sequence[int]) -> dict[int, bool]:
-        """Whether in some slots the target is in sight, and what is swept at some grasp meets nothing; see
-        `verdicts.swept_free`."""
+        """Whether in the slots `rows` the target is in sight and `verdicts.swept_free` holds."""
         ...
 
     def judge(self, world: World, rows: Sequence[int]) -> dict[int, Verdict]:
-        """Whether in some slots a collision-free grasp of the target exists, whatever anybody believes."""
+        """The verdicts on the true state in the slots `rows`."""
         ...
 
 
@@ -92,18 +91,18 @@ class OneSlot:
     """A single slot.
 
     Attributes:
-      snapshot: what was there to be seen.
-      observation: what was recognised.
-      belief: what is known of the target.
-      decision: of the policy; None since the last look.
-      action: what was decided at the last look, to be executed before the next; of kind NONE before the first.
+      snapshot: the shelf at the last look.
+      observation: the recognised scene.
+      belief: about the target.
+      decision: of the policy; None between a look and its decision.
+      action: the decision's, to be executed before the next look; of kind NONE before the first.
     """
 
     def __init__(self, problem: Problem, policy: Policy, recogniser: Recogniser, trials: Trials | None = None) -> None:
         """Args:
         problem: of the episode.
         policy, recogniser: need not be traceable.
-        trials: what tries actions out before one is made; nothing if left out.
+        trials: in which actions are tried before one is made; None for no trials.
         """
         self.snapshot: Snapshot | None = None
         self.observation: Observation | None = None
@@ -120,22 +119,20 @@ class OneSlot:
             self.action, self.observation = no_action(), None
 
     def decide_by(self, policies: Mapping[int, Policy | None]) -> None:
-        """See `Slots`; any policy will do."""
+        """See `Slots`; accepts any policy."""
         for policy in policies.values():
             self._policy = self._usual if policy is None else policy
 
-    def look(self, world: World, keys: Array, rows: Sequence[int]) -> Knowledge:
+    def look(self, world: World, keys: Array, rows: Sequence[int]) -> BeliefSummary:
         """See `Slots`."""
         snapshot = self._snapshot(world)
         observation = self._recogniser(keys[0], snapshot)
-        # Called the same at the first look, when nothing was done yet, so that nothing is compiled twice.
+        # The first look, before any action, makes the same call, so that nothing is compiled twice.
         before = observation if self.observation is None else self.observation
         self.belief = update_belief(self._problem, self.belief, observation, before, self.action)
         self.action = no_action()
         self.snapshot, self.observation, self.decision = snapshot, observation, None
-        return knowledge_of(
-            self._problem, jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), self.belief), world
-        )
+        return summary(self._problem, jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), self.belief), world)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`."""
@@ -161,24 +158,24 @@ class OneSlot:
         return {r: judge(self._problem, self._snapshot(world)) for r in rows}
 
     def _snapshot(self, world: World) -> Snapshot:
-        here = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[0]), world)
-        return Snapshot(self._problem.camera, self._problem.shelf, here)
+        single = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[0]), world)
+        return Snapshot(self._problem.camera, self._problem.shelf, single)
 
 
-def knowledge_of(problem: Problem, belief: Belief, world: World) -> Knowledge:
-    """What is known in all slots; fields of belief and world have a leading axis for them."""
-    size, truth = possible_poses_of(problem.poses, belief.exists, world)
-    return Knowledge(*jax.device_get((belief.found, size, truth, belief.restarts)))
+def summary(problem: Problem, belief: Belief, world: World) -> BeliefSummary:
+    """The beliefs of all slots; fields of belief and world have a leading axis for them."""
+    size, truth = sizes_and_truths(problem.poses, belief.exists, world)
+    return BeliefSummary(*jax.device_get((belief.found, size, truth, belief.restarts)))
 
 
 @kept()
-def possible_poses_of(poses: Array, exists: Bool[Array, "slots x"], world: World) -> tuple[Array, Array]:
-    """At how many candidate poses the target can be, and whether at the one nearest to the truth."""
-    nearest = jax.vmap(lambda here: nearest_candidate(poses, true_target_pose(here)))(world)
+def sizes_and_truths(poses: Array, exists: Bool[Array, "slots x"], world: World) -> tuple[Array, Array]:
+    """Number of candidate poses where the target can be, and whether it can be at the one nearest to the truth."""
+    nearest = jax.vmap(lambda single: nearest_candidate(poses, true_target_pose(single)))(world)
     return jnp.sum(exists, axis=1), jnp.take_along_axis(exists, nearest[:, None], axis=1)[:, 0]
 
 
 @kept()
 def swept_free_of(problem: Problem, seen: Observation, active: Bool[Array, ""]) -> Bool[Array, ""]:
-    """See `Slots.swept_free`; False, and little is computed, where `active` is."""
+    """See `Slots.swept_free`; False, with little computation, if `active` is."""
     return swept_free(problem.target_grasps, seen.objects, seen.target_pose, active & seen.target_visible)

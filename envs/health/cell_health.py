@@ -1,4 +1,4 @@
-"""Whether a search is possible in a cell that a configuration file describes: a line for each of its parts."""
+"""Checks whether a search is possible in the cell of a configuration file: one line for each part of the cell."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ def camera(settings: Settings) -> Iterator[Finding]:
 
 
 def target(settings: Settings) -> Iterator[Finding]:
-    """Whether the gripper takes the target, and the shelf holds it."""
+    """Whether the target fits the gripper and the shelf."""
     cell = settings.workcell
-    what, shelf, opening = cell.target, cell.shelf, cell.gripper.usable_opening
+    body, shelf, opening = cell.target, cell.shelf, cell.gripper.usable_opening
     grasps = settings.config.problem.grasps
-    _, widths = shape_of(what.shape).grasps(what.half_size, grasps.yaws, grasps.max_yaw)
-    size = " x ".join(f"{200 * half:.1f}" for half in what.half_size)
+    _, widths = shape_of(body.shape).grasps(body.half_size, grasps.yaws, grasps.max_yaw)
+    size = " x ".join(f"{200 * half:.1f}" for half in body.half_size)
     if min(widths) > opening:
         says = f"target: {min(widths):.3f} m wide, but the gripper takes {opening} m"
         yield Finding("target", State.BROKEN, says, "mend [target] half_size, or [gripper] usable_opening")
-    elif 2 * what.half_size[2] >= shelf.ceiling - shelf.ceiling_margin - shelf.board:
-        says = f"target: {2 * what.half_size[2]:.3f} m high, more than the shelf's free space"
+    elif 2 * body.half_size[2] >= shelf.ceiling - shelf.ceiling_margin - shelf.board:
+        says = f"target: {2 * body.half_size[2]:.3f} m high, more than the shelf's free space"
         yield Finding("target", State.BROKEN, says, "mend [target] half_size, or [shelf] board and ceiling")
     else:
-        yield Finding("target", State.FINE, f"{what.shape}, {size} cm, fits gripper and shelf")
+        yield Finding("target", State.FINE, f"{body.shape}, {size} cm, fits gripper and shelf")
 
 
 def shelf(settings: Settings) -> Iterator[Finding]:
-    """At what share of its possible poses the arm reaches the target."""
+    """The share of the target's possible poses that the arm reaches."""
     cell = settings.workcell
     remedy = "mend [shelf] front to ceiling, or [base] position: x into the shelf, z up, in the robot's frame"
     if blindness(cell.camera, cell.shelf) is not None:
@@ -65,7 +65,7 @@ def shelf(settings: Settings) -> Iterator[Finding]:
 
 
 def networks(settings: Settings) -> Iterator[Finding]:
-    """Whether the networks are used to such a view."""
+    """Whether the view is like those that the networks were trained on."""
     cell = settings.workcell
     if blindness(cell.camera, cell.shelf) is not None:
         yield Finding("networks", State.MISSING, "the view is not looked at before the camera sees the shelf")
@@ -83,7 +83,7 @@ def networks(settings: Settings) -> Iterator[Finding]:
 
 
 def planner(settings: Settings) -> Iterator[Finding]:
-    """What plans in this cell."""
+    """The planner's settings in this cell."""
     config = settings.config
     says = (
         f"preset {settings.preset}, rehearsal {config.rehearsal}, push model {config.push_model}, "

@@ -1,4 +1,4 @@
-"""What is usable on this machine, and what to do about what is not."""
+"""Checks of what is usable on this machine, with remedies."""
 
 # The bindings of MuJoCo come without type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -42,30 +42,30 @@ Check = Callable[[], Iterator[Finding]]
 
 
 def checks(scenario: Scenario | None, settings: Settings, cell: bool = False) -> Mapping[str, Check]:
-    """All that can be looked at, by subject.
+    """All checks, by subject.
 
     Args:
-      scenario: whose problem is looked for in the cache; None for none.
-      settings: that it would be built with.
-      cell: whether the cell of the settings is looked at, for which its problem is built.
+      scenario: whose problem is looked up in the cache; None to skip that.
+      settings: with which the problem would be built.
+      cell: whether to check the cell of the settings, for which its problem is built.
     """
-    found = dict(CHECKS)
+    by_subject = dict(CHECKS)
     if cell:
-        # What recognises takes long to import.
+        # Takes long to import.
         from mechsearch_jax.envs.health import cell_health
 
         parts = {part: getattr(cell_health, part) for part in CELL}
-        found |= {part: functools.partial(check, settings) for part, check in parts.items()}
+        by_subject |= {part: functools.partial(check, settings) for part, check in parts.items()}
     if scenario is not None:
-        found["problem"] = lambda: _problem(scenario, settings)
-    return found
+        by_subject["problem"] = lambda: _problem(scenario, settings)
+    return by_subject
 
 
 def examine(subject: str, check: Check) -> Iterator[Finding]:
-    """What a check finds; that it failed, where it does."""
+    """The findings of a check; one that says so if the check itself fails."""
     try:
         yield from check()
-    # Whatever is broken, the other checks still tell something.
+    # The other checks stay useful whatever is broken.
     except Exception as error:
         state = State.BROKEN if subject in NEEDED else State.MISSING
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"[:300]
@@ -73,11 +73,11 @@ def examine(subject: str, check: Check) -> Iterator[Finding]:
 
 
 def _versions() -> Iterator[Finding]:
-    known = {name: _version(name) for name in (*PACKAGES, *EXTRAS)}
-    told = ", ".join(f"{name} {version}" for name, version in known.items() if version)
-    yield Finding("versions", State.FINE, f"Python {platform.python_version()}, {told}")
+    versions = {name: _version(name) for name in (*PACKAGES, *EXTRAS)}
+    listed = ", ".join(f"{name} {version}" for name, version in versions.items() if version)
+    yield Finding("versions", State.FINE, f"Python {platform.python_version()}, {listed}")
     for name in PACKAGES:
-        if not known[name]:
+        if not versions[name]:
             yield Finding("versions", State.BROKEN, f"{name} is not installed", f"pip install {name}")
 
 
@@ -94,8 +94,8 @@ def _devices() -> Iterator[Finding]:
     from mechsearch_jax.runtime.cores import cores
 
     devices = jax.devices()
-    told = ", ".join(f"{device.platform}: {device.device_kind}" for device in devices)
-    yield Finding("devices", State.FINE, f"JAX computes on {told}; {cores()} cores")
+    names = ", ".join(f"{device.platform}: {device.device_kind}" for device in devices)
+    yield Finding("devices", State.FINE, f"JAX computes on {names}; {cores()} cores")
     if jax.default_backend() == "cpu" and (shutil.which("nvidia-smi") or Path("/proc/driver/nvidia/version").exists()):
         yield Finding(
             "devices",
@@ -128,18 +128,18 @@ def _batches() -> Iterator[Finding]:
         return
     import warp  # pyright: ignore[reportMissingImports]
 
-    # It tells on standard output that there is no GPU, which is told below.
+    # Warp prints that there is no GPU; the finding says so instead.
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         gpus = [device.name for device in warp.get_cuda_devices()]
-    told = ", ".join(gpus) if gpus else "the CPU alone, slowly: no GPU is seen"
-    yield Finding("batches", State.FINE, f"MJX and Warp {warp.config.version} work, on {told}")
+    devices = ", ".join(gpus) if gpus else "the CPU alone, slowly: no GPU is seen"
+    yield Finding("batches", State.FINE, f"MJX and Warp {warp.config.version} work, on {devices}")
 
 
 def _rendering() -> Iterator[Finding]:
     for backend in ("egl", "osmesa"):
-        asked = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+        environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
         try:
-            done = subprocess.run([sys.executable, "-c", _RENDER], env=asked, capture_output=True, timeout=60)
+            done = subprocess.run([sys.executable, "-c", _RENDER], env=environment, capture_output=True, timeout=60)
             works = done.returncode == 0
         except subprocess.TimeoutExpired:
             works = False
@@ -166,31 +166,31 @@ def _weights() -> Iterator[Finding]:
         except InputError as error:
             yield Finding("weights", State.BROKEN, str(error), "pip install --force-reinstall mechsearch-jax")
         else:
-            told = f"{name}: {card['parameters']} parameters, SHA-256 {card['sha256'][:12]}"
-            yield Finding("weights", State.FINE, told)
+            says = f"{name}: {card['parameters']} parameters, SHA-256 {card['sha256'][:12]}"
+            yield Finding("weights", State.FINE, says)
 
 
 def _cache() -> Iterator[Finding]:
     from mechsearch_jax.problem.cache import VARIABLE, cache_folder
     from mechsearch_jax.runtime.files import check_writable
 
-    kept = {"problems, compilations": cache_folder()}
+    folders = {"problems, compilations": cache_folder()}
     if given := os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        kept = {"problems": cache_folder(), "compilations": Path(given)}
-    for what, folder in kept.items():
+        folders = {"problems": cache_folder(), "compilations": Path(given)}
+    for content, folder in folders.items():
         if folder is None:
-            says = f"{what} are not kept: {VARIABLE} is empty, so that every start takes minutes"
+            says = f"{content} are not kept: {VARIABLE} is empty, so that every start takes minutes"
             yield Finding("cache", State.MISSING, says, f"unset {VARIABLE}, or set it to a folder")
             continue
         try:
             check_writable(folder)
         except InputError as error:
-            says = f"{what} are not kept: {error}"
+            says = f"{content} are not kept: {error}"
             yield Finding("cache", State.MISSING, says, f"set {VARIABLE} to a folder that can be written to")
             continue
         sizes = [file.stat().st_size for file in folder.rglob("*") if file.is_file()]
-        told = f"{what}: {folder}, {len(sizes)} files, {sum(sizes) / 1e6:.0f} MB, writable"
-        yield Finding("cache", State.FINE, told)
+        says = f"{content}: {folder}, {len(sizes)} files, {sum(sizes) / 1e6:.0f} MB, writable"
+        yield Finding("cache", State.FINE, says)
 
 
 def _meshes() -> Iterator[Finding]:
@@ -222,6 +222,6 @@ CHECKS: Mapping[str, Check] = {
     "cache": _cache,
     "meshes": _meshes,
 }
-# What is looked at of a cell, and without what nothing can be searched.
+# The checks of a cell, and those without which no search is possible.
 CELL = ("camera", "target", "shelf", "networks", "planner")
 NEEDED = ("versions", "devices", "simulator", "weights", *CELL)

@@ -1,4 +1,4 @@
-"""What is found out about one thing that a search needs."""
+"""Result of a check of one thing that a search needs."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class State(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """What was found out about one thing.
+    """Result of a check.
 
     Attributes:
-      subject: what it is.
+      subject: what was checked.
       state: how usable it is.
-      says: one line.
-      remedy: what to do about it; empty where nothing is to be done.
+      says: one line of text.
+      remedy: how to mend it; empty if nothing is wrong.
     """
 
     subject: str

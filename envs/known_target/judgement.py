@@ -1,4 +1,4 @@
-"""A target whose pose is known, seen or not: how far it is from graspable, what can be done, how it is taken out."""
+"""A target whose pose is known, seen or not: its distance from graspable, sampled actions, and retrievals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mechsearch_jax.retrieval import GraspChoice, best_grasps, found_grasps, fou
 
 @dataclasses.dataclass(frozen=True)
 class InFullView(SearchForGrasp):
-    """How far the target is from graspable where it is known to be: it may stand hidden."""
+    """The cost of `SearchForGrasp` for a target at a known pose, which may be hidden."""
 
     def cost(self, problem, belief, state, weights) -> Float[Array, ""]:
         nowhere_hidden = jnp.zeros_like(state.exists)
@@ -36,7 +36,7 @@ class Judgement(flax.struct.PyTreeNode):
     Attributes:
       cost: J of the planner, of this target alone.
       feasible: which grasps arm and shelf allow, shape (F,).
-      hits: which objects each of these hits on its whole way, shape (F, N).
+      hits: which objects each feasible grasp hits on its whole way, shape (F, N).
     """
 
     cost: Float[Array, "*batch"]
@@ -45,7 +45,7 @@ class Judgement(flax.struct.PyTreeNode):
 
     @property
     def least(self) -> int | None:
-        """How many objects the best grasp hits; None where none is feasible. Of a single world."""
+        """Number of objects that the best grasp hits; None if none is feasible. For a single world."""
         return int(self.hits.sum(axis=1)[self.feasible].min()) if self.feasible.any() else None
 
 
@@ -55,13 +55,13 @@ def judge(problem: Problem, objective: Objective, weights: Weights, world: World
 
     Args:
       problem: built for the target.
-      objective: whose cost it is; static.
+      objective: defines the cost; static.
       weights: of what is in the way of the grasp.
       world: the true state, fields without leading axes.
-      active: where false, little is computed, and what is told means nothing.
+      active: if False, little is computed and the result means nothing.
     """
-    here = Snapshot(problem.camera, problem.shelf, world)
-    belief, objects = _known(problem, world, active), objects_on_the_board(here)
+    snapshot = Snapshot(problem.camera, problem.shelf, world)
+    belief, objects = _certain_belief(problem, world, active), objects_on_the_board(snapshot)
     hits = found_hits(problem.target_grasps, belief.grasps, objects, active)
     rows = jnp.concatenate([no_hits(pairs(problem.grasps), hits.shape[1]), hits])
     state = present_state(problem, belief, objects, PlannerConfig())
@@ -70,8 +70,8 @@ def judge(problem: Problem, objective: Objective, weights: Weights, world: World
     return Judgement(cost, belief.grasps.feasible, hits & belief.grasps.feasible[:, None])
 
 
-def _known(problem: Problem, world: World, active: Bool[Array, ""] | bool = True) -> Belief:
-    """The belief of who knows where the target is."""
+def _certain_belief(problem: Problem, world: World, active: Bool[Array, ""] | bool = True) -> Belief:
+    """The belief that holds the target's true pose as found."""
     pose = true_target_pose(world)
     grasps = found_grasps(problem.target_grasps, upright_pose(pose, problem.target.height(problem.shelf)), active)
     return initial_belief(problem).replace(found=jnp.array(True), found_pose=pose, grasps=grasps)
@@ -81,7 +81,7 @@ def _known(problem: Problem, world: World, active: Bool[Array, ""] | bool = True
 def sample(policy: PlanningPolicy, key: Array, problem: Problem, world: World) -> Sequences:
     """Sequences of actions from a world, best first, as the planner samples them."""
     objects = objects_on_the_board(Snapshot(problem.camera, problem.shelf, world))
-    return plan(policy.rollout(problem, _known(problem, world)), key, objects).sequences
+    return plan(policy.rollout(problem, _certain_belief(problem, world)), key, objects).sequences
 
 
 def retrievals_of(problem: Problem, world: World, count: int) -> GraspChoice:

@@ -1,10 +1,10 @@
-"""A search with everything known: whatever can be tried is tried in copies of the simulated world.
+"""A search with full knowledge: it tells whether a scene can be solved at all by the planner's actions.
 
-It tells whether a scene can be solved at all by the actions that there are. Nothing is hidden from it: it plans with
-the true poses of all objects and of the target from the start, and it may take back what went wrong. All worlds that
-were reached are kept. In a round sequences are sampled, as the planner does, from the few in which the target is
-nearest to being graspable, and the best sequences are executed in copies of their worlds. A world that was tried in
-vain makes way for others by and by. One in which an object has left the board, or the target has fallen, is given up.
+It plans with the true poses of all objects and of the target, executes actions in copies of the simulated world, and
+backtracks. All worlds that were reached are kept. Each round samples sequences, as the planner does, from the few
+worlds in which the target is nearest to being graspable, and executes the best sequences in copies of their worlds.
+Every round in which a world is expanded lowers its priority. A world in which an object has left the board, or the
+target has fallen, is discarded.
 """
 
 from __future__ import annotations
@@ -30,26 +30,26 @@ from mechsearch_jax.planner import PlanningPolicy, Problem
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Scenario
 
-# Worlds in which no body is farther than this from where it is in another are taken for the same [m].
+# Two worlds count as the same if no body differs in position by more than this [m].
 ALIKE = 0.01
-# What a world is set back by for every round in which it was tried, in units of J: an object in the way counts 1.
+# Added to a world's cost J for every round in which it was expanded; an object in the way costs 1.
 TRIED = 0.25
-# First actions that agree to this are the same, in metres and entries of a rotation.
+# First actions count as the same if they agree to this, in metres and entries of a rotation.
 STEP = 0.002
 
 
 @dataclasses.dataclass(frozen=True)
 class KnownSearchConfig:
-    """How much is tried.
+    """Budget of the search.
 
     Attributes:
-      simulated: how many sequences are executed in a round.
-      worlds: from how many sequences are sampled in a round.
-      rounds: how many there are at most.
-      grasps: with how many grasps it is tried to take the target out of a world where one hits nothing.
-      retrievals: from how many worlds of a round that is tried, at most.
-      max_steps: number of actions, taking the target out among them.
-      seed: of what is sampled.
+      simulated: number of sequences that are executed in a round.
+      worlds: number of worlds from which sequences are sampled in a round.
+      rounds: largest number of rounds.
+      grasps: number of grasps that are tried in a world where a grasp hits nothing.
+      retrievals: largest number of worlds of a round in which that is tried.
+      max_steps: largest number of actions, the retrieval included.
+      seed: of the sampling.
     """
 
     simulated: int = 32
@@ -68,12 +68,12 @@ class KnownSearchConfig:
 
 @dataclasses.dataclass(frozen=True)
 class Node:
-    """A world that actions lead to.
+    """A world that was reached by actions.
 
     Attributes:
       world: its true state, as NumPy arrays without leading axes.
-      actions: that lead there.
-      judgement: of it, as NumPy arrays.
+      actions: that lead there from the start.
+      judgement: of the world, as NumPy arrays.
     """
 
     world: World
@@ -82,29 +82,29 @@ class Node:
 
     @property
     def cost(self) -> float:
-        """J of it."""
+        """J of the world."""
         return float(self.judgement.cost)
 
     @property
     def graspable(self) -> bool:
-        """Whether a grasp hits nothing."""
+        """Whether there is a grasp that hits nothing."""
         return self.judgement.least == 0
 
 
 @dataclasses.dataclass(frozen=True)
-class Found:
-    """What a search came to.
+class KnownSearchResult:
+    """Result of a search.
 
     Attributes:
-      actions: that take the target out; None where none were found.
-      best: the world in which the target is nearest to being graspable, the start among them.
+      actions: that take the target out; None if the search did not succeed.
+      best: the world in which the target is nearest to being graspable; may be the start.
       start: the world at the start.
-      rounds: how many rounds there were.
-      simulated: number of actions that were executed, retrievals among them.
-      sampled: how often a first action of each kind and object was sampled: ("push", 2).
-      executed: how often one of a sequence was carried out.
-      failed: how often one was not, by its kind, object and reason.
-      retrievals: how often it was tried to take the target out, by what came of it ("" for success).
+      rounds: number of rounds.
+      simulated: number of actions that were executed, retrievals included.
+      sampled: number of first actions that were sampled, by kind and object: ("push", 2).
+      executed: number of actions that were carried out, by kind and object.
+      failed: number of actions that failed, by kind, object and reason.
+      retrievals: number of attempted retrievals by failure reason, "" for success.
     """
 
     actions: tuple[ActionRecord, ...] | None
@@ -124,27 +124,27 @@ def known_search(
     policy: PlanningPolicy,
     simulator: Simulator,
     config: KnownSearchConfig | None = None,
-    told: Callable[[int, Node], None] = lambda round, best: None,
-) -> Found:
-    """Look for actions that take the target out.
+    on_round: Callable[[int, Node], None] = lambda round, best: None,
+) -> KnownSearchResult:
+    """Search for actions that take the target out.
 
     Args:
-      scenario: where everything stands at the start.
-      problem: built for its target.
-      policy: samples sequences and predicts them; its objective should be `InFullView`.
-      simulator: executes actions in as many worlds as are asked for.
-      config: how much is tried.
-      told: after every round, of its number and of the best world so far.
+      scenario: the scene at the start.
+      problem: built for the scenario's target.
+      policy: samples and predicts sequences; its objective should be `InFullView`.
+      simulator: executes actions in any number of worlds.
+      config: the budget.
+      on_round: called after every round with its number and the best world so far.
     """
     running = _Running(scenario, problem, policy, simulator, config or KnownSearchConfig())
     while running.goes_on:
         running.round()
-        told(running.rounds, running.best)
-    return running.found()
+        on_round(running.rounds, running.best)
+    return running.result()
 
 
 class _Proposal(NamedTuple):
-    """A sequence that may be executed: from where, with what expected cost, and its actions with their axis M."""
+    """A sequence that may be executed: its start, its expected cost, and its actions with a leading axis M."""
 
     node: Node
     expected: float
@@ -153,12 +153,12 @@ class _Proposal(NamedTuple):
 
     @property
     def group(self) -> tuple[int, int, int]:
-        """Proposals that begin alike: the world, and kind and object of the first action."""
+        """The start, and kind and object of the first action."""
         return id(self.node), int(self.actions.kind[0]), int(self.actions.object[0])
 
 
 class Frontier:
-    """Worlds to go on from.
+    """Worlds that can be expanded.
 
     Attributes:
       nodes: all of them.
@@ -170,7 +170,7 @@ class Frontier:
         self._places: list[Float[np.ndarray, "9 3"]] = []
 
     def add(self, node: Node) -> None:
-        """Keep a world, unless one that is alike is kept."""
+        """Keep a world unless one that counts as the same is kept already."""
         place = np.where(node.world.valid[:, None], node.world.position, 0.0)
         if not self._places or np.abs(np.stack(self._places) - place).max(axis=(1, 2)).min() > ALIKE:
             self.nodes.append(node)
@@ -178,7 +178,7 @@ class Frontier:
             self._places.append(place)
 
     def next(self, count: int) -> list[Node]:
-        """The worlds to be tried now: those of least cost, what `TRIED` adds included, and then of fewest actions."""
+        """The worlds to expand now: those of least cost including `TRIED`, ties by fewest actions."""
         promise = [
             (node.cost + TRIED * tried, len(node.actions)) for node, tried in zip(self.nodes, self._tried, strict=True)
         ]
@@ -216,12 +216,12 @@ class _Running:
 
     @property
     def goes_on(self) -> bool:
-        """Whether there is anything left to be tried."""
+        """Whether the search is neither solved nor at the end of its budget."""
         return self._solution is None and self.rounds < self._config.rounds and bool(self._open.nodes)
 
-    def found(self) -> Found:
-        """What it came to so far."""
-        return Found(
+    def result(self) -> KnownSearchResult:
+        """The result so far."""
+        return KnownSearchResult(
             actions=self._solution,
             best=self.best,
             start=self._start,
@@ -234,10 +234,10 @@ class _Running:
         )
 
     def round(self) -> None:
-        """Sample from the most promising worlds, execute the best sequences, and keep the worlds that come of it."""
+        """Sample from the most promising worlds, execute the best sequences, and keep the worlds that result."""
         nodes = self._open.next(self._config.worlds)
         keys = jax.random.split(jax.random.fold_in(jax.random.key(self._config.seed), self.rounds), len(nodes))
-        proposals = [one for node, k in zip(nodes, keys, strict=True) for one in self._proposals(node, k)]
+        proposals = [p for node, key in zip(nodes, keys, strict=True) for p in self._proposals(node, key)]
         self.rounds += 1
         nodes = self._execute(in_turn(proposals, self._config.simulated))
         nodes.sort(key=lambda node: (node.cost, len(node.actions)))
@@ -247,7 +247,7 @@ class _Running:
         self._keep(nodes)
 
     def _keep(self, nodes: Sequence[Node]) -> None:
-        """Keep worlds to go on from, if there is room for two more actions: one, and taking the target out."""
+        """Keep worlds with room for two more actions: one, and the retrieval."""
         for node in nodes:
             if len(node.actions) < self._config.max_steps - 1:
                 self._open.add(node)
@@ -257,31 +257,31 @@ class _Running:
         return judge(self._problem, policy.objective, policy.config.weights, world, active)
 
     def _judged(self, worlds: Sequence[World]) -> list[Judgement]:
-        """Judge worlds, so many at once as are simulated at once."""
+        """Judge worlds in chunks of constant size, so that the judge is compiled once."""
         judged: list[Judgement] = []
         for i in range(0, len(worlds), self._config.simulated):
-            some = worlds[i : i + self._config.simulated]
-            padded = [*some, *[some[0]] * (self._config.simulated - len(some))]
-            active = np.arange(len(padded)) < len(some)
-            every = jax.device_get(self._judges(_stacked(padded), jnp.asarray(active)))
-            judged += [jax.tree.map(lambda a, j=j: a[j], every) for j in range(len(some))]
+            chunk = worlds[i : i + self._config.simulated]
+            padded = [*chunk, *[chunk[0]] * (self._config.simulated - len(chunk))]
+            active = np.arange(len(padded)) < len(chunk)
+            judgements = jax.device_get(self._judges(_stacked(padded), jnp.asarray(active)))
+            judged += [jax.tree.map(lambda a, j=j: a[j], judgements) for j in range(len(chunk))]
         return judged
 
     def _proposals(self, node: Node, key: Array) -> list[_Proposal]:
         """The sampled sequences whose first actions differ, best first."""
         sequences = jax.device_get(sample(self._policy, key, self._problem, node.world))
         room = self._config.max_steps - 1 - len(node.actions)
-        found: dict[tuple[str | int, ...], _Proposal] = {}
+        proposals: dict[tuple[str | int, ...], _Proposal] = {}
         for i in np.flatnonzero(np.isfinite(sequences.value)):
             actions = jax.tree.map(lambda a, i=i: a[i], sequences.actions)
             expected = node.cost + float(sequences.value[i])
             proposal = _Proposal(node, expected, actions, min(int(sequences.length[i]), room))
             self._sampled[_named(actions, 0)] += 1
-            found.setdefault(_first_step(actions), proposal)
-        return list(found.values())
+            proposals.setdefault(_first_step(actions), proposal)
+        return list(proposals.values())
 
     def _execute(self, proposals: Sequence[_Proposal]) -> list[Node]:
-        """The worlds that proposals lead to, one after each action, without those that are lost."""
+        """The worlds that proposals lead to, one after each action, without those that are discarded."""
         reached: list[Node] = []
         if not proposals:
             return reached
@@ -296,18 +296,20 @@ class _Running:
                 self._note(chosen[i], outcome, i)
                 paths[i] = (*paths[i], record_action(chosen[i]))
             alive = [i for i in active if self._is_whole(outcome, worlds, i)]
-            here = [jax.tree.map(lambda a, i=i: a[i], worlds) for i in alive]
-            reached += [Node(w, paths[i], j) for i, w, j in zip(alive, here, self._judged(here), strict=True)]
+            worlds_alive = [jax.tree.map(lambda a, i=i: a[i], worlds) for i in alive]
+            reached += [
+                Node(w, paths[i], j) for i, w, j in zip(alive, worlds_alive, self._judged(worlds_alive), strict=True)
+            ]
             paths = {i: paths[i] for i in alive}
         return reached
 
     def _acted(self, actions: Sequence[Action], active: Sequence[int]) -> Outcome:
-        """Execute actions in some of as many worlds."""
+        """Execute actions, one per world, in the worlds `active`; nothing happens in the others."""
         self._simulated += len(active)
         mask = np.isin(np.arange(len(actions)), active)
         none = jax.device_get(no_action())
-        told = [action if mask[i] else none for i, action in enumerate(actions)]
-        return jax.device_get(self._simulator.execute(_stacked(told), jnp.asarray(mask)))
+        executed = [action if mask[i] else none for i, action in enumerate(actions)]
+        return jax.device_get(self._simulator.execute(_stacked(executed), jnp.asarray(mask)))
 
     def _note(self, action: Action, outcome: Outcome, i: int) -> None:
         """Count an action that was executed in world `i`."""
@@ -318,13 +320,13 @@ class _Running:
             self._failed[(*_named(action), reason)] += 1
 
     def _is_whole(self, outcome: Outcome, worlds: World, i: int) -> bool:
-        """Whether world `i` is one to go on with after an action."""
+        """Whether world `i` can be expanded after an action."""
         position, rotation = np.asarray(worlds.position[i, TARGET]), np.asarray(worlds.rotation[i, TARGET])
         trouble = target_trouble(self._problem.shelf, position, rotation)
         return trouble is None and not outcome.fallen[i].any() and bool(outcome.took_place[i])
 
     def _take_out(self, nodes: Sequence[Node]) -> None:
-        """Try to take the target out of worlds in which a grasp hits nothing, until it is out."""
+        """Try retrievals in worlds where a grasp hits nothing, until one succeeds."""
         for node in different([node for node in nodes if node.graspable], self._config.retrievals):
             grasps = retrievals_of(self._problem, node.world, self._config.grasps)
             actions = [jax.tree.map(lambda a, i=i: a[i], grasps.action) for i in np.flatnonzero(grasps.success)]
@@ -340,19 +342,19 @@ class _Running:
 
 
 def in_turn(proposals: Sequence[_Proposal], count: int) -> list[_Proposal]:
-    """The best so many proposals, of each group in turn: what a push model takes too easy must not crowd out the rest.
+    """The best `count` proposals, taken from each group in turn, so that a push model's optimism favours no group.
 
-    A group is a world with a kind of action and an object; groups go by their best.
+    A group is a world with a kind of action and an object; groups are ordered by their best proposal.
     """
     groups: dict[tuple[int, int, int], list[_Proposal]] = {}
-    for proposal in sorted(proposals, key=lambda one: one.expected):
+    for proposal in sorted(proposals, key=lambda proposal: proposal.expected):
         groups.setdefault(proposal.group, []).append(proposal)
-    ranked = [(place, one.expected, one) for group in groups.values() for place, one in enumerate(group)]
-    return [one for *_, one in sorted(ranked, key=lambda each: each[:2])[:count]]
+    ranked = [(place, member.expected, member) for group in groups.values() for place, member in enumerate(group)]
+    return [proposal for *_, proposal in sorted(ranked, key=lambda entry: entry[:2])[:count]]
 
 
 def different(nodes: Sequence[Node], count: int) -> list[Node]:
-    """The first so many nodes whose worlds differ by more than `ALIKE`."""
+    """The first `count` nodes whose worlds differ by more than `ALIKE`."""
     kept: list[Node] = []
     for node in nodes:
         if len(kept) < count and all(_apart(node, other) > ALIKE for other in kept):
@@ -361,7 +363,7 @@ def different(nodes: Sequence[Node], count: int) -> list[Node]:
 
 
 def _apart(a: Node, b: Node) -> float:
-    """How far the body that differs most stands apart in two worlds [m]."""
+    """Largest difference of a body's coordinates between two worlds [m]."""
     return float(np.abs(a.world.position - b.world.position)[a.world.valid].max())
 
 
@@ -372,9 +374,9 @@ def _named(action: Action, step: int | None = None) -> tuple[str, int]:
 
 
 def _first_step(actions: Action) -> tuple[str | int, ...]:
-    """What tells the first action of a sequence from others."""
-    told = [actions.T_world_gripper[0], actions.displacement[0], actions.T_world_place[0], actions.q7[0]]
-    numbers = np.concatenate([np.ravel(part) for part in told])
+    """A key that is equal for first actions that count as the same."""
+    parts = [actions.T_world_gripper[0], actions.displacement[0], actions.T_world_place[0], actions.q7[0]]
+    numbers = np.concatenate([np.ravel(part) for part in parts])
     return (*_named(actions, 0), *np.round(numbers / STEP).astype(int).tolist())
 
 

@@ -1,4 +1,4 @@
-"""Push models by name, those that need a simulator too, as policies take them."""
+"""Push models by name, including those that need a simulator."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 
 class PushModels(NamedTuple):
-    """What predicts pushes in a plan: `push_model` and `later_push_model` of a `planner.PolicyFactory`.
+    """The push models of a plan: `push_model` and `later_push_model` of a `planner.PolicyFactory`.
 
     Attributes:
-      first: predicts those that are the first action of a sequence.
-      later: predicts the others.
+      first: predicts pushes that are the first action of a sequence.
+      later: predicts later pushes.
     """
 
     first: PushModel
@@ -28,19 +28,19 @@ class PushModels(NamedTuple):
 def push_models(name: str, shelf: Shelf | None = None) -> PushModels:
     """The push models of a name; the same objects for the same arguments, so that nothing is compiled twice.
 
-    "physics" simulates every push on a GPU. On a CPU that would take too long: the first action of every sequence is
-    simulated there, and the others are predicted by the network.
+    "physics" simulates every push on a GPU. On a CPU, where that would take too long, it simulates the first action of
+    every sequence, and the network predicts later ones.
 
     Args:
       name: "quasi-static", "learned" or "physics".
-      shelf: in which a GPU simulates; the default shelf if None. The others work in any.
+      shelf: in which a GPU simulates; the default shelf if None. Other models work in any shelf.
 
     Raises:
-      InputError: there is none of that name, its weights are missing or damaged, or Warp cannot be imported.
+      InputError: there is no model of that name, its weights are missing or damaged, or Warp cannot be imported.
     """
     if name != "physics":
         return PushModels(own_push_model(name), own_push_model(name))
-    # What is not asked for, the batch simulator among it, is not imported.
+    # Imported here so that other models do without the simulators.
     from mechsearch_jax.envs.pushing.physics_push import MjxPhysics, NativePhysics
 
     if jax.default_backend() == "cpu":

@@ -1,4 +1,4 @@
-"""Pushes in files: made in portions, of which those that lie there already are not made again."""
+"""Pushes in files, generated in portions; portions that exist in a folder are read instead."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mechsearch_jax.runtime.files import replacing
 
 
 def save_pushes(path: Path, pushes: Pushes, identity: str) -> None:
-    """Write pushes and how they were made.
+    """Write pushes with an identity, a text that says how they were generated.
 
     Raises:
       InputError: the file cannot be written.
@@ -33,15 +33,15 @@ def save_pushes(path: Path, pushes: Pushes, identity: str) -> None:
 
 
 def load_pushes(path: Path, identity: str) -> Pushes:
-    """Read pushes that were made in a certain way.
+    """Read pushes of an identity.
 
     Raises:
-      InputError: the file is damaged, or its pushes were made otherwise.
+      InputError: the file is damaged, or its identity differs.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-        found = str(arrays.pop("identity"))
+        stored = str(arrays.pop("identity"))
         tree: dict[str, Any] = unflatten_dict(arrays, sep="/")
         worlds = {name: World(**tree.pop(name)) for name in ("before", "after")}
         pushes = Pushes(**worlds, **tree)
@@ -50,13 +50,13 @@ def load_pushes(path: Path, identity: str) -> Pushes:
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile):
         complaint = "is damaged, or was written by another version; remove it or choose another --data"
         raise InputError(f"{path}: {complaint}") from None
-    if found != identity:
-        raise InputError(f"{path}: was made otherwise ({found}); repeat that or choose another --data")
+    if stored != identity:
+        raise InputError(f"{path}: was made otherwise ({stored}); repeat that or choose another --data")
     return pushes
 
 
 def _drawn_from(config: PushesConfig) -> dict[str, Any]:
-    """The settings on which pushes depend; of those of a planner's actions, most concern others."""
+    """The settings on which pushes depend: all of `config`, but of its `actions` only those of pushes."""
     pushing = ("push_wrists", "push_tilt", "push_depths", "push_height", "push_leverage")
     pushing += ("cloud_points", "pusher_points")
     settings = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
@@ -70,21 +70,21 @@ def portions(
     draw_world: Callable[[Array], World],
     source: str = "",
     config: PushesConfig | None = None,
-    told: Callable[[int], None] = lambda pushes: None,
+    on_progress: Callable[[int], None] = lambda pushes: None,
 ) -> Iterator[Pushes]:
-    """Portions of pushes until there are enough; those that lie in the folder already are read instead of made.
+    """Portions of pushes until there are enough; those that exist in the folder are read instead of generated.
 
     Args:
-      generation: how many.
-      folder: for one file for each portion.
+      generation: number of pushes and portions.
+      folder: holds one file for each portion.
       make_simulator: called if anything has to be simulated.
       draw_world: see `generate_pushes`.
-      source: names the simulator and the scenes; what lies in the folder must have been made with the same.
-      config: which pushes.
-      told: is told how many pushes there are.
+      source: names the simulator and the scenes; files in the folder must have the same.
+      config: of the pushes.
+      on_progress: called with the number of pushes so far.
 
     Raises:
-      InputError: what lies in the folder is damaged or was made otherwise, or the folder cannot be written.
+      InputError: a file in the folder is damaged or of another identity, or the folder cannot be written.
     """
     config = config or PushesConfig()
     simulator: Simulator | None = None
@@ -105,13 +105,13 @@ def portions(
                 simulator,
                 draw_world,
                 config,
-                told=lambda _, pushes, base=base: told(base + pushes),
+                on_progress=lambda _, pushes, base=base: on_progress(base + pushes),
             )
             part = part.replace(lane=part.lane + number * generation.worlds)
             save_pushes(path, part, identity)
         count += len(part.object)
         if not len(part.object):
             raise InputError(f"no push was possible in {generation.worlds} worlds; give more --worlds")
-        told(count)
+        on_progress(count)
         number += 1
         yield part

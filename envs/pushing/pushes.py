@@ -1,8 +1,7 @@
-"""Random pushes, executed by the robot in simulation, and what became of every object: what a push model learns from.
+"""Random pushes, executed by the robot in simulation, with their outcomes: training data of push models.
 
-A few pushes follow each other in a world before it is drawn anew, so that scenes drift into what physics makes of them:
-objects that touch, lean on walls, or lie. Worlds are simulated all at once, by `MjxSimulator` on a GPU or by
-`NativeSimulator` on a CPU.
+A world undergoes a few pushes before it is drawn anew, so that the data include objects that touch, lean on walls, or
+lie. All worlds are simulated at once, by `MjxSimulator` on a GPU or by `NativeSimulator` on a CPU.
 """
 
 from __future__ import annotations
@@ -37,26 +36,27 @@ from mechsearch_jax.workspace.shelf import Shelf, hits_shelf
 
 # An object whose vertical has turned by more than this has fallen over [rad].
 TOPPLED = math.radians(15)
-# From how far away the gripper is brought up to the object [m]: it then overlaps none.
+# Distance from which the gripper is brought up to the object [m]; far enough to overlap no object.
 _AWAY = 0.6
 
 
 @dataclasses.dataclass(frozen=True)
 class PushesConfig:
-    """Which pushes are drawn; ranges are drawn from evenly.
+    """Distribution of the drawn pushes; ranges are sampled uniformly.
 
     Attributes:
       actions: the tilt of the gripper, its wrists, and the heights of planned pushes.
-      lengths: range of how far the gripper travels [m].
+      lengths: range of the gripper's travel [m].
       sideways: share of pushes to the left or right; the others go forward or diagonally.
-      forward: largest angle between those and +x [rad].
+      forward: largest angle between the latter and +x [rad].
       yaw: largest angle between the gripper's approach and +x, seen from above [rad].
       gap: range of the distance between gripper and object where a push starts [m].
-      planned: share of pushes at the height that the planner would choose; the others are at any, and topple more.
-      highest: of any height [m].
-      tries: so many pushes are drawn in a world at once, of which the first that is possible is taken.
-      renewed: chance that a world is drawn anew after a push.
-      renewed_toppled: the same where an object has fallen over.
+      planned: share of pushes at the height that the planner would choose; the others are at a random one, and topple
+        more.
+      highest: largest random height [m].
+      tries: number of pushes drawn in a world at once; the first possible one is taken.
+      renewed: probability that a world is drawn anew after a push.
+      renewed_toppled: the same if an object has fallen over.
     """
 
     actions: ActionConfig = dataclasses.field(default_factory=ActionConfig)
@@ -83,13 +83,13 @@ class PushesConfig:
 
 
 class Pushes(flax.struct.PyTreeNode):
-    """Pushes and what became of them; every field has a leading axis for the pushes.
+    """Pushes and their outcomes; every field has a leading axis for the pushes.
 
     Attributes:
       before, after: all bodies, the target last.
-      object: which of them was to be pushed, int32.
-      T_world_gripper: where the gripper started, shape (n, 4, 4).
-      displacement: how it moved [m], shape (n, 3).
+      object: index of the body to push, int32.
+      T_world_gripper: pose of the gripper at the start, shape (n, 4, 4).
+      displacement: of the gripper [m], shape (n, 3).
       q7: angle of joint 7 [rad], shape (n,).
       toppled: which bodies fell over, or off the board, shape (n, 9).
       fallen: which fell off the board, shape (n, 9).
@@ -108,10 +108,10 @@ class Pushes(flax.struct.PyTreeNode):
 
 
 def push_simulation() -> SimulatorConfig:
-    """How pushes are simulated here: as in an episode, but for most of the way in and out.
+    """Simulation settings of pushes: as in an episode, but without most of the way in and out.
 
-    Approximations: what the hand would drag along on the rest of the way out stays where it is, and what has not come
-    to rest 0.4 s after the retreat is taken to rest where it is.
+    Approximations: the hand drags nothing along on the omitted rest of the way out, and bodies that have not come to
+    rest 0.4 s after the retreat are taken to rest where they are.
     """
     # Everywhere counts as outside: there is no way along x.
     gripper = Gripper(approach=0.03, outside=(math.inf,))
@@ -120,7 +120,7 @@ def push_simulation() -> SimulatorConfig:
 
 
 def push_tables(config: PushesConfig, gripper: Gripper | None = None) -> ActionTables:
-    """The gripper's clouds; of grasps, which do not matter here, there are as many wrists."""
+    """The gripper's point clouds; grasps, which are unused here, get the same wrist angles."""
     return action_tables(gripper or Gripper(), config.actions.push_wrists, config.actions)
 
 
@@ -139,7 +139,7 @@ def _draw(key: Array, config: PushesConfig, shelf: Shelf, approach: float, table
     prints = footprints(scene)
     weight = jnp.where(world.valid.at[TARGET].set(False), 0.0, -jnp.inf)
     index = jax.random.categorical(keys[0], weight)
-    one = jax.tree.map(lambda a: a[index], prints)
+    pushed = jax.tree.map(lambda a: a[index], prints)
     extent = bounding_half_extents(scene)[index]
 
     sideways = jax.random.bernoulli(keys[1], config.sideways)
@@ -158,17 +158,17 @@ def _draw(key: Array, config: PushesConfig, shelf: Shelf, approach: float, table
     far = jnp.where(sideways, 1.5 * actions.push_depths[1], 0.8 * wide)
     shift = jax.random.uniform(keys[6]) * (far - near) + near
 
-    tall = one.high - one.low
+    tall = pushed.high - pushed.low
     along = jnp.abs(heading[0]) * extent[0] + jnp.abs(heading[1]) * extent[1]
-    planned, _ = contact_height(actions, one.round, along, tall)
+    planned, _ = contact_height(actions, pushed.round, along, tall)
     any_height = jax.random.uniform(
         keys[7], minval=LOW_CONTACT, maxval=jnp.clip(tall, LOW_CONTACT + 1e-3, config.highest)
     )
     height = jnp.where(jax.random.bernoulli(keys[8], config.planned), planned, any_height)
 
-    away = one.position + shift * across - _AWAY * heading
+    away = pushed.position + shift * across - _AWAY * heading
     T_away = make(rotation, jnp.append(away, shelf.board + height))
-    single = jax.tree.map(lambda a: a[None], one)
+    single = jax.tree.map(lambda a: a[None], pushed)
     distance, level = pusher_distance(single, transform(T_away, tables.pusher), heading, 2 * _AWAY)
     first = jnp.min(jnp.where(level, distance, 2 * _AWAY))
     gap = jax.random.uniform(keys[9], minval=config.gap[0], maxval=config.gap[1])
@@ -208,10 +208,9 @@ def draw_push(
     shelf: Shelf,
     approach: float = Gripper().approach,
 ) -> tuple[Action, Bool[Array, ""]]:
-    """A random push that the arm can make: it gets in without touching anything, and out of the shelf again.
+    """A random push that the arm can make: it enters the shelf without contact and can leave it again.
 
-    What the gripper touches while it pushes, and whether its links touch anything beside what it pushes, is left to
-    the simulation.
+    Contacts of gripper and links during the push are left to the simulation.
 
     Args:
       key: PRNG key.
@@ -220,18 +219,18 @@ def draw_push(
       config, shelf, approach: static; the last is the length of the straight way in [m].
 
     Returns:
-      The push, and whether one was found; if not, its kind is NONE.
+      The push, and whether it is possible; if not, its kind is NONE.
     """
     draw = functools.partial(_draw, config=config, shelf=shelf, approach=approach, tables=tables, world=world)
     tries = jax.vmap(draw)(jax.random.split(key, config.tries))
     first = jnp.argmax(tries.possible)
     action: Action = jax.tree.map(lambda a: a[first], tries.action)
-    found = tries.possible[first]
-    return action.replace(kind=jnp.where(found, action.kind, ActionKind.NONE)), found
+    possible = tries.possible[first]
+    return action.replace(kind=jnp.where(possible, action.kind, ActionKind.NONE)), possible
 
 
 def toppled(before: World, after: World) -> Bool[Array, "*batch n"]:
-    """Which bodies stand on another face than before; what lies and has rolled does not."""
+    """Which bodies stand on another face than before; lying bodies that have rolled do not count."""
     up = before.rotation[..., 2, :], after.rotation[..., 2, :]
     return before.valid & (by_shape(before.kind, lambda shape: shape.fall(*up, jnp), jnp) < math.cos(TOPPLED))
 
@@ -244,18 +243,18 @@ def generate_pushes(
     draw_world: Callable[[Array], World],
     config: PushesConfig | None = None,
     shelf: Shelf | None = None,
-    told: Callable[[int, int], None] = lambda rounds, pushes: None,
+    on_progress: Callable[[int, int], None] = lambda rounds, pushes: None,
 ) -> Pushes:
-    """Push in many worlds, several times one after the other.
+    """Push in many worlds, several times in sequence.
 
     Args:
       key: PRNG key; with `NativeSimulator` the same key gives the same pushes.
-      worlds: how many at once; each is a lane of its own.
-      rounds: how many pushes follow each other, less those of which none was possible.
+      worlds: number of worlds at once; each is a separate lane.
+      rounds: number of pushes in sequence; a world where none is possible skips a round.
       simulator: simulates them.
       draw_world: a random scene from a key; pure.
       config, shelf: see there.
-      told: is told after each round how many are done and how many pushes there are.
+      on_progress: called after each round with the number of rounds and of pushes so far.
 
     Returns:
       The pushes that were executed as commanded, on the host.
@@ -265,13 +264,13 @@ def generate_pushes(
     chunk = min(worlds, 256)
 
     def mapped(function):
-        return jax.jit(lambda *a: jax.lax.map(lambda one: function(*one), a, batch_size=chunk))
+        return jax.jit(lambda *a: jax.lax.map(lambda row: function(*row), a, batch_size=chunk))
 
     new_worlds = mapped(draw_world)
     draw = mapped(lambda k, world: draw_push(k, world, tables, config, shelf))
     fell_over = jax.jit(toppled)
     renew = np.ones(worlds, bool)
-    found: list[Pushes] = []
+    parts: list[Pushes] = []
     count = 0
     for i in range(rounds):
         scene_key, push_key, renew_key = jax.random.split(jax.random.fold_in(key, i), 3)
@@ -287,7 +286,7 @@ def generate_pushes(
         fallen = outcome.fallen & before.valid
         over = fell_over(before, after) | fallen
         sound = np.asarray(possible & outcome.took_place & (outcome.overflow == 0))
-        # What is stopped in its fall would go on falling in the next push.
+        # A body that is stopped in its fall would go on falling in the next push.
         lost = np.asarray(jnp.any(fallen, axis=1) | ~outcome.settled) | ~sound
         chance = np.where(np.asarray(jnp.any(over, axis=1)), config.renewed_toppled, config.renewed)
         renew = lost | (np.asarray(jax.random.uniform(renew_key, (worlds,))) < chance)
@@ -302,26 +301,26 @@ def generate_pushes(
             fallen=fallen,
             lane=jnp.arange(worlds, dtype=jnp.int32),
         )
-        found.append(jax.tree.map(lambda a, sound=sound: np.asarray(a)[sound], pushes))
+        parts.append(jax.tree.map(lambda a, sound=sound: np.asarray(a)[sound], pushes))
         count += int(sound.sum())
-        told(i + 1, count)
-    return joined(found)
+        on_progress(i + 1, count)
+    return joined(parts)
 
 
 def joined(parts: list[Pushes]) -> Pushes:
-    """Pushes one after the other; their lanes stay as they are."""
+    """The concatenation of pushes; lanes are unchanged."""
     return jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
 
 @dataclasses.dataclass(frozen=True)
 class Generation:
-    """How many pushes are made, and in which portions; each portion begins with new scenes.
+    """Number of generated pushes, and their portions; each portion begins with new scenes.
 
     Attributes:
       seed: of everything.
-      pushes: at least so many in all.
+      pushes: least number in all.
       worlds: simulated at once.
-      rounds: pushes that follow each other in a portion.
+      rounds: pushes in sequence in a portion.
     """
 
     seed: int
@@ -338,7 +337,7 @@ class Generation:
 
 
 def engine_name(gpu: bool) -> str:
-    """The name of what `engine` returns."""
+    """The name of the class that `engine` returns."""
     return "MjxSimulator" if gpu else "NativeSimulator"
 
 

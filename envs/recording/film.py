@@ -1,4 +1,4 @@
-"""The film of a recorded episode: a bystander sees the robot act, beside what the planner knows."""
+"""The film of a recorded episode: a bystander's view of the robot beside the planner's maps."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from mechsearch_jax.viz.raycast import Colour, Eye, Solid
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
-# From the middle of the opening's lower edge, where the bystander is, and where he looks [m]: he stands at the left,
-# and the boards between him and the objects are left out.
+# The bystander's position, at the left, and the point he looks at, from the middle of the opening's lower edge [m].
 STANDS, LOOKS_AT = np.array([-0.56, 1.25, 0.85]), np.array([-0.09, -0.04, 0.03])
+# Boards between him and the objects, which are not drawn.
 LEFT_OUT = ("ceiling", "left")
 # Width of his view, in units of its distance.
 VIEW_ANGLE = 1.02
 
 
 class Film:
-    """The pictures of an episode, one after the other.
+    """The pictures of an episode, in order.
 
     Attributes:
-      count: how many there are.
-      size: their width and height.
+      count: number of pictures.
+      size: their width and height in pixels.
     """
 
     def __init__(self, recording: Recording, width: int, fps: int, speed: float = 1.0):
@@ -46,7 +46,7 @@ class Film:
         recording: of the episode.
         width: of the pictures, in pixels.
         fps: pictures in a second.
-        speed: how many times as fast as it was everything goes.
+        speed: as a multiple of real time.
         """
         self._recording = recording
         self._played = playback(recording, fps, speed)
@@ -60,7 +60,7 @@ class Film:
         recording, played = self._recording, self._played
         *_, width, height = self._layout.beside
         eye = Eye(bystander(recording.shelf, width, height), LIGHT, AMBIENT, BACKGROUND_COLOUR)
-        empty = eye.picture(_shelf_solids(recording.shelf))
+        empty = eye.picture(list(shelf_solids(recording.shelf).values()))
         poses = link_poses(played.q)
 
         def beside(row: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -73,14 +73,14 @@ class Film:
                 step = recording.steps[index]
                 frame = recorded_frame(step, recording.camera, recording.shelf)
                 page = Page(frame, recording.camera, recording.shelf, recording.target, self._room, self._layout)
-                # So few at once that they do not pile up where drawing is slower.
-                for some in _in_lots(rows, 2 * cores()):
-                    for row, picture in zip(some, pool.map(beside, some), strict=True):
+                # Small lots, so that pictures do not pile up where drawing is slower.
+                for lot in _in_lots(rows, 2 * cores()):
+                    for row, picture in zip(lot, pool.map(beside, lot), strict=True):
                         yield page.image(picture, _moving(step.world, played, row, poses[row]))
 
 
 def bystander(shelf: Shelf, width: int, height: int) -> Camera:
-    """Where the film is taken from: at the robot's left, above the shelf."""
+    """The film's camera: at the robot's left, above the shelf."""
     edge = np.array([shelf.front, (shelf.left + shelf.right) / 2, shelf.board])
     position, forward = edge + STANDS, LOOKS_AT - STANDS
     distance = float(np.linalg.norm(forward))
@@ -99,15 +99,19 @@ def _in_lots(rows: Iterator[int], size: int) -> Iterator[list[int]]:
         yield lot
 
 
-def _colour(index: int) -> Colour:
+def slot_colour(index: int) -> Colour:
+    """The colour of a body's slot, or of the shelf."""
     red, green, blue = (float(c) for c in PALETTE[index])
     return red, green, blue
 
 
-def _shelf_solids(shelf: Shelf) -> list[Solid]:
-    boxes = [box for name, box in shelf_boxes(shelf).items() if name not in LEFT_OUT]
-    board = shape_of("box")
-    return [Solid(board, (high - low) / 2, np.eye(3), (low + high) / 2, _colour(SHELF)) for low, high in boxes]
+def shelf_solids(shelf: Shelf) -> dict[str, Solid]:
+    """The shelf's boards by name, without those in `LEFT_OUT`."""
+    boxes = {name: box for name, box in shelf_boxes(shelf).items() if name not in LEFT_OUT}
+    board, colour = shape_of("box"), slot_colour(SHELF)
+    return {
+        name: Solid(board, (high - low) / 2, np.eye(3), (low + high) / 2, colour) for name, (low, high) in boxes.items()
+    }
 
 
 def _body_solids(world: World, played: Playback, row: int) -> list[Solid]:
@@ -117,7 +121,7 @@ def _body_solids(world: World, played: Playback, row: int) -> list[Solid]:
             np.asarray(world.half_size[i]),
             played.rotation[row, i],
             played.position[row, i],
-            _colour(i),
+            slot_colour(i),
         )
         for i in np.flatnonzero(world.valid).tolist()
     ]

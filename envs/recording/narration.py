@@ -1,4 +1,4 @@
-"""Tells on the screen how an episode goes: what the robot sees, what it chose and why, and how long each stage took."""
+"""Prints an episode step by step: what the robot sees, what it chose and why, and how long each stage took."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class Narrator:
         console: Console,
         status: Status,
         problem: Problem,
-        drawn: Callable[[Moment, Frame], None] = lambda moment, frame: None,
+        on_frame: Callable[[Moment, Frame], None] = lambda moment, frame: None,
     ):
         """Args:
-        console, status: where it is told.
+        console, status: where to print.
         problem: of the episode.
-        drawn: told of every step that is over, with its frame.
+        on_frame: called after every step with its frame.
         """
-        self._drawn = drawn
+        self._on_frame = on_frame
         self.frames: list[Frame] = []
         self._restarts = 0
         self._console = console
@@ -87,10 +87,10 @@ class Narrator:
         self._line("time", stages, "dim")
         self._status.update("drawing")
         self.frames.append(pictures.frame(moment, self._problem))
-        self._drawn(moment, self.frames[-1])
+        self._on_frame(moment, self.frames[-1])
 
     def ended(self, episode: Episode) -> None:
-        """Say how it ended."""
+        """Print how it ended."""
         self._console.print(f"\n[bold]{escape(verdict(episode))}[/bold]", soft_wrap=True)
 
     def _sees(self, moment: Moment) -> None:
@@ -99,33 +99,33 @@ class Narrator:
         seen = int(np.isin(objects, shown).sum())
         if moment.record.found:
             x, y, _ = np.asarray(moment.belief.found_pose)
-            known = f"the target at x {x:.3f}, y {y:.3f} m"
+            target = f"the target at x {x:.3f}, y {y:.3f} m"
         else:
-            known = f"no target; it can be at {moment.record.belief_size} of {len(moment.belief.exists)} poses"
+            target = f"no target; it can be at {moment.record.belief_size} of {len(moment.belief.exists)} poses"
             if (moment.record.restarts or 0) > self._restarts:
-                known += ", after there were none left"
+                target += ", after there were none left"
             if moment.record.truth_possible is False:
-                known += ", and none of them is where it is"
+                target += ", and none of them is where it is"
         self._restarts = moment.record.restarts or 0
         self._console.print(f"\n[bold]step {moment.index + 1}[/bold]")
-        self._line("sees", f"{seen} of {len(objects)} objects, {known}")
+        self._line("sees", f"{seen} of {len(objects)} objects, {target}")
 
     def _line(self, label: str, text: str, style: str = "") -> None:
         self._console.print(f"  [cyan]{label:>6}[/cyan]  [{style or 'default'}]{escape(text)}[/]", soft_wrap=True)
 
 
 def events(record: Step) -> list[str]:
-    """What happened in a step that was not intended, beside what its `failure` says."""
-    told = []
+    """Unintended events of a step, beside its `failure`."""
+    messages = []
     if record.fallen:
         several = len(record.fallen) > 1
         which = " and ".join(map(str, record.fallen))
-        told.append(f"object{'s' if several else ''} {which} fell off the board: nothing can be retrieved any more")
+        messages.append(f"object{'s' if several else ''} {which} fell off the board: nothing can be retrieved any more")
     if record.target_fallen:
-        told.append("the target fell off the board")
+        messages.append("the target fell off the board")
     if record.at_rest is False:
-        told.append("something never came to rest, and was stopped as it moved")
-    return told
+        messages.append("something never came to rest, and was stopped as it moved")
+    return messages
 
 
 def verdict(episode: Episode) -> str:
@@ -144,8 +144,8 @@ def verdict(episode: Episode) -> str:
         parts.append(never if graspable is None else f"graspable {after(graspable)}")
         if graspable != by_paper:
             when = "never" if by_paper is None else after(by_paper)
-            known = by_paper is not None or all(step.paper_graspable is not None for step in episode.steps)
-            parts[-1] += f" ({when} with the paper's grasps)" if known else ""
+            recorded = by_paper is not None or all(step.paper_graspable is not None for step in episode.steps)
+            parts[-1] += f" ({when} with the paper's grasps)" if recorded else ""
         parts.append("retrieved" if episode.retrieved else f"not retrieved ({episode.failure})")
     restless = [str(i + 1) for i, step in enumerate(episode.steps) if step.at_rest is False]
     if restless:

@@ -1,4 +1,4 @@
-"""Pictures of the true world and of what the planner makes of it: frames of a filmstrip, maps of f and g."""
+"""Pictures of the true world and of the planner's view of it: frames of a filmstrip, maps of f and g."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def frame(moment: Moment, problem: Problem) -> Frame:
         if not kind.takes_target:
             expected = "" if record.predicted_cost is None else f" → {record.predicted_cost:.0f} expected"
             why = f"cost {record.cost:.0f}{expected}, best of {record.sequences} sequences"
-    known = "target found" if record.found else f"target can be at {record.belief_size} poses"
+    target = "target found" if record.found else f"target can be at {record.belief_size} poses"
     outcome = f" · {record.failure}" if record.failure else ""
     outcome += " · an object fell off the board" if record.fallen else ""
     nowhere = np.zeros(problem.poses.shape[0], bool)
     return Frame(
         title=f"{moment.index + 1}  {does}",
-        caption=f"{known} · {why}{outcome}",
+        caption=f"{target} · {why}{outcome}",
         image=colour_image(image),
         owner=np.asarray(image.segmentation),
         scene=objects,
@@ -62,7 +62,7 @@ def frame(moment: Moment, problem: Problem) -> Frame:
 
 
 def recorded_frame(step: RecordedStep, camera: Camera, shelf: Shelf) -> Frame:
-    """A step of a recording, ready to be drawn; what the camera saw is cast once more."""
+    """A step of a recording, ready to be drawn; the camera's image is ray-cast again."""
     image = Snapshot(camera, shelf, jax.tree.map(jnp.asarray, step.world)).image
     sketch = Sketch()
     if step.action is not None:
@@ -88,9 +88,9 @@ def inspect_scenario(
     """Maps of f and g at the start of an episode, and their picture.
 
     Args:
-      scenario: where everything stands.
+      scenario: the scene.
       problem: built for the scenario's target.
-      recogniser: what the planner sees the world through.
+      recogniser: of the planner.
       seed: of the recogniser's random numbers.
     """
     snapshot = Snapshot(problem.camera, problem.shelf, from_scenario(scenario))

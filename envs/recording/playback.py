@@ -1,7 +1,7 @@
-"""A recorded episode as it is played: the robot at home while it looks, its way there, the action, its way home.
+"""Playback of a recorded episode: the robot at home while it looks, its way to the action, the action, its way home.
 
-What a simulator executed is shown as it was. Simulators set the robot to where an action begins and back home; for
-these ways, in front of the shelf, the ways are shown that a robot would be given (`free_motion`).
+Simulated motion is shown as it was. A simulator sets the robot directly to where an action begins, and back home; the
+playback shows a planned motion in front of the shelf instead (`free_motion`).
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from mechsearch_jax.workspace.shelf import Shelf
 LOOKS, ENDS = 1.2, 1.5
 # A joint that turns by more than this between rows was set, not moved [rad].
 SET = 0.2
-# Time step, share of the joints' limits and, where none is found, duration of the ways in front of the shelf [s].
+# Ways in front of the shelf: time step [s], share of the joints' limits, and duration if planning fails [s].
 WAY_STEP, WAY_PACE, WAY_TIME = 0.04, 0.5, 1.5
 
 
 class Playback(NamedTuple):
-    """What is seen at every moment, one row each, evenly spaced in time.
+    """The scene at evenly spaced moments, one row each.
 
     Attributes:
-      step: index of the step that it belongs to.
-      time: since the beginning, as long as it took [s].
+      step: index of the step that a row belongs to.
+      time: since the beginning, in real time [s].
       q: joint angles [rad], shape (rows, 7).
       opening: distance between the fingers [m].
       position: of the nine bodies [m], shape (rows, 9, 3).
@@ -50,7 +50,7 @@ class Playback(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """Rows of a step; times are since the piece began, which lasts until `ends` [s]."""
+    """Rows of a step; `time` counts from the beginning of the piece, `ends` is its duration [s]."""
 
     time: np.ndarray
     q: np.ndarray
@@ -66,7 +66,7 @@ def playback(recording: Recording, fps: int, speed: float = 1.0) -> Playback:
     Args:
       recording: of the episode.
       fps: moments in a second.
-      speed: how many times as fast as it was everything goes.
+      speed: as a multiple of real time.
     """
     pieces: list[tuple[int, _Piece]] = []
     for i, step in enumerate(recording.steps):
@@ -75,16 +75,16 @@ def playback(recording: Recording, fps: int, speed: float = 1.0) -> Playback:
     pieces.append((pieces[-1][0], _still(last.q[-1], last.opening[-1], last.position[-1], last.rotation[-1], ENDS)))
     starts = np.cumsum([0.0, *(piece.ends for _, piece in pieces)])
     moments = np.arange(0.0, starts[-1], speed / fps)
-    found: list[tuple[np.ndarray, ...]] = []
+    columns: list[tuple[np.ndarray, ...]] = []
     for (i, piece), begin, end in zip(pieces, starts[:-1], starts[1:], strict=True):
         inside = moments[(moments >= begin) & (moments < end)]
-        found.append((np.full(len(inside), i), inside, *_sampled(piece, inside - begin)))
-    step, time, *rest = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        columns.append((np.full(len(inside), i), inside, *_sampled(piece, inside - begin)))
+    step, time, *rest = (np.concatenate(parts) for parts in zip(*columns, strict=True))
     return Playback(step, time, *rest)
 
 
 def _pieces(step: RecordedStep, shelf: Shelf) -> Iterator[_Piece]:
-    """The robot at home, its way there, and the rows of the trace, with the way home where it was set there."""
+    """The robot at home, then for each run of the trace without a jump the way to it and its rows."""
     home, world = np.asarray(HOME, float), step.world
     yield _still(home, 0.0, np.asarray(world.position, float), np.asarray(world.rotation, float), LOOKS)
     trace = step.trace
@@ -94,30 +94,30 @@ def _pieces(step: RecordedStep, shelf: Shelf) -> Iterator[_Piece]:
     rotation = rotation_matrix(trace.quaternion.reshape(-1, 4)).reshape(-1, BODIES, 3, 3)
     scene = superquadrics(world)
     jumps = 1 + np.flatnonzero(np.abs(np.diff(trace.q, axis=0)).max(axis=1) > SET)
-    here, gap = home, 0.0
+    last_q, gap = home, 0.0
     for rows in np.split(np.arange(len(trace.time)), jumps):
         first = rows[0]
         obstacles = Obstacles.of(
             shelf, (scene.replace(position=trace.position[max(first - 1, 0)], rotation=rotation[max(first - 1, 0)]),)
         )
-        way = _way(here, trace.q[first], max(gap, float(opening[first])), obstacles)
+        way = _way(last_q, trace.q[first], max(gap, float(opening[first])), obstacles)
         times = WAY_STEP * np.arange(len(way))
         still = (np.repeat(a[max(first - 1, 0)][None], len(way), axis=0) for a in (trace.position, rotation))
         yield _Piece(times, way, np.linspace(gap, opening[first], len(way)), *still, ends=WAY_STEP * len(way))
         times = trace.time[rows] - trace.time[first]
         lasts = float(times[-1]) + (float(times[1]) if len(times) > 1 else WAY_STEP)
         yield _Piece(times, trace.q[rows], opening[rows], trace.position[rows], rotation[rows], lasts)
-        here, gap = trace.q[rows[-1]], float(opening[rows[-1]])
+        last_q, gap = trace.q[rows[-1]], float(opening[rows[-1]])
 
 
 def _way(start: np.ndarray, end: np.ndarray, opening: float, obstacles: Obstacles) -> Float[np.ndarray, "rows 7"]:
-    """Joint angles on the way between two places in front of the shelf, both included."""
+    """Joint angles on a collision-free way in front of the shelf, start and end included."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     try:
         motion = free_motion(start, end, ArmBody.of(opening), obstacles, timestep=WAY_STEP, pace=WAY_PACE)
         return np.concatenate([start[None], motion.position])
     except InputError:
-        # To show something is better than to show nothing.
+        # Interpolated without regard to obstacles: better than showing nothing.
         share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, round(WAY_TIME / WAY_STEP)))
         return start + share[:, None] * (end - start)
 
@@ -127,7 +127,7 @@ def _still(q: np.ndarray, opening: float, position: np.ndarray, rotation: np.nda
 
 
 def _sampled(piece: _Piece, times: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Joints, opening, positions and rotations at some times, between rows in proportion."""
+    """Joints, opening, positions and rotations at times, interpolated between rows."""
     row = np.interp(times, piece.time, np.arange(len(piece.time)))
     low = np.floor(row).astype(int)
     high, share = np.minimum(low + 1, len(piece.time) - 1), row - low

@@ -1,6 +1,6 @@
-"""The recording of an episode, `recording.npz`: what moved, and what was believed and decided at every step.
+"""The recording of an episode, `recording.npz`: motion, belief and decision of every step.
 
-Enough to show the episode again without simulating, recognising or planning anything. Images are not kept: they are
+It is enough to show the episode again without simulating, recognising or planning. Images are not stored: they are
 ray-cast from the true poses.
 """
 
@@ -36,14 +36,14 @@ from mechsearch_jax.workspace.target import Target
 
 NAME = "recording.npz"
 FORMAT, VERSION = "mechsearch recording", 1
-# A file that is larger is none of ours [bytes]; ten actions make about half a megabyte.
+# Larger files are refused [bytes]; ten actions take about half a megabyte.
 LIMIT = 64 * 2**20
-# A simulator keeps the state of every so many time steps: 25 rows a second.
+# A simulator records every tenth time step: 25 rows a second.
 TRACE_EVERY = 10
 
-# What a file keeps: of the problem and of each step as text, of each step as arrays, and as groups of arrays.
+# Contents of a file: the problem's settings and each step's texts as JSON, each step's arrays, and its trees of arrays.
 _SETTINGS: dict[str, type] = {"camera": Camera, "shelf": Shelf, "target": Target}
-_TOLD = ("title", "caption", "found")
+_TEXTS = ("title", "caption", "found")
 _ARRAYS = ("existence", "graspability", "target_pose")
 _TREES: dict[str, type] = {"world": World, "scene": Superquadrics, "after": Superquadrics, "action": Action}
 
@@ -55,12 +55,12 @@ class RecordedStep:
     Attributes:
       title, caption, found: as in `Frame`.
       world: the true state when the robot looked.
-      scene, after: the objects as they were recognised, and as they were expected after the action.
+      scene, after: the recognised objects, and the objects predicted after the action.
       existence, graspability: f and g at the candidate poses.
       target_pose: x, y [m] and yaw [rad] of the true target.
-      action: what was decided; None where nothing was.
-      trace: what moved; without rows where nothing did.
-      sampled: what the decision chose from; nothing where that is not known.
+      action: the decision; None if there was none.
+      trace: the motion; without rows if nothing moved.
+      sampled: the actions that the decision chose from; empty if not recorded.
     """
 
     title: str
@@ -95,7 +95,7 @@ class Recording:
 
 
 class Traced(Protocol):
-    """A simulator that tells how everything moved in each world during the last action, as `NativeSimulator` does."""
+    """A simulator with traces of the last action in each world, such as `NativeSimulator`."""
 
     @property
     def traces(self) -> Sequence[Trace]: ...
@@ -112,10 +112,10 @@ class Recorder:
         self._steps: list[RecordedStep] = []
 
     def note(self, moment: Moment, frame: Frame) -> None:
-        """Keep a step that is over.
+        """Record a finished step.
 
         Args:
-          moment: all that is known of it.
+          moment: of the step.
           frame: its picture.
         """
         acted = moment.outcome is not None
@@ -141,12 +141,12 @@ class Recorder:
         )
 
     def recording(self, problem: Problem, heading: str) -> Recording:
-        """All that was noted."""
+        """The recorded steps as a `Recording`."""
         return Recording(heading, problem.camera, problem.shelf, problem.target, tuple(self._steps))
 
 
 def empty_trace() -> Trace:
-    """A trace of nothing."""
+    """A trace without rows."""
     rows = (np.zeros((0, *shape)) for shape in ((), (ARM,), (2,), (BODIES, 3), (BODIES, 4)))
     return Trace(*rows)
 
@@ -163,7 +163,7 @@ def save_recording(recording: Recording, path: PathLike) -> None:
         "version": VERSION,
         "heading": recording.heading,
         **{name: dataclasses.asdict(getattr(recording, name)) for name in _SETTINGS},
-        "steps": [{name: getattr(step, name) for name in _TOLD} for step in steps],
+        "steps": [{name: getattr(step, name) for name in _TEXTS} for step in steps],
     }
     arrays: dict[str, np.ndarray] = {"rows": np.array([len(step.trace.time) for step in steps])}
     arrays["acts"] = np.array([step.action is not None for step in steps])
@@ -191,14 +191,14 @@ def load_recording(path: PathLike) -> Recording:
         head = json.loads(str(arrays["head"]))
         if (head["format"], head["version"]) != (FORMAT, VERSION):
             raise ValueError("of another kind or version")
-        told, count = head["steps"], len(head["steps"])
+        texts, count = head["steps"], len(head["steps"])
         settings = {name: kind(**_tuples(head[name])) for name, kind in _SETTINGS.items()}
         _check(arrays, count, len(settings["target"].candidate_poses(settings["shelf"])))
         ends = np.cumsum(arrays["rows"])
         chosen_from = unpacked(arrays, count)
         steps = [
             dataclasses.replace(
-                _step(arrays, told[i], i, slice(ends[i] - arrays["rows"][i], ends[i])), sampled=chosen_from[i]
+                _step(arrays, texts[i], i, slice(ends[i] - arrays["rows"][i], ends[i])), sampled=chosen_from[i]
             )
             for i in range(count)
         ]
@@ -208,24 +208,25 @@ def load_recording(path: PathLike) -> Recording:
 
 
 def _check(arrays: dict[str, np.ndarray], count: int, poses: int) -> None:
-    """Refuse arrays that are not those of so many steps and candidate poses."""
+    """Raise ValueError unless the arrays are those of `count` steps and `poses` candidate poses."""
     nothing = superquadric.empty(MAX_OBJECTS)
-    likes = {"world": _no_world(), "scene": nothing, "after": nothing, "action": no_action()}
-    like = {f"{name}.{f}": np.asarray(getattr(tree, f)) for name, tree in likes.items() for f in _fields(type(tree))}
-    like |= {"rows": np.array(0), "acts": np.array(True), "target_pose": np.zeros(3)}
-    like |= {"existence": np.zeros(poses, bool), "graspability": np.zeros(poses, int)}
-    if not count or any(arrays[name].shape != (count, *one.shape) for name, one in like.items()):
+    trees = {"world": _no_world(), "scene": nothing, "after": nothing, "action": no_action()}
+    examples = {
+        f"{name}.{f}": np.asarray(getattr(tree, f)) for name, tree in trees.items() for f in _fields(type(tree))
+    }
+    examples |= {"rows": np.array(0), "acts": np.array(True), "target_pose": np.zeros(3)}
+    examples |= {"existence": np.zeros(poses, bool), "graspability": np.zeros(poses, int)}
+    if not count or any(arrays[name].shape != (count, *example.shape) for name, example in examples.items()):
         raise ValueError("steps are missing, or their arrays are of other shapes")
     still = empty_trace()
-    like |= {f"trace.{name}": getattr(still, name) for name in _fields(Trace)}
-    if any(arrays[name].dtype.kind != one.dtype.kind for name, one in like.items()):
+    traces = {f"trace.{name}": getattr(still, name) for name in _fields(Trace)}
+    examples |= traces
+    if any(arrays[name].dtype.kind != example.dtype.kind for name, example in examples.items()):
         raise ValueError("an array is of another type")
     rows = int(arrays["rows"].sum())
-    if arrays["rows"].min() < 0 or any(
-        arrays[name].shape != (rows, *one.shape[1:]) for name, one in like.items() if name.startswith("trace.")
-    ):
+    if arrays["rows"].min() < 0 or any(arrays[name].shape != (rows, *a.shape[1:]) for name, a in traces.items()):
         raise ValueError("rows are missing")
-    if not all(np.isfinite(arrays[name]).all() for name in like):
+    if not all(np.isfinite(arrays[name]).all() for name in examples):
         raise ValueError("there are numbers that are not finite")
     kinds = arrays["world.kind"]
     if kinds.min() < 0 or kinds.max() >= len(in_order()) or not (arrays["world.half_size"] > 0).all():
@@ -238,11 +239,11 @@ def _no_world() -> World:
     return World(np.zeros(BODIES, np.int32), vectors, vectors, rotations, present)  # pyright: ignore[reportArgumentType]
 
 
-def _step(arrays: dict[str, np.ndarray], told: dict[str, Any], i: int, rows: slice) -> RecordedStep:
+def _step(arrays: dict[str, np.ndarray], texts: dict[str, Any], i: int, rows: slice) -> RecordedStep:
     trees = {name: kind(*(arrays[f"{name}.{f}"][i] for f in _fields(kind))) for name, kind in _TREES.items()}
     trees["action"] = trees["action"] if arrays["acts"][i] else None
     trace = Trace(*(arrays[f"trace.{name}"][rows] for name in _fields(Trace)))
-    return RecordedStep(**{n: told[n] for n in _TOLD}, **{n: arrays[n][i] for n in _ARRAYS}, **trees, trace=trace)
+    return RecordedStep(**{n: texts[n] for n in _TEXTS}, **{n: arrays[n][i] for n in _ARRAYS}, **trees, trace=trace)
 
 
 def _fields(kind: type) -> tuple[str, ...]:
@@ -250,7 +251,7 @@ def _fields(kind: type) -> tuple[str, ...]:
 
 
 def _tuples(value: Any) -> Any:
-    """Lists of JSON as the tuples that they were, within a dictionary."""
+    """JSON's lists as tuples, also within a dictionary."""
     if isinstance(value, dict):
-        return {name: _tuples(each) for name, each in value.items()}
+        return {name: _tuples(item) for name, item in value.items()}
     return tuple(map(_tuples, value)) if isinstance(value, list) else value

@@ -1,4 +1,4 @@
-"""What a decision chose from: the first actions of its sampled sequences, as a recording keeps them."""
+"""The candidates of a decision: the first actions of its sampled sequences, as a recording stores them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Sampled:
     """First actions, those of the best sequences first; NumPy arrays with a leading axis K.
 
     Attributes:
-      action: what would be done.
-      value: equation 2 of its sequence: the change of the cost, negative is good.
-      cost: J that is expected after it.
-      position: of the objects after it [m], shape (K, N, 3); of no row where nobody predicted it.
-      rotation: theirs, shape (K, N, 3, 3).
+      action: the candidates.
+      value: equation 2 of the sequence: the change of the cost, negative is good.
+      cost: predicted J after the action.
+      position: predicted positions of the objects after the action [m], shape (K, N, 3); without rows if not predicted.
+      rotation: predicted rotations, shape (K, N, 3, 3).
     """
 
     action: Action
@@ -42,21 +42,21 @@ class Sampled:
         return jax.tree.map(lambda a: a[k], self.action)
 
     def after(self, k: int, scene: Superquadrics) -> Superquadrics:
-        """The objects of a scene after one of the actions; where they are if nobody predicted it."""
+        """The predicted objects of a scene after one of the actions; unchanged without a prediction."""
         if not len(self.position):
             return scene
         return scene.replace(position=self.position[k], rotation=self.rotation[k])
 
 
 def sampled(sequences: Sequences) -> Sampled:
-    """What a decision chose from: all that it sampled."""
-    found = jax.device_get(sequences)
-    action, value, cost = jax.tree.map(lambda a: a[:, 0], found.actions), found.value, found.cost[:, 0]
+    """The candidates of a decision: the first actions of all its sampled sequences."""
+    host = jax.device_get(sequences)
+    action, value, cost = jax.tree.map(lambda a: a[:, 0], host.actions), host.value, host.cost[:, 0]
     rows = np.flatnonzero((action.kind != ActionKind.NONE) & np.isfinite(value) & np.isfinite(cost))
     if not len(rows):
         return nothing_sampled()
-    chosen = jax.tree.map(lambda a: a[rows], (action, value, cost, found.after.position, found.after.rotation))
-    return Sampled(*chosen)
+    candidates = jax.tree.map(lambda a: a[rows], (action, value, cost, host.after.position, host.after.rotation))
+    return Sampled(*candidates)
 
 
 def nothing_sampled() -> Sampled:
@@ -66,22 +66,22 @@ def nothing_sampled() -> Sampled:
     return Sampled(none, numbers, numbers, np.zeros((0, MAX_OBJECTS, 3)), np.zeros((0, MAX_OBJECTS, 3, 3)))
 
 
-def packed(every: Sequence[Sampled]) -> dict[str, np.ndarray]:
-    """The arrays of some steps, one after the other, and how many rows each step has."""
-    arrays = {"sampled.rows": np.array([len(one) for one in every])}
-    arrays["sampled.foreseen"] = np.array([len(one.position) for one in every])
+def packed(steps: Sequence[Sampled]) -> dict[str, np.ndarray]:
+    """The candidates of steps as concatenated arrays, with the number of rows of each step."""
+    arrays = {"sampled.rows": np.array([len(step) for step in steps])}
+    arrays["sampled.foreseen"] = np.array([len(step.position) for step in steps])
     for name in ("value", "cost", "position", "rotation"):
-        arrays[f"sampled.{name}"] = np.concatenate([np.asarray(getattr(one, name), np.float32) for one in every])
+        arrays[f"sampled.{name}"] = np.concatenate([np.asarray(getattr(step, name), np.float32) for step in steps])
     for field in dataclasses.fields(Action):
-        arrays[f"sampled.action.{field.name}"] = np.concatenate([getattr(one.action, field.name) for one in every])
+        arrays[f"sampled.action.{field.name}"] = np.concatenate([getattr(step.action, field.name) for step in steps])
     return arrays
 
 
 def unpacked(arrays: Mapping[str, np.ndarray], steps: int) -> list[Sampled]:
-    """What `packed` packed.
+    """The inverse of `packed`.
 
     Raises:
-      ValueError: it is something else.
+      ValueError: shapes, types or values are wrong.
       KeyError: an array is missing.
     """
     rows, foreseen = arrays["sampled.rows"], arrays["sampled.foreseen"]
@@ -90,11 +90,11 @@ def unpacked(arrays: Mapping[str, np.ndarray], steps: int) -> list[Sampled]:
     names = [field.name for field in dataclasses.fields(Action)]
     result = []
     for i in range(steps):
-        one, places = slice(ends[i] - rows[i], ends[i]), slice(seen[i] - foreseen[i], seen[i])
-        fields: dict[str, Any] = {name: arrays[f"sampled.action.{name}"][one] for name in names}
+        of_step, predicted = slice(ends[i] - rows[i], ends[i]), slice(seen[i] - foreseen[i], seen[i])
+        fields: dict[str, Any] = {name: arrays[f"sampled.action.{name}"][of_step] for name in names}
         action = Action(**fields)
-        told = (arrays[f"sampled.{name}"][one] for name in ("value", "cost"))
-        result.append(Sampled(action, *told, *(arrays[f"sampled.{n}"][places] for n in ("position", "rotation"))))
+        values = (arrays[f"sampled.{name}"][of_step] for name in ("value", "cost"))
+        result.append(Sampled(action, *values, *(arrays[f"sampled.{n}"][predicted] for n in ("position", "rotation"))))
     return result
 
 
@@ -103,7 +103,7 @@ def _check(
 ) -> None:
     for counts in (rows, foreseen):
         if counts.shape != (steps,) or counts.dtype.kind not in "iu" or counts.min() < 0:
-            raise ValueError("it is not told how many actions were sampled")
+            raise ValueError("the numbers of sampled actions are missing")
     if ((foreseen != rows) & (foreseen != 0)).any():
         raise ValueError("predictions are missing")
     empty = packed([nothing_sampled()])

@@ -1,4 +1,4 @@
-"""What a page shows of each decision of a recording: pictures, meshes and words, before anything is sent anywhere."""
+"""What the viewer's page shows of each decision of a recording: pictures, meshes and texts."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class ShownSample(NamedTuple):
     """A sampled action.
 
     Attributes:
-      text: it in words, with its value and cost.
-      arrow: from where what moves begins to where it ends; None where nothing does.
-      colour: red, green and blue, 0 to 1, which tell its value.
+      text: the action in words, with its value and cost.
+      arrow: from start to end of the motion; None if nothing moves.
+      colour: red, green and blue, 0 to 1, by its value.
     """
 
     text: str
@@ -39,13 +39,13 @@ class ShownDecision(NamedTuple):
     """What is shown of a step.
 
     Attributes:
-      text: what was done and why.
-      view: what the camera saw.
+      text: the action and its reason.
+      view: the camera's image.
       cells: f and g.
-      recognised: the shapes.
-      ghosts: what the action is predicted to do, and the hand.
-      path: of the action [m]; None where nothing moves.
-      samples: what it was chosen from, best first.
+      recognised: the recognised shapes.
+      ghosts: the predicted effect of the action, and the hand.
+      path: of the action [m]; None if nothing moves.
+      samples: the candidates of the decision, best first.
     """
 
     text: str
@@ -58,7 +58,7 @@ class ShownDecision(NamedTuple):
 
 
 def shown_decisions(recording: Recording) -> list[ShownDecision]:
-    """What is shown of each step; what the camera saw is cast once more."""
+    """What is shown of each step; the camera's images are ray-cast again."""
     scenes = [scene for step in recording.steps for scene in (step.scene, step.after)]
     room = drawing.height_of(scenes, recording.shelf)
     return [_decision(step, recording, room) for step in recording.steps]
@@ -79,7 +79,7 @@ def _decision(step: RecordedStep, recording: Recording, room: float) -> ShownDec
 
 
 def predicted(scene: Superquadrics, after: Superquadrics, sketch: Sketch) -> list[Ghost]:
-    """What an action moves where it is to end, and the hand where it begins and ends."""
+    """Moved objects at their predicted ends, and the hand at start and end of an action."""
     ghosts = _present(web.meshes_of(sketches.moved(scene, after)))
     hands = sketch.hands if sketch.hands is not None else ()
     return [
@@ -92,7 +92,7 @@ def predicted(scene: Superquadrics, after: Superquadrics, sketch: Sketch) -> lis
 
 
 def _samples(step: RecordedStep) -> list[ShownSample]:
-    """What the decision chose from, coloured by value: the best as `BEST`, the worst as `WORST`."""
+    """The candidates of a decision, coloured by value from `BEST` to `WORST`."""
     sampled = step.sampled
     worst = float(np.ptp(sampled.value)) if len(sampled) else 0.0
     best, last = drawing.rgb(BEST), drawing.rgb(WORST)
@@ -108,7 +108,7 @@ def _samples(step: RecordedStep) -> list[ShownSample]:
 
 
 def sampled_sketch(step: RecordedStep, k: int) -> Sketch:
-    """What there is to show of a sampled action."""
+    """The sketch of a sampled action."""
     action = step.sampled.single(k)
     return kind_of(int(action.kind)).sketch(step.scene, step.sampled.after(k, step.scene), action)
 

@@ -1,6 +1,6 @@
-"""An episode in the browser, from its recording: the robot acts, and every decision is shown with what was believed.
+"""A recorded episode in the browser: the robot acts, and every decision is shown with the belief.
 
-What stands still is sent once, what belongs to a decision when its step begins, and of what moves only the poses.
+The server sends still geometry once, a decision's when its step begins, and only poses of what moves.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mechsearch_jax.envs.camera.simulated_camera import PALETTE, SHELF
-from mechsearch_jax.envs.recording.film import LEFT_OUT, LOOKS_AT, STANDS
+from mechsearch_jax.envs.recording.film import LOOKS_AT, STANDS, shelf_solids, slot_colour
 from mechsearch_jax.envs.recording.playback import playback
 from mechsearch_jax.envs.recording.recording import Recording
 from mechsearch_jax.envs.recording.shown_decisions import (
@@ -25,9 +24,8 @@ from mechsearch_jax.envs.recording.shown_decisions import (
     sampled_sketch,
     shown_decisions,
 )
-from mechsearch_jax.envs.world.model import shelf_boxes
 from mechsearch_jax.robot.arm_clearance import link_poses
-from mechsearch_jax.shapes import in_order, shape_of
+from mechsearch_jax.shapes import in_order
 from mechsearch_jax.viz import drawing, sketches, web
 from mechsearch_jax.viz.panda import panda_pieces
 from mechsearch_jax.viz.raycast import Solid
@@ -36,13 +34,13 @@ from mechsearch_jax.workspace.camera import Camera
 if TYPE_CHECKING:
     import viser
 
-# The film's bystander comes nearer by this, since a browser's window shows more.
+# Scales the distance of the film's bystander, since a browser's window shows more.
 NEARER = 0.8
 # Length of an arrow's head, and radius of its shaft [m].
 HEAD, SHAFT = 0.03, 0.004
 # Intensities of the lights.
 AMBIENT_LIGHT, LIGHT_ABOVE = 1.4, 1.6
-# Layers that can be hidden, what they are called, and whether they are shown at first.
+# Layers that can be hidden: label, and whether shown at first.
 LAYERS = {
     "robot": ("robot", True),
     "true": ("true shapes", True),
@@ -52,13 +50,13 @@ LAYERS = {
     "sampled": ("samples", True),
     "camera": ("camera", False),
 }
-# What is shown of a decision unless a sampled action is asked for.
+# The entry of the list of sampled actions that stands for the decision itself.
 CHOSEN: str = "the one that was chosen"
 LEGEND = "Where the target can be, and what a grasp there would meet: "
 
 
 class Pose(NamedTuple):
-    """Of a node in each row.
+    """Poses of a node, one for each row.
 
     Attributes:
       position: [m], shape (rows, 3).
@@ -78,22 +76,22 @@ class Viewer:
 
     Attributes:
       count: number of moments.
-      row: the one that is shown.
-      playing: whether time goes on.
+      row: index of the moment that is shown.
+      playing: whether time advances.
     """
 
     def __init__(self, recording: Recording, server: viser.ViserServer, fps: int, speed: float = 1.0):
         """Args:
         recording: of the episode.
-        server: what shows it; nothing else uses it.
+        server: shows the page; must not be shared.
         fps: moments in a second.
-        speed: how many times as fast as it was everything goes.
+        speed: as a multiple of real time.
         """
         self._recording, self._server, self._fps = recording, server, fps
         self._played = playback(recording, fps, speed)
         self.count, self.row, self.playing = len(self._played.time), 0, False
         self._lock, self._step = threading.RLock(), -1
-        self._asked: Any = None
+        self._examined: Any = None
         self._decisions = shown_decisions(recording)
         self._still()
         self._nodes = [self._decision(i, decision) for i, decision in enumerate(self._decisions)]
@@ -105,7 +103,7 @@ class Viewer:
         """Show a moment.
 
         Args:
-          row: its number; the first or the last where there is no such.
+          row: its index, clipped to the first and last.
         """
         with self._lock, self._server.atomic():
             self.row = min(max(row, 0), self.count - 1)
@@ -119,15 +117,15 @@ class Viewer:
 
     @property
     def text(self) -> str:
-        """What is said of the present decision."""
+        """The text of the present decision."""
         return self._text.content
 
     def step_at(self, row: int) -> int:
-        """The step that a moment belongs to."""
+        """Index of the step that a moment belongs to."""
         return int(self._played.step[row])
 
     def play(self, on: bool) -> None:
-        """Let time go on or stand still; at the end it begins anew."""
+        """Start or pause; starting at the end restarts from the beginning."""
         with self._lock:
             if on and self.row == self.count - 1:
                 self.show(0)
@@ -135,10 +133,10 @@ class Viewer:
             self._button.label = "pause" if on else "play"
 
     def run(self, going: Callable[[], bool] = lambda: True) -> None:
-        """Play whenever that is asked for.
+        """Advance time whenever `playing` is on.
 
         Args:
-          going: whether to go on; asked at every moment.
+          going: called at every moment; the loop ends when it returns False.
         """
         due = time.monotonic()
         while going():
@@ -163,15 +161,12 @@ class Viewer:
         self._server.initial_camera.position = edge + NEARER * STANDS
         self._server.initial_camera.look_at = edge + LOOKS_AT
         self._layers = {name: scene.add_frame(f"/{name}", show_axes=False, visible=LAYERS[name][1]) for name in LAYERS}
-        board = shape_of("box")
-        for name, (low, high) in shelf_boxes(shelf).items():
-            if name not in LEFT_OUT:
-                solid = Solid(board, (high - low) / 2, np.eye(3), (low + high) / 2, _colour(SHELF))
-                self._mesh(f"/shelf/{name}", web.mesh_of([solid]), solid.colour)
+        for name, board in shelf_solids(shelf).items():
+            self._mesh(f"/shelf/{name}", web.mesh_of([board]), board.colour)
         _frustum(scene, self._recording.camera)
 
     def _robot(self) -> dict[str, tuple[Any, Pose]]:
-        """Its nodes and where they are: links, hand, and fingers, which move along the hand's second axis."""
+        """The robot's nodes with poses: links, hand, and fingers, which move along the hand's second axis."""
         poses, half = link_poses(self._played.q), self._played.opening[:, None] / 2
         hand = poses[:, 7]
         shift = hand[:, :3, 1] * half
@@ -190,10 +185,10 @@ class Viewer:
         nodes: dict[str, tuple[Any, Pose]] = {}
         for i in np.flatnonzero(world.valid).tolist():
             shape, half = in_order()[int(world.kind[i])], np.asarray(world.half_size[i])
-            mesh = web.mesh_of([Solid(shape, half, np.eye(3), np.zeros(3), _colour(i))])
+            mesh = web.mesh_of([Solid(shape, half, np.eye(3), np.zeros(3), slot_colour(i))])
             name = f"/true/{'target' if i == len(world.valid) - 1 else i}"
             pose = Pose.of(played.position[:, i], played.rotation[:, i])
-            nodes[name] = self._mesh(name, mesh, _colour(i)), pose
+            nodes[name] = self._mesh(name, mesh, slot_colour(i)), pose
         return nodes
 
     def _panel(self) -> None:
@@ -218,7 +213,7 @@ class Viewer:
         bands = drawing.bands()
         colours = ", ".join(f'<b style="color:{band.colour}">{band.label}</b>' for band in bands)
         gui.add_html(f'<div style="font-size:small;padding:0 1em">{LEGEND}{colours}</div>')
-        # What the server itself sets calls back, too, without a client.
+        # The server's own changes call back, too, without a client.
         self._slider.on_update(lambda event: event.client and self._seek(round(self._slider.value / apart)))
         self._choice.on_update(
             lambda event: event.client and self._seek(begins[self._titles.index(self._choice.value)])
@@ -237,7 +232,7 @@ class Viewer:
         box.on_update(switched)
 
     def _decision(self, i: int, decision: ShownDecision) -> list[Any]:
-        """Send what belongs to a step, hidden, so that little is left to be sent when the step begins."""
+        """Send the geometry of a step, hidden, so that little is left to be sent when the step begins."""
         scene = self._server.scene
         frames = [
             scene.add_frame(f"/{name}/{i}", show_axes=False, visible=False) for name in ("recognised", "map", "sampled")
@@ -253,7 +248,7 @@ class Viewer:
         return [*frames, self._prediction(str(i), decision.ghosts, decision.path)]
 
     def _prediction(self, name: str, ghosts: list[Ghost], path: Float[np.ndarray, "points 3"] | None) -> Any:
-        """Send what an action was predicted to do, hidden."""
+        """Send the predicted effect of an action, hidden."""
         frame = self._server.scene.add_frame(f"/action/{name}", show_axes=False, visible=False)
         for ghost in ghosts:
             self._ghost(f"/action/{name}", *ghost)
@@ -262,7 +257,7 @@ class Viewer:
         return frame
 
     def _decide(self, step: int) -> None:
-        """Show what belongs to a step instead of what belonged to another."""
+        """Show a step's geometry instead of the previous step's."""
         if self._step >= 0:
             for node in (*self._nodes[self._step], self._views[self._step]):
                 node.visible = False
@@ -275,28 +270,30 @@ class Viewer:
         self.examine(None)
 
     def examine(self, k: int | None) -> None:
-        """Show what a sampled action of the present decision was predicted to do.
+        """Show the predicted effect of a sampled action of the present decision.
 
         Args:
-          k: which; None for the one that was chosen.
+          k: its index; None for the chosen action.
         """
         with self._lock, self._server.atomic():
             step, decision = self._recording.steps[self._step], self._decisions[self._step]
-            if self._asked is not None:
-                self._asked.remove()
-                self._asked = None
+            if self._examined is not None:
+                self._examined.remove()
+                self._examined = None
             if k is not None:
                 sketch = sampled_sketch(step, k)
                 ghosts = predicted(step.scene, step.sampled.after(k, step.scene), sketch)
-                self._asked = self._prediction("asked", ghosts, sketches.shown_path(sketch, self._recording.shelf))
-                self._asked.visible = True
+                self._examined = self._prediction(
+                    "examined", ghosts, sketches.shown_path(sketch, self._recording.shelf)
+                )
+                self._examined.visible = True
             self._nodes[self._step][-1].visible = k is None
-            told = CHOSEN if k is None else decision.samples[k].text
-            self._sample.value = told
-            self._text.content = decision.text if k is None else f"{decision.text}\n\nPredicted of {told}"
+            label = CHOSEN if k is None else decision.samples[k].text
+            self._sample.value = label
+            self._text.content = decision.text if k is None else f"{decision.text}\n\nPredicted of {label}"
 
     def _index(self, text: str) -> int | None:
-        """Which sampled action of the present decision has such a text; None for another text."""
+        """Index of the sampled action of the present decision with a text; None if there is none."""
         samples = self._decisions[self._step].samples
         return next((k for k, sample in enumerate(samples) if sample.text == text), None)
 
@@ -311,11 +308,6 @@ class Viewer:
         )  # fmt: skip
 
 
-def _colour(index: int) -> tuple[float, float, float]:
-    red, green, blue = (float(c) for c in PALETTE[index])
-    return red, green, blue
-
-
 def _map(scene: Any, name: str, cells: web.Cells) -> None:
     """f and g on the board."""
     level = np.tile([1.0, 0.0, 0.0, 0.0], (len(cells.position), 1))
@@ -326,7 +318,7 @@ def _map(scene: Any, name: str, cells: web.Cells) -> None:
 
 
 def _arrow(scene: Any, parent: str, path: Float[np.ndarray, "points 3"]) -> None:
-    """A line along a path, and an arrow where it ends; nothing for a path that is too short to be seen."""
+    """A line along a path with an arrow at its end; nothing for a path that is too short to be seen."""
     back = np.linalg.norm(path - path[-1], axis=1)
     if back[0] <= sketches.SHORTEST:
         return
@@ -342,7 +334,7 @@ def _arrow(scene: Any, parent: str, path: Float[np.ndarray, "points 3"]) -> None
 
 
 def _frustum(scene: Any, camera: Camera) -> None:
-    """The camera where it stands, as it looks at the shelf."""
+    """The frustum of the camera that looks at the shelf."""
     wxyz = Rotation.from_matrix(np.array(camera.rotation)).as_quat(scalar_first=True)
     angle = 2 * float(np.arctan(camera.height / 2 / camera.fy))
     scene.add_camera_frustum(

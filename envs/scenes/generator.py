@@ -1,4 +1,4 @@
-"""Random scenarios as in the paper's appendix C.2: drop objects on the shelf, then hide the target behind them."""
+"""Random scenarios as in the paper's appendix C.2: objects are dropped on the shelf, then the target is hidden."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mechsearch_jax.workspace.scenario import MAX_OBJECTS, Body, Scenario, rotat
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# The shapes and half-extents of the paper's eleven objects; the x and y of those that are not round may be swapped.
+# Shapes and half-extents of the paper's eleven objects; x and y of those that are not round may be swapped.
 CATALOGUE = ObjectSizes().catalogue
 
 
@@ -39,14 +39,14 @@ class GeneratorConfig:
 
     Attributes:
       drop: height above the board from which objects are dropped [m].
-      gap: least distance between what is dropped, and between the target and its neighbours, seen from above [m].
-      visible: a target that shows more pixels than this is not hidden; the detector needs more than 100.
+      gap: least distance between dropped objects, and between the target and its neighbours, seen from above [m].
+      visible: a target is hidden if it shows at most this many pixels; the detector needs more than 100.
       anywhere: whether the target may stand anywhere in the rectangle that its candidate positions span, a box at any
         yaw, instead of at candidate poses only.
-      drift: bodies that move farther than this once the target is in place were not at rest [m].
-      placements: how often one object's place is drawn before the scene is given up.
-      target_placements: the same for the target's, where it may stand anywhere.
-      attempts: how many scenes are tried for one seed.
+      drift: a scene is at rest if no body moves farther than this once the target is in place [m].
+      placements: number of places drawn for an object before the scene is discarded.
+      target_placements: number of poses drawn for a target that may stand anywhere.
+      attempts: number of scenes drawn for one seed.
     """
 
     drop: float = 0.02
@@ -66,7 +66,7 @@ class GeneratorConfig:
 
 
 def outline(body: Body) -> Float[np.ndarray, "corners 2"]:
-    """The body's outline seen from above, as a convex polygon that holds it [m]."""
+    """A convex polygon that contains the body seen from above [m]."""
     rim = shape_of(body.shape).rim(body.half_size)
     corners = np.concatenate([np.insert(rim, 2, z, axis=1) for z in (-body.half_size[2], body.half_size[2])])
     flat = (corners @ rotation_matrix(body.quaternion).T + np.array(body.position))[:, :2]
@@ -89,17 +89,17 @@ def _on_board(polygon: np.ndarray, shelf: Shelf, gap: float) -> bool:
 
 
 def _approaching(gripper: Gripper | None) -> Gripper:
-    """A gripper whose ways in are the straight approach alone: everywhere counts as outside.
+    """A gripper that enters by the straight approach alone: everywhere counts as outside.
 
-    What a seed means must not change, and scenes were made by the approach. An approximation: of the default target's
-    candidate poses one in 750 can be approached but not reached from outside the shelf.
+    The scene of a seed must not change, and scenes were generated with this check. An approximation: one in 750 of the
+    default target's candidate poses can be approached but not reached from outside the shelf.
     """
     return dataclasses.replace(gripper or Gripper(), outside=(math.inf,))
 
 
 @functools.cache
 def graspable_alone(shelf: Shelf, target: Target, gripper: Gripper | None = None) -> Bool[np.ndarray, " x"]:
-    """At which of its candidate poses the target could be grasped if there were no other objects; read-only.
+    """Whether the target alone on the shelf is graspable, at each of its candidate poses; read-only.
 
     See `_approaching`.
     """
@@ -111,8 +111,10 @@ def graspable_alone(shelf: Shelf, target: Target, gripper: Gripper | None = None
 
 
 def graspable_at(shelf: Shelf, target: Target, gripper: Gripper | None = None) -> Callable[[np.ndarray], bool]:
-    """What tells of any pose (x, y [m], yaw [rad]) whether the target could be grasped there if there were no other
-    objects. See `_approaching`."""
+    """A function of a pose (x, y [m], yaw [rad]): whether the target alone on the shelf is graspable there.
+
+    See `_approaching`.
+    """
     gripper = _approaching(gripper)
     tables = grasp_tables(gripper, target, GraspConfig())
     return lambda pose: bool(_any_grasp(tables, shelf, gripper, target, jnp.asarray(pose, jnp.float32)))
@@ -144,12 +146,12 @@ class ScenarioGenerator:
         sizes: ObjectSizes | None = None,
     ):
         """Args:
-        target: what is hidden; the usual one by default.
+        target: the target to hide; the usual one by default.
         shelf, camera: the scene.
         config: how scenarios are made.
-        graspable: tells from a pose (x, y [m], yaw [rad]) whether the shelf alone leaves the target graspable there;
-          by default `graspable_alone`, or `graspable_at` where the target may stand anywhere.
-        gripper: that is to grasp it; the default gripper if None.
+        graspable: whether the target alone on the shelf is graspable at a pose (x, y [m], yaw [rad]); by default
+          `graspable_alone`, or `graspable_at` if the target may stand anywhere.
+        gripper: of the robot; the default gripper if None.
         sizes: of the objects; the paper's if None.
 
         Raises:
@@ -251,7 +253,7 @@ class ScenarioGenerator:
         return Body(self.target.shape, self.target.half_size, (round(x, 6), round(y, 6), round(height, 6)), turn)
 
     def _hide(self, rng: np.random.Generator, scene: Scenario) -> Scenario | None:
-        """The scene with the target at a random pose out of the camera's sight, if there is one."""
+        """The scene with the target at a random hidden pose; None if no drawn pose is hidden, graspable and stable."""
         outlines = [outline(body) for body in scene.objects]
         for pose in self._drawn_poses(rng):
             candidate = dataclasses.replace(scene, target=self._target_at(pose))
@@ -263,7 +265,7 @@ class ScenarioGenerator:
         return None
 
     def _drawn_poses(self, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-        """Poses to try for the target, in this order."""
+        """Random poses for the target, in the order in which they are tried."""
         if not self.config.anywhere:
             return rng.permutation(self._poses)
         low, high = self._poses.min(axis=0), self._poses.max(axis=0)
@@ -276,7 +278,7 @@ class ScenarioGenerator:
         return int(target_pixels(self._camera, from_scenario(scene))) <= self.config.visible
 
     def is_at_rest(self, scene: Scenario) -> bool:
-        """Whether a scene's bodies stay where they are when time passes, and its target hidden."""
+        """Whether a scene's bodies stay at rest and its target hidden in simulation."""
         before = np.asarray(self._simulator.reset(scene).position)
         outcome = self._simulator.settle()
         world = self._simulator.world
@@ -289,12 +291,3 @@ def _draw_shape(rng: np.random.Generator, catalogue: Sequence[Any]) -> tuple[str
     name, (x, y, z) = catalogue[int(rng.integers(len(catalogue)))]
     swapped = not shape_of(name).round and rng.random() < 0.5
     return name, (y, x, z) if swapped else (x, y, z)
-
-
-def generate_scenario(seed: int, objects: int, target: str = "cylinder", name: str | None = None) -> Scenario:
-    """One scenario with the usual target of a shape; see `ScenarioGenerator.generate`.
-
-    Raises:
-      InputError: there is no such shape, or as `ScenarioGenerator.generate`.
-    """
-    return ScenarioGenerator(Target.of(target)).generate(seed, objects, name)

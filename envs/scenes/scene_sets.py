@@ -1,8 +1,8 @@
 """Named sets of scenes from fixed seeds: those of the paper's experiments, and others for development
 (docs/method.md, "Scene sets").
 
-A scene depends on its own seed alone, and is made when it is asked for. What every scene holds is on record in
-`scene_sets.json`, so that a machine or a version that makes another one is noticed.
+A scene depends on its own seed alone, and is generated on demand. `scene_sets.json` records the content hash of every
+scene, so that a machine or a version that generates a different one is noticed.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ RECORD = Path(__file__).with_name("scene_sets.json")
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """Scenes that are made alike; their names are those of the block and a number, as "c2-4-017".
+    """Scenes of one kind; their names are the block's and a number, such as "c2-4-017".
 
     Attributes:
       name: of the block.
-      scenes: how many.
+      scenes: number of scenes.
       objects: number of surrounding objects.
       target: shape of the target.
       first_seed: of scene 0; the others follow.
@@ -45,22 +45,17 @@ class Block:
     layout: Literal["clutter", "line"] = "clutter"
 
     def scene_name(self, index: int) -> str:
-        """What a scene is called."""
+        """The name of a scene."""
         return f"{self.name}-{index:03d}"
-
-    @property
-    def scene_names(self) -> list[str]:
-        """What all scenes are called, in order."""
-        return [self.scene_name(index) for index in range(self.scenes)]
 
 
 class SceneSet(NamedTuple):
-    """Scenes with a name.
+    """A named set of scenes.
 
     Attributes:
-      name: what commands call them.
-      about: what they are, in a few words; empty for a part of another set.
-      blocks: what they consist of.
+      name: as used by commands.
+      about: a few words; empty for a part of another set.
+      blocks: of the set.
     """
 
     name: str
@@ -69,18 +64,18 @@ class SceneSet(NamedTuple):
 
     @property
     def scenes(self) -> int:
-        """How many."""
+        """Number of scenes."""
         return sum(block.scenes for block in self.blocks)
 
 
 def _blocks(
     name: str, scenes: int, counts: Sequence[int], first_seed: int, target: str = "cylinder"
 ) -> tuple[Block, ...]:
-    """One block for each number of objects, all from the same seeds: the number of objects is part of a seed."""
+    """One block for each number of objects, all from the same seeds: the generator mixes that number into the seed."""
     return tuple(Block(f"{name}-{count}", scenes, count, target, first_seed) for count in counts)
 
 
-# Seeds below 1000 are for everybody: examples, tests, timings. No two experiments share one.
+# Seeds below 1000 are reserved for examples, tests and timings. No two experiments share a seed.
 _EXPERIMENTS = (
     SceneSet("c2", "the paper's C.2", _blocks("c2", 180, (2, 4, 6, 8), 10_000)),
     SceneSet("d1", "the paper's D.1", (Block("d1", 200, 2, "cylinder", 20_000, "line"),)),
@@ -104,13 +99,13 @@ SETS: Mapping[str, SceneSet] = _with_parts()
 _BLOCKS: Mapping[str, Block] = {block.name: block for whole in _EXPERIMENTS for block in whole.blocks}
 
 
-# The scenes that settings of the package were chosen on, in words: rates on them are not those on new scenes.
+# The scenes that settings of the package were chosen on, in words: rates on them are biased.
 CHOSEN_ON = "the published ones, the sets `development*`, and numbers 000 to 089 of `c2`"
 _CHOSEN_ON = re.compile(r"published-\d-\d\d|development(?:-box)?-\d-\d{3}|c2-\d-0[0-8]\d")
 
 
 def is_chosen_on(scenario: str) -> bool:
-    """Whether a scenario has the name of a scene that settings were chosen on: see `CHOSEN_ON`."""
+    """Whether settings were chosen on the scene of this name; see `CHOSEN_ON`."""
     return _CHOSEN_ON.fullmatch(scenario) is not None
 
 
@@ -118,7 +113,7 @@ def find_set(name: str) -> SceneSet:
     """The set of a name.
 
     Raises:
-      InputError: there is none.
+      InputError: there is no such set.
     """
     if name not in SETS:
         raise InputError(f"{name}: there is no such scene set; there are {', '.join(SETS)}")
@@ -126,7 +121,7 @@ def find_set(name: str) -> SceneSet:
 
 
 def find_scene(name: str) -> tuple[Block, int] | None:
-    """The block and the number of a scene of some set; None if no set has one of that name."""
+    """The block and index of the scene of a name; None if no set has such a scene."""
     match = re.fullmatch(r"(.+)-(\d{3})", name)
     block = _BLOCKS.get(match[1]) if match else None
     return (block, int(match[2])) if match and block and int(match[2]) < block.scenes else None
@@ -134,8 +129,8 @@ def find_scene(name: str) -> tuple[Block, int] | None:
 
 @functools.cache
 def _generate(layout: str, target: str) -> Callable[[int, int, str], Scenario]:
-    """What makes a scene from its seed, its number of objects and its name."""
-    # They take long to import and to make, and nothing is made where all files are there.
+    """A function that generates a scene from its seed, its number of objects and its name."""
+    # Imported here because it takes long, and nothing is generated if all files exist.
     from mechsearch_jax.envs.scenes.generator import GeneratorConfig, ScenarioGenerator
     from mechsearch_jax.envs.scenes.three_objects import LineGenerator
     from mechsearch_jax.workspace.detector import FOUND_PIXELS
@@ -149,7 +144,7 @@ def _generate(layout: str, target: str) -> Callable[[int, int, str], Scenario]:
 
 
 def make_scene(block: Block, index: int) -> Scenario:
-    """Generate a scene of a block; the same on the same machine, whichever others are made.
+    """Generate a scene of a block; on the same machine always the same.
 
     Args:
       block: of a set.
@@ -166,27 +161,27 @@ def make_scene(block: Block, index: int) -> Scenario:
 
 @functools.cache
 def recorded() -> Mapping[str, Sequence[str]]:
-    """The content hashes of all scenes on record, by block, in order."""
+    """The recorded content hashes of all scenes, by block, in order."""
     return json.loads(RECORD.read_text(encoding="utf-8"))
 
 
 def digest(scene_set: SceneSet) -> str:
-    """Twelve hexadecimal digits that stand for the recorded content of all scenes of a set, in order."""
+    """Twelve hexadecimal digits: a hash of the recorded content of all scenes of a set, in order."""
     hashes = [content for block in scene_set.blocks for content in recorded()[block.name]]
     return hashlib.sha256(" ".join(hashes).encode()).hexdigest()[:HASH_DIGITS]
 
 
 def is_recorded(block: Block, index: int, scenario: Scenario) -> bool:
-    """Whether a scenario holds what is on record for a scene."""
+    """Whether a scenario has the recorded content of a scene."""
     return scenario.content_hash == recorded()[block.name][index]
 
 
 class SceneFiles(NamedTuple):
-    """Where scenes are.
+    """Files of scenes.
 
     Attributes:
-      files: of all that were asked for, in order.
-      strange: names of those that are not what is on record.
+      files: of all requested scenes, in order.
+      strange: names of generated scenes whose content differs from the record.
     """
 
     files: list[Path]
@@ -198,12 +193,12 @@ def scene_files(
     folder: PathLike | None = None,
     progress: Callable[[Sequence[Any]], Iterable[Any]] = iter,
 ) -> SceneFiles:
-    """Files of scenes; those that are not there are made, and so are those that do not hold what is on record.
+    """Files of scenes; missing ones, and ones whose content differs from the record, are generated.
 
     Args:
       scenes: of any blocks.
-      folder: for the files; the cache's if None, or one that is gone when the process ends if there is no cache.
-      progress: is given the scenes that have to be made, and passes them on one by one.
+      folder: for the files; if None the cache's, or a temporary one of this process if there is no cache.
+      progress: wraps the iteration over the scenes that have to be generated.
 
     Raises:
       InputError: a file cannot be written.
@@ -211,7 +206,7 @@ def scene_files(
     place = Path(folder) if folder is not None else _kept_scenes()
     wanted = [(block, index, place / f"{block.scene_name(index)}.json") for block, index in scenes]
     strange = []
-    for block, index, file in progress([one for one in wanted if not holds(one[2], *one[:2])]):
+    for block, index, file in progress([entry for entry in wanted if not holds(entry[2], *entry[:2])]):
         scene = make_scene(block, index)
         save_scenario(scene, file)
         if not is_recorded(block, index, scene):
@@ -225,7 +220,7 @@ def set_scenes(scene_set: SceneSet) -> list[tuple[Block, int]]:
 
 
 def holds(file: PathLike, block: Block, index: int) -> bool:
-    """Whether a file holds what is on record for a scene, under its name."""
+    """Whether a file holds the recorded content of a scene, under its name."""
     try:
         scenario = load_scenario(file)
     except InputError:
@@ -234,7 +229,7 @@ def holds(file: PathLike, block: Block, index: int) -> bool:
 
 
 def _kept_scenes() -> Path:
-    # Brings the planner along, which who only asks for names can do without.
+    # Imports the planner, which callers that only need names do not.
     from mechsearch_jax.problem.cache import cache_folder
 
     folder = cache_folder()
@@ -247,17 +242,17 @@ def _temporary_folder() -> tempfile.TemporaryDirectory[str]:
 
 
 def record(progress: Callable[[Sequence[Any]], Iterable[Any]] = iter, path: PathLike = RECORD) -> None:
-    """Make all scenes and put on record what they hold: only after a change that is meant to change them.
+    """Generate all scenes and record their content hashes: only after a change that is meant to change them.
 
     Args:
-      progress: is given all blocks and numbers, and passes them on one by one.
+      progress: wraps the iteration over all scenes.
       path: of the record.
 
     Raises:
       InputError: the file cannot be written.
     """
     hashes: dict[str, list[str]] = {name: [] for name in _BLOCKS}
-    for block, index in progress([one for whole in _EXPERIMENTS for one in set_scenes(whole)]):
+    for block, index in progress([scene for whole in _EXPERIMENTS for scene in set_scenes(whole)]):
         hashes[block.name].append(make_scene(block, index).content_hash)
     lines = ",\n".join(f" {json.dumps(name)}: {json.dumps(content)}" for name, content in hashes.items())
     with replacing(path) as file:

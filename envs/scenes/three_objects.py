@@ -1,7 +1,7 @@
 """Scenes of the paper's 3-object toy experiment (appendix D.1): two large cylinders hide a target behind them.
 
-The camera, the two cylinders and the target are in one line, seen from above. Each of the two hides the target by
-itself, so that both have to be moved before it is found.
+Seen from above, the camera, the two cylinders and the target are in one line. Each cylinder alone hides the target, so
+that both have to be moved before it is found.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 @dataclasses.dataclass(frozen=True)
 class LineConfig:
-    """What the paper leaves open of its 3-object scenes.
+    """Parameters of 3-object scenes that the paper leaves open.
 
     Attributes:
       target: x and y of the target in all scenes [m].
       radius: range of the large cylinders' radii [m]; up to what the hand can hold.
       height: range of their heights [m].
-      gap: least distance between the three, and between a cylinder and the board's front edge [m].
-      attempts: how often sizes and places are drawn for one seed.
+      gap: least distance between the three bodies, and between a cylinder and the board's front edge [m].
+      attempts: number of draws of sizes and places for one seed.
     """
 
     target: tuple[float, float] = (0.70, 0.05)
@@ -53,16 +53,16 @@ class LineGenerator:
 
     def __init__(self, config: LineConfig | None = None, checks: GeneratorConfig | None = None):
         """Args:
-        config: what the scenes look like.
-        checks: when a target is hidden and at rest.
+        config: of the scenes.
+        checks: when a target counts as hidden and at rest.
         """
         self.config = config or LineConfig()
         self._shelf, self._camera, self._target = Shelf(), Camera(), Target.cylinder()
-        # It only checks scenes: where its own targets could be grasped does not matter.
+        # It only checks scenes, so that graspability does not matter.
         self._checks = ScenarioGenerator(self._target, self._shelf, self._camera, checks, lambda pose: True)
 
     def generate(self, seed: int, name: str | None = None) -> Scenario:
-        """A scene at rest with two cylinders, the one nearer to the camera first.
+        """A scene at rest with two cylinders, the nearer to the camera first.
 
         Args:
           seed: any whole number from 0.
@@ -89,7 +89,7 @@ class LineGenerator:
         eye, end = np.array(self._camera.position[:2]), np.array(self.config.target)
         length = float(np.linalg.norm(end - eye))
         along = (end - eye) / length
-        # Distances from the camera between which both centres can be, if the other were not there.
+        # Range of a centre's distance from the camera without regard to the other cylinder.
         first = (self._shelf.front - eye[0]) / along[0]
         distance = first + share * (length - first)
         gaps = np.diff([*distance, length]) - radius - [radius[1], self._target.half_size[0]]
@@ -107,6 +107,5 @@ class LineGenerator:
         return Body("cylinder", (radius, radius, half_height), (x, y, z), UPRIGHT)
 
     def _both_hide(self, scene: Scenario) -> bool:
-        """Whether each of the objects hides the target by itself."""
-        alone = (dataclasses.replace(scene, objects=(body,)) for body in scene.objects)
-        return all(self._checks.is_hidden(one) for one in alone)
+        """Whether each object alone hides the target."""
+        return all(self._checks.is_hidden(dataclasses.replace(scene, objects=(body,))) for body in scene.objects)

@@ -1,6 +1,6 @@
-"""The model of many worlds at once: one compiled MJCF, and the few of its fields that differ from world to world.
+"""The model of many worlds at once: one compiled MJCF, and the few fields that differ between worlds.
 
-`body_fields` gives for thousands of worlds, in closed form, what `model.with_bodies` has MuJoCo compute for one.
+`body_fields` computes in closed form, for thousands of worlds, what `model.with_bodies` has MuJoCo compute for one.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -21,9 +21,9 @@ from mechsearch_jax.shapes import in_order
 
 
 class BodyFields(flax.struct.PyTreeNode):
-    """Fields of the model that depend on the bodies' shapes; every one has a leading axis for the worlds.
+    """Fields of the model that depend on the bodies' shapes, with a leading axis for the worlds.
 
-    Names, units and the axes that follow (bodies, geoms, degrees of freedom) are those of MJX's model.
+    Names, units and further axes (bodies, geoms, degrees of freedom) are those of MJX's model.
     """
 
     geom_size: jax.Array
@@ -66,12 +66,12 @@ def body_fields(
     put("body_mass", body, mass)
     put("body_inertia", body, inertia)
     put("body_gravcomp", body, ~valid)
-    # A free body is all of its subtree; the world's subtree is everything.
+    # A free body is its whole subtree; the world's subtree is everything.
     put("body_subtreemass", body, mass)
     robot = blank.body_mass.sum() - blank.body_mass[body].sum()
     put("body_subtreemass", 0, robot + mass.sum(axis=1))
 
-    # The inverse of a free body's mass matrix is diagonal; its turns share the mean, as in mj_setConst.
+    # The inverse of a free body's mass matrix is diagonal; its rotations share the mean, as in mj_setConst.
     inverse = jnp.stack([1 / mass, (1 / inertia).mean(axis=-1)], axis=-1)
     put("body_invweight0", body, inverse)
     dof = np.concatenate([np.arange(6) + blank.joint(f"body{i}").dofadr[0] for i in range(BODIES)])

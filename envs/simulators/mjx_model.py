@@ -1,4 +1,4 @@
-"""The scene in MuJoCo's Warp implementation: one model and state for many worlds, and a step of all of them."""
+"""The scene in MuJoCo Warp: one model and state for many worlds, and a step of all of them."""
 
 # The bindings of MuJoCo come without type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -30,19 +30,19 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
 
-# The constraint solver's tolerance: the least that MuJoCo Warp takes where it makes its model itself.
+# The constraint solver's tolerance: the least that MuJoCo Warp accepts for its own models.
 SOLVER_TOLERANCE = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
 class MjxConfig:
-    """How the batch simulator runs.
+    """Settings of the batch simulator.
 
     Attributes:
-      simulator: as for the native simulator; `trace_every` has no meaning here, there are no traces.
+      simulator: as for the native simulator; `trace_every` is ignored, there are no traces.
       contacts: capacity for contacts, per world on average; the buffer is shared.
       rows: capacity for constraint rows in every world.
-      chunk: time steps between looks at whether all worlds are done.
+      chunk: time steps between checks whether all worlds are done.
     """
 
     simulator: SimulatorConfig = dataclasses.field(default_factory=SimulatorConfig)
@@ -57,7 +57,7 @@ class MjxConfig:
 
 
 def import_mjx() -> Any:
-    """The module `mujoco.mjx`, once Warp is known to be there.
+    """The module `mujoco.mjx`, after a check that Warp is installed.
 
     Raises:
       InputError: Warp cannot be imported.
@@ -65,7 +65,7 @@ def import_mjx() -> Any:
     try:
         import warp  # pyright: ignore[reportMissingImports]
 
-        # By default it announces itself, and every kernel that it loads, on standard output.
+        # By default Warp prints a line for itself and for every kernel that it loads.
         if warp.config.log_level == warp.LOG_INFO:
             warp.config.log_level = warp.LOG_WARNING
         from mujoco import mjx
@@ -78,15 +78,15 @@ def import_mjx() -> Any:
 
 
 def where(condition: Bool[Array, " worlds"], a: Array, b: Array) -> Array:
-    """`jnp.where` of a condition per world."""
+    """`jnp.where` with a condition per world."""
     return jnp.where(condition.reshape(-1, *[1] * (b.ndim - 1)), a, b)
 
 
 class MjxModel:
-    """The model that all worlds share, and what follows from it.
+    """The model that all worlds share, and functions of it.
 
     Attributes:
-      blank: with empty slots, of C MuJoCo.
+      blank: the C MuJoCo model with empty slots.
       robot: the robot's configuration at home, shape (9,).
     """
 
@@ -99,18 +99,18 @@ class MjxModel:
         blank = copy.copy(models.compile_model(shelf, camera, config.simulator.motion.timestep))
         # Warp has no midphase that could be disabled.
         blank.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
-        # To Warp this flag says what collides two boxes: the algorithm of C MuJoCo, rather than that for any two convex
-        # shapes, which in float32 misses or misjudges every tenth contact of a finger with a box.
+        # In Warp this flag selects C MuJoCo's box-box collision instead of the general convex one, which in float32
+        # misses or misjudges every tenth contact of a finger with a box.
         blank.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         self.blank = blank
         with warnings.catch_warnings():
-            # The planes have no friction of their own: that of a contact is the larger of the two.
+            # The planes have zero friction: a contact takes the larger of the two.
             warnings.filterwarnings("ignore", message=r".*friction\[")
             model = self._mjx.put_model(blank, impl="warp")
-        # What overflows is in the outcomes; printed from the device, it would be a line for every world and step.
+        # Outcomes report overflows; printed from the device, they would take a line for every world and step.
         option = model.opt.replace(_impl=model.opt._impl.replace(warn_overflow=0))
-        # MJX takes over the tolerance of C MuJoCo, which is too small for float32: the solver would only hop about the
-        # solution, and all worlds wait for the one that hops longest.
+        # MJX takes over the tolerance of C MuJoCo, which is too small for float32: the solver would oscillate about
+        # the solution, and all worlds would wait for the slowest.
         option = option.replace(tolerance=jnp.maximum(option.tolerance, SOLVER_TOLERANCE))
         self._model = model.replace(opt=option)
         self._axes = jax.tree.map(lambda _: None, self._model).replace(
@@ -121,7 +121,7 @@ class MjxModel:
         self.robot = jnp.asarray(np.concatenate([HOME, np.zeros(ROBOT - ARM)]), jnp.float32)
 
     def start(self, world: World) -> tuple[BodyFields, Array, Array]:
-        """The fields of the model, the configuration and the commands of worlds at rest with the robot at home."""
+        """The model's fields, configurations and commands of worlds at rest with the robot at home."""
         count = len(world.kind)
         fields = body_fields(self.blank, world.kind, world.half_size, world.valid)
         upright = jnp.where(world.valid[..., None, None], world.rotation, jnp.eye(3)[None, None])
@@ -132,22 +132,21 @@ class MjxModel:
         return fields, jnp.concatenate([robot, poses], axis=1), robot
 
     def make_data(self, worlds: int) -> Any:
-        """The state of so many worlds, as yet with nothing in it."""
-        # Within a plan that is traced, it still has to give numbers.
+        """The initial state of `worlds` worlds without bodies."""
+        # The data need concrete numbers even while a plan is traced.
         with jax.ensure_compile_time_eval():
-            one = self._one(self._config.contacts * worlds)
-            # MJX ties it to a device, and with it all results; what was compiled for free arrays would not serve for
-            # those.
-            one = jax.device_get(one)
-        return jax.jit(_repeated)(jnp.arange(worlds), one)
+            # MJX commits the data to a device, which would commit all results; functions compiled for uncommitted
+            # arrays would be compiled again for them.
+            single = jax.device_get(self._single(self._config.contacts * worlds))
+        return jax.jit(_repeated)(jnp.arange(worlds), single)
 
     def data_shapes(self, worlds: int) -> Any:
         """The shapes of `make_data`."""
-        return jax.eval_shape(_repeated, jnp.arange(worlds), jax.device_get(self._one(self._config.contacts * worlds)))
+        single = jax.device_get(self._single(self._config.contacts * worlds))
+        return jax.eval_shape(_repeated, jnp.arange(worlds), single)
 
     def kernels(self, worlds: int) -> Callable[[], None] | None:
-        """Begin to compile Warp's kernels for so many worlds in another process; returns what waits for it, if it is
-        not known to have been done."""
+        """Begin to compile Warp's kernels for `worlds` worlds in another process; see `compile_kernels`."""
         device = "cpu" if jax.default_backend() == "cpu" else "cuda:0"
         batched = tuple(BodyFields.__dataclass_fields__)
         return compile_kernels(self.blank, batched, worlds, self._config.contacts * worlds, self._config.rows, device)
@@ -161,23 +160,24 @@ class MjxModel:
         """In which worlds both fingers press on the target.
 
         Args:
-          contacts: what Warp keeps of a state beside MJX's fields.
+          contacts: Warp's part of a state, `data._impl`.
         """
         return self._touches(contacts, "left") & self._touches(contacts, "right")
 
     def bytes_per_world(self) -> int:
-        """About how much of the device's memory a world takes [bytes]: its state, and the commands of an action.
+        """An estimate of a world's device memory [bytes]: its state and the commands of an action.
 
-        Each is counted as often as it lies in memory when one becomes the next.
+        Each is counted with the copies that exist while one step becomes the next.
         """
         plan = self._config.simulator.motion
         stretches = 2 * (plan.approach_longest + plan.carry_longest) + 4 * plan.leave_longest + plan.transfer_longest
         longest = stretches + plan.close_steps + plan.open_steps
-        # One row of commands for each kind of motion, the chosen one, and the joint angles that they came from.
+        # The commands of each kind of motion and of the chosen one, and the joint angles that they are computed from.
         commands = 8 * longest * ROBOT * np.dtype(np.float32).itemsize
-        return 3 * sum(leaf.nbytes for leaf in jax.tree.leaves(self._one(self._config.contacts))) + commands
+        return 3 * sum(leaf.nbytes for leaf in jax.tree.leaves(self._single(self._config.contacts))) + commands
 
-    def _one(self, contacts: int) -> Any:
+    def _single(self, contacts: int) -> Any:
+        """The data of a single world."""
         return self._mjx.make_data(self.blank, impl="warp", naconmax=contacts, njmax=self._config.rows)
 
     def _touches(self, contacts: Any, side: str) -> Array:
@@ -186,20 +186,20 @@ class MjxModel:
         owner = jnp.asarray(self.blank.geom_bodyid)
         finger = self.blank.body(f"{side}_finger").id
         target = self.blank.body(f"body{TARGET}").id
-        found = jnp.arange(len(contacts.contact__worldid)) < contacts.nacon[0]
-        found &= contacts.contact__efc_address[:, 0] >= 0
+        presses = jnp.arange(len(contacts.contact__worldid)) < contacts.nacon[0]
+        presses &= contacts.contact__efc_address[:, 0] >= 0
         a, b = owner[contacts.contact__geom[:, 0]], owner[contacts.contact__geom[:, 1]]
-        found &= ((a == finger) & (b == target)) | ((a == target) & (b == finger))
-        return jnp.zeros(worlds, bool).at[jnp.where(found, contacts.contact__worldid, worlds)].set(True, mode="drop")
+        presses &= ((a == finger) & (b == target)) | ((a == target) & (b == finger))
+        return jnp.zeros(worlds, bool).at[jnp.where(presses, contacts.contact__worldid, worlds)].set(True, mode="drop")
 
 
-def _repeated(places: Array, one: Any) -> Any:
+def _repeated(places: Array, single: Any) -> Any:
     """A state for each place."""
-    return jax.vmap(lambda _, data: data, in_axes=(0, None))(places, one)
+    return jax.vmap(lambda _, data: data, in_axes=(0, None))(places, single)
 
 
 def overflow_of(flags: Array) -> Array:
-    """Warp's flags as flags of `Overflow`; those that only say that a solver stopped early are none."""
+    """Warp's flags as flags of `Overflow`; flags of solvers that stopped early are dropped."""
     from mujoco.mjx.third_party.mujoco_warp import OverflowType
 
     groups = {

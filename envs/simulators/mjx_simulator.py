@@ -1,4 +1,4 @@
-"""The batch simulator: MuJoCo's Warp implementation in MJX steps thousands of worlds in one compiled function.
+"""The batch simulator: MuJoCo Warp in MJX steps thousands of worlds in one compiled function.
 
 It has the scene, the motion primitives and the verdicts of the native simulator, for W worlds at once:
 
@@ -6,22 +6,21 @@ It has the scene, the motion primitives and the verdicts of the native simulator
     world = simulator.reset(scenarios)            # W scenarios; a `World` whose fields have a leading axis W
     outcome = simulator.execute(actions)          # an `Action` whose fields have a leading axis W
     outcome = simulator.execute(actions, active)  # worlds whose `active` (W,) is False stay exactly as they are
-    simulator.world                               # where everything is now
+    simulator.world                               # the present state
     outcome.failure                               # (W,) codes of `Failure`; `outcome.reason(i)` is the text
     outcome.overflow                              # (W,) flags of `Overflow`; not 0: do not trust this world
 
-In one call some worlds may push, others pick and place, others take the target out and others do nothing. All step
-together until the last of them is at rest; a world that is done before that is frozen. A world whose state is no longer
-finite is put back to where it was and frozen at once, so that it touches no other. The first call for a number of
-worlds compiles; later ones do not, whatever the actions are.
+The kinds of action may differ between the worlds of a call. All worlds step together until the last of them is at rest;
+a world that is done before that is frozen. A world whose state diverges is restored and frozen at once, so that it
+affects no other. The first call for a number of worlds compiles; later ones do not, whatever the actions are.
 
-A step of few worlds takes as long as one of some hundreds. Who has many does not wait for the last of them:
+A step of few worlds takes as long as one of hundreds. So with many worlds one need not wait for the last of them:
 
-    simulator.begin(actions, active)               # the others go on with what they are at
-    done, outcome = simulator.advance(64)          # until so many more are done; which, and what came of it
+    simulator.begin(actions, active)               # worlds that are not active continue
+    done, outcome = simulator.advance(64)          # until 64 more are done: which ones, and their outcomes
 
-Everything stays on the device: the host waits for the kinds of the actions, and where a field of an outcome or of
-`world` is read.
+All arrays stay on the device: the host waits for the kinds of the actions, and for fields of an outcome or of `world`
+that are read.
 """
 
 from __future__ import annotations
@@ -61,12 +60,12 @@ from mechsearch_jax.workspace.shelf import Shelf
 
 
 class MjxSimulator:
-    """Many worlds in MuJoCo's Warp implementation, a `Simulator`; see the module's description.
+    """Many worlds in MuJoCo Warp, a `Simulator`; see the module's description.
 
-    On a CPU the same scenarios and actions always give the same results, on a GPU they do not.
+    The same scenarios and actions always give the same results on a CPU, but not on a GPU.
 
     Attributes:
-      engine: what records call it.
+      engine: the simulator's name in records.
       shelf, camera, config: as given.
       world: the present state of all worlds; None before the first `reset`.
     """
@@ -84,10 +83,10 @@ class MjxSimulator:
         self._model = MjxModel(self.shelf, self.camera, self.config)
         self._fields: BodyFields | None = None
         self._data: Any = None
-        # What all worlds are at, and of which nothing was said since they were done; which of them move.
+        # Task and progress of all worlds, and which outcomes were reported already; which worlds are moving.
         self._tasks: tuple[Task, Progress, Array] | None = None
         self._moving = np.zeros(0, bool)
-        # They hang on this simulator's model, so that no other process could use them.
+        # These depend on this simulator's model, so that no other process could use them.
         self._start = Kept(self._model.start, on_disk=False)
         self._place = Kept(_placed, on_disk=False, donate_argnums=(1,))
         self._begin = Kept(self._begun, on_disk=False, donate_argnums=(0,))
@@ -109,7 +108,7 @@ class MjxSimulator:
         return self.load(jax.tree.map(lambda *leaves: np.stack(leaves), *worlds))
 
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
-        """Start episodes in some of the worlds; see `Simulator.replace`.
+        """Start episodes in the given worlds; see `Simulator.replace`.
 
         Raises:
           InputError: the simulator was not reset, or there are more objects in a scenario than slots.
@@ -122,14 +121,15 @@ class MjxSimulator:
         return self.load(new, np.isin(np.arange(count), list(scenarios)))
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
-        """Take over the state of all worlds, or of some; see `Simulator.load`.
+        """Set the state of all worlds, or of those in `only`; see `Simulator.load`.
 
         Raises:
-          InputError: some worlds are to be kept, but there are none, or not as many.
+          InputError: `only` is given, but the number of worlds differs from the present one.
         """
         count = len(world.kind)
         if only is not None and (self.world is None or len(self.world.kind) != count or len(only) != count):
-            raise InputError(f"MjxSimulator: some of {count} worlds can be replaced only where there are as many")
+            now = 0 if self.world is None else len(self.world.kind)
+            raise InputError(f"MjxSimulator: {count} worlds cannot be set in part: there are {now} now")
         world = jax.tree.map(lambda a: a if isinstance(a, jax.Array) else jax.device_put(a), world)
         fields, qpos, ctrl = self._start(world)
         new = fields, world
@@ -151,16 +151,16 @@ class MjxSimulator:
           InputError: the simulator was not reset, there are not as many actions as worlds, or a kind is unknown.
         """
         self.begin(actions, active)
-        found = self._advanced(self._count())[1]
+        outcome = self._advanced(self._count())[1]
         self._moving[:] = False
-        return found
+        return outcome
 
     def begin(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> None:
-        """Begin with actions; worlds that are not active go on with what they are at.
+        """Begin actions; worlds that are not active continue.
 
         Args:
           actions: of any kinds; fields with a leading axis for the worlds.
-          active: in which worlds; all by default. None of them may be moving.
+          active: which worlds; all by default. None of them may be moving.
 
         Raises:
           InputError: as `execute`, or one of the worlds is moving.
@@ -177,14 +177,13 @@ class MjxSimulator:
         self._tasks, self._moving = tuple(new), self._moving | begins
 
     def advance(self, least: int) -> tuple[Bool[np.ndarray, " worlds"], Outcome]:
-        """Step what moves until some more worlds are done; `world` has then what became of these.
+        """Step the moving worlds until more of them are done, and update `world` for these.
 
         Args:
-          least: how many, at least; all that move where they are fewer.
+          least: least number of worlds that become done; all moving ones if there are fewer.
 
         Returns:
-          Which worlds are done, and were not before; and what came of their actions: of others the outcome says
-          nothing.
+          Which worlds became done, and the outcomes of their actions; outcomes of other worlds mean nothing.
 
         Raises:
           InputError: the simulator was not reset.
@@ -195,7 +194,7 @@ class MjxSimulator:
         return done, outcome
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
-        """Let time pass, with the robot where it is, until everything is at rest; see `Simulator.settle`.
+        """Step with the robot where it is until everything is at rest; see `Simulator.settle`.
 
         Raises:
           InputError: the simulator was not reset.
@@ -206,12 +205,12 @@ class MjxSimulator:
         return outcome
 
     def programs(self, world: World) -> list[Program]:
-        """All that is compiled to reset, and to act in, worlds of these shapes; see `session.preparing.Prepares`."""
+        """All programs that reset, and act in, worlds of these shapes; see `Prepares`."""
         count = len(world.kind)
         mask = jax.ShapeDtypeStruct((count,), bool)
         actions = jax.tree.map(lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), no_action())
 
-        # Tracing takes its time, and who lowers does it.
+        # Traced only when the first program is lowered, since it takes long.
         @functools.cache
         def shapes() -> tuple[Any, Any, Any]:
             start = jax.eval_shape(self._model.start, world)
@@ -234,19 +233,19 @@ class MjxSimulator:
             "next episodes": placing,
             "next motions": lambda: self._merge.begin(mask, shapes()[2], shapes()[2]),
         }
-        known, self._prepared = self._prepared, self._prepared | {count}
-        return [Program(name, lambda: count in known, begin) for name, begin in begins.items()]
+        prepared, self._prepared = self._prepared, self._prepared | {count}
+        return [Program(name, lambda: count in prepared, begin) for name, begin in begins.items()]
 
     def simulate(self, world: World, actions: Action | None) -> tuple[World, Outcome]:
-        """What actions would make of worlds: `load` and `execute` without memory, to be traced.
+        """`load` and `execute` as a pure, traceable function.
 
-        This simulator's own worlds stay as they are. An action of an unknown kind changes nothing and fails as such.
+        This simulator's state is unchanged. An action of an unknown kind changes nothing and fails as such.
 
         Args:
           world, actions: fields with a leading axis for the worlds; without actions the worlds settle.
 
         Returns:
-          The worlds afterwards, and what came of the actions.
+          The worlds afterwards, and the outcomes.
         """
         count = len(world.kind)
         fields, qpos, ctrl = self._start(world)
@@ -257,12 +256,12 @@ class MjxSimulator:
     def follow(
         self, controls: Float[Array, "steps worlds 9"], start: Float[Array, "worlds 9"] | None = None
     ) -> Outcome:
-        """Step all worlds with these controls, without any verdict: for measurements, and for motions of one's own.
+        """Step all worlds with the given controls, without verdicts: for measurements and custom motions.
 
         Args:
-          controls: joint angles [rad] and distances of the two fingers from the middle [m] that the position actuators
-            are told.
-          start: where the robot is put first, at rest; by default it begins where it is.
+          controls: commands of the position actuators: joint angles [rad], and distances of the two fingers from the
+            middle [m].
+          start: the robot's configuration at the start, at rest; by default the present one.
         """
         self._count()
         data, self._data = self._data, None
@@ -274,7 +273,7 @@ class MjxSimulator:
         return outcome
 
     def bytes_per_world(self) -> int:
-        """About how much of the device's memory a world takes [bytes]; see `MjxModel.bytes_per_world`."""
+        """An estimate of a world's device memory [bytes]; see `MjxModel.bytes_per_world`."""
         return self._model.bytes_per_world()
 
     def _count(self) -> int:
@@ -284,7 +283,7 @@ class MjxSimulator:
         return len(self.world.kind)
 
     def _advanced(self, least: int) -> tuple[Array, Outcome]:
-        """Which worlds are done now, and what came of it."""
+        """Which worlds became done, and the outcomes."""
         data, self._data = self._data, None
         self._data, self.world, self._tasks, done, outcome = self._go_on(
             self._fields, data, self.world, self._tasks, np.int32(least)
@@ -292,30 +291,27 @@ class MjxSimulator:
         return done, outcome
 
     def _begun(self, data: Any, actions: Action, active: Array) -> tuple[Any, Task, Progress, Array]:
-        """`begin`, compiled, where nothing else moves: the state, the tasks, and how far they are.
-
-        The last says where nothing is to be said of a world that is done.
-        """
+        """`begin`, compiled, for worlds of which none is moving: the state, tasks, progress and reported worlds."""
         task, start = acting(data, actions, active, self._model.robot, self.config.simulator)
         data = data.replace(qpos=data.qpos.at[:, :ROBOT].set(where(task.moves, start, data.qpos[:, :ROBOT])))
         data = _at_rest(data, task.moves)
         return data, task, begin(task, data), ~active
 
     def _gone_on(self, fields: BodyFields, data: Any, world: World, tasks: tuple[Task, Progress, Array], least: Array):
-        """`advance`, compiled: the state, the worlds, the tasks, which are done, and what came of them."""
-        task, progress, known = tasks
-        chunk, step = self.config.chunk, self._one_step(fields, task)
+        """`advance`, compiled: the state, the worlds, the tasks, which became done, and the outcomes."""
+        task, progress, reported = tasks
+        chunk, step = self.config.chunk, self._time_step(fields, task)
 
-        def some(state):
+        def steps(state):
             return jax.lax.scan(lambda state, _: (step(state), None), state, None, chunk)[0]
 
         def waits(state):
             done = state[1].done
-            return (jnp.sum(done & ~known) < least) & ~jnp.all(done)
+            return (jnp.sum(done & ~reported) < least) & ~jnp.all(done)
 
-        data, progress = jax.lax.while_loop(waits, some, (data, progress))
-        ended = progress.done & ~known
-        # What moved is stopped. Where all was undone, the robot is again told what it was told before.
+        data, progress = jax.lax.while_loop(waits, steps, (data, progress))
+        ended = progress.done & ~reported
+        # Motion is stopped. A restored world gets back the commands of before the action.
         controls = where(progress.diverged, task.idle, task.controls[-1])
         resting = _at_rest(data, ended & task.moves)
         touch = self._model.step(fields, resting)
@@ -325,21 +321,21 @@ class MjxSimulator:
         )
         warm = resting.qacc_warmstart
         data = data.replace(qacc_warmstart=where(ended, jnp.zeros_like(warm), warm))
-        # Of the others nothing is to be said, and nothing to be taken over.
+        # Other worlds get no verdict, and their state is not taken over.
         ending = task.replace(moves=task.moves & ended, kind=jnp.where(ended, task.kind, ActionKind.NONE))
         simulator = self.config.simulator
         world, outcome = verdicts(self.shelf, simulator, ending, progress, world, data.qpos, in_hand)
-        return data, world, (task, progress, known | ended), ended, outcome
+        return data, world, (task, progress, reported | ended), ended, outcome
 
     def _simulate(self, fields: BodyFields, data: Any, world: World, actions: Action | None, active: Array):
-        """`execute` or `settle` as a whole: the state, the world and what came of it."""
+        """`execute` or `settle` as a whole: the state, the world and the outcome."""
         if actions is None:
             task = waiting(data, active)
             data = _at_rest(data, task.moves)
             tasks = task, begin(task, data), ~active
         else:
-            data, task, progress, known = self._begun(data, actions, active)
-            tasks = task, progress, known
+            data, task, progress, reported = self._begun(data, actions, active)
+            tasks = task, progress, reported
         data, world, _, _, outcome = self._gone_on(fields, data, world, tasks, jnp.int32(len(active)))
         return data, world, outcome
 
@@ -348,16 +344,16 @@ class MjxSimulator:
         worlds, steps = len(world.kind), len(controls)
         everywhere = jnp.ones(worlds, bool)
         task = waiting(data, everywhere).replace(controls=controls, length=jnp.full(worlds, steps + 1, jnp.int32))
-        step = self._one_step(fields, task)
+        step = self._time_step(fields, task)
         state = (data, begin(task, data))
         (data, progress), _ = jax.lax.scan(lambda state, _: (step(state), None), state, None, steps)
         world, fallen = taken_over(self.shelf, world, data.qpos, everywhere)
         failure = jnp.where(progress.diverged, int(Failure.UNSTABLE), int(Failure.NONE)).astype(jnp.int32)
         none = ~everywhere
-        told = (progress.steps, none, fallen, none, none, none, progress.overflow, progress.error)
-        return data, world, Outcome(failure, *told)
+        rest = (progress.steps, none, fallen, none, none, none, progress.overflow, progress.error)
+        return data, world, Outcome(failure, *rest)
 
-    def _one_step(self, fields: BodyFields, task: Task):
+    def _time_step(self, fields: BodyFields, task: Task):
         step = functools.partial(self._model.step, fields)
         return functools.partial(advance, self.config.simulator, step, self._model.robot, task)
 
@@ -365,18 +361,18 @@ class MjxSimulator:
 def _placed(
     changed: Bool[Array, " worlds"], data: Any, qpos: Array, ctrl: Array, new: tuple[Any, World], old: tuple[Any, World]
 ) -> tuple[Any, tuple[Any, World]]:
-    """`load`, compiled: the state, and fields and worlds, where some are changed and at rest."""
+    """`load`, compiled: the state, and fields and worlds, with the changed worlds at rest."""
     data = _at_rest(data, changed).replace(qpos=where(changed, qpos, data.qpos), ctrl=where(changed, ctrl, data.ctrl))
     return data, jax.tree.map(functools.partial(where, changed), new, old)
 
 
 def _at_rest(data: Any, which: Bool[Array, " worlds"]) -> Any:
-    """The state, with nothing moving in these worlds."""
+    """The state with all motion stopped in the worlds `which`."""
     still = jnp.zeros_like(data.qvel)
     return data.replace(qvel=where(which, still, data.qvel), qacc_warmstart=where(which, still, data.qacc_warmstart))
 
 
 def _merged(keep: Bool[Array, " worlds"], old: tuple[Task, Progress, Array], new: tuple[Task, Progress, Array]):
-    """What worlds are at: the old where it is to be kept, the new elsewhere."""
+    """Tasks, progress and reported worlds: the old ones in the worlds `keep`, the new ones elsewhere."""
     task, progress = merged(keep, old[:2], new[:2])
     return task, progress, jnp.where(keep, old[2], new[2])

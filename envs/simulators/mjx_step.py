@@ -1,4 +1,4 @@
-"""What the worlds of the batch simulator are to do, how far they have come at each step, and what came of it."""
+"""Tasks of the batch simulator's worlds, their progress at each time step, and the verdicts on them."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from mechsearch_jax.robot.kinematics import gripper_pose
 from mechsearch_jax.robot.motion import Reference
 from mechsearch_jax.workspace.shelf import Shelf
 
-# A state beyond this has diverged; the same bound as in C MuJoCo.
+# A state with larger numbers has diverged; the same bound as in C MuJoCo.
 LARGEST = 1e10
 
 
 class Task(flax.struct.PyTreeNode):
-    """What every world is to do; fields have a leading axis for the worlds, `controls` for time before it.
+    """The task of every world; fields have a leading axis for the worlds, `controls` one for time before it.
 
     Attributes:
       controls: of the actuators; the last row is held, shape (steps, W, 9).
       length: time steps of the motion, after which the bodies come to rest.
       closed, opens: the time steps, counted from 1, after which the hand has closed and begins to open.
-      home: whether the robot is then set to its home configuration.
+      home: whether the robot is set to its home configuration after the motion.
       moves: whether there is anything to simulate.
-      kind: of the action; NONE where there is none.
-      object: index of the body that the action is about.
-      before: the configuration before the action, which a diverged world gets back, shape (W, nq).
-      idle: what the robot was told before, shape (W, 9).
+      kind: of the action; NONE if there is none.
+      object: index of the action's object.
+      before: the configuration before the action, to which a diverged world is restored, shape (W, nq).
+      idle: the commands before the action, shape (W, 9).
     """
 
     controls: jax.Array
@@ -53,17 +53,17 @@ class Task(flax.struct.PyTreeNode):
 
 
 class Progress(flax.struct.PyTreeNode):
-    """How far every world has come; fields have a leading axis for the worlds.
+    """Progress of every world; fields have a leading axis for the worlds.
 
     Attributes:
-      done: nothing is to be simulated any more.
+      done: whether nothing is left to simulate.
       settled, diverged: how it ended.
       moving: whether any body was not at rest in the present block of steps.
       steps: simulated so far.
       overflow: flags of `Overflow` so far.
-      at_grasp, at_release: configurations when the hand has closed, and when it is to open, shape (W, nq).
-      reference: where the arm's joints would be if nothing held them up [rad], shape (W, 7).
-      error: the largest distance of a joint from there so far [rad].
+      at_grasp, at_release: configurations when the hand has closed, and when it begins to open, shape (W, nq).
+      reference: joint angles if nothing held the arm up [rad], shape (W, 7).
+      error: the largest distance of a joint from them so far [rad].
     """
 
     done: jax.Array
@@ -79,9 +79,9 @@ class Progress(flax.struct.PyTreeNode):
 
 
 def commands(reference: Reference) -> Float[Array, "worlds steps 9"]:
-    """What the actuators are told at each step; as `simulator.controls`, for references with a leading axis.
+    """Commands of the actuators; as `simulator.controls`, for references with a leading axis.
 
-    When a motion is over, its last row goes on.
+    Rows after the end of a motion repeat its last one.
     """
     arm = reference.q + jnp.asarray(LAG, jnp.float32)[None, None] * reference.velocity
     fingers = reference.fingers[..., None]
@@ -89,7 +89,7 @@ def commands(reference: Reference) -> Float[Array, "worlds steps 9"]:
 
 
 def waiting(data: Any, active: Bool[Array, " worlds"]) -> Task:
-    """Hold still: the robot is told what it was told before."""
+    """The task of holding still with the present commands."""
     none = jnp.zeros(len(active), jnp.int32)
     return Task(data.ctrl[None], none, none, none, none > 0, active, none, none, data.qpos, data.ctrl)
 
@@ -97,9 +97,9 @@ def waiting(data: Any, active: Bool[Array, " worlds"]) -> Task:
 def acting(
     data: Any, actions: Action, active: Bool[Array, " worlds"], home: Float[Array, " 9"], config: SimulatorConfig
 ) -> tuple[Task, Float[Array, "worlds 9"]]:
-    """What actions ask of the actuators, and where the robot begins.
+    """The tasks of actions, and the robot's configurations at their start.
 
-    Where the arm does not reach all of a motion, nothing moves: the robot is told what it was told before.
+    If the arm does not reach all of a motion, nothing moves, and the commands are unchanged.
 
     Args:
       data: the state before.
@@ -110,38 +110,38 @@ def acting(
     """
     kind = jnp.where(active, actions.kind, ActionKind.NONE)
     motions = []
-    for each in KINDS.values():
-        motion = jax.vmap(lambda action, each=each: each.reference(action, config.motion))(actions)
+    for registered in KINDS.values():
+        motion = jax.vmap(lambda action, kind=registered: kind.reference(action, config.motion))(actions)
         if motion is not None:
-            motions.append((each, *motion))
+            motions.append((registered, *motion))
     # One row more than the longest: the robot at home, or the last command, held from then on.
     steps = max(reference.fingers.shape[1] for _, reference, _ in motions) + 1
     controls = jnp.broadcast_to(data.ctrl, (steps, *data.ctrl.shape))
     start, length = data.qpos[:, :ROBOT], jnp.zeros_like(kind)
     closed = opens = length
     moves = goes_home = jnp.zeros(len(kind), bool)
-    for each, reference, reached in motions:
-        this = (kind == int(each.code)) & reached
-        told = jnp.moveaxis(commands(reference), 1, 0)
-        after = jnp.broadcast_to(home, told[-1].shape) if each.returns_home else told[-1]
-        over = jnp.arange(len(told))[:, None] >= reference.length[None]
-        told = jnp.where(over[..., None], after[None], told)
-        padded = jnp.concatenate([told, jnp.broadcast_to(after, (steps - len(told), *after.shape))])
-        controls = jnp.where(this[None, :, None], padded, controls)
+    for registered, reference, reached in motions:
+        applies = (kind == int(registered.code)) & reached
+        rows = jnp.moveaxis(commands(reference), 1, 0)
+        after = jnp.broadcast_to(home, rows[-1].shape) if registered.returns_home else rows[-1]
+        over = jnp.arange(len(rows))[:, None] >= reference.length[None]
+        rows = jnp.where(over[..., None], after[None], rows)
+        padded = jnp.concatenate([rows, jnp.broadcast_to(after, (steps - len(rows), *after.shape))])
+        controls = jnp.where(applies[None, :, None], padded, controls)
         finger = jnp.maximum(reference.start[:, ARM:], 0.0)
-        start = where(this, jnp.concatenate([reference.start[:, :ARM], finger, finger], axis=1), start)
-        length = jnp.where(this, reference.length, length)
-        closed = jnp.where(this, reference.closed, closed)
-        opens = jnp.where(this, reference.opens, opens)
-        goes_home |= this & each.returns_home
-        moves |= this
+        start = where(applies, jnp.concatenate([reference.start[:, :ARM], finger, finger], axis=1), start)
+        length = jnp.where(applies, reference.length, length)
+        closed = jnp.where(applies, reference.closed, closed)
+        opens = jnp.where(applies, reference.opens, opens)
+        goes_home |= applies & registered.returns_home
+        moves |= applies
     return Task(controls, length, closed, opens, goes_home, moves, kind, actions.object, data.qpos, data.ctrl), start
 
 
 def merged(
     keep: Bool[Array, " worlds"], old: tuple[Task, Progress], new: tuple[Task, Progress]
 ) -> tuple[Task, Progress]:
-    """Tasks and progress: the old ones in the worlds to keep, the new ones in the others."""
+    """Tasks and progress: the old ones in the worlds `keep`, the new ones elsewhere."""
     controls = jnp.where(keep[None, :, None], old[0].controls, new[0].controls)
     task, progress = jax.tree.map(
         lambda a, b: where(keep, a, b), (old[0].replace(controls=keep), old[1]), (new[0].replace(controls=keep), new[1])
@@ -150,7 +150,7 @@ def merged(
 
 
 def begin(task: Task, data: Any) -> Progress:
-    """No step yet; done where there is nothing to do."""
+    """Progress before the first step; worlds without a task are done."""
     none = jnp.zeros(len(task.moves), bool)
     zero = jnp.zeros(len(task.moves), jnp.int32)
     q = data.qpos[:, :ARM]
@@ -164,14 +164,14 @@ def advance(
     task: Task,
     state: tuple[Any, Progress],
 ) -> tuple[Any, Progress]:
-    """One time step of all worlds that are not done, each the next of its own task.
+    """One time step of all worlds that are not done, each the next of its task.
 
     Args:
-      config: when a world is at rest.
+      config: when a world counts as at rest.
       step: steps all worlds.
       home: the robot's home configuration.
-      task: what they are to do.
-      state: where they are, and how far they have come.
+      task: of the worlds.
+      state: the simulation's state, and the progress.
     """
     data, progress = state
     frozen, i = progress.done, progress.steps
@@ -181,15 +181,15 @@ def advance(
     qpos = data.qpos.at[:, :ROBOT].set(where(goes_home, robot, data.qpos[:, :ROBOT]))
     qvel = data.qvel.at[:, :ROBOT].set(where(goes_home, jnp.zeros_like(robot), data.qvel[:, :ROBOT]))
     clear = data._impl.replace(overflow=jnp.zeros_like(data._impl.overflow))
-    # Warp records its kernels anew whenever an array lies elsewhere. A plain row would be read where it lies among
-    # all commands, another place at every step; chosen from two, it is written to where the last one was.
+    # Warp records its kernels anew whenever an array's address changes. A plain row would be a view into all commands,
+    # with another address at every step; selected from two arrays, it is written to a constant one.
     ctrl = where(frozen, data.ctrl, row)
     before = data.replace(qpos=qpos, qvel=qvel, ctrl=ctrl, _impl=clear)
     after = step(before)
 
     fine = _finite(after.qpos) & _finite(after.qvel)
     diverged = ~frozen & ~fine
-    # Finite everywhere, whatever became of a world: a state that is not would flood the contacts that all share.
+    # Diverged worlds are restored at once: a state that is not finite would flood the contact buffer that all share.
     qpos = where(frozen, before.qpos, where(diverged, task.before, after.qpos))
     qvel = where(frozen, before.qvel, where(diverged, jnp.zeros_like(qvel), after.qvel))
     warm = where(frozen, before.qacc_warmstart, where(diverged, jnp.zeros_like(qvel), after.qacc_warmstart))
@@ -220,13 +220,13 @@ def advance(
 
 
 def off_board(shelf: Shelf, valid: Bool[Array, "worlds 9"], qpos: Float[Array, "worlds nq"]) -> Bool[Array, "worlds 9"]:
-    """Which bodies are off the board in a configuration."""
+    """Which bodies are off the board in configurations."""
     position = qpos[:, ROBOT:].reshape(-1, BODIES, 7)[..., :3]
     return valid & ((position[..., 0] < shelf.front) | (position[..., 2] < shelf.board))
 
 
 def taken_over(shelf: Shelf, world: World, qpos: Array, moves: Bool[Array, " worlds"]) -> tuple[World, Array]:
-    """The worlds with the bodies where a state has them, and which bodies have fallen off the board."""
+    """The worlds with the bodies' poses from configurations, and which bodies have fallen off the board."""
     poses = qpos[:, ROBOT:].reshape(-1, BODIES, 7)
     fallen = off_board(shelf, world.valid, qpos)
     changed = moves[:, None] & world.valid
@@ -248,31 +248,31 @@ def verdicts(
     qpos: Array,
     in_hand: Bool[Array, " worlds"],
 ) -> tuple[World, Outcome]:
-    """The worlds after a task, and what came of it.
+    """The worlds after a task, and its outcomes.
 
     Args:
-      shelf: whose front edge and board things fall off.
-      config: how far a held object may slip, and a joint be from its reference.
-      task, progress: what was to be done, and how far it got.
-      world: before.
+      shelf: off which bodies fall.
+      config: bounds of a held object's slip and of the tracking error.
+      task, progress: of the worlds.
+      world: before the task.
       qpos: the configuration afterwards.
       in_hand: whether both fingers press on the target.
     """
     kind = task.kind
     world, fallen = taken_over(shelf, world, qpos, task.moves)
     retrieves = (
-        _is_one_of(kind, [each for each in KINDS.values() if each.takes_target]) & task.moves & ~progress.diverged
+        _is_one_of(kind, [kind for kind in KINDS.values() if kind.takes_target]) & task.moves & ~progress.diverged
     )
     held = retrieves & in_hand
     outside = retrieves & (qpos[:, ROBOT:].reshape(-1, BODIES, 7)[:, TARGET, 0] < shelf.front)
     fallen = fallen & ~(held[:, None] & (jnp.arange(BODIES) == TARGET)[None])
-    gone = off_board(shelf, world.valid, task.before)
+    off_before = off_board(shelf, world.valid, task.before)
     error = jnp.where(progress.diverged, 0.0, progress.error)
-    holds = _is_one_of(kind, [each for each in KINDS.values() if each.holds_object])
+    holds = _is_one_of(kind, [kind for kind in KINDS.values() if kind.holds_object])
     dropped = holds & (_slip(progress, task.object) >= config.slip)
     failure = jnp.zeros_like(kind)
     for code, applies in (
-        (Failure.FALLEN, retrieves & jnp.any(fallen & ~gone, axis=1)),
+        (Failure.FALLEN, retrieves & jnp.any(fallen & ~off_before, axis=1)),
         (Failure.INSIDE, retrieves & ~outside),
         (Failure.MISSED, retrieves & ~held),
         (Failure.DROPPED, dropped),
@@ -296,13 +296,13 @@ def verdicts(
 
 
 def _is_one_of(kind: Int[Array, " worlds"], kinds: Sequence[Kind]) -> Bool[Array, " worlds"]:
-    """In which worlds the action is of one of these kinds."""
-    codes = jnp.array([int(each.code) for each in kinds], jnp.int32)
+    """In which worlds the action is of one of the given kinds."""
+    codes = jnp.array([int(registered.code) for registered in kinds], jnp.int32)
     return jnp.any(kind[:, None] == codes[None], axis=1)
 
 
 def _slip(progress: Progress, body: Int[Array, " worlds"]) -> Float[Array, " worlds"]:
-    """How far a body has moved in the hand between when it closed and when it was to open [m]."""
+    """Displacement of a body in the hand between its closing and its opening [m]."""
     places = []
     for qpos in (progress.at_grasp, progress.at_release):
         T = gripper_pose(qpos[:, :ARM])
@@ -314,5 +314,5 @@ def _slip(progress: Progress, body: Int[Array, " worlds"]) -> Float[Array, " wor
 
 
 def _finite(state: Array) -> Array:
-    """In which worlds a state has not diverged."""
+    """In which worlds a state is finite: it has not diverged."""
     return jnp.all(jnp.abs(state) < LARGEST, axis=1)

@@ -33,10 +33,10 @@ from mechsearch_jax.workspace.shelf import Shelf
 class NativeSimulator:
     """Many worlds, each a `NativeWorld`, stepped by threads; a `Simulator`.
 
-    What happens in a world is exactly what a `NativeWorld` of its own would make of it.
+    Each world behaves exactly as a single `NativeWorld`.
 
     Attributes:
-      engine: what records call it.
+      engine: the simulator's name in records.
       world: the present state of all worlds; None before the first `reset` or `load`.
     """
 
@@ -50,7 +50,7 @@ class NativeSimulator:
         camera: Camera | None = None,
     ):
         """Args:
-        threads: how many worlds are simulated at the same time; one for each core if left out.
+        threads: number of worlds that are simulated at the same time; one for each core if None.
         config, shelf, camera: of every world.
         """
         self.world: World | None = None
@@ -60,7 +60,7 @@ class NativeSimulator:
 
     @property
     def traces(self) -> list[Trace]:
-        """What happened in every world during its last action."""
+        """The traces of every world's last action."""
         return [world.trace for world in self._worlds]
 
     def reset(self, scenarios: Sequence[Scenario]) -> World:
@@ -75,7 +75,7 @@ class NativeSimulator:
         return self.replace(dict(enumerate(scenarios)))
 
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
-        """Start episodes in some of the worlds; see `Simulator.replace`.
+        """Start episodes in the given worlds; see `Simulator.replace`.
 
         Raises:
           InputError: it was not reset before, or there are more objects in a scenario than slots.
@@ -86,16 +86,18 @@ class NativeSimulator:
         return self._gather()
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
-        """Take over the state of all worlds, or of some; see `Simulator.load`.
+        """Set the state of all worlds, or of those in `only`; see `Simulator.load`.
 
         Raises:
-          InputError: some worlds are to be kept, but there are not as many.
+          InputError: `only` is given, but the number of worlds differs from the present one.
         """
         count = len(world.kind)
         if only is None:
             self._make(count)
         elif len(self._worlds) != count or len(only) != count:
-            raise InputError(f"NativeSimulator: some of {count} worlds can be replaced only where there are as many")
+            raise InputError(
+                f"NativeSimulator: {count} worlds cannot be set in part: there are {len(self._worlds)} now"
+            )
         host = jax.device_get(world)
         for i in range(count) if only is None else np.flatnonzero(only):
             self._worlds[i].load(jax.tree.map(lambda leaf, i=i: leaf[i], host))
@@ -117,7 +119,7 @@ class NativeSimulator:
         return motions((self._config or SimulatorConfig()).motion)
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
-        """Let time pass in every active world; see `Simulator.settle`.
+        """Step every active world until it is at rest; see `Simulator.settle`.
 
         Raises:
           InputError: it was not reset before.
@@ -130,12 +132,12 @@ class NativeSimulator:
             raise InputError("NativeSimulator: reset it before use")
 
     def _make(self, count: int) -> None:
-        """Have so many worlds."""
+        """Create or drop worlds so that there are `count`."""
         missing = [NativeWorld(self._shelf, self._camera, self._config) for _ in range(count - len(self._worlds))]
         self._worlds = (self._worlds + missing)[:count]
 
     def _each(self, active: Bool[Array, " worlds"] | None, run: Callable[[int], Outcome]) -> Outcome:
-        """Run something in every active world; what came of it, and of nothing in the others."""
+        """The outcomes of `run` in every active world, and of doing nothing in the others."""
         count = len(self._worlds)
         busy = np.flatnonzero(np.ones(count, bool) if active is None else np.asarray(active)).tolist()
         with ThreadPoolExecutor(self._threads) as pool:

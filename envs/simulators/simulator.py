@@ -1,4 +1,4 @@
-"""What simulators have in common: how they are used, how they are set, and what they tell the robot's motors."""
+"""Protocols, settings and actuator commands that all simulators share."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from mechsearch_jax.workspace.scenario import Scenario
 
 ARM = len(HOME)
 ROBOT = ARM + 2
-# A position actuator with a velocity gain trails its command by this many seconds of its motion, for each joint.
+# A position actuator with a velocity gain lags behind its command by this many seconds of its motion; per joint.
 LAG = (np.array(models.ARM_VELOCITY_GAIN) + models.ARM_DAMPING) / np.array(models.ARM_STIFFNESS)
 
 
 @dataclasses.dataclass(frozen=True)
 class SimulatorConfig:
-    """How worlds are simulated.
+    """Settings of the simulation.
 
     Attributes:
       motion: durations and lengths of the motion primitives.
       rest_speed: bodies slower than this are at rest [m/s, and rad/s times 0.1 m].
-      settle_steps: after an action the bodies are given at most so many steps to come to rest.
-      settle_block: how many steps pass between looks at whether they have.
-      slip: an object that has moved farther than this in the closed hand was dropped [m].
-      tracking_bound: an arm with a joint farther than this from its reference is held up, and its action fails [rad].
-        Ordinary actions stay below 0.01, a few reach 0.027; a hand that shoves a box against a wall reaches 0.065 and
-        more.
-      trace_every: a trace keeps the state of every so many steps; only the native simulator has traces.
+      settle_steps: largest number of time steps for the bodies to come to rest after an action.
+      settle_block: time steps between checks whether they have.
+      slip: an object that has moved farther than this in the closed hand counts as dropped [m].
+      tracking_bound: an arm with a joint farther than this from its reference counts as held up, and its action fails
+        [rad]. Ordinary actions stay below 0.01, a few reach 0.027; a hand that shoves a box against a wall reaches
+        0.065 and more.
+      trace_every: time steps between rows of a trace; only the native simulator has traces.
     """
 
     motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
@@ -61,10 +61,10 @@ class SimulatorConfig:
 
 @runtime_checkable
 class Simulator(Protocol):
-    """Worlds that can be acted in, W at once: `NativeSimulator` on a CPU, `MjxSimulator` on a GPU.
+    """W simulated worlds: `NativeSimulator` on a CPU, `MjxSimulator` on a GPU.
 
     Attributes:
-      engine: what records call it.
+      engine: the simulator's name in records.
       world: the present state, its fields with a leading axis W; None before the first `reset` or `load`.
     """
 
@@ -72,7 +72,7 @@ class Simulator(Protocol):
     world: World | None
 
     def reset(self, scenarios: Sequence[Scenario]) -> World:
-        """Start episodes: every body is exactly where its scenario has it, at rest, and the robot at home.
+        """Start episodes: every body at rest at its pose in the scenario, and the robot at home.
 
         Args:
           scenarios: one for each world.
@@ -83,7 +83,7 @@ class Simulator(Protocol):
         ...
 
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
-        """Start episodes in some of the worlds, as `reset` does; the others stay exactly as they are.
+        """Start episodes in the given worlds, as `reset` does; the others stay exactly as they are.
 
         Raises:
           InputError: it was not reset before, or there are more objects in a scenario than slots.
@@ -91,23 +91,23 @@ class Simulator(Protocol):
         ...
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
-        """Take over the state of all worlds, or of some; the robot is at home there and everything at rest.
+        """Set the state of all worlds, or of those in `only`, at rest and with the robot at home.
 
         Args:
           world: fields with a leading axis for the worlds.
-          only: which worlds to change; the others keep their state. There must be as many worlds as now.
+          only: which worlds to change; the others keep their state. The number of worlds must be the present one.
 
         Raises:
-          InputError: some worlds are to be kept, but there are none, or not as many.
+          InputError: `only` is given, but the number of worlds differs from the present one.
         """
         ...
 
     def execute(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> Outcome:
-        """Execute an action in every world and let the bodies come to rest; `world` is then what became of them.
+        """Execute an action in every active world, let the bodies come to rest, and update `world`.
 
         Args:
-          actions: of any kinds that are registered; fields with a leading axis for the worlds.
-          active: in which worlds; all by default. The others do not change and report no failure and 0 steps.
+          actions: of any registered kinds; fields with a leading axis for the worlds.
+          active: which worlds; all by default. The others do not change and report no failure and 0 steps.
 
         Raises:
           InputError: it was not reset before, there are not as many actions as worlds, or a kind is unknown.
@@ -115,10 +115,10 @@ class Simulator(Protocol):
         ...
 
     def settle(self, active: Bool[Array, " worlds"] | None = None) -> Outcome:
-        """Let time pass, with the robot where it is, until everything is at rest or the time for that is over.
+        """Step with the robot where it is until everything is at rest, for at most `settle_steps`.
 
         Args:
-          active: in which worlds; all by default.
+          active: which worlds; all by default.
 
         Raises:
           InputError: it was not reset before.
@@ -128,27 +128,27 @@ class Simulator(Protocol):
 
 @runtime_checkable
 class Flowing(Protocol):
-    """A `Simulator` some of whose worlds begin with an action while others are still moving."""
+    """A `Simulator` whose worlds can begin actions while others are still moving."""
 
     def begin(self, actions: Action, active: Bool[Array, " worlds"] | None = None) -> None:
-        """Begin with actions in the worlds that are active, none of which may be moving; the others go on."""
+        """Begin actions in the active worlds, none of which may be moving; the others continue."""
         ...
 
     def advance(self, least: int) -> tuple[Bool[np.ndarray, " worlds"], Outcome]:
-        """Step what moves until at least so many more worlds are done, or all that move.
+        """Step the moving worlds until at least `least` of them, or all, are done.
 
         Returns:
-          Which are done that were not before, and what came of their actions; of others the outcome says nothing.
+          Which worlds became done, and the outcomes of their actions; outcomes of other worlds mean nothing.
         """
         ...
 
 
 @runtime_checkable
 class Prepares(Protocol):
-    """What knows the programs that it will call."""
+    """An object that can list the programs that it will call, so that they are compiled beforehand."""
 
     def programs(self, world: World) -> Sequence[Program]:
-        """Those for so many worlds, the longest first.
+        """The programs for these worlds, those that compile longest first.
 
         Args:
           world: of all worlds, or its shapes.
@@ -157,12 +157,12 @@ class Prepares(Protocol):
 
 
 def check_actions(name: str, actions: Action, worlds: int) -> None:
-    """Check that there is an action of a known kind for each world.
+    """Check that there is an action of a registered kind for each world.
 
     Args:
       name: of the simulator, for the message.
       actions: concrete.
-      worlds: how many there are.
+      worlds: number of worlds.
 
     Raises:
       InputError: there are not as many actions as worlds, or a kind is unknown.
@@ -174,27 +174,27 @@ def check_actions(name: str, actions: Action, worlds: int) -> None:
 
 
 def controls(reference: Reference) -> Float[np.ndarray, "steps 9"]:
-    """What the actuators are told at each step so that the arm follows a reference without lag: ahead by `LAG`.
+    """Commands of the actuators so that the arm follows a reference without lag: ahead by `LAG`.
 
     One row for each step until the motion is over.
     """
     length = int(reference.length)
     # Cut on the host: on a device every length would be compiled.
-    told = (reference.q, reference.velocity, reference.fingers)
-    q, velocity, fingers = (np.asarray(a, float)[:length] for a in jax.device_get(told))
+    fields = (reference.q, reference.velocity, reference.fingers)
+    q, velocity, fingers = (np.asarray(a, float)[:length] for a in jax.device_get(fields))
     arm, fingers = q + LAG * velocity, fingers[:, None]
     return np.concatenate([arm, fingers, fingers], axis=1)
 
 
 def unhindered(
-    q: Float[Array, "*batch 7"], told: Float[Array, "*batch 7"], timestep: float
+    q: Float[Array, "*batch 7"], command: Float[Array, "*batch 7"], timestep: float
 ) -> Float[Array, "*batch 7"]:
-    """Where the joints are a time step later if nothing holds them up: what `controls` were made of.
+    """Joint angles a time step later if nothing holds the arm up: the inverse of `controls`.
 
     Args:
-      q: where they were [rad].
-      told: what their actuators are told [rad].
+      q: joint angles [rad].
+      command: of their actuators [rad].
       timestep: of the simulation [s].
     """
     gain = jnp.asarray(timestep / (timestep + LAG), q.dtype)
-    return q + (told - q) * jnp.broadcast_to(gain, q.shape)
+    return q + (command - q) * jnp.broadcast_to(gain, q.shape)

@@ -1,9 +1,9 @@
-"""Warp's kernels, compiled beforehand in another process, many at the same time.
+"""Compiles Warp's kernels beforehand in another process, on all cores.
 
-Warp compiles a module of kernels where the first of them is launched, one after the other, which takes minutes on a new
-machine, and each needs Python's lock for a while. What it has compiled it keeps on disk (`WARP_CACHE_PATH`), for every
-process. So a step of the same model is taken in a process of its own in which nothing is launched, but each module is
-noted, and then all are compiled, on all cores. The process of who asks goes on meanwhile.
+Warp compiles a module of kernels when the first of them is launched, one module after the other. On a new machine this
+takes minutes and holds Python's lock repeatedly. Warp keeps compiled modules on disk (`WARP_CACHE_PATH`) for every
+process. So a separate process makes a step of the same model with launches replaced by notes of their modules, and then
+compiles all of these in parallel, while the calling process continues.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -32,18 +32,18 @@ from mechsearch_jax.runtime.cores import cores
 def compile_kernels(
     model: mujoco.MjModel, batched: Sequence[str], worlds: int, contacts: int, rows: int, device: str
 ) -> Callable[[], None] | None:
-    """Begin to compile what a step of many worlds launches, unless a note beside the kernels says that it was done.
+    """Begin to compile the kernels of a step of many worlds, unless a marker file beside the kernels says it was done.
 
     Args:
       model: of C MuJoCo.
-      batched: names of the model's fields that every world has its own of.
-      worlds: how many; some kernels are of a number of worlds.
+      batched: names of the model's fields that differ between worlds.
+      worlds: number of worlds, on which some kernels depend.
       contacts, rows: capacities, `naconmax` and `njmax`.
       device: Warp's name of the device.
 
     Returns:
-      What waits until all are compiled. Where that fails, it warns, and they are compiled when they are needed. None
-      where all were compiled before.
+      A function that waits until all are compiled; if that fails, it warns, and they are compiled when needed. None if
+      all were compiled before.
     """
     import warp
 
@@ -51,13 +51,13 @@ def compile_kernels(
     file = Path(folder.name) / "model.mjb"
     mujoco.mj_saveModel(model, str(file))
     sizes: dict[str, Any] = {"batched": list(batched), "worlds": worlds, "contacts": contacts, "rows": rows}
-    what = repr((sizes, device, warp.get_device(device).name, warp.__version__, mujoco.__version__))
-    digest = hashlib.sha256(what.encode() + file.read_bytes()).hexdigest()[:32]
-    note = Path(str(warp.config.kernel_cache_dir)) / f"step-{digest}"
-    if note.exists():
+    settings = repr((sizes, device, warp.get_device(device).name, warp.__version__, mujoco.__version__))
+    digest = hashlib.sha256(settings.encode() + file.read_bytes()).hexdigest()[:32]
+    marker = Path(str(warp.config.kernel_cache_dir)) / f"step-{digest}"
+    if marker.exists():
         folder.cleanup()
         return None
-    # Importing JAX must not take the GPU's memory there.
+    # JAX must not take the GPU's memory in that process.
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     process = subprocess.Popen(
         [
@@ -80,7 +80,7 @@ def compile_kernels(
             warnings.warn(f"Warp's kernels are compiled one by one when they are needed: {last}", stacklevel=2)
             return
         with contextlib.suppress(OSError):
-            note.touch()
+            marker.touch()
 
     return wait
 
@@ -88,19 +88,19 @@ def compile_kernels(
 def modules_of_a_step(
     model: mujoco.MjModel, batched: Sequence[str], worlds: int, contacts: int, rows: int, device: str
 ) -> list[tuple[Any, int | None]]:
-    """The modules that a step launches kernels of, with their block sizes; see `compile_kernels` for the arguments.
+    """The modules whose kernels a step launches, with their block sizes; see `compile_kernels` for the arguments.
 
-    For a process of its own: afterwards Warp launches nothing any more.
+    Only for a separate process: afterwards Warp launches nothing any more.
     """
     import warp
     from mujoco.mjx.third_party import mujoco_warp
     from warp._src.context import Module
 
-    found: dict[tuple[Any, int | None], None] = {}
+    modules: dict[tuple[Any, int | None], None] = {}
 
-    def noted(module: Any, device: Any, block_dim: int | None = None, **options: Any) -> None:
-        # Without an executable a launch returns.
-        found[module, block_dim] = None
+    def note(module: Any, device: Any, block_dim: int | None = None, **options: Any) -> None:
+        # A launch without an executable returns at once.
+        modules[module, block_dim] = None
 
     def once(condition: Any, while_body: Callable[..., None], **arguments: Any) -> None:
         while_body(**arguments)
@@ -109,21 +109,21 @@ def modules_of_a_step(
         for branch in filter(None, (on_true, on_false)):
             branch(**arguments)
 
-    # What would wait for a result of what was not launched.
+    # These would wait for results of kernels that were not launched.
     warp.capture_while, warp.capture_if = once, both
     warp.get_suggested_block_size = lambda kernel, device=None: (256, 1)
-    Module.load = noted
+    Module.load = note
     with warp.ScopedDevice(device):
-        here = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(batched, worlds))
-        # As `MjxModel` has it; some kernels are of it.
-        here.opt.warn_overflow = 0
+        warp_model = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(batched, worlds))
+        # As in `MjxModel`; some kernels depend on it.
+        warp_model.opt.warn_overflow = 0
         data = mujoco_warp.make_data(model, nworld=worlds, naconmax=contacts, njmax=rows)
-        mujoco_warp.step(here, data)
-    return list(found)
+        mujoco_warp.step(warp_model, data)
+    return list(modules)
 
 
 def main(settings: str) -> None:
-    """Compile what a step launches; `settings` is what `compile_kernels` writes."""
+    """Compile the kernels of a step; `settings` is the JSON that `compile_kernels` passes."""
     import warp
     from mujoco.mjx.warp import forward
     from warp._src.context import Module
@@ -133,11 +133,11 @@ def main(settings: str) -> None:
     load, model = Module.load, mujoco.MjModel.from_binary_path(sizes.pop("model"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = modules_of_a_step(model, **sizes)
-    # What calls a step from JAX is a module, too, even where it has no kernels.
-    found.append((warp.get_module(forward.ffi.__name__), None if device != "cpu" else 1))
+        modules = modules_of_a_step(model, **sizes)
+    # The module that calls a step from JAX is loaded, too, even without kernels.
+    modules.append((warp.get_module(forward.ffi.__name__), None if device != "cpu" else 1))
     with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(lambda each: load(each[0], warp.get_device(device), each[1]), found))
+        list(pool.map(lambda entry: load(entry[0], warp.get_device(device), entry[1]), modules))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What tries actions out, by name."""
+"""Rehearsals by name: the simulation in which actions are tried before one is made."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from mechsearch_jax.runtime.errors import InputError
 
 @functools.cache
 def rehearsal(name: str) -> Trials | None:
-    """What tries actions out before one is made; the same object for the same name.
+    """The `Trials` of a name; the same object for the same name.
 
     Args:
-      name: "physics", a simulation, or "none": None.
+      name: "physics" for a simulation, "none" for None.
 
     Raises:
-      InputError: there is none of that name.
+      InputError: there is no rehearsal of that name.
     """
     if name == "none":
         return None
     if name != "physics":
         raise InputError(f'rehearsal "{name}" is unknown; use none, physics')
-    # Where it is not asked for, the simulator is not imported.
+    # Imported here so that "none" does without the simulator.
     from mechsearch_jax.envs.trials.native import NativeTrials
 
     return NativeTrials()

@@ -1,9 +1,9 @@
 """Trials in C MuJoCo, on several threads.
 
-The recognised objects become bodies as in `physics_push`, and a found target one of its own shape; they come to rest,
-and the arm moves as the environment's does. The environment's own simulator is not involved.
+The recognised objects become bodies as in `physics_push`, and a found target a body of its own shape; they come to
+rest, and the arm moves as in the environment. The environment's own simulator is not involved.
 
-An approximation: what is not recognised is not there, a hidden target least of all.
+An approximation: what is not recognised, including a hidden target, is absent from the trials.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -24,7 +24,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
-from mechsearch_jax.envs.pushing.physics_push import bodies, sound
+from mechsearch_jax.envs.pushing.physics_push import bodies
+from mechsearch_jax.envs.pushing.push_rollouts import sound
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
 from mechsearch_jax.envs.trials.order import in_order
 from mechsearch_jax.envs.trials.scene import TrialScene
@@ -45,7 +46,7 @@ from mechsearch_jax.workspace.target import Target
 
 
 class Cell(NamedTuple):
-    """What trials need of a problem."""
+    """The parts of a problem that trials need."""
 
     target: Target
     shelf: Shelf
@@ -56,14 +57,14 @@ class Cell(NamedTuple):
 class NativeTrials:
     """The `Trials` in C MuJoCo, of many scenes at once, on several threads.
 
-    The same ones always give the same results. An action that the arm cannot follow fails; what becomes of one whose
-    simulation diverges, or whose scene is no scene, is not known. The gripper is the problem's.
+    The same trials always give the same results. An action that the arm cannot follow fails; the result is UNKNOWN if
+    the simulation diverges or the scene is invalid. The gripper is the problem's.
 
     Attributes:
-      simulation: how it is simulated.
-      threads: how many; one for each of `runtime.cores.cores` if left out.
-      friction: sliding friction of everything, as a multiple of what it is taken to be; too little of it holds the arm
-        up where a trial was not.
+      simulation: its settings.
+      threads: number of threads; `runtime.cores.cores` if None.
+      friction: factor on all sliding frictions; with too low a friction the arm is held up in reality where it was not
+        in the trial.
 
     Raises:
       InputError: the friction is not positive.
@@ -90,7 +91,7 @@ class NativeTrials:
     def in_cell(
         self, cell: Cell, scenes: TrialScenes, actions: Action, wanted: Bool[Array | np.ndarray, "r k"]
     ) -> Int[np.ndarray, "r k"]:
-        """`__call__` for who has no problem; see there."""
+        """`__call__` without a problem."""
         if scenes.objects.valid.shape[-1] > TARGET:
             raise InputError(f"the simulator has slots for {TARGET} objects, not for {scenes.objects.valid.shape[-1]}")
         config = self._motion_config(cell)
@@ -122,11 +123,11 @@ class NativeTrials:
         return in_order(np.asarray(wanted), self.threads or cores(), make, attempt)
 
     def programs(self, problem: Problem) -> list[Program]:
-        """What is computed with JAX; see `many_slots.PreparesTrials`."""
+        """The JAX programs of trials; see `many_slots.PreparesTrials`."""
         return self.cell_programs(Cell(problem.target, problem.shelf, problem.gripper))
 
     def cell_programs(self, cell: Cell) -> list[Program]:
-        """`programs` for who has no problem."""
+        """`programs` without a problem."""
         nowhere = jax.device_get((empty(TARGET), jnp.zeros(3), jnp.array(False)))
         return [*motions(self._motion_config(cell)), program("small ones", _world, cell.target, cell.shelf, *nowhere)]
 
@@ -138,7 +139,7 @@ class NativeTrials:
 def _world(
     target: Target, shelf: Shelf, objects: Superquadrics, pose: Float[Array, "3"], found: Bool[Array, ""]
 ) -> World:
-    """The bodies that stand for the objects, and for the target where it is found."""
+    """The bodies of the objects, and of the target if it is found."""
     T_world_target = upright_pose(pose, target.height(shelf))
     world = bodies(objects)
     return World(
@@ -153,7 +154,7 @@ def _world(
 def _at_rest(
     shelf: Shelf, simulation: SimulatorConfig, world: World, friction: float, mass: float
 ) -> TrialScene | None:
-    """A scene in which actions can be tried; None where it is none, which must not end those beside it."""
+    """A scene at rest; None if MuJoCo cannot build it, so that one invalid scene does not end the other trials."""
     try:
         return TrialScene(shelf, simulation, bodies_of(world), friction, mass)
     except (ValueError, mujoco.FatalError):

@@ -1,4 +1,4 @@
-"""In which order what is to be tried in many scenes is tried, by several threads."""
+"""The order in which several threads run trials in many scenes."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from jaxtyping import Bool, Int
 from mechsearch_jax.planner.trials import TrialResult
 
 Scene = TypeVar("Scene")
-# Tries column i of row r in its scene; None where `needed` says meanwhile that nobody wants to know any more.
+# Tries column i of row r in its scene; returns None if `needed` turns False meanwhile.
 Attempt = Callable[[Scene, int, int, Callable[[], bool]], TrialResult | None]
 
 
 class _Row(Generic[Scene]):
-    """What is left to be tried in a scene.
+    """The state of a scene's trials.
 
     Attributes:
-      left: the columns that no thread has begun, in their order.
-      begun: how many were.
-      first: the first column that is known to succeed; as many as there are where none is.
-      lock: held by who makes the scene.
-      scene: one, once it is made.
+      left: columns that no thread has begun, in order.
+      begun: number of columns that were begun.
+      first: the first column that has succeeded so far; the number of columns if none has.
+      lock: held while the scene is made.
+      scene: holds the scene once it is made; empty before.
     """
 
     def __init__(self, wanted: Bool[np.ndarray, " k"]):
@@ -37,28 +37,25 @@ class _Row(Generic[Scene]):
 
 
 def in_order(
-    wanted: Bool[np.ndarray, "n k"],
-    threads: int,
-    make: Callable[[int], Scene],
-    attempt: Attempt[Scene],
+    wanted: Bool[np.ndarray, "n k"], threads: int, make: Callable[[int], Scene], attempt: Attempt[Scene]
 ) -> Int[np.ndarray, "n k"]:
-    """What becomes of what is wanted in each row, as `TrialResult`, up to the first that succeeds.
+    """The results of the wanted trials of each row, as `TrialResult`, up to the row's first success.
 
-    The best of every row comes first, then the next of those rows where nothing has succeeded yet. A free thread also
-    tries what may turn out not to be needed; it stops when it does. So what is said of a row up to its first success
-    never depends on the threads, and what comes after it means nothing.
+    Threads take the first column of every row, then the next column of rows without a success, and so on. An idle
+    thread also starts trials that may turn out not to be needed, and stops them when they do. Results of a row up to
+    its first success therefore do not depend on the number of threads; those after it mean nothing.
 
     Args:
-      wanted: what is to be tried, the best first.
-      threads: how many trials run at the same time.
-      make: the scene of a row; called once, in a thread.
-      attempt: tries; called in a thread.
+      wanted: the trials to run, the best column first.
+      threads: number of trials that run at the same time.
+      make: makes the scene of a row; called once, in a thread.
+      attempt: runs a trial; called in a thread.
     """
     results = np.full(wanted.shape, TrialResult.UNKNOWN, np.int32)
     rows: dict[int, _Row[Scene]] = {int(r): _Row(wanted[r]) for r in np.flatnonzero(wanted.any(axis=1))}
     lock = threading.Lock()
 
-    def next_one() -> tuple[int, int] | None:
+    def next_trial() -> tuple[int, int] | None:
         with lock:
             open_rows = [(row.begun, r) for r, row in rows.items() if row.left and row.left[0] < row.first]
             if not open_rows:
@@ -68,8 +65,8 @@ def in_order(
             return r, rows[r].left.pop(0)
 
     def work() -> None:
-        while (one := next_one()) is not None:
-            r, i = one
+        while (trial := next_trial()) is not None:
+            r, i = trial
             row = rows[r]
             with row.lock:
                 if not row.scene:

@@ -1,6 +1,6 @@
-"""Trials in processes of their own, for batches beside a GPU.
+"""Trials in separate processes, for batches beside a GPU.
 
-What a trial needs of Python keeps threads waiting for each other long before sixteen cores are busy.
+Threads would not use sixteen cores: the Python part of a trial holds the interpreter lock.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ from mechsearch_jax.runtime.compiled import keep_in, kept_in
 from mechsearch_jax.runtime.cores import cores, share_of_cores
 from mechsearch_jax.session.preparing import Program
 
-# Settings of JAX that say what it keeps on disk.
+# JAX's settings of its cache on disk.
 CACHE = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
-# Results of a scene's actions that are still to come.
+# The future results of a scene's actions.
 Pending = Future[Int[np.ndarray, " k"]]
 
 
 class ProcessTrials:
-    """The `Trials` of `NativeTrials`, each scene's in one of several processes.
+    """The `Trials` of `NativeTrials`, each scene's in one of several processes, with the same results.
 
-    They say the same, one action of a scene after the other. Where a process dies all scenes are tried once more, each
-    alone; of one in which it dies again, it is not known what becomes of its actions. The processes begin when they
-    are prepared or first needed, and end with `close`, or with this process.
+    A scene's actions are tried in sequence. If a process dies, every scene is tried again, alone; if it dies again, the
+    results of that scene are UNKNOWN. The processes start when they are prepared or first needed, and end with `close`
+    or with this process.
 
     Attributes:
-      trials: what each process does.
-      processes: how many.
+      trials: run by each process.
+      processes: number of processes.
     """
 
     def __init__(self, trials: NativeTrials | None = None, processes: int | None = None) -> None:
         """Args:
-        trials: the default if left out; its threads do not count.
-        processes: one for each of `runtime.cores.cores` if left out.
+        trials: the default if None; its number of threads is ignored.
+        processes: `runtime.cores.cores` if None.
         """
         self.trials = dataclasses.replace(trials or NativeTrials(), threads=1)
         self.processes = processes or cores()
@@ -62,8 +62,8 @@ class ProcessTrials:
         results = np.full(wanted.shape, TrialResult.UNKNOWN, np.int32)
 
         def begin(row: int) -> Pending:
-            one = jax.tree.map(lambda a: a[row : row + 1], (scenes, actions, wanted))
-            return self._workers().submit(_row, self.trials, cell, *one)
+            single = jax.tree.map(lambda a: a[row : row + 1], (scenes, actions, wanted))
+            return self._workers().submit(_row, self.trials, cell, *single)
 
         rows = np.flatnonzero(wanted.any(axis=1)).tolist()
         try:
@@ -77,7 +77,7 @@ class ProcessTrials:
         return results
 
     def programs(self, problem: Problem) -> list[Program]:
-        """The processes, each with what it computes; see `many_slots.PreparesTrials`."""
+        """A program that starts the processes and prepares each; see `many_slots.PreparesTrials`."""
         cell = _cell(problem)
 
         def begin() -> Callable[[], None]:
@@ -86,16 +86,16 @@ class ProcessTrials:
 
             def finish() -> None:
                 first.result()
-                # What the first has compiled, the others read from disk.
-                for other in [workers.submit(_prepare, self.trials, cell) for _ in range(self.processes)]:
-                    other.result()
+                # The others read from disk what the first has compiled.
+                for future in [workers.submit(_prepare, self.trials, cell) for _ in range(self.processes)]:
+                    future.result()
 
             return finish
 
         return [Program("trials", lambda: self._pool is not None, begin)]
 
     def close(self) -> None:
-        """End the processes; they begin anew where they are needed again."""
+        """End the processes; they start again when needed."""
         pool, self._pool = self._pool, None
         if pool is not None:
             pool.shutdown(kill_workers=True)
@@ -112,7 +112,7 @@ class ProcessTrials:
         return self._pool
 
     def _alone(self, begin: Callable[[], Pending], count: int) -> Int[np.ndarray, " k"]:
-        """The results of a scene's actions, while no other scene is tried."""
+        """The results of a scene's actions while no other scene is tried."""
         try:
             return begin().result()
         except BrokenExecutor as error:
@@ -129,7 +129,7 @@ def _cell(problem: Problem) -> Cell:
 
 
 def _keep(executables: Path | None, cache: Mapping[str, Any]) -> None:
-    """Keep on disk in a new process what is compiled, where the first one does."""
+    """Keep compiled programs of a new process on disk, where this process keeps its own."""
     if executables is not None:
         keep_in(executables)
     for name, value in cache.items():
@@ -137,9 +137,9 @@ def _keep(executables: Path | None, cache: Mapping[str, Any]) -> None:
 
 
 def _prepare(trials: NativeTrials, cell: Cell) -> None:
-    """Make a process ready: compile, or read from disk, what its trials compute with JAX."""
-    for each in trials.cell_programs(cell):
-        finish = each.begin()
+    """Compile, or read from disk, the JAX programs of a process's trials."""
+    for program in trials.cell_programs(cell):
+        finish = program.begin()
         if finish is not None:
             finish()
 
@@ -147,5 +147,5 @@ def _prepare(trials: NativeTrials, cell: Cell) -> None:
 def _row(
     trials: NativeTrials, cell: Cell, scenes: TrialScenes, actions: Action, wanted: Bool[np.ndarray, "1 k"]
 ) -> Int[np.ndarray, " k"]:
-    """What becomes of the actions of a scene."""
+    """The results of the actions of a single scene."""
     return trials.in_cell(cell, scenes, actions, wanted)[0]

@@ -1,7 +1,7 @@
-"""A scene in which everything has come to rest, and in which actions are tried out, each from the same state.
+"""A scene at rest in which actions are tried, each from the same state.
 
-Bodies at rest are asleep: MuJoCo leaves them out until something touches them. So a trial costs what the arm costs, and
-what it moves.
+Bodies at rest are asleep: MuJoCo skips them until something touches them, so that a trial costs only the arm and what
+it moves.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -31,50 +31,45 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, rotation_matrix
 from mechsearch_jax.workspace.shelf import Shelf
 
-# So many steps pass between looks at whether it is known what becomes of an action.
+# Time steps between checks whether the result of an action is certain.
 BLOCK = 100
-# So many pass between looks at whether all is at rest after it.
+# Time steps between checks whether all is at rest after an action.
 REST_BLOCK = 25
-# What is so far below the board does not come back [m].
+# A body so far below the board has fallen [m].
 BELOW = 0.05
 # A target that leans further than this falls over [rad].
 TIPPED = math.radians(45)
-# Fingers that come closer to the middle than this have nothing between them [m].
+# Fingers closer to the middle than this hold nothing [m].
 EMPTY = 1e-3
 
 
 @functools.cache
 def blank_model(shelf: Shelf, timestep: float) -> mujoco.MjModel:
-    """The model with empty slots, in which what is at rest sleeps; not to be changed."""
+    """The model with empty slots, in which bodies at rest sleep; not to be changed."""
     model = models.compile_model(shelf, Camera(), timestep)
     model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
-    # Little is awake at a time.
+    # Few bodies are awake at a time.
     model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     return model
 
 
 class TrialScene(NativeWorld):
-    """Bodies at rest. What is tried in it does not change it, and may be tried in several threads at once.
+    """Bodies at rest. Trials do not change the scene and may run in several threads at once.
 
     Attributes:
-      diverged: whether the simulation did before everything was at rest; nothing can be tried then.
+      diverged: whether the simulation diverged before everything was at rest; all trials are UNKNOWN then.
     """
 
     def __init__(
-        self,
-        shelf: Shelf,
-        config: SimulatorConfig,
-        bodies: list[Body | None],
-        friction: float = 1.0,
-        mass: float = 1.0,
+        self, shelf: Shelf, config: SimulatorConfig, bodies: list[Body | None], friction: float = 1.0, mass: float = 1.0
     ):
         """Let bodies come to rest.
 
         Args:
-          shelf: where.
-          config: how it is simulated.
+          shelf: of the scene.
+          config: of the simulation.
           bodies: in their slots.
-          friction, mass: sliding friction of everything, and masses of the bodies, as multiples of what they are.
+          friction, mass: factors on all sliding frictions, and on the bodies' masses.
 
         Raises:
           ValueError, mujoco.FatalError: MuJoCo cannot build the scene.
@@ -92,20 +87,20 @@ class TrialScene(NativeWorld):
     def attempt(
         self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool] = lambda: True
     ) -> TrialResult | None:
-        """What becomes of an action; None where that is not needed any more. Nothing is computed with JAX.
+        """The result of an action; None if it is not needed any more. Uses no JAX.
 
         Args:
           kind: of the action.
           reference: of the arm, as NumPy arrays.
           index: slot of the object that the action moves.
-          needed: called again and again; whether the result is still wanted.
+          needed: called repeatedly; whether the result is still wanted.
         """
         if self.diverged:
             return TrialResult.UNKNOWN
-        here = copy.copy(self)
-        here._data = copy.copy(self._data)
-        here._record()
-        return here._attempted(kind, reference, index, needed)
+        scene = copy.copy(self)
+        scene._data = copy.copy(self._data)
+        scene._record()
+        return scene._attempted(kind, reference, index, needed)
 
     def _attempted(
         self, kind: Kind, reference: Reference, index: int, needed: Callable[[], bool]
@@ -143,7 +138,7 @@ class TrialScene(NativeWorld):
         return TrialResult.FAILED if failed else TrialResult.SUCCEEDED
 
     def _hide_what_is_no_body(self) -> None:
-        """Leave out geometry that stands for nothing, or is hidden inside of a body."""
+        """Disable contacts of geometry in empty slots or hidden inside of a body."""
         for i, body in enumerate(self._bodies):
             for shape in in_order():
                 if body is None or body.shape != shape.name:
@@ -151,20 +146,20 @@ class TrialScene(NativeWorld):
                     self._model.geom_contype[geom] = self._model.geom_conaffinity[geom] = 0
 
     def _fall_asleep(self) -> None:
-        """Let all bodies sleep where they are, until they are touched."""
+        """Put all bodies to sleep where they are, until they are touched."""
         positions = self._data.qpos.copy()
         self._go_home()
-        # One more step without motion, and they sleep.
+        # They sleep after one more step without motion.
         self._data.tree_asleep[1:] = np.maximum(self._data.tree_asleep[1:], -1)
         mujoco.mj_step(self._model, self._data)
         self._data.qpos[:] = positions
         self._data.qvel[:] = 0.0
 
     def _rest_again(self, states: Float[np.ndarray, "steps size"]) -> None:
-        """Hold the robot still until no body has moved for as long as `settle_block`, or the time for that is over.
+        """Hold the robot still until no body has moved for `settle_block` steps, for at most `settle_steps`.
 
         Args:
-          states: those before, whose last ones count, too.
+          states: the preceding states, whose last ones count, too.
         """
         hold = np.tile(self._data.ctrl, (REST_BLOCK, 1))
         quiet = self._quiet(states)
@@ -176,7 +171,7 @@ class TrialScene(NativeWorld):
         self._data.qvel[:] = 0.0
 
     def _quiet(self, states: Float[np.ndarray, "steps size"]) -> int:
-        """In how many of the last states all bodies were at rest."""
+        """For how many states up to the last all bodies have been at rest."""
         limit = self.config.rest_speed * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
         if not len(states):
             return 0
@@ -186,7 +181,7 @@ class TrialScene(NativeWorld):
         return len(states) - 1 - int(moves[-1]) if len(moves) else len(states)
 
     def _harm_is_certain(self, kind: Kind) -> bool:
-        """Whether something has left the board, or a target that stood and is not to be taken out cannot but fall."""
+        """Whether a body has left the board, or a target that stood, and is not being retrieved, is bound to fall."""
         deep = self._data.qpos[ROBOT:].reshape(BODIES, 7)[:, 2] < self.shelf.board - BELOW
         if (deep & self._there & ~self._gone).any():
             return True
@@ -196,7 +191,7 @@ class TrialScene(NativeWorld):
         return bool(abs(up) < math.cos(TIPPED))
 
     def _fails_for_certain(self, states: Float[np.ndarray, "steps size"], reference: Reference) -> bool:
-        """Whether an attempt to take the target out cannot succeed any more."""
+        """Whether a retrieval cannot succeed any more."""
         if self._tracking_error(states, reference) > self.config.tracking_bound:
             return True
         return len(states) > int(reference.closed) and bool((self._data.qpos[ARM:ROBOT] < EMPTY).all())

@@ -1,8 +1,8 @@
 """The MuJoCo model: a Panda in front of a shelf with eight object slots and the target (docs/method.md,
 "The simulator").
 
-One MJCF serves every scenario. Each slot is a free body with a geometry of every shape; those that are not in use are
-shrunk into the inside of the one that is, and an unused slot is parked in front of the shelf as a weightless
+One MJCF serves every scenario. Each slot is a free body with a geometry of every shape; unused geometries are shrunk
+into the inside of the used one, and an unused slot is parked in front of the shelf as a weightless body of a
 millimetre. Sizes, masses and inertias are set per world, on a copy of the compiled model.
 """
 
@@ -29,7 +29,7 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body
 from mechsearch_jax.workspace.shelf import Shelf
 
-# Torsional friction of a rubber pad of about 18 x 18 mm that is pressed evenly: two thirds of its mean radius [m].
+# Torsional friction of an evenly pressed rubber pad of about 18 x 18 mm: two thirds of its mean radius [m].
 FINGER_TORSION = 0.006
 FINGER_FRICTION = 1.0
 
@@ -40,13 +40,13 @@ ARM_FORCE = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 FINGER_STIFFNESS, FINGER_VELOCITY_GAIN, FINGER_FORCE = 1000.0, 40.0, 70.0
 FINGER_TRAVEL = 0.04
 
-# Contacts are found, and push, at MARGIN from either geometry, which is that much smaller than what it stands for:
-# resting things touch where they should, yet what collision detection sees is always a little apart.
+# Geometries are smaller than the bodies by MARGIN, and contacts act at that distance from them: resting bodies touch at
+# their true surfaces, yet collision detection always sees them a little apart.
 MARGIN = 5e-4
-# Keeps tall cylinders from rolling on their rim for ever [N m s, N s/m]; too little to be noticed otherwise.
+# Keeps tall cylinders from rolling on their rim for ever [N m s, N s/m]; otherwise negligible.
 BODY_DAMPING = 2e-3
 TINY = 1e-3
-# What an empty slot weighs [kg], and its moments of inertia [kg m2].
+# Mass of an empty slot [kg], and its moments of inertia [kg m2].
 EMPTY_MASS, EMPTY_INERTIA = 1e-3, 1e-6
 OBJECT_BIT, ROBOT_BIT = 1, 2
 
@@ -99,7 +99,7 @@ def _add_defaults(root: ElementTree.Element) -> None:
     default = _element(root, "default")
     _element(default, "geom", condim="4", margin=_text(MARGIN))
     robot = _element(default, "default", class_="robot")
-    # The robot's own contact parameters count, stiffer than the default: a soft grip lets what it holds creep and turn.
+    # The robot's contact parameters take priority, stiffer than the default: in a soft grip objects creep and turn.
     _element(
         robot,
         "geom",
@@ -112,7 +112,7 @@ def _add_defaults(root: ElementTree.Element) -> None:
     )
     objects = _element(default, "default", class_="object")
     _element(objects, "geom", contype=str(OBJECT_BIT), conaffinity=str(OBJECT_BIT), size=_text(*[TINY] * 3), group="0")
-    # Friction of a contact is the larger of the two: what touches the planes brings its own.
+    # The friction of a contact is the larger of the two, here that of the body on the plane.
     planes = _element(default, "default", class_="plane")
     _element(planes, "geom", type="plane", contype="0", conaffinity=str(OBJECT_BIT), friction="0 0 0", group="4")
     boards = _element(default, "default", class_="board")
@@ -139,7 +139,7 @@ def _add_shelf(world: ElementTree.Element, shelf: Shelf) -> None:
         )
     for name, (low, high) in shelf_boxes(shelf).items():
         centre, half = (high + low) / 2, (high - low) / 2
-        # What is carried in front of the shelf may be higher than the upper board, which therefore is no plane.
+        # Carried objects may be above the upper board in front of the shelf, which therefore is a box, not a plane.
         meets = {"conaffinity": str(ROBOT_BIT | OBJECT_BIT)} if name == "ceiling" else {}
         _element(world, "geom", class_="board", name=f"{name}_box", pos=_text(*centre), size=_text(*half), **meets)
 
@@ -217,18 +217,17 @@ def _add_bodies(world: ElementTree.Element) -> None:
 
 
 def geometry_name(shape: Shape, slot: int) -> str:
-    """What the geometry of a shape in a slot is called."""
+    """The name of the geometry of a shape in a slot."""
     return f"{shape.name}{slot}"
 
 
 def parking_place(slot: int) -> tuple[float, float, float]:
-    """Where an unused slot waits: far in front of the shelf, on the free side of all of its infinite planes."""
+    """The position of an unused slot: far in front of the shelf, on the free side of all its infinite planes [m]."""
     return (-2.0, 0.02 * slot, 0.6)
 
 
 def shelf_corners(shelf: Shelf) -> dict[str, tuple[tuple[Any, Any, Any], tuple[Any, Any, Any]]]:
-    """The shelf's boards as axis-aligned boxes: their lower and upper corners in the world [m]; the shelf may be
-    traced."""
+    """Lower and upper corners of the shelf's boards, axis-aligned boxes in the world [m]; the shelf may be traced."""
     t = shelf.thickness
     low, high = (shelf.front, shelf.right - t), (shelf.back + t, shelf.left + t)
     return {
@@ -241,7 +240,7 @@ def shelf_corners(shelf: Shelf) -> dict[str, tuple[tuple[Any, Any, Any], tuple[A
 
 
 def shelf_boxes(shelf: Shelf) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """`shelf_corners` as arrays of the host."""
+    """`shelf_corners` as NumPy arrays."""
     return {name: (np.array(low), np.array(high)) for name, (low, high) in shelf_corners(shelf).items()}
 
 
@@ -265,7 +264,7 @@ def panda_shelf_mjcf(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> s
         iterations="100",
         ls_iterations="50",
     )
-    # Bounding volumes inside a body are not kept up to date when its sizes are set per world.
+    # Bounding volumes inside a body are not updated when its sizes are set per world.
     _element(option, "flag", midphase="disable")
     _element(_element(root, "visual"), "map", znear="0.01")
     _add_defaults(root)
@@ -289,8 +288,7 @@ def panda_shelf_mjcf(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> s
 def compile_model(shelf: Shelf, camera: Camera, timestep: float = 0.004) -> mujoco.MjModel:
     """The compiled `panda_shelf_mjcf`.
 
-    From then on MuJoCo, in this process, writes no MUJOCO_LOG.TXT into the folder that it was started in: what goes
-    wrong in a simulation, its outcome tells.
+    Stops MuJoCo in this process from writing MUJOCO_LOG.TXT into the working folder: outcomes report what goes wrong.
     """
     log = mujoco.MjLogConfig.get()
     log.logto_file = False
@@ -323,19 +321,19 @@ def mass_and_inertia(body: Body) -> tuple[float, Float[np.ndarray, " 3"]]:
 def with_bodies(
     model: mujoco.MjModel, bodies: Sequence[Body | None], skin: float = MARGIN, mass: float = 1.0
 ) -> mujoco.MjModel:
-    """A copy of the model whose slots have the shapes and masses of `bodies`; poses are part of the state, not of it.
+    """A copy of the model whose slots have the shapes and masses of `bodies`; poses belong to the state.
 
     Args:
       model: the compiled model.
       bodies: one for each slot, the target last; None leaves a slot empty.
       skin: how much smaller the contact geometry is than the bodies [m]; 0 for pictures.
-      mass: of the bodies, as a multiple of what it is.
+      mass: factor on the bodies' masses and inertias.
     """
     model = copy.copy(model)
     for i, body in enumerate(bodies):
         index = model.body(f"body{i}").id
-        own, inertia = mass_and_inertia(body) if body else (EMPTY_MASS, np.full(3, EMPTY_INERTIA))
-        model.body_mass[index], model.body_inertia[index] = mass * own, mass * inertia
+        body_mass, inertia = mass_and_inertia(body) if body else (EMPTY_MASS, np.full(3, EMPTY_INERTIA))
+        model.body_mass[index], model.body_inertia[index] = mass * body_mass, mass * inertia
         model.body_gravcomp[index] = 0.0 if body else 1.0
         for shape in in_order():
             used = body is not None and body.shape == shape.name
@@ -349,7 +347,7 @@ def with_bodies(
 
 
 def initial_state(model: mujoco.MjModel, bodies: Sequence[Body | None]) -> mujoco.MjData:
-    """The robot at home with closed fingers and the bodies where they say they are, all at rest."""
+    """The robot at home with closed fingers and the bodies at their poses, all at rest."""
     data = mujoco.MjData(model)
     for i, angle in enumerate(HOME):
         data.joint(f"joint{i + 1}").qpos[0] = angle

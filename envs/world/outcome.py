@@ -1,4 +1,4 @@
-"""What became of an action, as every simulator tells it."""
+"""Outcome of an action, the same for every simulator."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ import jax.numpy as jnp
 class Failure(enum.IntEnum):
     """Why an action was not executed as commanded.
 
-    `UNREACHABLE`: the arm cannot follow the motion; nothing moved. `DROPPED`: the object slipped out of the hand on
-    its way. `UNSTABLE`: the simulation diverged; the world is as before. `UNKNOWN`: there is no such kind of action;
-    nothing moved. `HELD_UP`: something was in the arm's way, so that a joint was farther from its reference than
-    `SimulatorConfig.tracking_bound`. In any other case the world is as it became.
+    `UNKNOWN`: there is no such kind of action; nothing moved. `UNREACHABLE`: the arm cannot follow the motion; nothing
+    moved. `UNSTABLE`: the simulation diverged; the world is as before. `HELD_UP`: something was in the arm's way, so
+    that a joint was farther from its reference than `SimulatorConfig.tracking_bound`. `DROPPED`: the object slipped out
+    of the hand on its way. After the last two the world is as the action left it.
 
-    Of an action that takes the target out: `MISSED`: the target is not between the closed fingers. `INSIDE`: it is, but
-    not outside the shelf. `FALLEN`: some body fell off the board meanwhile.
+    Retrievals only: `MISSED`: the target is not between the closed fingers. `INSIDE`: it is, but not outside the shelf.
+    `FALLEN`: a body fell off the board meanwhile.
 
-    Where several apply, the first of `UNKNOWN`, `UNREACHABLE`, `UNSTABLE`, `HELD_UP`, `DROPPED`, `MISSED`, `INSIDE`,
-    `FALLEN` is told.
+    If several apply, the failure is the first in this order.
     """
 
     NONE = 0
@@ -36,18 +35,18 @@ class Failure(enum.IntEnum):
 
     @property
     def text(self) -> str | None:
-        """What records say of it; None for `NONE`."""
+        """The failure in words, for records; None for `NONE`."""
         if self is Failure.NONE:
             return None
         return "the arm was held up" if self is Failure.HELD_UP else self.name.lower()
 
 
 class Overflow(enum.IntFlag):
-    """What was too small for a world's contacts while it was simulated; its result cannot be trusted then.
+    """The buffers that overflowed with a world's contacts during simulation; its result cannot be trusted then.
 
-    `ROWS` (more constraint rows than `njmax`) and `SHAPES` (a buffer of the convex collision) are a world's own.
-    `CONTACTS` is the buffer that all worlds share: which of them lost contacts is not known, so that every world which
-    was running at that moment is marked.
+    `ROWS` (more constraint rows than `njmax`) and `SHAPES` (a buffer of the convex collision) concern a single world.
+    `CONTACTS` is the buffer that all worlds share: as it is unknown which world lost contacts, every world that was
+    running at that moment is marked.
     """
 
     NONE = 0
@@ -57,19 +56,19 @@ class Overflow(enum.IntFlag):
 
 
 class Outcome(flax.struct.PyTreeNode):
-    """What an action did, with any leading axes, for example one for the worlds.
+    """Outcome of an action, with any leading axes, for example one for the worlds.
 
     Attributes:
       failure: a `Failure`, int32.
-      steps: simulated time steps, int32; 0 where nothing was to be done, or it was out of reach.
-      settled: whether everything came to rest in the time that there is for it; what did not was stopped as it moved.
-      fallen: which bodies are off the board, since then or before, the target last, shape (..., 9); never a target in
-        the hand.
-      held: after a retrieval, whether the target is between the closed fingers; False after anything else.
-      outside: after a retrieval, whether the target is outside the shelf; False after anything else.
+      steps: simulated time steps, int32; 0 if the action was out of reach or none.
+      settled: whether everything came to rest within `SimulatorConfig.settle_steps`; what had not was stopped.
+      fallen: which bodies are off the board, since this action or before, the target last, shape (..., 9); never a
+        target in the hand.
+      held: after a retrieval, whether the target is between the closed fingers; else False.
+      outside: after a retrieval, whether the target is outside the shelf; else False.
       retrieved: whether a retrieval took the target out and no body fell off the board meanwhile.
       overflow: flags of `Overflow`, int32; always 0 in the native simulator.
-      tracking_error: how far the joint that was farthest from its reference was from it [rad]; 0 where nothing moved.
+      tracking_error: largest distance of a joint from its reference [rad]; 0 if nothing moved.
     """
 
     failure: jax.Array
@@ -84,10 +83,10 @@ class Outcome(flax.struct.PyTreeNode):
 
     @property
     def took_place(self) -> jax.Array:
-        """Whether the world is what the action made of it; False where a failure left or put everything as it was."""
+        """Whether the action changed the world; False if a failure left it, or restored it, as it was."""
         undone = (Failure.UNREACHABLE, Failure.UNKNOWN, Failure.UNSTABLE)
         return jnp.all(jnp.stack([self.failure != int(code) for code in undone]), axis=0)
 
     def reason(self, i: int | tuple[int, ...] = ()) -> str | None:
-        """Why the action failed, in a few words, or None; of a batch, that at index `i`."""
+        """Why the action failed, in a few words, or None; `i` indexes a batch."""
         return Failure(int(self.failure[i])).text

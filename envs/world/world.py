@@ -23,7 +23,7 @@ MAX_TILT = math.radians(15)
 
 
 def fallen_over(rotation: Float[np.ndarray, "3 3"]) -> bool:
-    """Whether a target with this `R_world_target` no longer stands."""
+    """Whether a target with this `R_world_target` has fallen over."""
     return bool(abs(rotation[2, 2]) < math.cos(MAX_TILT))
 
 
@@ -46,7 +46,7 @@ class World(flax.struct.PyTreeNode):
 
 
 def slots(scenario: Scenario) -> list[Body | None]:
-    """The scenario's bodies in the order of a `World`'s slots, None where a slot is empty.
+    """The scenario's bodies in the order of a `World`'s slots; None for an empty slot.
 
     Raises:
       InputError: there are more objects than slots.
@@ -58,7 +58,7 @@ def slots(scenario: Scenario) -> list[Body | None]:
 
 
 def from_scenario(scenario: Scenario) -> World:
-    """The world as a scenario describes it.
+    """The world of a scenario.
 
     Raises:
       InputError: there are more objects than slots.
@@ -76,7 +76,7 @@ def from_scenario(scenario: Scenario) -> World:
 
 
 def bodies_of(world: World) -> list[Body | None]:
-    """The bodies in a world's slots, None where a slot is empty.
+    """The bodies in a world's slots; None for an empty slot.
 
     Args:
       world: fields without further leading axes.
@@ -96,12 +96,12 @@ def bodies_of(world: World) -> list[Body | None]:
 
 
 def superquadrics(world: World) -> Superquadrics:
-    """All bodies, the target last, as a recogniser that knows the truth would report them."""
+    """The true superquadrics of all bodies, the target last."""
     exponents = jnp.array([shape.exponents for shape in in_order()])
     return Superquadrics(world.half_size, exponents[world.kind], world.position, world.rotation, world.valid)
 
 
 def true_superquadrics(world: World) -> Superquadrics:
-    """The surrounding objects, without the target, as a recogniser that knows the truth would report them."""
+    """The true superquadrics of the objects, without the target."""
     lead = world.valid.ndim - 1
     return superquadrics(jax.tree.map(lambda leaf: leaf[(slice(None),) * lead + (slice(TARGET),)], world))

@@ -141,8 +141,8 @@ def train_push(
     check_writable(out)
     folder = data or out / "pushes"
     check_writable(folder)
-    with counting("pushes", pushes) as count:
-        task = push_task(generation, folder, PushConfig(**dataclasses.asdict(network)), count)
+    with counting("pushes", pushes) as on_progress:
+        task = push_task(generation, folder, PushConfig(**dataclasses.asdict(network)), on_progress)
     run(task, config, out)
 
 

@@ -110,13 +110,13 @@ def bench_ceiling(
     with console.status("searching") as status:
         for scene in scenes:
 
-            def told(number: int, best: Node, scene=scene) -> None:
+            def on_round(number: int, best: Node, scene=scene) -> None:
                 line = f"{len(rows)}/{len(scenes)} {scene.name}: round {number}, {_nearest(best)}"
                 status.update(line)
                 if not console.is_terminal:
                     console.print(line, soft_wrap=True)
 
-            rows.append(ceiling.row(scene, outcomes, told))
+            rows.append(ceiling.row(scene, outcomes, on_round))
     solvability.save_ceiling(rows, ceiling.settings, _command(), out / "ceiling.json")
     console.print(ceiling_table(rows))
 

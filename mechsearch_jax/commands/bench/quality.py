@@ -64,10 +64,11 @@ def bench_agreement(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.parts.agreement import agreement, draw_actions, generated_scenes, save_agreement
+    from mechsearch_jax.benchmarks.parts.agreement import agreement, draw_actions, generated_scenes
     from mechsearch_jax.benchmarks.report.tables import agreement_table
     from mechsearch_jax.envs.simulators.mjx_model import import_mjx
     from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import save_json
 
     at_least_one("bench agreement", actions=actions, scenes=scenes)
     given = _loaded(scenarios)
@@ -80,10 +81,10 @@ def bench_agreement(
         status.update("drawing actions")
         cases = draw_actions(where, actions, seed)
         status.update("executing actions")
-        found = agreement(cases)
-    console.print(agreement_table(found))
+        result = agreement(cases)
+    console.print(agreement_table(result))
     if out is not None:
-        save_agreement(found, out)
+        save_json(result.value(), out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,7 +182,8 @@ def _measured(
     benches: Mapping[str, Bench], places: Mapping[str, Workcell], status: Status, out: Path | None
 ) -> Measured:
     """Measure in each place, and write what is measured after each: one takes minutes."""
-    from mechsearch_jax.benchmarks.parts.recognition import joined, save_recognition
+    from mechsearch_jax.benchmarks.parts.images import save_rows
+    from mechsearch_jax.benchmarks.parts.recognition import joined
 
     parts: dict[str, Measured] = {}
     for name, bench in benches.items():
@@ -189,7 +191,8 @@ def _measured(
         status.update(f"{name}: compiling")
         parts[name] = bench.run(lambda done, name=name, total=total: status.update(f"{name}: {done}/{total}"))
         if out is not None:
-            save_recognition(joined(parts, places), out)
+            measured = joined(parts, places)
+            save_rows(measured.value(), measured.rows, out)
     return joined(parts, places)
 
 
@@ -251,7 +254,7 @@ def bench_segmentation(
         status.update("compiling")
         measured = bench.run(lambda done: status.update(f"segmenting {done}/{total}"))
         if out is not None:
-            segmentation.save_segmentation(measured, out)
+            images.save_rows(measured.value(), measured.rows, out)
         if picture is not None:
             status.update("drawing")
             save_figure(segmentation.worst_figure(bench, measured.rows, worst), picture)
@@ -289,7 +292,7 @@ def bench_push(
     from mechsearch_jax.benchmarks.parts import push
     from mechsearch_jax.benchmarks.report.tables import push_scores_tables
     from mechsearch_jax.problem.cache import keep_compilations
-    from mechsearch_jax.runtime.files import check_writable
+    from mechsearch_jax.runtime.files import check_writable, save_json
     from mechsearch_jax.train.run import counting
 
     worlds = (64 if jax.default_backend() == "cpu" else 512) if worlds is None else worlds
@@ -300,14 +303,14 @@ def bench_push(
     keep_compilations()
     with contextlib.ExitStack() as stack:
         folder = data or Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        with counting("pushes", pushes) as told:
-            made = bench.pushes(folder, told)
+        with counting("pushes", pushes) as on_progress:
+            made = bench.pushes(folder, on_progress)
     console = Console(highlight=False)
     with console.status("predicting") as status:
         total = len(made.object)
         measured = bench.run(made, lambda name, done: status.update(f"{name}: {done}/{total}"))
         if out is not None:
-            push.save_push_scores(measured, out)
+            save_json(measured.value(), out)
     console.print(push_scores_tables(measured))
 
 

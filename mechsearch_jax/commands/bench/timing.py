@@ -32,8 +32,8 @@ def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing])
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.parts.bench import save_timing
     from mechsearch_jax.benchmarks.report.tables import timing_table
+    from mechsearch_jax.runtime.files import save_json
 
     check_files(out)
     forget_kept_compilations()
@@ -42,7 +42,7 @@ def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing])
         timing = measure()
     console.print(timing_table(timing))
     if out is not None:
-        save_timing(timing, out)
+        save_json(timing.value(), out)
 
 
 def _timing_of(subject: Literal["existence", "graspability"], what: str) -> Callable[..., None]:
@@ -161,9 +161,9 @@ def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, ou
       repeats: number of timed calls.
       out: JSON file for the result.
     """
-    from mechsearch_jax.benchmarks.parts import bench as benches
+    from mechsearch_jax.benchmarks.parts.simulation import bench_simulate as timed
 
-    _print_timing("simulate", out, lambda: benches.bench_simulate(worlds, steps, repeats))
+    _print_timing("simulate", out, lambda: timed(worlds, steps, repeats))
 
 
 COMMANDS = {
