@@ -4,8 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from mechsearch_jax.envs.episode.episodes import Start, run_episode, run_episodes, target_of
+from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
 from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.pool import Listeners, RunSettings, Start
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.planner import search_for_grasp
@@ -87,9 +88,8 @@ def test_the_batch_simulator_takes_the_target_out_by_the_default(problem):
         method.policy(),
         MjxSimulator(),
         2,
-        episodes.update,
-        options=method.options(),
-        trials=trials,
+        Listeners(episodes.update),
+        RunSettings(options=method.options(), trials=trials),
     )
     assert sorted(episodes) == [0, 1]
     for episode in episodes.values():
