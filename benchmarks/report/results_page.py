@@ -121,6 +121,7 @@ def paper_rates(episodes: Sequence[Episode]) -> str:
     for count in COUNTS:
         chosen = with_objects(episodes, count)
         figures = paper_figures(TABLES["table1"], "oracle", METHODS[1], BOTH, count)
+        assert figures is not None
         ours = [share(reached(chosen, key)) for key in ("found_step", "graspable_step", "retrieved")]
         lines.append([count, len(chosen), *ours, f"{figures.find:.2f}", f"{figures.grasp:.2f}"])
     header = ["objects", "episodes", "found", "graspable", "retrieved", "the paper: found", "the paper: graspable"]

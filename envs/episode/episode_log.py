@@ -130,7 +130,7 @@ def record(
     verdict: Verdict,
     choice: Choice | None,
     truth_possible: bool | None = None,
-    restarts: int | None = None,
+    restarts: int = 0,
 ) -> Step:
     """The record of a step when it is decided; its results are filled in later.
 

@@ -17,7 +17,7 @@ from mechsearch_jax.belief.belief import without_grasps
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, sight_of
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.episode.policy_numbers import as_pytree, mould, numbers, with_numbers
-from mechsearch_jax.envs.episode.slots import Knowledge, knowledge_of, possible_poses_of, swept_free_of
+from mechsearch_jax.envs.episode.slots import BeliefSummary, sizes_and_truths, summary, swept_free_of
 from mechsearch_jax.envs.episode.verdicts import Verdict, graspable_many, judge_many, judged_sets
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
@@ -132,7 +132,7 @@ class ManySlots:
             *(Program("small ones", lambda: False, functools.partial(choosing, call)) for call in calls),
             program("look", _look, problem, state, world, keys, rows, self._recogniser, self._sight),
             program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
-            program("small ones", possible_poses_of, problem.poses, state.belief.exists, world),
+            program("small ones", sizes_and_truths, problem.poses, state.belief.exists, world),
             program("small ones", _forget, problem, state, fresh),
             program("small ones", _note, state, done, rows),
             program("small ones", _some_worlds, world, rows),
@@ -154,11 +154,11 @@ class ManySlots:
             self._policies[id(policy)] = policy, numbers(as_pytree(policy))
         return self._policies[id(policy)][1]
 
-    def look(self, world: World, keys: Array, rows: Sequence[int]) -> Knowledge:
+    def look(self, world: World, keys: Array, rows: Sequence[int]) -> BeliefSummary:
         """See `Slots`."""
         for _, padded in self._chunks(rows):
             self._state = _look(self._problem, self._state, world, keys, padded, self._recogniser, self._sight)
-        return knowledge_of(self._problem, self._state.belief, world)
+        return summary(self._problem, self._state.belief, world)
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`.

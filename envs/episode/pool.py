@@ -185,8 +185,8 @@ class EpisodePool:
         for r, log in logs.items():
             # Where an object has left the board, an episode goes on for what else is to be known of it, no further.
             verdict = verdicts.get(r, Verdict())
-            if log.spoilt and (verdict.graspable or (r in choices and takes_target(choices[r]))):
-                trouble.setdefault(r, log.spoilt)
+            if log.irretrievable and (verdict.graspable or (r in choices and takes_target(choices[r]))):
+                trouble.setdefault(r, log.irretrievable)
             choice = None if r in trouble else choices.get(r)
             size = 1 if found[r] else int(knowledge.size[r])
             truth = None if found[r] or r in lost else bool(knowledge.truth[r])
