@@ -16,7 +16,8 @@ from pathlib import Path
 # JAX is first imported; a jaxlib that does not know a flag aborts, so it is asked first. `XLA_FLAGS=""` leaves all as
 # it is for users.
 QUICK = (
-    "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+    "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
+    "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling,xla_cpu_disable_slp_vectorizer"
 )
 # There is a process for each core; threads of linear algebra beside it only wait for each other. The processes that are
 # started from here read this as they import NumPy.

@@ -57,16 +57,34 @@ def test_the_sign_test_is_a_sum_over_coin_tosses():
     [(0, 0, False), (5, 0, False), (6, 0, True), (6, 6, False), (9, 2, False), (10, 2, True), (0, 12, False)],
 )
 def test_losses_are_significant_and_noise_is_not(losses, gains, lost):
-    graspable, retrieved = compare(outcomes(BEFORE), outcomes(changed(BEFORE, losses, gains)))
+    graspable, retrieved, actions = compare(outcomes(BEFORE), outcomes(changed(BEFORE, losses, gains)))
     assert (retrieved.measure, retrieved.pairs, retrieved.before) == ("retrieved", 80, 68)
     assert (retrieved.losses, retrieved.gains, retrieved.now) == (losses, gains, 68 - losses + gains)
     assert retrieved.lost is graspable.lost is lost
+    # A target that is not retrieved took longer, and one that is took less.
+    assert (actions.losses, actions.gains) == (losses, gains)
+
+
+def test_the_levels_add_up_to_the_chance_of_a_false_alarm():
+    assert sum(measure.alpha for measure in guard.MEASURES.values()) == pytest.approx(guard.ALPHA)
 
 
 def test_a_measure_is_lost_alone():
     now = [dataclasses.replace(one, graspable=True) for one in outcomes(changed(BEFORE, 6, 0))]
-    graspable, retrieved = compare(outcomes(BEFORE), now)
+    graspable, retrieved, _ = compare(outcomes(BEFORE), now)
     assert (graspable.losses, graspable.gains, graspable.lost, retrieved.lost) == (0, 12, False, True)
+
+
+@pytest.mark.parametrize(("longer", "shorter", "lost"), [(6, 0, False), (7, 0, True), (14, 5, False), (14, 3, True)])
+def test_retrievals_that_take_longer_are_a_loss(longer, shorter, lost):
+    changes = [2] * longer + [-1] * shorter + [0] * (len(BEFORE) - longer - shorter)
+    pairs = zip(outcomes(BEFORE), changes, strict=True)
+    now = [dataclasses.replace(outcome, steps=outcome.steps + change) for outcome, change in pairs]
+    graspable, retrieved, actions = compare(outcomes(BEFORE), now)
+    assert (actions.gains, actions.losses, actions.lost) == (shorter, longer, lost)
+    assert actions.now - actions.before == 2 * longer - shorter
+    assert not graspable.lost
+    assert not retrieved.lost
 
 
 def test_pairs_are_of_the_same_scene_and_seed():
@@ -90,7 +108,7 @@ def test_power_is_that_of_all_possible_changes():
             total += ways * gain**gains * lose**losses * (1 - gain - lose) ** same
     assert power(pairs, loss, flips, alpha) == pytest.approx(total)
     for scenes in guard.SUITES:
-        assert power(scenes, 0.0) <= guard.ALPHA / 2
+        assert power(scenes, 0.0) <= guard.MEASURES["retrieved"].alpha
         assert power(scenes, detectable(scenes)) >= guard.POWER > power(scenes, detectable(scenes) - 0.005)
 
 
@@ -147,7 +165,7 @@ def test_a_reference_in_which_a_retrieval_counts_as_graspable_says_so(run, capsy
     run.reference.write_text(json.dumps(stored))
     before = guard.read_reference(run.reference).outcomes
     assert [one.graspable for one in before] == [None if flag else False for flag in BEFORE]
-    assert [one.measure for one in compare(before, outcomes(BEFORE))] == ["retrieved"]
+    assert [one.measure for one in compare(before, outcomes(BEFORE))] == ["retrieved", "actions"]
     run(BEFORE)
     printed = " ".join(capsys.readouterr().out.split())
     assert "graspable: not compared, since in the reference a retrieval counts as graspable, too" in printed

@@ -28,11 +28,26 @@ REFERENCE = Path(__file__).parents[1] / "results" / "guard-cpu.json"
 # Number of scenes with each number of objects, from the set `development`, by the size of the suite.
 SUITES: Mapping[int, int] = {40: 10, 80: 20, 160: 40}
 SEED = 0
-# The compared measures, and the probability of a false alarm in all, which is divided between them.
-MEASURES = ("graspable", "retrieved")
+
+
+class Measure(NamedTuple):
+    """How a measure is tested: at what significance level, and whether more (1) or less (-1) of it is better."""
+
+    alpha: float
+    sign: int
+
+
+# Attributes of `Outcome`. The levels add up to the probability of a false alarm in all.
+MEASURES: Mapping[str, Measure] = {
+    "graspable": Measure(0.02, 1),
+    "retrieved": Measure(0.02, 1),
+    "actions": Measure(0.01, -1),
+}
 ALPHA = 0.05
-# Share of episodes whose verdict changes with the seed: published scenes, `standard`, retrieved
-# (benchmarks/results/motion-h200.json, P: 0.10 to 0.13). Any change of the random numbers does the same.
+# Actions of an episode without a retrieval: one more than any with it has, ten and the retrieval.
+NOT_RETRIEVED = 12
+# Share of episodes that end otherwise with another seed: published scenes, `standard`, retrieved
+# (benchmarks/results/motion-h200.json, P: 0.10 to 0.13). A change of random numbers alone does the same.
 FLIPS = 0.12
 POWER = 0.8
 
@@ -73,6 +88,11 @@ class Outcome:
         )
 
     @property
+    def actions(self) -> int:
+        """Number of actions up to the retrieval, or `NOT_RETRIEVED`."""
+        return self.steps if self.retrieved else NOT_RETRIEVED
+
+    @property
     def episode(self) -> tuple[str, int]:
         """The key by which stored and new episodes are paired."""
         return self.content_hash, self.seed
@@ -85,8 +105,8 @@ class Comparison:
     Attributes:
       measure: one of `MEASURES`.
       pairs: number of episodes.
-      before, now: number of episodes in which it held before, and holds now.
-      gains, losses: number of episodes in which it holds only now, and held only before.
+      before, now: sums over the episodes: in how many it holds, or the number of actions.
+      gains, losses: number of episodes in which it is better now, and was better before.
       p_value: probability of at least so many losses if gains and losses are equally likely.
       alpha: significance level.
     """
@@ -137,11 +157,11 @@ def compare(before: Sequence[Outcome], now: Sequence[Outcome]) -> list[Compariso
         lacking = f"{missing[0]} as it is here" if missing else "anything"
         raise InputError(f"bench guard: the reference does not hold {lacking}; write a new one with --write")
     changes = []
-    for measure in MEASURES:
+    for measure, (alpha, sign) in MEASURES.items():
         pairs = [(getattr(reference[outcome.episode], measure), getattr(outcome, measure)) for outcome in now]
         if any(None in pair for pair in pairs):
             continue
-        change = PairedDifference.of([b - a for a, b in pairs], [outcome.content_hash for outcome in now])
+        change = PairedDifference.of([sign * (b - a) for a, b in pairs], [outcome.content_hash for outcome in now])
         changes.append(
             Comparison(
                 measure=measure,
@@ -151,13 +171,13 @@ def compare(before: Sequence[Outcome], now: Sequence[Outcome]) -> list[Compariso
                 gains=change.gains,
                 losses=change.losses,
                 p_value=sign_test(change.gains, change.losses),
-                alpha=ALPHA / len(MEASURES),
+                alpha=alpha,
             )
         )
     return changes
 
 
-def power(pairs: int, loss: float, flips: float = FLIPS, alpha: float = ALPHA / len(MEASURES)) -> float:
+def power(pairs: int, loss: float, flips: float = FLIPS, alpha: float = MEASURES["retrieved"].alpha) -> float:
     """The power of the test: the probability that a true loss is significant.
 
     Args:

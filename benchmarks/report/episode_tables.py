@@ -155,11 +155,12 @@ def guard_table(comparisons: Sequence[guard.Comparison], code: str) -> Group:
         cells = (comparison.measure, *map(str, counts), f"{comparison.p_value:.3f}", verdict)
         table.add_row(*cells, style="bold" if comparison.lost else None)
     alone, beside = (100 * guard.detectable(pairs, flips) for flips in (0.0, guard.FLIPS))
+    levels = ", ".join(f"{comparison.alpha:g} ({comparison.measure})" for comparison in comparisons)
     explanation = (
-        f"p: one-sided sign test, significant up to {comparisons[0].alpha:g}, so that a false alarm has a chance of "
-        f"{guard.ALPHA:g} at most. Noticed with a chance of {guard.POWER:g}: a loss of {alone:.1f} points where "
-        f"nothing else changes, of {beside:.1f} where {100 * guard.FLIPS:.0f}% of the episodes end otherwise by "
-        "chance, as with another seed."
+        f"actions: up to the retrieval, or {guard.NOT_RETRIEVED} without one; a gain is fewer. p: one-sided sign test, "
+        f"significant up to {levels}, so that a false alarm has a chance of {guard.ALPHA:g} at most. Noticed with a "
+        f"chance of {guard.POWER:g}: a loss of {alone:.1f} points of a rate where nothing else changes, of "
+        f"{beside:.1f} where {100 * guard.FLIPS:.0f}% of the episodes end otherwise by chance, as with another seed."
     )
     left_out = [name for name in guard.MEASURES if name not in {comparison.measure for comparison in comparisons}]
     why = (
