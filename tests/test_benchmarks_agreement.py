@@ -17,7 +17,7 @@ from mechsearch_jax.benchmarks.parts.agreement import (
     draw_actions,
     pose_differences,
 )
-from mechsearch_jax.benchmarks.report.tables import agreement_table
+from mechsearch_jax.benchmarks.report.console_tables import agreement_table
 from mechsearch_jax.envs.world.world import from_scenario
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, example_scenarios, load_scenario

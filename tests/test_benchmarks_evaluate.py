@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 from scripted import is_gone, one_by_one, run
 
-from mechsearch_jax.benchmarks.report import tables
+from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.benchmarks.report.episode_tables import rates_table
 from mechsearch_jax.benchmarks.running import evaluate as benchmark
 from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs, present_code, shard_of
@@ -259,7 +259,7 @@ def test_a_runner_that_loses_an_episode_is_told_of(tmp_path, files):
 def test_progress_and_rates_are_shown(tmp_path, files):
     screen = io.StringIO()
     console = Console(file=screen, width=100)
-    with tables.EpisodeProgress(console, 3) as progress:
+    with console_tables.EpisodeProgress(console, 3) as progress:
         jobs = make_jobs(files[:3], [Method()], (0,))
         rows = evaluate(jobs, tmp_path / "rows", one_by_one, ended=progress.ended)
     console.print(rates_table(rows))

@@ -14,7 +14,7 @@ from rich.console import Console
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.benchmarks.parts import bench, push
 from mechsearch_jax.benchmarks.parts.push import Bench, Measured, held_out_generation, nudged, repeated
-from mechsearch_jax.benchmarks.report import tables
+from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.envs.pushing import pushes as generator
 from mechsearch_jax.envs.simulators.native import NativeSimulator
@@ -239,7 +239,7 @@ def rows_of(table):
 def test_the_tables_show_every_model_and_the_groups_of_the_best():
     measured = Measured(SCORES, None, {"pushes": 4}, {"device": "cpu: cpu"})
     assert measured.best == "quasi-static"
-    group = tables.push_scores_tables(measured)
+    group = console_tables.push_scores_tables(measured)
     models, distances, objects, _ = group.renderables
     numbers = ["-", "6.00", "0.500", "0.250"]
     assert rows_of(models) == [
@@ -277,7 +277,7 @@ def test_predicting_is_timed(model, drawn, weights, monkeypatch):
     about = (value["versions"].get("weights"), value["shapes"].get("parameters"))
     assert about == ((card["sha256"], card["parameters"]) if model == "learned" else (None, None))
     console = Console(file=io.StringIO(), width=200)
-    console.print(tables.timing_table(timing))
+    console.print(console_tables.timing_table(timing))
     assert "predictions/s" in console.file.getvalue()
     assert f"{1e3 * timing.median / 4:,.3g} ms" in console.file.getvalue()
 

@@ -14,7 +14,7 @@ import pytest
 from mechsearch_jax.benchmarks.parts import images, recognition, recognition_figure, recognition_methods
 from mechsearch_jax.benchmarks.parts.recognition import Bench, Row
 from mechsearch_jax.benchmarks.parts.recognition_methods import Method
-from mechsearch_jax.benchmarks.report import tables
+from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.commands.bench import quality
 from mechsearch_jax.envs.world.world import true_superquadrics
 from mechsearch_jax.images.cloud import shelf_view
@@ -148,8 +148,8 @@ def test_tables_name_every_method_and_fit_a_terminal(measured):
     from rich.console import Console
 
     console = Console(width=80, record=True, file=io.StringIO())
-    console.print(tables.recognition_tables(measured))
-    console.print(tables.recognition_times_table(measured))
+    console.print(console_tables.recognition_tables(measured))
+    console.print(console_tables.recognition_times_table(measured))
     text = console.export_text()
     assert "…" not in text
     for name in METHODS:

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from mechsearch_jax.benchmarks.parts import images, segmentation
 from mechsearch_jax.benchmarks.parts.segmentation import Bench, overlaps
-from mechsearch_jax.benchmarks.report import tables
+from mechsearch_jax.benchmarks.report import console_tables
 from mechsearch_jax.envs.camera.recognisers import true_masks
 from mechsearch_jax.envs.world.world import TARGET
 from mechsearch_jax.runtime.errors import InputError
@@ -73,7 +73,7 @@ def test_results_are_written_with_their_rows(perfect, tmp_path):
 
 def test_the_table_shows_every_group(wrong):
     console = Console(file=io.StringIO(), width=120)
-    console.print(tables.segmentation_tables(wrong.run()))
+    console.print(console_tables.segmentation_tables(wrong.run()))
     text = console.file.getvalue()
     assert "files scenes, clean" in text
     assert "files scenes, gaussian" in text

@@ -10,10 +10,10 @@ import pytest
 from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, idle, push_off, reveal, topple
 
 from mechsearch_jax.actions import no_action
+from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episode_log import Choice, EpisodeLog, Result, distrust, record
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
 from mechsearch_jax.envs.episode.policy_numbers import mould
-from mechsearch_jax.envs.episode.pool import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native import NativeSimulator

@@ -4,9 +4,9 @@ import jax
 import numpy as np
 import pytest
 
+from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.envs.episode.pool import Listeners, RunSettings, Start
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.planner import search_for_grasp

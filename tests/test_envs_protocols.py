@@ -10,9 +10,9 @@ from stage import BOX, CYLINDER, HIDDEN, OPEN, Grab, Stage, push_off, reveal
 
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.envs.camera.snapshot import oracle, true_target_pose
+from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
 from mechsearch_jax.envs.episode.method import Method
-from mechsearch_jax.envs.episode.pool import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.protocols import ALL_FAILED, HIDDEN_AGAIN, OUTSIDE, PROTOCOLS, REACHED
 from mechsearch_jax.envs.episode.verdicts import swept_free
 from mechsearch_jax.envs.world.outcome import Failure

@@ -20,10 +20,10 @@ from mechsearch_jax.envs.camera.snapshot import Snapshot, objects_on_the_board, 
 from mechsearch_jax.envs.episode.many_slots import ManySlots
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.trials import native
+from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
 from mechsearch_jax.envs.trials.order import in_order
-from mechsearch_jax.envs.trials.scene import TrialScene
 from mechsearch_jax.envs.world.outcome import Failure
 from mechsearch_jax.envs.world.world import bodies_of, from_scenario
 from mechsearch_jax.geometry.superquadric import empty

@@ -11,8 +11,8 @@ from stage import HIDDEN, OPEN, SILL, Stage, grab, reveal
 
 from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.episode import verdicts
+from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
-from mechsearch_jax.envs.episode.pool import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.verdicts import Verdict, judge, paper_grasps
 from mechsearch_jax.envs.recording.narration import verdict
 from mechsearch_jax.envs.world.world import from_scenario

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from mechsearch_jax.benchmarks.ceiling import solvability
 from mechsearch_jax.benchmarks.guard import guard
-from mechsearch_jax.benchmarks.report.tables import plain_table
+from mechsearch_jax.benchmarks.report.console_tables import plain_table
 from mechsearch_jax.benchmarks.statistics.paired import VariantDifferences
 from mechsearch_jax.benchmarks.statistics.rates import EVENTS, GOALS, Events, Rates, summarise, summarise_events
 from mechsearch_jax.benchmarks.statistics.variants import MOST_IN_FULL, VARIANT, Key

@@ -7,17 +7,17 @@ import dataclasses
 import functools
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-from typing import get_args
 
 import jax
 
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.camera.recognisers import recogniser
+from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episodes, target_of
-from mechsearch_jax.envs.episode.method import EngineName, Method
-from mechsearch_jax.envs.episode.pool import Listeners, RunSettings, Start
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import Episode
+from mechsearch_jax.envs.simulators.named import EngineName, new_simulator
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.envs.trials.native import NativeTrials
@@ -37,23 +37,6 @@ SHARE_OF_WORLDS = 0.4
 MOST_FAILURES = 8
 # How many slots look or decide in one computation.
 AT_ONCE, AT_ONCE_ON_CPU = 64, 4
-
-
-def new_simulator(engine: EngineName, workcell: Workcell) -> Simulator:
-    """A simulator of a workcell by an engine; MJX takes long to import and is not always installed.
-
-    Raises:
-      InputError: it is unknown, or cannot be imported.
-    """
-    if engine not in get_args(EngineName):
-        raise InputError(f'simulator "{engine}" is unknown; use {" or ".join(get_args(EngineName))}')
-    if engine == "NativeSimulator":
-        from mechsearch_jax.envs.simulators.native import NativeSimulator
-
-        return NativeSimulator(shelf=workcell.shelf, camera=workcell.camera)
-    from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
-
-    return MjxSimulator(workcell.shelf, workcell.camera)
 
 
 @dataclasses.dataclass(frozen=True)

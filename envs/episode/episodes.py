@@ -23,10 +23,10 @@ import jax
 import numpy as np
 
 from mechsearch_jax.envs.camera.snapshot import Recogniser, oracle
+from mechsearch_jax.envs.episode.closed_loop import STRICT, EpisodePool, Listeners, RunSettings, Start, keys_at
 from mechsearch_jax.envs.episode.compile_clock import CompileClock
 from mechsearch_jax.envs.episode.many_slots import ManySlots
 from mechsearch_jax.envs.episode.moments import Watcher
-from mechsearch_jax.envs.episode.pool import STRICT, EpisodePool, Listeners, RunSettings, Start, keys_at
 from mechsearch_jax.envs.episode.protocols import EpisodeProtocol
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.episode.slots import OneSlot, Slots

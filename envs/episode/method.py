@@ -5,20 +5,20 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 from mechsearch_jax.actions.registry import check_kinds
 from mechsearch_jax.envs.camera.recognisers import RecognitionName, recogniser
 from mechsearch_jax.envs.episode.policy_numbers import mould
 from mechsearch_jax.envs.episode.protocols import PROTOCOLS, EpisodeProtocol, ProtocolName
 from mechsearch_jax.envs.pushing.push_models import push_models
+from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.envs.trials.named import rehearsal
 from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.errors import InputError
 
-EngineName = Literal["NativeSimulator", "MjxSimulator"]
 # What the options of an episode hold beside the configuration's.
 _OF_EPISODES = frozenset(("policy", "recognition", "protocol", "simulator", "target", "seed"))
 

@@ -137,10 +137,13 @@ def _generate(layout: str, target: str) -> Callable[[int, int, str], Scenario]:
     from mechsearch_jax.workspace.target import Target
 
     config = GeneratorConfig(visible=FOUND_PIXELS, anywhere=True)
-    if layout == "line":
-        line = LineGenerator(checks=config)
-        return lambda seed, objects, name: line.generate(seed, name)
-    return ScenarioGenerator(Target.of(target), config=config).generate
+    match layout:
+        case "clutter":
+            return ScenarioGenerator(Target.of(target), config=config).generate
+        case "line":
+            line = LineGenerator(checks=config)
+            return lambda seed, objects, name: line.generate(seed, name)
+    raise InputError(f'layout "{layout}" is unknown; use clutter or line')
 
 
 def make_scene(block: Block, index: int) -> Scenario:

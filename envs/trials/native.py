@@ -27,8 +27,8 @@ from mechsearch_jax.actions.trajectory import reference_motion
 from mechsearch_jax.envs.pushing.physics_push import bodies
 from mechsearch_jax.envs.pushing.push_rollouts import sound
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
+from mechsearch_jax.envs.trials.attempt import TrialScene
 from mechsearch_jax.envs.trials.order import in_order
-from mechsearch_jax.envs.trials.scene import TrialScene
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of
 from mechsearch_jax.geometry.superquadric import Superquadrics, empty
 from mechsearch_jax.geometry.transforms import upright_pose

@@ -17,8 +17,9 @@ from mechsearch_jax.runtime.files import check_writable, is_file, is_folder
 from mechsearch_jax.shapes import SHAPES
 
 if TYPE_CHECKING:
-    from mechsearch_jax.envs.episode.method import EngineName, Method
+    from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.scenes.scene_sets import Block
+    from mechsearch_jax.envs.simulators.named import EngineName
     from mechsearch_jax.planner import Option
     from mechsearch_jax.problem.settings import Settings
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.benchmarks.paper.reproduce import Setting
     from mechsearch_jax.benchmarks.running.evaluate import Job
     from mechsearch_jax.benchmarks.store.rows import Row
-    from mechsearch_jax.envs.episode.method import EngineName
+    from mechsearch_jax.envs.simulators.named import EngineName
 
 TableName = Literal["table1", "table3", "table4", "table5"]
 Recognition = Literal["oracle", "masks", "full"]

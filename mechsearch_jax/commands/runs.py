@@ -18,10 +18,10 @@ from mechsearch_jax.runtime.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.report.tables import EpisodeProgress
+    from mechsearch_jax.benchmarks.report.console_tables import EpisodeProgress
     from mechsearch_jax.benchmarks.running.evaluate import Job, Runner
     from mechsearch_jax.benchmarks.store.rows import Row
-    from mechsearch_jax.envs.episode.method import EngineName
+    from mechsearch_jax.envs.simulators.named import EngineName
 
 
 def _count(metavar: str) -> Any:
@@ -271,7 +271,7 @@ def run_jobs(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.report.tables import EpisodeProgress
+    from mechsearch_jax.benchmarks.report.console_tables import EpisodeProgress
     from mechsearch_jax.benchmarks.running.evaluate import evaluate, shard_of
 
     jobs = shard_of(jobs, *parsed_shard(command, run.shard))

@@ -28,7 +28,7 @@ def list_sets() -> None:
     """List the named sets of scenes: how many scenes, with how many objects, and what they hold."""
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.report.tables import scene_sets_table
+    from mechsearch_jax.benchmarks.report.console_tables import scene_sets_table
 
     Console(highlight=False).print(scene_sets_table())
 

@@ -141,8 +141,8 @@ def bench_guard(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.guard import guard
+    from mechsearch_jax.benchmarks.report.console_tables import EpisodeProgress
     from mechsearch_jax.benchmarks.report.episode_tables import guard_table
-    from mechsearch_jax.benchmarks.report.tables import EpisodeProgress
     from mechsearch_jax.benchmarks.running.evaluate import evaluate, make_jobs
     from mechsearch_jax.benchmarks.running.processes import Processes
     from mechsearch_jax.envs.episode.method import Method

@@ -65,7 +65,7 @@ def bench_agreement(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.parts.agreement import agreement, draw_actions, generated_scenes
-    from mechsearch_jax.benchmarks.report.tables import agreement_table
+    from mechsearch_jax.benchmarks.report.console_tables import agreement_table
     from mechsearch_jax.envs.simulators.mjx_model import import_mjx
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import save_json
@@ -143,7 +143,7 @@ def bench_recognition(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.parts import images, recognition, recognition_figure
-    from mechsearch_jax.benchmarks.report.tables import recognition_tables, recognition_times_table
+    from mechsearch_jax.benchmarks.report.console_tables import recognition_tables, recognition_times_table
     from mechsearch_jax.viz.drawing import save_figure
 
     at_least_one("bench recognition", worst=drawn.worst)
@@ -239,7 +239,7 @@ def bench_segmentation(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.parts import images, segmentation
-    from mechsearch_jax.benchmarks.report.tables import segmentation_tables
+    from mechsearch_jax.benchmarks.report.console_tables import segmentation_tables
     from mechsearch_jax.viz.drawing import save_figure
 
     at_least_one("bench segmentation", worst=worst)
@@ -290,7 +290,7 @@ def bench_push(
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.parts import push
-    from mechsearch_jax.benchmarks.report.tables import push_scores_tables
+    from mechsearch_jax.benchmarks.report.console_tables import push_scores_tables
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.runtime.files import check_writable, save_json
     from mechsearch_jax.train.run import counting
@@ -325,7 +325,7 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.parts import scenes
-    from mechsearch_jax.benchmarks.report.tables import scenes_table
+    from mechsearch_jax.benchmarks.report.console_tables import scenes_table
     from mechsearch_jax.problem.cache import keep_compilations
 
     names = [Path(name).resolve().name for name in scenarios]

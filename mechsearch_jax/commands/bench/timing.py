@@ -32,7 +32,7 @@ def _print_timing(subject: str, out: Path | None, measure: Callable[[], Timing])
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.report.tables import timing_table
+    from mechsearch_jax.benchmarks.report.console_tables import timing_table
     from mechsearch_jax.runtime.files import save_json
 
     check_files(out)
