@@ -184,7 +184,7 @@ def test_a_push_that_takes_too_long_is_out_of_reach():
 
 def test_a_world_has_memory_for_the_longest_reference():
     model = MjxModel(Shelf(), Camera(), MjxConfig())
-    without = 3 * sum(leaf.nbytes for leaf in jax.tree.leaves(model._one(MjxConfig().contacts)))
+    without = 3 * sum(leaf.nbytes for leaf in jax.tree.leaves(model._single(MjxConfig().contacts)))
     build = jax.tree.map(lambda reference: functools.partial(reference, config=PLAN), BUILD)
     shapes = [jax.eval_shape(build[kind], *(a[0] for a in arguments(kind))) for kind in BUILD]
     rows = max(reference.q.shape[0] for reference, _ in shapes)
