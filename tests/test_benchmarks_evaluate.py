@@ -288,14 +288,15 @@ def test_a_policy_of_another_module_reaches_the_worker(tmp_path, files, monkeypa
 
 
 def test_workers_that_die_hang_or_fail_cost_one_row_each(tmp_path, files):
-    for name in ("crash", "hang"):
+    for name in ("crash", "exit", "hang"):
         save_scenario(Scenario(name, (), TARGET), tmp_path / f"{name}.json")
-    names = ("one", "crash", "hang", "raise", "three")
+    names = ("one", "crash", "exit", "hang", "raise", "three")
     jobs = make_jobs([tmp_path / f"{name}.json" for name in names], [Method()], (0,))
     rows = evaluate(jobs, tmp_path / "rows", Processes(1, 1.5, run))
     assert {row.scenario: row.failure for row in rows} == {
         "one": None,
         "crash": "error: the worker process ended with status 3: out of luck",
+        "exit": "error: SystemExit: enough",
         "hang": "error: it took longer than 1.5 s, and its worker was killed",
         "raise": "error: ValueError: no",
         "three": None,

@@ -101,9 +101,8 @@ def _cell(setting: Setting, objects: int | None, rates: Rates, paper: Figures | 
     means = {}
     for name, goal in GOALS.items():
         share, steps = getattr(rates, goal), getattr(rates, f"{goal}_steps")
-        episodes = 0 if share is None else rates.episodes
-        means[name] = Mean.of(share, getattr(rates, f"{goal}_interval"), episodes)
-        reached = round((share or 0.0) * episodes)
+        means[name] = Mean.of(share, getattr(rates, f"{goal}_interval"), rates.episodes)
+        reached = round(share * rates.episodes)
         means[f"{name}_steps"] = Mean.of(steps, getattr(rates, f"{goal}_steps_interval"), reached)
     return Cell(setting, objects, rates.episodes, rates.errors, **means, paper=paper)
 

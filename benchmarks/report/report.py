@@ -45,8 +45,8 @@ def read_tables(paths: Sequence[PathLike]) -> list[Row]:
 
 
 def changed_scenarios(rows: Sequence[Row]) -> list[str]:
-    """Names under which rows hold more than one content, or one and an unknown: their files were changed in between."""
-    contents: dict[str, set[str | None]] = {}
+    """Names under which rows hold more than one content: their files were changed in between."""
+    contents: dict[str, set[str]] = {}
     for row in rows:
         contents.setdefault(row.scenario, set()).add(row.content_hash)
     return sorted(name for name, hashes in contents.items() if len(hashes) > 1)
@@ -58,10 +58,7 @@ def changed_scenarios_remark(rows: Sequence[Row]) -> str:
     if not names:
         return ""
     more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-    return (
-        "Scenarios whose content is not the same, or not known, in all rows count as several: "
-        f"{', '.join(names[:5])}{more}."
-    )
+    return f"Scenarios whose content is not the same in all rows count as several: {', '.join(names[:5])}{more}."
 
 
 def chosen_scenes_remark(rows: Sequence[Row]) -> str:

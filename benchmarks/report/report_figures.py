@@ -142,9 +142,9 @@ def rates_figure(summary: Sequence[Rates], key: Key) -> Figure:
 
 
 def _drawn(rates: Sequence[Rates], goal: str) -> np.ndarray:
-    """Shares, their lower and upper bounds, shape (3, n); NaN, which is not drawn, where a share is not known."""
+    """Shares with their lower and upper bounds, shape (3, n)."""
     shares = [(getattr(group, goal), *getattr(group, f"{goal}_interval")) for group in rates]
-    return np.array([(np.nan,) * 3 if share[0] is None else share for share in shares]).T
+    return np.array(shares).T
 
 
 def curve_rates(rows: Sequence[Row], columns: Sequence[str]) -> list[Rates]:

@@ -60,7 +60,7 @@ class Job:
         """The row of an episode that could not be run to its end."""
         return Row.failed(self.scenario, self.options, reason, present_code())
 
-    def failed_by(self, error: Exception) -> Row:
+    def failed_by(self, error: BaseException) -> Row:
         """The same, where an exception says why."""
         return self.failed(f"{type(error).__name__}: {' '.join(str(error).split())}"[:500])
 
@@ -292,13 +292,13 @@ class _Work:
         Raises:
           InputError: a worker ran other code.
         """
-        foreign = next((row.code for row in rows if row.code != present_code()), None)
-        if foreign is not None:
-            raise InputError(f"a worker ran {foreign}, this is {present_code()}; start again, and leave the code alone")
-        self._writer.append(rows)
-        for row in rows:
+        kept = [row for row in rows if row.code == present_code()]
+        self._writer.append(kept)
+        for row in kept:
             self._claims.release(episode_key(row))
         self.look()
+        if foreign := next((row.code for row in rows if row.code != present_code()), None):
+            raise InputError(f"a worker ran {foreign}, this is {present_code()}; start again, and leave the code alone")
 
     def check(self) -> None:
         """Fail where a runner is done, and lacks the row of an episode that it began.

@@ -3,11 +3,13 @@
 Workers are programs of their own with one thread each, and their share of the cores for pushes that they simulate: on a
 machine with few cores and no GPU this is faster than sharing all threads, and a worker that dies, or hangs and is
 killed, takes one episode with it, not the run. Pebble keeps the workers, in processes that loky starts: with an
-environment of their own, and without the main module.
+environment of their own, and without the main module. Each is a pool of its own: the workers of a pool share a lock,
+which one that is killed at the wrong moment would leave held for ever.
 """
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import os
@@ -41,6 +43,8 @@ ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "JAX_PLATFORMS": "cpu",
 }
+# So many workers in a row that end before they take a job say that none can be started.
+MOST_DEATHS = 3
 # How often a worker looks whether its parent is still there [s].
 LOOK_EVERY = 1.0
 
@@ -79,33 +83,43 @@ class Processes:
           InputError: no worker can be started.
         """
         count = min(self.workers, len(jobs))
-        todo = iter(jobs)
-        running: dict[Future[Row], Job] = {}
-        with tempfile.TemporaryDirectory() as outputs:
-            pool = pebble.ProcessPool(
-                count,
-                initializer=_begin,
-                initargs=(outputs, os.getpid()),
-                context=_context({**ENVIRONMENT, **share_of_cores(count)}),
-            )
-            try:
-                while True:
-                    while len(running) < count and (job := next(filter(begin, todo), None)):
-                        running[pool.schedule(self.run, (job,), timeout=self.time_limit)] = job
-                    if not running:
-                        return
-                    done, _ = wait(running, return_when=FIRST_COMPLETED)
-                    ended([self._row(running.pop(future), future, Path(outputs)) for future in done])
-            finally:
-                pool.stop()
-                pool.join()
+        todo, again, deaths = filter(begin, jobs), list[Job](), 0
+        with tempfile.TemporaryDirectory() as outputs, contextlib.ExitStack() as stack:
+            context = _context({**ENVIRONMENT, **share_of_cores(count)})
+
+            def new_worker() -> pebble.ProcessPool:
+                worker = pebble.ProcessPool(1, initializer=_begin, initargs=(outputs, os.getpid()), context=context)
+                stack.callback(_end, worker)
+                return worker
+
+            idle = [new_worker() for _ in range(count)]
+            running: dict[Future[Row], tuple[pebble.ProcessPool, Job]] = {}
+            while True:
+                while idle and (job := again.pop() if again else next(todo, None)):
+                    worker = idle.pop()
+                    # A worker may have died since its last job.
+                    worker = worker if worker.active else new_worker()
+                    running[worker.schedule(self.run, (job,), timeout=self.time_limit)] = worker, job
+                if not running:
+                    return
+                rows = []
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    worker, job = running.pop(future)
+                    if isinstance(future.exception(), BrokenProcessPool):
+                        deaths += 1
+                        again.append(job)
+                        idle.append(new_worker())
+                    else:
+                        deaths = 0
+                        idle.append(worker)
+                        rows.append(self._row(job, future, Path(outputs)))
+                if rows:
+                    ended(rows)
+                if deaths >= MOST_DEATHS:
+                    raise InputError(f"worker processes end while they start{_newest_line(Path(outputs))}")
 
     def _row(self, job: Job, future: Future[Row], outputs: Path) -> Row:
-        """The row of a job that is over.
-
-        Raises:
-          InputError: workers end before they take a job.
-        """
+        """The row of a job that is over."""
         try:
             return future.result()
         except TimeoutError:
@@ -113,11 +127,13 @@ class Processes:
         except pebble.ProcessExpired as error:
             reason = _last_line(outputs / str(error.pid))
             return job.failed(f"the worker process ended with status {error.exitcode}{reason}")
-        except BrokenProcessPool:
-            reasons = [reason for file in outputs.iterdir() if (reason := _last_line(file))]
-            raise InputError(f"worker processes end while they start{reasons[0] if reasons else ''}") from None
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             return job.failed_by(error)
+
+
+def _end(worker: pebble.ProcessPool) -> None:
+    worker.stop()
+    worker.join()
 
 
 def _context(environment: Mapping[str, str]) -> Any:
@@ -153,3 +169,9 @@ def _last_line(output: Path) -> str:
     except OSError:
         return ""
     return next((f": {line.strip()[:300]}" for line in reversed(lines) if line.strip()), "")
+
+
+def _newest_line(outputs: Path) -> str:
+    """The last line of the worker that was the last to print anything; empty where none did."""
+    files = sorted(outputs.iterdir(), key=lambda file: file.stat().st_mtime, reverse=True)
+    return next((line for file in files if (line := _last_line(file))), "")

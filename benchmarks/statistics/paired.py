@@ -72,7 +72,7 @@ def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) 
     """How every other variant differs from the baseline, by label and goal.
 
     Several episodes of a variant that the columns do not tell apart count as one, with their mean. Scenarios of the
-    same name that hold something else are no pair, nor are any for `graspable` where an episode does not say it.
+    same name that hold something else are no pair.
 
     Args:
       rows: of all variants.

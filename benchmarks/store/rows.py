@@ -285,7 +285,7 @@ def read_rows(path: PathLike) -> list[Row]:
         raise InputError(f"{path}: cannot be read ({error.strerror or ' '.join(str(error).split())})") from error
     except pyarrow.ArrowException as error:
         raise InputError(f"{path}: is not a Parquet file ({' '.join(str(error).split())})") from error
-    missing = set(SCHEMA.names) - set(table.schema.names)
+    missing = _FIELDS.keys() - set(table.schema.names)
     if missing:
         raise InputError(
             f"{path}: lacks the column {min(missing)}: it is no table of episodes of this version; use another file"

@@ -175,7 +175,7 @@ class ManySlots:
         return choices | self._ask(HIDDEN, keys, [r for r in rows if not there[r]])
 
     def _ask(self, question: Question, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
-        """What the policy answers to a question in chunk slots, after trials; see `_propose`."""
+        """What the policy answers to a question in the slots of a chunk, after trials; see `_propose`."""
         chunks = list(self._chunks(rows))
         proposed = []
         for chunk, padded in chunks:
