@@ -120,7 +120,6 @@ def test_all_that_is_jitted_takes_both_shelves_and_cameras_alike(two):
         assert traced_as(one) == traced_as(other)
         # What of it is static has to be equal, and data must not be.
         assert not all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (one, other)), strict=True))
-    assert isinstance(hash(two[0].space), int)
 
 
 def test_a_plan_is_traced_once_for_both(two):
@@ -275,9 +274,7 @@ def test_of_100_shelves_and_cameras_nearly_all_are_seen_by_one_program():
     assert sum(traced_as(sight) == expected for sight in sights) >= 90
 
 
-def test_what_all_actions_share_can_be_static_or_data():
-    space = ActionSpace(SHELF, None, None, 0.5, 4, 3)
-    other = dataclasses.replace(space, shelf=MOVED)
-    assert jax.tree.structure(space) == jax.tree.structure(other)
-    assert jax.tree.structure(space) != jax.tree.structure(dataclasses.replace(space, wrists=2))
-    assert len({space, other, dataclasses.replace(space)}) == 2
+def test_of_what_all_actions_share_the_shelf_and_the_tables_are_data():
+    space = ActionSpace(SHELF, None, None, None, 0.5, 4)
+    assert jax.tree.structure(space) == jax.tree.structure(dataclasses.replace(space, shelf=MOVED))
+    assert jax.tree.structure(space) != jax.tree.structure(dataclasses.replace(space, waypoints=5))
