@@ -24,7 +24,7 @@ from mechsearch_jax.workspace.shelf import Shelf
 SHELF = Shelf()
 MODEL = quasi_static.QuasiStatic()
 PUSH = jax.jit(MODEL, static_argnums=0)
-ALL_WAYS = jax.jit(actions.all_ways)
+ALL_CANDIDATES = jax.jit(actions.all_candidates)
 Q7 = jnp.zeros(())
 
 
@@ -143,9 +143,9 @@ def test_footprints_of_objects_on_their_side():
     np.testing.assert_allclose(prints.high[0] - prints.low[0], 0.06, rtol=1e-5)
 
 
-def of_kind(ways, name):
-    """The ways of one kind among those of all."""
-    return ways[[kind.name for kind in SAMPLED_KINDS].index(name)]
+def of_kind(candidates, name):
+    """The candidates of one kind among those of all."""
+    return candidates[[kind.name for kind in SAMPLED_KINDS].index(name)]
 
 
 @pytest.fixture(scope="module")
@@ -157,18 +157,18 @@ def draw(problem):
     belief = planner.update_belief(problem, planner.initial_belief(problem), observation)
 
     possible = possible_space(problem, belief, belief.exists)
-    ways = ALL_WAYS(problem.space, objects, possible)
+    candidates = ALL_CANDIDATES(problem.space, objects, possible)
 
     @jax.jit
-    def drawn(problem, possible, objects, ways, weights, keys):
+    def drawn(problem, possible, objects, candidates, weights, keys):
         sample = lambda key: actions.sample_action(  # noqa: E731
-            key, problem.space, objects, possible, ways, objects.valid, weights
+            key, problem.space, objects, possible, candidates, objects.valid, weights
         )
-        return ways, jax.vmap(sample)(keys)
+        return candidates, jax.vmap(sample)(keys)
 
     keys = jax.random.split(jax.random.key(0), 200)
     draw = lambda weights: jax.tree.map(  # noqa: E731
-        np.asarray, drawn(problem, possible, objects, ways, weights, keys)
+        np.asarray, drawn(problem, possible, objects, candidates, weights, keys)
     )
     draw.objects = objects
     return draw
@@ -180,10 +180,10 @@ def test_neighbours_that_are_recognised_as_overlapping_do_not_lock_each_other_in
     pair = on_board((*body, 0.6, 0.05, 0.0), (*body, 0.6, 0.114 - deep, 0.0))
     belief = planner.initial_belief(problem)
     nowhere = possible_space(problem, belief, jnp.zeros_like(belief.exists))
-    ways = ALL_WAYS(problem.space, pair, nowhere)
-    grasps = of_kind(ways, "pick-and-place")
+    candidates = ALL_CANDIDATES(problem.space, pair, nowhere)
+    grasps = of_kind(candidates, "pick-and-place")
     assert grasps.reached[0].any()
-    assert actions.free_ways(grasps)[0].any() != locked
+    assert actions.free_candidates(grasps)[0].any() != locked
 
 
 @pytest.fixture(scope="module")
@@ -204,7 +204,7 @@ def test_objects_are_drawn_by_their_weights(sampled, draw):
     assert share > even_share + 0.1
 
 
-def test_ways_of_an_object_are_drawn_by_their_weights_the_clean_ones_first():
+def test_candidates_of_an_object_are_drawn_by_their_weights_the_clean_ones_first():
     clean = jnp.array([[True, True, False], [False, False, False], [False, False, False]])
     usable = jnp.array([[True, True, True], [True, False, True], [False, False, False]])
     weight = jnp.float32([[1.0, 0.25, 1.0], [0.25, 1.0, 0.25], [1.0, 1.0, 1.0]])
@@ -256,10 +256,10 @@ def test_placed_objects_stand_clear_of_each_other_on_the_board(sampled, problem)
 
 
 def test_grasped_objects_fit_between_the_fingers(sampled, problem):
-    objects, ways, _ = sampled
+    objects, candidates, _ = sampled
     prints = footprints.footprints(objects)
     narrow = 2 * np.min(np.asarray(prints.half), axis=1)
-    graspable = np.asarray(of_kind(ways, "pick-and-place").reached).any(axis=(1, 2))
+    graspable = np.asarray(of_kind(candidates, "pick-and-place").reached).any(axis=(1, 2))
     assert np.all(narrow[graspable] <= problem.gripper.usable_opening + 1e-5)
 
 

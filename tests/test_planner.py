@@ -71,7 +71,7 @@ def root(decision, problem):
         rollout = rollout_of(problem, belief)
         state = rollout.root(objects)
         state = rollout.update(state, state.moved)
-        return state.replace(ways=rollout.ways(state, state.moved))
+        return state.replace(candidates=rollout.candidates(state, state.moved))
 
     return begin(problem, belief, objects)
 
@@ -218,8 +218,8 @@ def test_later_actions_are_drawn_in_the_present_scene_in_the_published_code(prob
         def update(self, state, moved):
             return state
 
-        def ways(self, state, moved):
-            return state.ways
+        def candidates(self, state, moved):
+            return state.candidates
 
         def cost(self, state):
             return jnp.sum(state.scene.position[0])
@@ -342,22 +342,24 @@ def test_the_share_of_what_cannot_be_moved_yet_goes_to_what_is_in_the_way(root):
     for chance in (0.1, 0.5, 0.8):
         by_kind = [
             w.replace(reached=rng.random(w.reached.shape) < 0.05, hits=rng.random(w.hits.shape) < chance)
-            for w in root.ways
+            for w in root.candidates
         ]
-        state = root.replace(ways=tuple(by_kind), available=jnp.asarray(rng.random(n) < 0.8))
+        state = root.replace(candidates=tuple(by_kind), available=jnp.asarray(rng.random(n) < 0.8))
         able, share = np.asarray(state.able), rng.random(n)
-        ways = [[] for _ in range(n)]
+        hits_of = [[] for _ in range(n)]
         for kind, can in zip(by_kind, able, strict=True):
             for i in range(n):
-                ways[i] += [hits for hits, at in zip(kind.hits[i], kind.reached[i], strict=True) if can[i] and at.any()]
+                hits_of[i] += [
+                    hits for hits, at in zip(kind.hits[i], kind.reached[i], strict=True) if can[i] and at.any()
+                ]
         expected, stuck = (
             share.astype(float),
-            np.array([able[:, i].any() and all(map(np.any, w)) for i, w in enumerate(ways)]),
+            np.array([able[:, i].any() and all(map(np.any, w)) for i, w in enumerate(hits_of)]),
         )
         for _ in range(DEPTH):
             held, expected = np.where(stuck, expected, 0.0), np.where(stuck, 0.0, expected)
             for i in np.flatnonzero(stuck):
-                blames = sum((np.where(hits, ALONE ** (1.0 - hits.sum()), 0.0) for hits in ways[i]), np.zeros(n))
+                blames = sum((np.where(hits, ALONE ** (1.0 - hits.sum()), 0.0) for hits in hits_of[i]), np.zeros(n))
                 expected += held[i] * blames / max(blames.sum(), 1e-12)
         np.testing.assert_allclose(given(state, jnp.float32(share)), expected, rtol=1e-4, atol=1e-6)
         assert chance < 0.8 or stuck.any()

@@ -43,8 +43,8 @@ class Line(Rollout):
     def update(self, state, moved):
         return state
 
-    def ways(self, state, moved):
-        return state.ways
+    def candidates(self, state, moved):
+        return state.candidates
 
     def cost(self, state):
         place = jnp.round((state.scene.position[0, 1] - self.start) / STEP).astype(jnp.int32)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mechsearch_jax.actions.candidates import all_candidates
 from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.kinds.nothing import no_action
-from mechsearch_jax.actions.ways import all_ways
 from mechsearch_jax.belief.belief import possible_space, with_target
 from mechsearch_jax.envs.camera import recognisers, simulated_camera
 from mechsearch_jax.envs.camera.recognisers import recogniser
@@ -131,8 +131,8 @@ def test_a_plan_is_traced_once_for_both(two):
         problem, belief = rollout.problem, rollout.belief
         scene, _ = with_target(problem, belief, objects)
         possible = possible_space(problem, belief, belief.exists)
-        ways = all_ways(problem.space, scene, possible)
-        reached = sum(jnp.sum(kind.reached) for kind in ways).astype(jnp.float32)
+        candidates = all_candidates(problem.space, scene, possible)
+        reached = sum(jnp.sum(kind.reached) for kind in candidates).astype(jnp.float32)
         corner = jnp.float32(problem.shelf.front)
         return Decision(no_action(), reached, corner, possible.top, objects, no_sequences(rollout.config, objects), 0)
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from mechsearch_jax.actions import SAMPLED_KINDS, Action, PossibleSpace, all_ways, kind_of, sample_action
+from mechsearch_jax.actions import SAMPLED_KINDS, Action, PossibleSpace, all_candidates, kind_of, sample_action
 from mechsearch_jax.envs.scenes.generator import ScenarioGenerator
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxSimulator
@@ -163,10 +163,10 @@ def _sampler(problem: Problem) -> Callable[[Array, World], Action]:
 
     def draw(keys: Array, world: World, problem: Problem) -> Action:
         scene = true_superquadrics(world)
-        ways = all_ways(problem.space, scene, nowhere)
+        candidates = all_candidates(problem.space, scene, nowhere)
 
         def draw_single(key: Array) -> Action:
-            return sample_action(key, problem.space, scene, nowhere, ways, scene.valid).action
+            return sample_action(key, problem.space, scene, nowhere, candidates, scene.valid).action
 
         return jax.vmap(draw_single)(keys)
 

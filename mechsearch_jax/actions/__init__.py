@@ -1,5 +1,6 @@
 """What the robot can do: one file for each kind of action, their registry, and how they are sampled."""
 
+from mechsearch_jax.actions.candidates import AllCandidates, all_candidates, free_candidates, no_candidates
 from mechsearch_jax.actions.config import ActionConfig, ActionSpace, ActionTables, action_tables
 from mechsearch_jax.actions.kind import Kind, SampledKind
 from mechsearch_jax.actions.kinds.nothing import no_action
@@ -8,9 +9,8 @@ from mechsearch_jax.actions.registry import KINDS, SAMPLED_KINDS, ActionKind, ki
 from mechsearch_jax.actions.sampler import sample_action
 from mechsearch_jax.actions.sketch import Sketch
 from mechsearch_jax.actions.trajectory import JointTrajectory, joint_trajectory
-from mechsearch_jax.actions.types import Action, Prediction, Sample, Ways
+from mechsearch_jax.actions.types import Action, Candidates, Prediction, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace, widen
-from mechsearch_jax.actions.ways import AllWays, all_ways, free_ways, no_ways
 
 __all__ = [
     "KINDS",
@@ -20,7 +20,8 @@ __all__ = [
     "ActionKind",
     "ActionSpace",
     "ActionTables",
-    "AllWays",
+    "AllCandidates",
+    "Candidates",
     "JointTrajectory",
     "Kind",
     "PossibleSpace",
@@ -28,14 +29,13 @@ __all__ = [
     "Sample",
     "SampledKind",
     "Sketch",
-    "Ways",
     "action_tables",
-    "all_ways",
-    "free_ways",
+    "all_candidates",
+    "free_candidates",
     "joint_trajectory",
     "kind_of",
     "no_action",
-    "no_ways",
+    "no_candidates",
     "retrieve_action",
     "sample_action",
     "widen",

@@ -1,4 +1,4 @@
-"""What all kinds of action share: the gripper's way in against the shelf, the objects and unseen space."""
+"""Tests that all kinds of action share: the gripper's way in against shelf, objects and unseen space."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import translate
 from mechsearch_jax.robot.entry import crossing_length, crossing_poses
 
-# Number of poses on each stretch of a motion where it is followed closely.
+# Number of poses on each stretch of a motion that is tested closely.
 CLOSE_WAYPOINTS = 12
-# At how many places an action's gripper and object are tested against unseen space.
+# Number of places where an action's gripper and object are tested against unseen space.
 PLACES = 5
-# At how many places of its crossing a gripper is tested. Crossings are at most 17 cm long, which leaves 3.4 cm from
-# place to place: less than the fingers measure along x, however they are turned, so that what is swept has no gaps.
+# Number of places where a gripper is tested on its crossing. Crossings are at most 17 cm long, so that places are at
+# most 3.4 cm apart: less than the fingers measure along x at any yaw, so that the swept volume has no gaps.
 CROSSING_PLACES = 5
-# At how many places an object in the hand is tested on its straight way in or out.
+# Number of places where an object in the hand is tested on its straight way in or out.
 SWEPT_PLACES = 7
 
 
@@ -31,30 +31,30 @@ def object_clouds(scene: Superquadrics, count: int) -> Float[Array, "n 3 p"]:
 
 
 def swept_places(T_world_object, direction, distance, steps=SWEPT_PLACES):
-    """An object's pose at several places on its way along a direction [m]: (..., steps, 4, 4)."""
+    """Poses of an object moved along a direction by 0 to `distance` [m], shape (..., steps, 4, 4)."""
     share = jnp.linspace(0.0, distance, steps).reshape(*[1] * (T_world_object.ndim - 2), steps, 1)
     T = jnp.broadcast_to(T_world_object[..., None, :, :], (*T_world_object.shape[:-2], steps, 4, 4))
     return translate(T, share * direction[..., None, :])
 
 
 def gripper_clouds(tables: ActionTables) -> Clouds:
-    """What the gripper sweeps on its way in, and after that what it takes up where it is; see `cloud_index`."""
+    """Clouds that the gripper sweeps on its way in, then those of the gripper at rest; see `cloud_index`."""
     swept, still = (a.reshape(-1, *a.shape[2:]) for a in (tables.clouds, tables.still))
-    # A point that is there twice changes nothing.
+    # Repeated points change no collision.
     longer = jnp.pad(still, ((0, 0), (0, 0), (0, swept.shape[-1] - still.shape[-1])), mode="edge")
     return clouds_of(jnp.concatenate([swept, longer]))
 
 
 def cloud_index(tables: ActionTables, opening, wrist, still: bool = False):
-    """Which of `gripper_clouds` is meant."""
+    """Index in `gripper_clouds` for an opening (`OPEN` or `CLOSED`) and a wrist; swept, or `still` for at rest."""
     openings, wrists = tables.q7.shape
     return (still * openings + opening) * wrists + wrist
 
 
 def crossing_places(space: ActionSpace, T: Float[Array, "c 4 4"]) -> tuple[Float[Array, "c k 4 4"], Bool[Array, " c"]]:
-    """Places of the gripper on its crossings to poses, and which of these have any.
+    """Poses of the gripper on its crossings to poses T, and which T have a crossing.
 
-    As far as the nearest place outside: what follows lies in front of the shelf.
+    Crossings end at the nearest place outside: beyond lies the free space in front of the shelf.
     """
     outside = space.gripper.nearest_outside
     places = crossing_poses(T, outside, space.gripper, CROSSING_PLACES)
@@ -62,7 +62,7 @@ def crossing_places(space: ActionSpace, T: Float[Array, "c 4 4"]) -> tuple[Float
 
 
 def approach_enters(tables: ActionTables, possible: PossibleSpace, cloud, T, mask):
-    """Whether the swept gripper enters possible space, for poses (C, 4, 4) where the mask is true."""
+    """Whether the swept gripper enters possible space at poses (C, 4, 4); False where the mask is."""
 
     def entering(clouds, possible, row):
         T, cloud = row

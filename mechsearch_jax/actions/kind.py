@@ -1,4 +1,4 @@
-"""What a kind of action has to offer: one file for each kind, named in `registry`."""
+"""The protocol that every kind of action implements, one file each; `registry` lists them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.actions.types import Action, Draft, DrawnWay, Prediction, Ways
+from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
 from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.footprints import Footprints
@@ -26,7 +26,7 @@ class Kind(Protocol):
       name: what files and the command line call it.
       moves_object: whether it moves the object `Action.object`.
       holds_object: whether that object must stay in the closed hand from grasp to release.
-      takes_target: whether it is to end with the target in the closed hand, outside the shelf.
+      takes_target: whether it must end with the target in the closed hand, outside the shelf.
       returns_home: whether the robot is back in its home configuration afterwards.
     """
 
@@ -52,45 +52,45 @@ class Kind(Protocol):
         action: Action,
         wrist: Int[Array, ""],
     ) -> Prediction:
-        """What an action of this kind does to the objects; called for actions of other kinds too, and then ignored.
+        """Predict the objects after an action; also called with actions of other kinds, where the result is ignored.
 
         Args:
           space: what all actions share.
           push_model: predicts pushes.
           scene: the objects, fields (N, ...).
-          untouchable: which of them must not be moved.
+          untouchable: which objects must not be moved, shape (N,).
           action: a single action.
           wrist: index of its wrist angle.
         """
         ...
 
     def reference(self, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:
-        """The motion of arm and fingers, and whether the arm reaches all of it; None for a kind that does not move."""
+        """The motion of arm and fingers, and whether the arm reaches all of it; None for a kind without motion."""
         ...
 
     def sketch(self, scene: Superquadrics, after: Superquadrics, action: Action) -> Sketch:
-        """What a picture shows of an action, from the objects before it and as they are predicted after it."""
+        """What a picture shows of an action, from the objects before it and those predicted after it."""
         ...
 
     def describe(self, action: Action, target: int | None = None) -> str:
-        """A single action in words, as the robot sees it.
+        """A single action in words, with directions as seen by the robot.
 
         Args:
           action: of this kind.
-          target: the index that stands for the target, if any does.
+          target: the object index that stands for the target; None if there is none.
         """
         ...
 
 
 class SampledKind(Kind, Protocol):
-    """A kind of action that moves an object and that sequences are sampled from.
+    """A kind of action that moves an object and from which sequences are sampled.
 
-    Every object has V ways to be moved so, each by D distances.
+    Every object has V x D candidates: V gripper poses, each with D distances.
 
     Attributes:
-      opening: which of the gripper's swept clouds its approach is tested with, `config.OPEN` or `config.CLOSED`.
-      surrounds_object: whether the fingers are around the object, which is then no obstacle.
-      moves_target: whether it may move a target that has been found like any other object.
+      opening: the gripper's state on the approach, `config.OPEN` or `config.CLOSED`.
+      surrounds_object: whether the fingers enclose the object, which is then no obstacle.
+      moves_target: whether it may move a found target.
     """
 
     @property
@@ -101,33 +101,39 @@ class SampledKind(Kind, Protocol):
     def moves_target(self) -> bool: ...
 
     def wrists(self, space: ActionSpace) -> Int[np.ndarray, " v"]:
-        """Index of the wrist angle of each way."""
+        """Index of the wrist angle of each gripper pose."""
         ...
 
     def distances(self, space: ActionSpace) -> int:
-        """D."""
+        """The number of distances D."""
         ...
 
     def propose(
         self, space: ActionSpace, scene: Superquadrics, prints: Footprints, fresh: Bool[Array, " n"]
     ) -> tuple[Float[Array, "n v 4 4"], Float[Array, "n v"]]:
-        """Gripper poses of all ways, and their `Ways.weight`; of objects that are not `fresh`, anything."""
+        """Gripper poses of all candidates, and their `Candidates.weight`; only those of `fresh` objects are used."""
         ...
 
     def travels(self, space: ActionSpace, T: Float[Array, "k 4 4"], near: Bool[Array, " k"]) -> Bool[Array, "k d"]:
-        """Whether arm and shelf allow the rest of the motion, for all ways of all objects whose approach is `near`."""
+        """Whether arm and shelf allow the motion after the approach; K = N V gripper poses.
+
+        Args:
+          space: what all actions share.
+          T: gripper poses, object by object.
+          near: whether the arm can approach each pose; the result is False elsewhere.
+        """
         ...
 
     def swept_hits(
         self, space: ActionSpace, scene: Superquadrics, T: Float[Array, "k 4 4"], mask: Bool[Array, "k n"]
     ) -> Bool[Array, "k n"]:
-        """Which objects what is in the hand runs into, where the mask is true."""
+        """Which objects the grasped object hits on its way out, where the mask is true."""
         ...
 
     def entering(
-        self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, ways: Ways
+        self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, candidates: Candidates
     ) -> Bool[Array, "n v d"]:
-        """Which ways enter space where the target may be; looked at only where nothing stands in the way."""
+        """Which candidates enter space where the target may be; tested only for candidates that hit nothing."""
         ...
 
     def draft(
@@ -136,8 +142,8 @@ class SampledKind(Kind, Protocol):
         space: ActionSpace,
         scene: Superquadrics,
         possible: PossibleSpace,
-        ways: Ways,
-        drawn: DrawnWay,
+        candidates: Candidates,
+        drawn: DrawnCandidate,
     ) -> Draft:
-        """An action from a way that was drawn, whose number may be out of range where it is not wanted."""
+        """The action of a drawn candidate, whose number may be out of range if it is not `wanted`."""
         ...

@@ -9,48 +9,48 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from mechsearch_jax.actions.candidates import AllCandidates, free_candidates
 from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.registry import SAMPLED_KINDS, ActionKind
-from mechsearch_jax.actions.types import DrawnWay, Sample
+from mechsearch_jax.actions.types import DrawnCandidate, Sample
 from mechsearch_jax.actions.unseen_space import PossibleSpace, touch_probability
-from mechsearch_jax.actions.ways import AllWays, free_ways
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import transform
 
-# Random numbers are drawn for so many objects at a time: a scene's eight and the target, which is the last of a scene.
+# Number of objects for which random numbers are drawn at a time: a scene's eight, and the target in the last slot.
 BLOCK = 9
 
 
-def _numbers(key: Array, kinds: int, capacity: int, width: int) -> Float[Array, "kinds capacity width"]:
-    """Random numbers (Gumbel) of all ways of all objects by all kinds; an object's do not depend on the capacity.
+def _gumbel(key: Array, kinds: int, capacity: int, width: int) -> Float[Array, "kinds capacity width"]:
+    """Gumbel noise for the candidates of all objects and kinds; an object's noise does not depend on the capacity.
 
-    The last object of a scene, which may be the target, has those of the last of the first `BLOCK`.
+    The last slot, which may hold the target, always has the noise of the last slot of the first `BLOCK`.
     """
     blocks = math.ceil(capacity / BLOCK)
     keys = [key, *(jax.random.fold_in(key, i) for i in range(1, blocks))]
     drawn = [jax.random.gumbel(k, (kinds * BLOCK * width,)).reshape(kinds, BLOCK, width) for k in keys]
     if capacity == BLOCK:
         return drawn[0]
-    others = jnp.concatenate([drawn[0][:, :-1], *drawn[1:]], axis=1)[:, : capacity - 1]
-    return jnp.concatenate([others, drawn[0][:, -1:]], axis=1)
+    all_but_last = jnp.concatenate([drawn[0][:, :-1], *drawn[1:]], axis=1)[:, : capacity - 1]
+    return jnp.concatenate([all_but_last, drawn[0][:, -1:]], axis=1)
 
 
-def _choose(weight: Float[Array, " w"], numbers: Float[Array, " w"]) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """A random index in proportion to weights, from random numbers, and whether any weight is positive."""
+def _choose(weight: Float[Array, " w"], gumbel: Float[Array, " w"]) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """Draw an index in proportion to weights from Gumbel noise; also whether any weight is positive."""
     logits = jnp.where(weight > 0, jnp.log(jnp.where(weight > 0, weight, 1.0)), -jnp.inf)
-    return jnp.argmax(logits + numbers), jnp.any(weight > 0)
+    return jnp.argmax(logits + gumbel), jnp.any(weight > 0)
 
 
-def _shares(clean, dirty, weight):
-    """One for every object that has an action, shared by weight among its clean ones, or the others in need."""
-    usable = jnp.where(jnp.any(clean, axis=-1, keepdims=True), clean, dirty) * weight
+def _shares(preferred, free, weight):
+    """Share of each candidate in its object: 1 in all by weight, among the preferred, or among all free if none is."""
+    usable = jnp.where(jnp.any(preferred, axis=-1, keepdims=True), preferred, free) * weight
     total = jnp.sum(usable, axis=-1, keepdims=True)
     return usable / jnp.where(total > 0.0, total, 1.0)
 
 
 def _stacked(rows: Sequence[Shaped[Array, "n _ _"]]) -> Shaped[Array, "rows width"]:
-    """The ways of all objects by all kinds, padded to the same number."""
+    """Rows of candidates, one row for each kind and object, padded to the same width."""
     width = max(a.shape[1] * a.shape[2] for a in rows)
     flat = [a.reshape(a.shape[0], -1) for a in rows]
     return jnp.concatenate([jnp.pad(a, ((0, 0), (0, width - a.shape[1]))) for a in flat])
@@ -61,54 +61,56 @@ def sample_action(
     space: ActionSpace,
     scene: Superquadrics,
     possible: PossibleSpace,
-    all_ways: AllWays,
+    all_candidates: AllCandidates,
     available: Bool[Array, "*kinds n"],
     weights: Float[Array, " n"] | None = None,
 ) -> Sample:
-    """Draw an action: an object and a kind (the multi-set of B.5) by the object's weight, then a way by its own.
+    """Draw an action: object and kind (the multi-set of B.5) by the object's weight, then a candidate by its own.
 
     Args:
       key: PRNG key.
       space: what all actions share.
       scene: the objects.
-      possible: where the target may be. An object's actions that enter it are drawn only if it has no others.
-      all_ways: the ways to move the objects of this scene.
+      possible: where the target may be. Candidates that enter it are drawn only if their object has no others.
+      all_candidates: the candidates of this scene.
       available: which objects may be moved, by all kinds alike or by each of `SAMPLED_KINDS`.
-      weights: sampling weights of the objects, positive; the paper's, and those left out, are equal.
+      weights: sampling weights of the objects, positive; equal if left out, as in the paper.
     """
     n = scene.capacity
     key_choice, key_place = jax.random.split(key)
     able = jnp.broadcast_to(available, (len(SAMPLED_KINDS), n))
-    ways = _stacked([free_ways(w) & a[:, None, None] for w, a in zip(all_ways, able, strict=True)])
-    enters = _stacked([w.enters for w in all_ways])
-    beside = _stacked([jnp.broadcast_to(w.weight[..., None], w.reached.shape) for w in all_ways])
+    free = _stacked([free_candidates(c) & a[:, None, None] for c, a in zip(all_candidates, able, strict=True)])
+    enters = _stacked([c.enters for c in all_candidates])
+    within = _stacked([jnp.broadcast_to(c.weight[..., None], c.reached.shape) for c in all_candidates])
     weights = jnp.ones(n) if weights is None else weights
-    weight = jnp.tile(weights, len(SAMPLED_KINDS))[:, None] * _shares(ways & ~enters, ways, beside)
-    numbers = _numbers(key_choice, len(SAMPLED_KINDS), n, ways.shape[1])
-    choice, possible_at_all = _choose(weight.reshape(-1), numbers.reshape(-1))
-    row, way = choice // ways.shape[1], choice % ways.shape[1]
-    chosen, index = row // n, row % n
+    weight = jnp.tile(weights, len(SAMPLED_KINDS))[:, None] * _shares(free & ~enters, free, within)
+    gumbel = _gumbel(key_choice, len(SAMPLED_KINDS), n, free.shape[1])
+    choice, any_possible = _choose(weight.reshape(-1), gumbel.reshape(-1))
+    row, number = choice // free.shape[1], choice % free.shape[1]
+    drawn_kind, index = row // n, row % n
 
     drafts = [
-        kind.draft(key_place, space, scene, possible, w, DrawnWay(index, way, possible_at_all & (chosen == i)))
-        for i, (kind, w) in enumerate(zip(SAMPLED_KINDS, all_ways, strict=True))
+        kind.draft(
+            key_place, space, scene, possible, c, DrawnCandidate(index, number, any_possible & (drawn_kind == i))
+        )
+        for i, (kind, c) in enumerate(zip(SAMPLED_KINDS, all_candidates, strict=True))
     ]
     draft = drafts[-1]
     for i in reversed(range(len(drafts) - 1)):
-        draft = jax.tree.map(lambda a, b, i=i: jnp.where(chosen == i, a, b), drafts[i], draft)
-    able = possible_at_all & draft.possible
-    kind = jnp.where(able, draft.action.kind, ActionKind.NONE).astype(jnp.int32)
+        draft = jax.tree.map(lambda a, b, i=i: jnp.where(drawn_kind == i, a, b), drafts[i], draft)
+    executable = any_possible & draft.possible
+    kind = jnp.where(executable, draft.action.kind, ActionKind.NONE).astype(jnp.int32)
     return Sample(draft.action.replace(kind=kind), draft.wrist, draft.grippers, draft.bodies)
 
 
 def contact_probability(
     space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, sample: Sample
 ) -> Float[Array, ""]:
-    """Share of the possible poses at which a sampled action would touch the target; 0 where none is possible.
+    """Share of the possible poses at which a sampled action would touch the target; 0 if no pose is possible.
 
     Args:
       space: what all actions share.
-      scene: the objects that the action was sampled for.
+      scene: the objects for which the action was sampled.
       possible: where the target may be.
       sample: the action.
     """

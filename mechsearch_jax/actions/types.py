@@ -1,4 +1,4 @@
-"""The action of a robot, and what a sampled one comes to."""
+"""Actions of the robot, candidate actions, and predicted effects."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class Action(flax.struct.PyTreeNode):
 
     Attributes:
       kind: an `ActionKind`, int32.
-      object: index of the object that is pushed or picked, int32; N stands for a found target, beside N objects. 0 for
-        kinds that move none.
-      T_world_gripper: gripper pose where a push starts, or where something is grasped, shape (..., 4, 4).
+      object: index of the pushed or picked object, int32; beside N objects, N stands for the found target. 0 for kinds
+        that move none.
+      T_world_gripper: gripper pose where a push starts or a grasp closes, shape (..., 4, 4).
       displacement: translation of the gripper while it pushes, in the world [m], shape (..., 3); zero for other kinds.
-      T_world_place: gripper pose where the object is released, shape (..., 4, 4); for a push, the pose where it ends.
+      T_world_place: gripper pose where the object is released or a push ends, shape (..., 4, 4).
       q7: angle of joint 7 during the whole motion [rad].
-      opening: distance between the fingers while the gripper approaches [m]; 0 is closed.
+      opening: distance between the fingers during the approach [m]; 0 is closed.
     """
 
     kind: jax.Array
@@ -38,10 +38,10 @@ class Sample(flax.struct.PyTreeNode):
     """A sampled action.
 
     Attributes:
-      action: the action; of kind NONE where none is possible.
+      action: the action; of kind NONE if none is possible.
       wrist: index of its wrist angle.
-      grippers, bodies: places of the gripper and of the object that touch what is there, shape (PLACES, 4, 4); None for
-        an action that touches nothing.
+      grippers, bodies: poses of the gripper and of the object that may touch a hidden target, shape (PLACES, 4, 4);
+        None for an action that touches nothing.
     """
 
     action: Action
@@ -50,13 +50,13 @@ class Sample(flax.struct.PyTreeNode):
     bodies: jax.Array | None = None
 
 
-class DrawnWay(NamedTuple):
-    """Which way of moving which object was drawn.
+class DrawnCandidate(NamedTuple):
+    """Index of a drawn candidate among those of one kind.
 
     Attributes:
       object: index of the object.
-      number: of the way and its distance, among V times D.
-      wanted: whether it is looked at; where it is not, what comes of it means nothing.
+      number: index among the V x D candidates of the object.
+      wanted: whether the draft is used; if not, it may hold anything.
     """
 
     object: Int[Array, ""]
@@ -65,14 +65,11 @@ class DrawnWay(NamedTuple):
 
 
 class Draft(flax.struct.PyTreeNode):
-    """What one way of moving an object comes to, before it is chosen.
+    """The action that a kind makes of a drawn candidate.
 
     Attributes:
-      possible: whether it can be done.
-      action: the action, if it can.
-      wrist: index of its wrist angle.
-      grippers: places of the gripper that touch what is there, shape (PLACES, 4, 4).
-      bodies: places of the object that touch what is there, shape (PLACES, 4, 4).
+      possible: whether it can be executed.
+      action, wrist, grippers, bodies: as in `Sample`.
     """
 
     possible: jax.Array
@@ -83,11 +80,11 @@ class Draft(flax.struct.PyTreeNode):
 
 
 class Prediction(flax.struct.PyTreeNode):
-    """What an action is predicted to do.
+    """Predicted effect of an action.
 
     Attributes:
       scene: the objects afterwards.
-      moved: which of them the action moves, shape (N,).
+      moved: which objects the action moves, shape (N,).
       possible: whether it can be executed as predicted.
     """
 
@@ -96,15 +93,17 @@ class Prediction(flax.struct.PyTreeNode):
     possible: jax.Array
 
 
-class Ways(flax.struct.PyTreeNode):
-    """The ways in which one kind of action can move each object of a scene, and what stands in the way.
+class Candidates(flax.struct.PyTreeNode):
+    """Candidate actions of one kind for each object of a scene, among which one is drawn (paper B.5).
+
+    Each of N objects has V gripper poses, each with D distances.
 
     Attributes:
-      T_world_gripper: where the gripper goes, shape (N, V, 4, 4).
-      weight: sampling weight of each beside the others of its object, shape (N, V); 0 where it is not worth a look.
-      reached: whether arm, hand and shelf allow it, by distance, shape (N, V, D).
-      hits: which objects are run into, shape (N, V, N).
-      enters: whether gripper or object would enter space where the target may be, by distance, shape (N, V, D).
+      T_world_gripper: gripper pose where the push starts or the grasp closes, shape (N, V, 4, 4).
+      weight: sampling weight among the candidates of the object, shape (N, V); 0 if implausible.
+      reached: whether arm, hand and shelf allow the motion, shape (N, V, D).
+      hits: which objects the gripper or the grasped object hits, shape (N, V, N).
+      enters: whether gripper or object enters space where the target may be, shape (N, V, D).
     """
 
     T_world_gripper: jax.Array

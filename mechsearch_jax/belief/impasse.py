@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from mechsearch_jax.actions.ways import all_ways, free_ways
+from mechsearch_jax.actions.candidates import all_candidates, free_candidates
 from mechsearch_jax.belief.belief import Belief, possible_space, with_target
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.problem.problem import Problem
@@ -17,11 +17,11 @@ def _movable(problem: Problem, belief: Belief, objects: Superquadrics) -> tuple[
     """Which objects the arm can reach inside the shelf, and which it can reach without hitting another object."""
     scene, is_target = with_target(problem, belief, objects)
     possible = possible_space(problem, belief, belief.exists)
-    ways = all_ways(problem.space, scene, possible)
+    candidates = all_candidates(problem.space, scene, possible)
     is_object = scene.valid & ~is_target
     reached, free = (
-        jnp.any(jnp.stack([jnp.any(which(kind), axis=(1, 2)) for kind in ways]), axis=0) & is_object
-        for which in (lambda kind: kind.reached, free_ways)
+        jnp.any(jnp.stack([jnp.any(which(kind), axis=(1, 2)) for kind in candidates]), axis=0) & is_object
+        for which in (lambda kind: kind.reached, free_candidates)
     )
     return reached, free
 

@@ -84,13 +84,15 @@ def passed_on(state: State, share: Float[Array, " n"]) -> Float[Array, " n"]:
     not allow to be moved at all is lost.
 
     Args:
-      state: with the ways to move each object.
+      state: with its candidate actions.
       share: of each object, shape (N,).
     """
-    reached = [jnp.any(w.reached, axis=-1) & able[:, None] for w, able in zip(state.ways, state.able, strict=True)]
-    wanted, hits = jnp.concatenate(reached, axis=1), jnp.concatenate([ways.hits for ways in state.ways], axis=1)
-    stuck = ~jnp.any(wanted & ~jnp.any(hits, axis=-1), axis=1) & jnp.any(state.able, axis=0)
-    in_the_way = jax.vmap(blame)(hits, wanted)
+    reached = [
+        jnp.any(c.reached, axis=-1) & able[:, None] for c, able in zip(state.candidates, state.able, strict=True)
+    ]
+    reachable, hits = jnp.concatenate(reached, axis=1), jnp.concatenate([c.hits for c in state.candidates], axis=1)
+    stuck = ~jnp.any(reachable & ~jnp.any(hits, axis=-1), axis=1) & jnp.any(state.able, axis=0)
+    in_the_way = jax.vmap(blame)(hits, reachable)
     for _ in range(DEPTH):
         given = jnp.where(stuck, share, 0.0)
         share = share - given + jnp.sum(given[:, None] * in_the_way, axis=0)
@@ -132,7 +134,7 @@ def guided_draw(
         problem.space,
         state.scene,
         possible_space(problem, belief, state.exists),
-        state.ways,
+        state.candidates,
         state.able,
         sampling_weights(problem, belief, objective, guided_fraction, state),
     )

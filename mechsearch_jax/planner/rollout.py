@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from mechsearch_jax.actions.candidates import AllCandidates, all_candidates, no_candidates
 from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.actions.sampler import contact_probability
 from mechsearch_jax.actions.types import Action, Prediction, Sample
-from mechsearch_jax.actions.ways import AllWays, all_ways, no_ways
 from mechsearch_jax.belief.belief import Belief, possible_space, with_target
 from mechsearch_jax.belief.moved_target import candidate_of
 from mechsearch_jax.config.config import PlannerConfig
@@ -39,7 +39,7 @@ GAIN = 0.02
 # Draws an action in a state, and predicts it: one of several.
 Attempt = Callable[[State, Array], tuple[Sample, Prediction]]
 # What an action changes in a state, and what is then computed for the next one.
-CHANGING = ("scene", "target_at", "moved", "available", "alive", "ways")
+CHANGING = ("scene", "target_at", "moved", "available", "alive", "candidates")
 
 
 def prefix_values(
@@ -85,7 +85,7 @@ def present_state(problem: Problem, belief: Belief, objects: Superquadrics, conf
         target_at=jnp.zeros_like(belief.exists),
         views=no_views(scene.capacity, problem.config.existence, places),
         hits=no_hits(pairs(problem.grasps, belief.grasps.feasible), scene.capacity),
-        ways=no_ways(problem.space, scene.capacity),
+        candidates=no_candidates(problem.space, scene.capacity),
         moved=scene.valid,
         available=scene.valid & (~is_target | config.move_target),
         alive=jnp.array(True),
@@ -136,11 +136,11 @@ class Rollout:
         more = found_hits(problem.target_grasps, grasps, objects, of_found, state.hits[rows:], moved)
         return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, more]))
 
-    def ways(self, state: State, moved: Bool[Array, " n"]) -> AllWays:
-        """What can be done where an action of a state is drawn, after the `moved` objects did."""
+    def candidates(self, state: State, moved: Bool[Array, " n"]) -> AllCandidates:
+        """Candidate actions where an action of a state is drawn, brought up to date after some objects moved."""
         possible = possible_space(self.problem, self.belief, state.exists)
         scene = self.drawn_in(self.present, state).scene
-        return all_ways(self.problem.space, scene, possible, state.ways, moved, state.able)
+        return all_candidates(self.problem.space, scene, possible, state.candidates, moved, state.able)
 
     def cost(self, state: State) -> Float[Array, ""]:
         """J of a state that is up to date."""
@@ -197,10 +197,10 @@ class Rollout:
         states = shared(jax.vmap(self.update)(states.replace(exists=states.exists & computes), moved))
 
         def go_on():
-            ways = shared(jax.vmap(self.ways)(states, moved))
+            candidates = shared(jax.vmap(self.candidates)(states, moved))
             act = jax.vmap(functools.partial(self.act, first))
-            changes, actions, penalty = act(states.replace(ways=ways), keys)
-            return changes | {"ways": ways}, actions, penalty
+            changes, actions, penalty = act(states.replace(candidates=candidates), keys)
+            return changes | {"candidates": candidates}, actions, penalty
 
         def stay():
             changes = {name: getattr(states, name) for name in CHANGING}

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from mechsearch_jax.actions.candidates import AllCandidates
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
 from mechsearch_jax.actions.types import Action
-from mechsearch_jax.actions.ways import AllWays
 from mechsearch_jax.existence import ObjectViews
 from mechsearch_jax.geometry.superquadric import Superquadrics
 
@@ -25,7 +25,7 @@ class State(flax.struct.PyTreeNode):
         as long as it was not. See `belief.moved_target`.
       views: the objects as the camera sees them.
       hits: H, shape (K, N).
-      ways: to move the objects.
+      candidates: candidate actions, of each of `SAMPLED_KINDS`.
       moved: which objects differ from the state before, shape (N,).
       available: which objects may be moved, shape (N,); the target only by some kinds, see `able`.
       alive: whether the sequence has found something to do so far.
@@ -37,7 +37,7 @@ class State(flax.struct.PyTreeNode):
     target_at: jax.Array
     views: ObjectViews
     hits: jax.Array
-    ways: AllWays
+    candidates: AllCandidates
     moved: jax.Array
     available: jax.Array
     alive: jax.Array

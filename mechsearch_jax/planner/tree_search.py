@@ -65,7 +65,7 @@ def import_mctx() -> ModuleType:
 def _up_to_date(rollout: Rollout, state: State) -> State:
     """A state with its f, g and actions, after `state.moved` moved."""
     state = rollout.update(state, state.moved)
-    return state.replace(ways=rollout.ways(state, state.moved))
+    return state.replace(candidates=rollout.candidates(state, state.moved))
 
 
 def _step(rollout: Rollout, key: Array, index: Array, node: Node) -> Node:

@@ -21,7 +21,7 @@ from mechsearch_jax.actions.config import OPEN, ActionSpace
 from mechsearch_jax.actions.kinds.object_grasps import grasp_variants, object_grasps
 from mechsearch_jax.actions.kinds.placement import ObjectGrasp, placement
 from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.actions.types import Action, Draft, DrawnWay, Prediction, Ways
+from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
 from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.dynamics.rigid import in_hand, pick_and_place
 from mechsearch_jax.geometry.collision import clouds_of, collisions
@@ -33,15 +33,21 @@ CODE = 2
 
 
 def _object_hits(T, owner, held, scene, clouds, distance, mask):
-    """Which others an object hits on its way along the gripper's -z: (C,) grasps of objects `owner` against (N).
+    """Which of N objects a grasped object hits as it moves along the gripper's -z, for C grasps; shape (C, N).
 
-    `held` says how each owner is turned in the hand. Its own column has to be masked out.
+    Args:
+      T: gripper poses, shape (C, 4, 4).
+      owner: index of the grasped object, shape (C,).
+      held: its rotation in the hand, shape (C, 3, 3).
+      scene, clouds: the objects and their surface points.
+      distance: length of the motion [m].
+      mask: which pairs to test, shape (C, N); must be False for the grasped object itself.
     """
     c, n = mask.shape
     places = swept_places(make(held, scene.position[owner]), -T[:, :3, 2], distance)
-    wanted = jnp.repeat(mask, SWEPT_PLACES, axis=0)
+    tested = jnp.repeat(mask, SWEPT_PLACES, axis=0)
     hits = collisions(
-        clouds_of(clouds), jnp.repeat(owner, SWEPT_PLACES), places.reshape(-1, 4, 4), scene, wanted, own=True
+        clouds_of(clouds), jnp.repeat(owner, SWEPT_PLACES), places.reshape(-1, 4, 4), scene, tested, own=True
     )
     return jnp.any(hits.reshape(c, SWEPT_PLACES, n), axis=1)
 
@@ -58,7 +64,7 @@ class PickAndPlace:
     returns_home: bool = True
     opening: int = OPEN
     surrounds_object: bool = True
-    # What could be picked could be taken out.
+    # A target that can be picked can be retrieved.
     moves_target: bool = False
 
     def wrists(self, space: ActionSpace) -> Int[np.ndarray, " v"]:
@@ -79,7 +85,7 @@ class PickAndPlace:
         return near[:, None]
 
     def swept_hits(self, space: ActionSpace, scene: Superquadrics, T, mask) -> Bool[Array, "k n"]:
-        """Which objects the grasped one hits on its way out; it may brush them `contact_tolerance` deep."""
+        """Which objects the grasped object hits on its way out, deeper than `contact_tolerance`."""
         n, config = scene.capacity, space.config
         owner = jnp.asarray(np.repeat(np.arange(n), len(self.wrists(space))))
         held = jax.vmap(lambda index, T: in_hand(scene, index, T))(owner, T)
@@ -88,19 +94,19 @@ class PickAndPlace:
         return _object_hits(T, owner, held, scene, clouds, space.gripper.approach, mask)
 
     def entering(
-        self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, ways: Ways
+        self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, candidates: Candidates
     ) -> Bool[Array, "n v d"]:
-        """Whether the gripper enters possible space as it grasps; where the object is put is looked at later."""
-        n, v, d = ways.reached.shape
-        usable = ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None] & space.config.avoid_unseen
+        """Whether the gripper enters possible space as it grasps; `placement` tests where the object is put."""
+        n, v, d = candidates.reached.shape
+        usable = candidates.reached & ~jnp.any(candidates.hits, axis=-1)[..., None] & space.config.avoid_unseen
         cloud = cloud_index(space.tables, OPEN, np.tile(self.wrists(space), n))
-        T = ways.T_world_gripper.reshape(-1, 4, 4)
+        T = candidates.T_world_gripper.reshape(-1, 4, 4)
         return approach_enters(space.tables, possible, cloud, T, usable.reshape(-1)).reshape(n, v, d)
 
-    def draft(self, key, space: ActionSpace, scene, possible, ways, drawn: DrawnWay) -> Draft:
-        """The grasp, a place that it can be taken to, and the space at both ends."""
-        index, way = drawn.object, jnp.clip(drawn.number, 0, ways.reached.shape[1] - 1)
-        T, wrist = ways.T_world_gripper[index, way], jnp.asarray(self.wrists(space))[way]
+    def draft(self, key, space: ActionSpace, scene, possible, candidates, drawn: DrawnCandidate) -> Draft:
+        """The grasp, a place where the object can be put, and the poses of gripper and object at both ends."""
+        index, number = drawn.object, jnp.clip(drawn.number, 0, candidates.reached.shape[1] - 1)
+        T, wrist = candidates.T_world_gripper[index, number], jnp.asarray(self.wrists(space))[number]
         placed, T_place, T_object = placement(key, space, scene, possible, ObjectGrasp(index, T, wrist, drawn.wanted))
         action = Action(
             kind=jnp.int32(CODE),
@@ -115,7 +121,7 @@ class PickAndPlace:
         return Draft(placed, action, wrist, grippers, jnp.broadcast_to(T_object, (PLACES, 4, 4)))
 
     def predict(self, space, push_model, scene, untouchable, action: Action, wrist) -> Prediction:
-        """The object, turned in the hand, moves with the gripper; `draft` has found out that it can."""
+        """The object, turned in the hand, moves with the gripper; `draft` has tested that it can."""
         after = pick_and_place(scene, action.object, action.T_world_gripper, action.T_world_place)
         moved = scene.valid & (jnp.arange(scene.capacity) == action.object)
         return Prediction(after, moved, action.kind == CODE)
@@ -125,7 +131,7 @@ class PickAndPlace:
         return pick_and_place_reference(action.T_world_gripper, action.T_world_place, action.q7, action.opening, config)
 
     def sketch(self, scene: Superquadrics, after: Superquadrics, action: Action) -> Sketch:
-        """The hand at both ends, and the object's way, as an arch above the others from its top to its top."""
+        """The hand at both ends, and an arch from the object's top at the grasp to its top at the place."""
         i = int(action.object)
         begin, end = (np.asarray(s.position, float)[i] for s in (scene, after))
         top = np.array([0.0, 0.0, float(np.abs(np.asarray(scene.rotation)[i, 2]) @ np.asarray(scene.size)[i])])

@@ -1,4 +1,4 @@
-"""Pushes: the closed hand travels along the board, and what it meets gives way (paper appendix B.5)."""
+"""Pushes: the closed hand moves along the board and pushes objects (paper appendix B.5)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mechsearch_jax.actions.approach import (
 from mechsearch_jax.actions.config import CLOSED, ActionConfig, ActionSpace
 from mechsearch_jax.actions.kinds.push_starts import PushStarts, object_pushes, push_starts
 from mechsearch_jax.actions.sketch import Sketch
-from mechsearch_jax.actions.types import Action, Draft, DrawnWay, Prediction, Ways
+from mechsearch_jax.actions.types import Action, Candidates, Draft, DrawnCandidate, Prediction
 from mechsearch_jax.actions.unseen_space import PossibleSpace, cloud_enters
 from mechsearch_jax.dynamics.push_model import PushModel
 from mechsearch_jax.geometry.collision import collisions
@@ -43,16 +43,16 @@ from mechsearch_jax.robot.motion import MotionConfig, Reference, push_reference
 from mechsearch_jax.workspace.shelf import Shelf, cloud_hits_shelf
 
 CODE = 1
-# Number of places on the way of a push that are tested for collision.
+# Number of places along a push that are tested for collision.
 PUSH_PLACES = 3
-# An object is not to be pushed to where its centre is nearer than this to the front edge [m].
+# Least distance of a pushed object's centre from the front edge [m].
 EDGE = 0.01
-# As the hand goes back, objects that the push moved are tested smaller by this on every side: many touch the hand [m].
+# As the hand goes back, moved objects are tested smaller by this on every side, since many touch the hand [m].
 TOUCHING = 0.008
 
 
 def _displacements(config: ActionConfig, heading: Float[np.ndarray, "*batch 2"]) -> Float[Array, "*batch d 3"]:
-    """The ways of the gripper along planar unit vectors, by every distance [m]."""
+    """Displacements of the gripper along planar unit vectors, by every distance [m]."""
     level = np.concatenate([heading, np.zeros_like(heading[..., :1])], axis=-1)
     return jnp.asarray(level[..., None, :] * np.asarray(config.push_distances, np.float32)[:, None])
 
@@ -65,27 +65,29 @@ def motion_free(
     still: Bool[Array, " n"],
     action: Action,
 ) -> Bool[Array, ""]:
-    """Whether the arm can follow a push from outside the shelf to outside, and links 2 to 5 touch nothing.
+    """Whether the arm can follow a push from outside the shelf and back, and links 2 to 5 touch nothing.
 
-    It stays in one configuration and passes no singularity. Proposals are looked at in few poses, which is enough to
-    rule out most; this is for the few that are drawn.
+    It stays in one configuration and passes no singularity. `Push.travels` tests all candidates at fewer poses; this is
+    the close test of the few that are drawn.
 
     Args:
       shelf: the shelf.
       gripper: static.
       scene, after: the objects before and after the push.
-      still: which objects it leaves in place.
+      still: which objects the push leaves in place.
       action: the push.
     """
     n = CLOSE_WAYPOINTS
     start, end = action.T_world_gripper, action.T_world_place
-    way = translate(jnp.broadcast_to(start, (n, 4, 4)), jnp.linspace(0.0, 1.0, n)[:, None] * (end - start)[None, :3, 3])
+    push = translate(
+        jnp.broadcast_to(start, (n, 4, 4)), jnp.linspace(0.0, 1.0, n)[:, None] * (end - start)[None, :3, 3]
+    )
     into, back = jax.vmap(lambda T: way_in(T, gripper.nearest_outside, gripper, CLOSE_CROSSINGS, n))(
         jnp.stack([start, end])
     )
-    q, follows = arm_path(jnp.concatenate([into, way[1:], back[::-1][1:]]), action.q7, shelf)
+    q, follows = arm_path(jnp.concatenate([into, push[1:], back[::-1][1:]]), action.q7, shelf)
     begins, ends = len(into), len(into) + n - 1
-    # Poses 5 cm apart at most, of which those before the push see the objects where they were.
+    # Poses at most 5 cm apart; those before the push are tested against the objects before it.
     stretches = q[:begins:2], q[begins:ends:3], q[ends::2]
     both = arm_hits(jnp.concatenate(stretches), _joined(scene, after))
     first, second = len(stretches[0]), len(stretches[0]) + len(stretches[1])
@@ -109,19 +111,19 @@ def gripper_meets(
     moved: Bool[Array, " n"],
     pushes: Bool[Array, ""],
 ) -> Bool[Array, ""]:
-    """Whether the gripper hits what a push should not make it hit.
+    """Whether the gripper hits objects that a push must not touch.
 
-    A `PushModel` knows the hand and the fingers while they push. Here links 6 and 7 are looked at, against objects that
-    stay; the way in along x, against all objects as they are; and the way back, against those that moved beside the
-    push's own, and along x against all objects as they are then.
+    The `PushModel` covers hand and fingers while they push. Tested here are:
+    links 6 and 7 during the push, against objects that stay; the way in along x, against all objects before the push;
+    the way back, against moved objects except the pushed one, and along x against all objects after the push.
 
     Args:
       space: what all actions share.
       scene, after: the objects before and after the push.
       action: the push.
       wrist: index of its wrist angle.
-      moved: which objects it moves.
-      pushes: whether it is one; nothing is hit where it is not.
+      moved: which objects the push moves.
+      pushes: whether the action is a push; if not, the result is False.
     """
     n, k, tables = scene.capacity, PUSH_PLACES, space.tables
     slim = after.replace(size=jnp.maximum(after.size - TOUCHING, 0.5 * after.size))
@@ -130,13 +132,13 @@ def gripper_meets(
     along = translate(jnp.broadcast_to(ends[0], (k, 4, 4)), share[:, None] * action.displacement[None])
     crossings, crosses = crossing_places(space, ends)
     places = jnp.concatenate([along, ends[1:], crossings.reshape(-1, 4, 4)])
-    others = moved & (jnp.arange(n) != action.object)
+    moved_along = moved & (jnp.arange(n) != action.object)
     nothing = jnp.zeros(n, bool)
     rows = [
         jnp.concatenate(row)
         for row in (
             (~moved, nothing, nothing),
-            (nothing, nothing, others),
+            (nothing, nothing, moved_along),
             (jnp.broadcast_to(crosses[0], n), nothing, nothing),
             (nothing, jnp.broadcast_to(crosses[1], n), nothing),
         )
@@ -149,7 +151,7 @@ def gripper_meets(
 
 
 def _in_words(displacement: Float[np.ndarray, " 3"]) -> str:
-    """A direction as the robot sees it, to the nearest eighth of a turn."""
+    """A direction in words as seen by the robot, to the nearest eighth of a turn."""
     eighth = round(math.atan2(displacement[1], displacement[0]) / (math.pi / 4))
     ahead = {0: "forward", 1: "forward", 3: "back", 4: "back"}.get(abs(eighth))
     side = {1: "to the left", -1: "to the right"}.get(np.sign(eighth)) if abs(eighth) in (1, 2, 3) else None
@@ -187,7 +189,7 @@ class Push:
         return _displacements(space.config, np.tile(self._starts(space).heading, (capacity, 1)))
 
     def travels(self, space: ActionSpace, T, near) -> Bool[Array, "k d"]:
-        """Whether the arm follows the push from outside to outside and nothing of it touches the shelf at its end."""
+        """Whether the arm follows the push from outside and back, and the gripper misses the shelf at its end."""
         d, tables = self.distances(space), space.tables
         wrist = self.wrists(space)
         capacity = T.shape[0] // len(wrist)
@@ -201,8 +203,8 @@ class Push:
             back = jnp.float32(gripper.approach)
             middle = translate(T, 0.5 * (end[:3, 3] - T[:3, 3]))
             into, out = crossing_poses(jnp.stack([T, end]), outside, gripper, FEW_CROSSINGS)
-            way = jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)])
-            follows = arm_follows(jnp.concatenate([into, way, out[::-1]]), q7, shelf)
+            push = jnp.stack([back_off(T, back), T, middle, end, back_off(end, back)])
+            follows = arm_follows(jnp.concatenate([into, push, out[::-1]]), q7, shelf)
             return follows & ~cloud_hits_shelf(shelf, end, taken(clouds, cloud[None])[0])
 
         q7, cloud = jnp.repeat(tables.q7[CLOSED, wrist], d), np.repeat(cloud_index(tables, CLOSED, wrist), d)
@@ -215,28 +217,28 @@ class Push:
         return jnp.zeros(mask.shape, bool)
 
     def entering(
-        self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, ways: Ways
+        self, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, candidates: Candidates
     ) -> Bool[Array, "n v d"]:
-        """Whether gripper or object enter possible space at places on the way less than two finger widths apart."""
-        n, v, d = ways.reached.shape
+        """Whether gripper or object enters possible space, at places along the push less than two fingers apart."""
+        n, v, d = candidates.reached.shape
         tables, wrist, owner = space.tables, np.tile(self.wrists(space), n), np.repeat(np.arange(n), v)
         clouds = object_clouds(scene, space.config.object_points)
-        usable = ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None] & space.config.avoid_unseen
+        usable = candidates.reached & ~jnp.any(candidates.hits, axis=-1)[..., None] & space.config.avoid_unseen
         shift = self._displacements(space, n)
 
         def enters(grippers, scene, row):
             T, shift, gripper, owner = row
             possible, poses, bodies = scene
-            way = shift[None] * jnp.linspace(0.0, 1.0, PLACES)[:, None]
+            passed = shift[None] * jnp.linspace(0.0, 1.0, PLACES)[:, None]
             along = [
-                translate(jnp.broadcast_to(pose, (PLACES, 4, 4)), way) for pose in (T, taken(poses, owner[None])[0])
+                translate(jnp.broadcast_to(pose, (PLACES, 4, 4)), passed) for pose in (T, taken(poses, owner[None])[0])
             ]
             swept = [taken(grippers, gripper[None]), taken(bodies, owner[None])]
             entered = [cloud_enters(possible, *pair) for pair in zip(along, swept, strict=True)]
             return jnp.any(entered[0] | entered[1])
 
         rows = (
-            jnp.repeat(ways.T_world_gripper.reshape(-1, 4, 4), d, axis=0),
+            jnp.repeat(candidates.T_world_gripper.reshape(-1, 4, 4), d, axis=0),
             shift.reshape(-1, 3),
             jnp.asarray(np.repeat(cloud_index(tables, CLOSED, wrist), d)),
             jnp.asarray(np.repeat(owner, d)),
@@ -244,13 +246,13 @@ class Push:
         grippers, of_scene = gripper_clouds(tables).points, (possible, make(scene.rotation, scene.position), clouds)
         return masked_vmap(enters, usable.reshape(-1), grippers, of_scene, rows, block=64).reshape(n, v, d)
 
-    def draft(self, key, space: ActionSpace, scene, possible, ways, drawn: DrawnWay) -> Draft:
-        """The push, and the space that it sweeps between its ends."""
-        _, v, d = ways.reached.shape
-        index, way = drawn.object, jnp.clip(drawn.number, 0, v * d - 1)
-        push, distance = way // d, way % d
+    def draft(self, key, space: ActionSpace, scene, possible, candidates, drawn: DrawnCandidate) -> Draft:
+        """The push, and the poses of gripper and object between its ends."""
+        _, v, d = candidates.reached.shape
+        index, number = drawn.object, jnp.clip(drawn.number, 0, v * d - 1)
+        push, distance = number // d, number % d
         starts = self._starts(space)
-        T, wrist = ways.T_world_gripper[index, push], jnp.asarray(starts.wrist)[push]
+        T, wrist = candidates.T_world_gripper[index, push], jnp.asarray(starts.wrist)[push]
         displacement = _displacements(space.config, starts.heading)[push, distance]
         action = Action(
             kind=jnp.int32(CODE),
@@ -276,19 +278,19 @@ class Push:
         action: Action,
         wrist: Int[Array, ""],
     ) -> Prediction:
-        """What the push model says; impossible where the arm cannot follow, or where it would do what it must not.
+        """The prediction of the push model, and whether the push is possible.
 
-        That is: jam, tip an object, move what is untouchable, push an object to the front edge, or hit one that stays.
-        A prediction that is not a number makes a push impossible, too.
+        It is impossible if the arm cannot follow, or if the push jams, tips an object, moves an untouchable one, pushes
+        one to the front edge, or makes the gripper hit one that stays; or if the prediction is not finite.
         """
         pushes = action.kind == CODE
-        # A model that simulates has less to do where nothing is pushed.
-        way = jnp.where(pushes, action.displacement, 0.0)
-        pushed = push_model(space.shelf, scene, space.tables.pusher, action.T_world_gripper, way, action.q7)
+        # A push model that simulates has less to do where nothing is pushed.
+        displacement = jnp.where(pushes, action.displacement, 0.0)
+        pushed = push_model(space.shelf, scene, space.tables.pusher, action.T_world_gripper, displacement, action.q7)
         moved = pushed.moved
         config = space.config
-        holds = pushed.resolved & jnp.isfinite(pushed.residual) & jnp.all(pushed.topples <= config.topple)
-        spoiled = ~holds | jnp.any(moved & untouchable)
+        allowed = pushed.resolved & jnp.isfinite(pushed.residual) & jnp.all(pushed.topples <= config.topple)
+        spoiled = ~allowed | jnp.any(moved & untouchable)
         spoiled |= jnp.any(moved & (pushed.scene.position[:, 0] < space.shelf.front + EDGE))
         spoiled |= gripper_meets(space, scene, pushed.scene, action, wrist, moved, pushes & ~spoiled)
 
@@ -304,12 +306,12 @@ class Push:
         return push_reference(action.T_world_gripper, action.displacement, action.q7, config)
 
     def sketch(self, scene: Superquadrics, after: Superquadrics, action: Action) -> Sketch:
-        """The hand where it begins and where it ends, and its way between them."""
-        start, way = np.asarray(action.T_world_gripper, float), np.asarray(action.displacement, float)
+        """The hand at the start and the end of the push, and the line between them."""
+        start, displacement = np.asarray(action.T_world_gripper, float), np.asarray(action.displacement, float)
         end = start.copy()
-        end[:3, 3] += way
+        end[:3, 3] += displacement
         share = np.linspace(0.0, 1.0, 40)[:, None]
-        return Sketch(np.stack([start, end]), float(action.opening), path=start[:3, 3] + share * way)
+        return Sketch(np.stack([start, end]), float(action.opening), path=start[:3, 3] + share * displacement)
 
     def describe(self, action: Action, target: int | None = None) -> str:
         d = np.asarray(action.displacement)

@@ -1,4 +1,4 @@
-"""Every way to move every object of a scene, and what stands in the way: one batched evaluation for all kinds."""
+"""Candidate actions for every object of a scene (paper B.5), all kinds evaluated in one batch."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from mechsearch_jax.actions.approach import cloud_index, gripper_clouds
 from mechsearch_jax.actions.config import ActionSpace
 from mechsearch_jax.actions.kind import SampledKind
 from mechsearch_jax.actions.registry import SAMPLED_KINDS
-from mechsearch_jax.actions.types import Ways
+from mechsearch_jax.actions.types import Candidates
 from mechsearch_jax.actions.unseen_space import PossibleSpace
 from mechsearch_jax.geometry.collision import collisions
 from mechsearch_jax.geometry.footprints import footprints
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.robot.entry import WaysIn, gripper_enters
 
-# The ways of every sampled kind, in the order of `SAMPLED_KINDS`.
-AllWays = tuple[Ways, ...]
+# The candidates of every sampled kind, in the order of `SAMPLED_KINDS`.
+AllCandidates = tuple[Candidates, ...]
 
 
-def no_ways(space: ActionSpace, capacity: int) -> AllWays:
-    """The ways to move so many objects that are yet to be looked at."""
+def no_candidates(space: ActionSpace, capacity: int) -> AllCandidates:
+    """The candidates of `capacity` objects before any evaluation: none is feasible."""
 
-    def none(kind: SampledKind) -> Ways:
+    def empty(kind: SampledKind) -> Candidates:
         n, v, d = capacity, len(kind.wrists(space)), kind.distances(space)
-        return Ways(
+        return Candidates(
             T_world_gripper=jnp.zeros((n, v, 4, 4)),
             weight=jnp.zeros((n, v)),
             reached=jnp.zeros((n, v, d), bool),
@@ -36,36 +36,35 @@ def no_ways(space: ActionSpace, capacity: int) -> AllWays:
             enters=jnp.zeros((n, v, d), bool),
         )
 
-    return tuple(none(kind) for kind in SAMPLED_KINDS)
+    return tuple(empty(kind) for kind in SAMPLED_KINDS)
 
 
-def all_ways(
+def all_candidates(
     space: ActionSpace,
     scene: Superquadrics,
     possible: PossibleSpace,
-    previous: AllWays | None = None,
+    previous: AllCandidates | None = None,
     moved: Bool[Array, " n"] | None = None,
     available: Bool[Array, "*kinds n"] | None = None,
-) -> AllWays:
-    """All ways to move all objects, and what stands in their way.
+) -> AllCandidates:
+    """Propose and test all candidate actions for all objects.
 
-    The kinds are tested together as far as they are alike: the approaches of the first kind to all objects, then those
-    of the next.
+    Approaches of all kinds are tested in one batch: those of the first kind to all objects, then those of the next.
 
     Args:
       space: what all actions share.
       scene: the objects, fields (N, ...).
       possible: where the target may be.
-      previous: the ways before some objects moved.
-      moved: which moved since; only what concerns them is computed anew.
-      available: which objects may be moved, by all kinds alike or by each of `SAMPLED_KINDS`; all if left out. What the
-        ways of the others enter is not looked at.
+      previous: the candidates before objects moved; only what concerns the `moved` objects is computed anew.
+      moved: which objects moved since.
+      available: which objects may be moved, by all kinds alike or by each of `SAMPLED_KINDS`; default all. `enters` is
+        computed for these only.
     """
     n = scene.capacity
-    previous = no_ways(space, n) if previous is None else previous
+    previous = no_candidates(space, n) if previous is None else previous
     fresh = scene.valid if moved is None else moved & scene.valid
     concerns = fresh[:, None] | fresh[None, :]
-    others = concerns & scene.valid[:, None] & scene.valid[None, :]
+    tested_pairs = concerns & scene.valid[:, None] & scene.valid[None, :]
     proposed = _proposed(space, scene, previous, fresh)
     T_world_gripper, _, cloud = proposed.approaches
     clouds = gripper_clouds(space.tables)
@@ -77,7 +76,7 @@ def all_ways(
     for kind, before, T, part in zip(SAMPLED_KINDS, previous, proposed.T_world_gripper, proposed.parts, strict=True):
         travels = kind.travels(space, T_world_gripper[part], near[part]).reshape(*T.shape[:2], -1)
         reached.append(jnp.where(fresh[:, None, None], travels, before.reached))
-        obstacles = others & ~jnp.eye(n, dtype=bool) if kind.surrounds_object else others
+        obstacles = tested_pairs & ~jnp.eye(n, dtype=bool) if kind.surrounds_object else tested_pairs
         owner = np.repeat(np.arange(n), T.shape[1])
         against.append(obstacles[owner] & jnp.any(reached[-1], axis=-1).reshape(-1)[:, None])
     mask = jnp.concatenate(against)
@@ -90,20 +89,20 @@ def all_ways(
         hits = by_hand[part]
         hits |= kind.swept_hits(space, scene, T_world_gripper[part], mask[part] & ~hits)
         hits = jnp.where(concerns[:, None, :], hits.reshape(*T.shape[:2], n), before.hits)
-        ways = Ways(T, weight, reached[i], hits, before.enters)
-        looked_at = ways.replace(reached=reached[i] & able[i][:, None, None])
-        tested.append(ways.replace(enters=kind.entering(space, scene, possible, looked_at)))
+        candidates = Candidates(T, weight, reached[i], hits, before.enters)
+        usable = candidates.replace(reached=reached[i] & able[i][:, None, None])
+        tested.append(candidates.replace(enters=kind.entering(space, scene, possible, usable)))
     return tuple(tested)
 
 
 class _Proposed(NamedTuple):
-    """All ways before anything is tested.
+    """Candidates before any test: lists by kind, and arrays over the K candidates of all kinds together.
 
     Attributes:
-      T_world_gripper, weight: as in `Ways`, of each kind.
-      parts: which of the K ways of all kinds together are those of each.
-      approaches: the straight way in to each of the K.
-      wanted: which of the K are tested.
+      T_world_gripper, weight: as in `Candidates`, by kind.
+      parts: slice of the K candidates that belong to each kind.
+      approaches: the straight way in, for each of the K.
+      wanted: which of the K are tested, shape (K,).
     """
 
     T_world_gripper: list[Float[Array, "n _ 4 4"]]
@@ -113,8 +112,8 @@ class _Proposed(NamedTuple):
     wanted: Bool[Array, " k"]
 
 
-def _proposed(space: ActionSpace, scene: Superquadrics, previous: AllWays, fresh: Bool[Array, " n"]) -> _Proposed:
-    """What each kind proposes for the fresh objects, beside what was proposed for the others before."""
+def _proposed(space: ActionSpace, scene: Superquadrics, previous: AllCandidates, fresh: Bool[Array, " n"]) -> _Proposed:
+    """Propose candidates for the fresh objects; the other objects keep their previous ones."""
     n, prints = scene.capacity, footprints(scene)
     poses, weights, wanted, wrists, openings, parts = [], [], [], [], [], []
     first = 0
@@ -137,6 +136,6 @@ def _proposed(space: ActionSpace, scene: Superquadrics, previous: AllWays, fresh
     return _Proposed(poses, weights, parts, approaches, jnp.concatenate(wanted))
 
 
-def free_ways(ways: Ways) -> Bool[Array, "n v d"]:
-    """Which ways nothing stands in the way of."""
-    return ways.reached & ~jnp.any(ways.hits, axis=-1)[..., None]
+def free_candidates(candidates: Candidates) -> Bool[Array, "n v d"]:
+    """Which candidates are reachable and hit no object."""
+    return candidates.reached & ~jnp.any(candidates.hits, axis=-1)[..., None]
