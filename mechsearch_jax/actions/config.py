@@ -1,4 +1,4 @@
-"""Which actions there are, and the constants that follow from it."""
+"""The set of actions, and constants computed from it."""
 
 from __future__ import annotations
 
@@ -22,42 +22,41 @@ from mechsearch_jax.workspace.shelf import Shelf
 LONGEST_PUSH = 0.5
 # How far the hand extends behind the finger tips' centres [m].
 HAND_LENGTH = 0.11
-# Which of the swept clouds an action's approach is tested with.
+# Index of the gripper's state on an action's approach in `ActionTables`.
 OPEN, CLOSED = 0, 1
 
 
 @dataclasses.dataclass(frozen=True)
 class ActionConfig:
-    """Which actions there are; hashable, static under jit.
+    """The set of candidate actions; hashable, static under jit.
 
     Attributes:
       actions: names of the kinds that are sampled: "push", "pick-and-place" or both.
-      push_directions: in which directions, as angles from +x, which is straight into the shelf, towards +y, which is to
-        the left [rad]; the paper's are left and right.
-      push_distances: how far the gripper travels in a push [m].
+      push_directions: directions of pushes as angles from +x (into the shelf) towards +y (to the left) [rad]; the
+        paper's are left and right.
+      push_distances: distances of the gripper's travel in a push [m].
       push_tilt: angle by which the pushing gripper points downwards [rad].
-      push_wrists: angles of joint 7 relative to 45 degrees that pushes are tried with [rad].
+      push_wrists: angles of joint 7 in pushes, relative to 45 degrees [rad].
       push_yaws: angles between the gripper's approach and +x in a push to a side, seen from above [rad].
       push_height: largest height of the finger tips above the board in a push [m].
-      push_leverage: largest height at which a push may begin to touch without toppling, above which there is none;
-        see `push_model.LEVERAGE`.
-      topple: a push is not executed if an object is predicted to fall over with a probability above this.
+      push_leverage: limits of the contact height above which a push topples the object; see `push_model.LEVERAGE`.
+      topple: largest predicted probability that an object falls over in a push that is executed.
       push_gap: distance between gripper and object where a push starts [m].
       push_depths: how far the finger tips reach past the object's front, or past its centre, in a push to a side [m].
-      push_offsets: how far the finger tips are from the object's centre in other pushes, across the push and away from
-        the robot, as shares of its half extent there.
+      push_offsets: offset of the finger tips from the object's centre in other pushes, across the push and away from
+        the robot, as a share of the object's half extent in that direction.
       push_postures: yaw of the gripper, and index of its wrist in `push_wrists`, in other pushes. Of all pairs of five
-        yaws and three wrists these keep most of the pushes that can be made in published scenes.
-      grasps: the ways in which an object is grasped.
-      placements: how many places are tried for a picked object, and how many of those are tested for collision.
+        yaws and three wrists these keep most of the feasible pushes in published scenes.
+      grasps: how an object is grasped.
+      placements: number of places drawn for a picked object, and number of those tested for collision.
       place_yaw: largest angle by which a picked object is turned [rad].
-      clearance: distance to keep from neighbours when placing [m].
-      contact_tolerance: an object may brush others this deep on its way out [m]: those that touch each other are
-        recognised as overlapping as often as not, and would lock each other in.
-      avoid_unseen: whether an object's actions that enter space where the target may be are sampled only if it has no
-        others; the paper does not look at that.
+      clearance: distance to neighbours when placing [m].
+      contact_tolerance: depth of contact with other objects that is allowed on a picked object's way out [m]: touching
+        objects are often recognised as overlapping, and would lock each other in.
+      avoid_unseen: whether candidates that enter space where the target may be are sampled only if their object has no
+        others; the paper does not test this.
       cloud_points: points on the swept gripper.
-      still_points: points on the gripper where it is.
+      still_points: points on the gripper at rest.
       pusher_points: points on the hand and fingers.
       object_points: points on an object.
     """
@@ -115,14 +114,14 @@ class ActionConfig:
 
 
 class ActionTables(flax.struct.PyTreeNode):
-    """Constants of the actions.
+    """Constants of the actions, for W wrist angles; clouds are in the gripper's frame, open (`OPEN`), then closed.
 
     Attributes:
-      q7: angles of joint 7 with the hand open, then closed, shape (2, W) [rad].
-      clouds: what the gripper sweeps on its way in, in its own frame, open and then closed: shape (2, W, 3, P) [m].
-      low, high: boxes around them, shape (2, W, 3) [m].
-      still: what the gripper takes up where it is, shape (2, W, 3, S) [m].
-      pusher: surface of the closed hand and fingers in the gripper's frame, shape (Q, 3) [m].
+      q7: angles of joint 7, shape (2, W) [rad].
+      clouds: points that the gripper sweeps on its way in, shape (2, W, 3, P) [m].
+      low, high: bounding boxes of `clouds`, shape (2, W, 3) [m].
+      still: points on the gripper at rest, shape (2, W, 3, S) [m].
+      pusher: surface of the closed hand and fingers, shape (Q, 3) [m].
     """
 
     q7: jax.Array
@@ -140,13 +139,13 @@ class ActionTables(flax.struct.PyTreeNode):
 )
 @dataclasses.dataclass(frozen=True)
 class ActionSpace:
-    """What all actions share and no scene changes, gathered so that it can be passed on as one argument: a pytree.
+    """What all actions share, the same in every scene; a pytree.
 
     Attributes:
       shelf, tables: data.
       gripper, config: static.
-      max_yaw: of grasps, as in `graspability.GraspConfig`; static.
-      waypoints: poses at which an approach has to be reachable; static.
+      max_yaw: largest yaw of grasps, as in `graspability.GraspConfig` [rad]; static.
+      waypoints: number of poses at which an approach must be reachable; static.
     """
 
     shelf: Shelf
@@ -168,10 +167,10 @@ def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: Act
     Args:
       gripper: the gripper.
       grasp_wrists: angles of joint 7 in grasps, relative to 45 degrees [rad].
-      config: has as many angles for pushes.
+      config: the actions; `push_wrists` must have as many angles.
 
     Raises:
-      InputError: it has not.
+      InputError: the numbers of angles differ.
     """
     if len(grasp_wrists) != len(config.push_wrists):
         raise InputError(
@@ -185,7 +184,7 @@ def action_tables(gripper: Gripper, grasp_wrists: tuple[float, ...], config: Act
     still = np.stack(
         [[gripper_cloud(gripper, opening, float(a), config.still_points) for a in angles] for opening, angles in hands]
     )
-    # Only the hand and the fingers push; the links behind them would thin out the points that matter.
+    # Only hand and fingers push; points on the links behind them would leave fewer for these.
     surface = gripper_cloud(gripper, 0.0, float(q7[CLOSED][0]), 2048)
     pusher = surface[surface[:, 2] > -HAND_LENGTH][: config.pusher_points]
     tables = {

@@ -1,4 +1,4 @@
-"""All kinds of action. A new kind is a file of its own, beside the others, and its two lines here."""
+"""All kinds of action. A new kind is a new file in `kinds` and two lines here."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mechsearch_jax.runtime.errors import InputError, shown
 
 
 class ActionKind(enum.IntEnum):
-    """The values of `Action.kind`, which are kept in files."""
+    """The values of `Action.kind`; files store them."""
 
     NONE = nothing.CODE
     PUSH = push.CODE
@@ -19,7 +19,7 @@ class ActionKind(enum.IntEnum):
     RETRIEVE = retrieve.CODE
 
 
-# Those that sequences are sampled from. Their order decides which random number stands for which action.
+# Kinds from which sequences are sampled. Their order decides which random number belongs to which action.
 SAMPLED_KINDS: Sequence[SampledKind] = (pick_and_place.PickAndPlace(), push.Push())
 
 KINDS: Mapping[ActionKind, Kind] = {
@@ -31,7 +31,7 @@ def kind_of(code: int) -> Kind:
     """The kind with a code.
 
     Raises:
-      InputError: there is none.
+      InputError: no kind has this code.
     """
     for kind in KINDS.values():
         if kind.code == int(code):
@@ -41,10 +41,10 @@ def kind_of(code: int) -> Kind:
 
 
 def check_kinds(names: Sequence[str]) -> None:
-    """Refuse names that none of `SAMPLED_KINDS` has.
+    """Check names of kinds.
 
     Raises:
-      InputError: there is one.
+      InputError: a name is not one of `SAMPLED_KINDS`.
     """
     sampled = [kind.name for kind in SAMPLED_KINDS]
     for name in names:

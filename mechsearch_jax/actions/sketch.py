@@ -1,6 +1,6 @@
-"""What a picture shows of an action, in the world and without any knowledge of how it is drawn.
+"""What a picture shows of an action, in the world frame and independent of how it is drawn.
 
-Objects that are predicted to move are drawn where they end, whatever the kind of action.
+For every kind of action, objects that are predicted to move are drawn where they end.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ class Sketch:
     """Lines in the world; every part may be missing.
 
     Attributes:
-      hands: poses of the gripper, where it begins to act and then where else it acts, shape (k, 4, 4) [m].
+      hands: poses of the gripper, first where the action begins, shape (k, 4, 4) [m].
       opening: distance between its fingers [m].
-      path: what moves while it acts, drawn as an arrow, shape (points, 3) [m].
-      takes_target: whether it is the target that moves along the path.
+      path: path of the hand or of the object in it, drawn as an arrow, shape (points, 3) [m].
+      takes_target: whether the target moves along the path.
     """
 
     hands: Float[np.ndarray, "k 4 4"] | None = None

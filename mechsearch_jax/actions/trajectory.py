@@ -1,4 +1,4 @@
-"""An action as a robot's controller takes it: joint angles over time."""
+"""The joint trajectory of an action, for a robot's controller."""
 
 from __future__ import annotations
 
@@ -19,12 +19,11 @@ from mechsearch_jax.runtime.errors import InputError
 class JointTrajectory(flax.struct.PyTreeNode):
     """The motion of the arm and the fingers, one row for each time step.
 
-    It begins and ends outside the shelf, and holds all that happens inside; the ways between there and the home
-    configuration, in front of the shelf, are the caller's. The fingers cannot come closer than the thing between them:
-    a width of 0 then means grip.
+    It begins and ends outside the shelf. The caller plans the motion between there and the home configuration, in front
+    of the shelf. A width of 0 with an object between the fingers means grip.
 
     Attributes:
-      time: since the motion began [s], shape (T,).
+      time: time since the motion began [s], shape (T,).
       position: joint angles [rad], shape (T, 7).
       velocity: joint velocities [rad/s], shape (T, 7).
       gripper: distance between the fingers [m], shape (T,).
@@ -40,10 +39,10 @@ class JointTrajectory(flax.struct.PyTreeNode):
 def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[Reference, Bool[Array, ""]] | None:
     """`Kind.reference`, compiled: the motion of an action and whether the arm reaches all of it, or None.
 
-    The host computes it, beside a GPU too, which takes longer for the many small steps of a single motion.
+    Computed on the host even if there is a GPU, which is slower at the many small steps of a single motion.
 
     Args:
-      kind: of the action; static.
+      kind: kind of the action; static.
       action: a single action.
       config: lengths and durations; static.
     """
@@ -53,13 +52,13 @@ def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[
 def joint_trajectory(problem, action: Action, config: MotionConfig | None = None) -> JointTrajectory:
     """The joint trajectory of a decision's action: a push, a pick-and-place or a retrieval.
 
-    Not to be called inside `jit`: its length depends on the action. For the action that does nothing it is a
-    single row, the home configuration.
+    Not for use inside `jit`: its length depends on the action. For the action that does nothing it is a single row, the
+    home configuration.
 
     Args:
-      problem: what does not change; says how the gripper is used.
+      problem: the problem, with the gripper.
       action: a single action.
-      config: lengths and durations; the problem's gripper and the defaults if left out.
+      config: lengths and durations; default: the problem's gripper and default durations.
 
     Raises:
       InputError: the kind of action is unknown, or the arm does not reach all of the motion, or not in time.

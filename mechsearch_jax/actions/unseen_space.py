@@ -1,4 +1,4 @@
-"""The space that an unseen target may take, and what enters it."""
+"""The space that an unseen target may fill, and tests of what enters it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from mechsearch_jax.geometry.transforms import transform_rows
 
 
 class PossibleSpace(flax.struct.PyTreeNode):
-    """Where a target that has not been ruled out would stand, as a raster at the spacing of the candidate poses.
+    """The part of the shelf that a target at a possible pose would fill, as a raster spaced as the candidate poses are.
 
     Attributes:
-      occupied: whether any of it lies in a cell, shape (rows along x, columns along y).
+      occupied: whether a target at a possible pose covers part of a cell, shape (rows along x, columns along y).
       chance: share of the possible poses whose centre is in a cell, same shape; the sum is 1, or 0 if there are none.
       origin: centre of the first cell [m], shape (2,).
       cell: spacing [m], shape (2,).
@@ -29,7 +29,7 @@ class PossibleSpace(flax.struct.PyTreeNode):
 
 
 def widen(cells: Bool[Array, "r c"]) -> Bool[Array, "r c"]:
-    """A raster with the neighbours of its cells. A cell is 15 mm wide and a target's radius 20 mm: one is enough."""
+    """Grow a raster by one cell on every side: enough, as a cell is 15 mm wide and a target's radius 20 mm."""
     return jax.lax.reduce_window(cells, False, jax.lax.bitwise_or, (3, 3), (1, 1), "SAME")
 
 
@@ -56,12 +56,12 @@ def enters(space: PossibleSpace, points: Float[Array, "*batch 3"]) -> Bool[Array
 def cloud_enters(
     space: PossibleSpace, T_world_cloud: Float[Array, "*batch 4 4"], cloud: Float[Array, "*#batch 3 p"]
 ) -> Bool[Array, "*batch"]:
-    """Whether a point of a placed cloud, given as rows of coordinates in its own frame, lies in possible space."""
+    """Whether any point of a cloud (rows of coordinates in its own frame) at a pose lies in possible space."""
     return jnp.any(_enters(space, *transform_rows(T_world_cloud, cloud)), axis=-1)
 
 
 def touch_probability(space: PossibleSpace, points: Float[Array, "... 3"]) -> Float[Array, ""]:
-    """Share of the possible poses at which the target would be touched by world points."""
+    """Share of the possible poses at which world points would touch the target."""
     x, y, z = points.reshape(-1, 3).T
     row, column, inside = _cells(space, x, y, z)
     touched = jnp.zeros(space.occupied.shape, bool).at[row, column].max(inside)

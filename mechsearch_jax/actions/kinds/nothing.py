@@ -1,4 +1,4 @@
-"""Doing nothing: what is left where no action is possible, or all that was tried out did harm."""
+"""Doing nothing: the decision if no action is possible, or every action that was tried did harm."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Nothing:
     returns_home: bool = False
 
     def predict(self, space, push_model, scene, untouchable, action, wrist) -> Prediction:
-        """Nothing changes, and nothing is achieved: not a possible action."""
+        """Nothing changes; marked impossible, since it achieves nothing."""
         return Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False))
 
     def reference(self, action, config) -> None:

@@ -1,4 +1,4 @@
-"""Candidate grasps of the objects in the way: from the side, with the fingers closing horizontally (paper B.5)."""
+"""Candidate grasps of objects: from the side, with the fingers closing horizontally (paper B.5)."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.options import option
 from mechsearch_jax.workspace.shelf import Shelf
 
-# How close to an object's front the palm may pass, and how far above the board the finger tips' centres stay [m].
+# Least distance of the palm from an object's front, and of the finger tips' centres from the board [m].
 PASSING_GAP = 0.003
 LOWEST = 0.025
-# How far the palm's flat front is behind the finger tips' centres, which is also how far it extends above them [m].
+# Distance of the palm's flat front behind the finger tips' centres; the palm also extends as far above them [m].
 PALM = 0.033
 
 
 @dataclasses.dataclass(frozen=True)
 class BoxGrasp:
-    """A way to grasp an object with flat sides.
+    """A side grasp of an object with flat sides.
 
     Attributes:
-      face: which side the gripper approaches: 0 is the one most square to +x, 1 the next.
-      turn: how far the approach turns away from square to that side, as a share of what is possible; positive towards
-        +x. The object turns in the hand as the fingers close.
-      drop: how far below its top the object is grasped [m].
-      reach: how far the fingers reach past its front, as a share of what the palm leaves room for.
+      face: the side that the gripper approaches: 0 is the most square to +x, 1 the next.
+      turn: angle of the approach from square to that side, as a share of the largest possible one; positive towards +x.
+        The object turns in the hand as the fingers close.
+      drop: distance of the grasp below the object's top [m].
+      reach: how far the fingers reach past its front, as a share of the largest reach that the palm allows.
     """
 
     face: int = 0
@@ -51,13 +51,13 @@ class ObjectGraspConfig:
     """How objects are grasped.
 
     Attributes:
-      boxes: the ways to grasp an object with flat sides.
-      round_drops: how far below its top a round object is grasped, in turn over its approach directions, of which
-        there are as many as `boxes` [m].
+      boxes: grasps of an object with flat sides.
+      round_drops: distances of the grasp below a round object's top, used in turn over its approach directions, of
+        which there are as many as `boxes` [m].
       tilts: angles by which the gripper points downwards [rad].
-      max_turn: largest angle between the approach and the side that is grasped [rad].
-      min_turn: smaller ones are as good as none [rad].
-      turn_gap: how much of the opening must be left when the approach is turned [m].
+      max_turn: largest angle between the approach and the normal of the grasped side [rad].
+      min_turn: smaller angles are treated as square [rad].
+      turn_gap: least free part of the opening when the approach is turned [m].
     """
 
     boxes: tuple[BoxGrasp, ...] = (
@@ -86,18 +86,18 @@ class ObjectGraspConfig:
 
 
 def grasp_variants(config: ObjectGraspConfig, wrists: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Index of the way, index of the wrist and tilt [rad] of each candidate grasp of an object, each of shape (A,)."""
+    """Index in `boxes`, index of the wrist and tilt [rad] of each candidate grasp, each of shape (A,)."""
     grid = np.meshgrid(np.arange(len(config.boxes)), config.tilts, np.arange(wrists), indexing="ij")
-    way, tilt, wrist = (g.reshape(-1) for g in grid)
-    return way, wrist, tilt.astype(np.float32)
+    box, tilt, wrist = (g.reshape(-1) for g in grid)
+    return box, wrist, tilt.astype(np.float32)
 
 
 def _largest_turn(width: Array, depth: Array, opening: float, config: ObjectGraspConfig) -> Array:
-    """How far a hand may be turned from square to a side before an object of these half-extents is too wide for it."""
+    """Largest angle of the approach from square at which an object of these half-extents fits in the hand [rad]."""
     radius = jnp.sqrt(width**2 + depth**2)
-    held = 0.5 * (opening - config.turn_gap)
-    wide = radius > held
-    room = jnp.arcsin(jnp.where(wide, held / radius, 0.0)) - jnp.arctan2(width, depth)
+    half_opening = 0.5 * (opening - config.turn_gap)
+    wide = radius > half_opening
+    room = jnp.arcsin(jnp.where(wide, half_opening / radius, 0.0)) - jnp.arctan2(width, depth)
     return jnp.where(wide, jnp.clip(room, 0.0, config.max_turn), config.max_turn)
 
 
@@ -111,7 +111,7 @@ def object_grasps(
 ) -> tuple[Float[Array, "n a 4 4"], Bool[Array, "n a"]]:
     """Side grasps of objects that stand or lie on the board.
 
-    Round objects are grasped through their axis from directions spread over `max_yaw`, others as `config.boxes` says.
+    Round objects are grasped through their axis from directions spread over `max_yaw`, others by `config.boxes`.
 
     Args:
       shelf: the shelf.
@@ -122,13 +122,12 @@ def object_grasps(
       wrists: number of angles of joint 7.
 
     Returns:
-      Gripper poses in the world, in the order of `grasp_variants`, and whether the object is thin enough to be grasped
-      so.
+      Gripper poses in the world, in the order of `grasp_variants`, and whether the object fits between the fingers.
     """
-    way, _, tilt = grasp_variants(config, wrists)
-    n, a, count = prints.yaw.shape[0], len(way), len(config.boxes)
+    box, _, tilt = grasp_variants(config, wrists)
+    n, a, count = prints.yaw.shape[0], len(box), len(config.boxes)
     is_round = prints.round[:, None]
-    rank, share, box_drop, box_reach = np.array([dataclasses.astuple(box) for box in config.boxes], np.float32)[way].T
+    rank, share, box_drop, box_reach = np.array([dataclasses.astuple(b) for b in config.boxes], np.float32)[box].T
 
     faces = prints.yaw[:, None] + QUARTER_TURN * jnp.arange(4)[None]
     faces = jnp.arctan2(jnp.sin(faces), jnp.cos(faces))
@@ -139,15 +138,15 @@ def object_grasps(
     width = jnp.where(face % 2 == 0, prints.half[:, 1:], prints.half[:, :1])
     turn = share[None] * _largest_turn(width, depth, gripper.usable_opening, config)
     directions = np.linspace(-max_yaw, max_yaw, count) if count > 1 else np.zeros(1)
-    yaw = jnp.where(is_round, jnp.float32(directions[way])[None], square - jnp.where(square < 0, -turn, turn))
+    yaw = jnp.where(is_round, jnp.float32(directions[box])[None], square - jnp.where(square < 0, -turn, turn))
     fits = (2 * width <= gripper.usable_opening) & (jnp.abs(yaw) <= max_yaw + 1e-3)
     fits &= is_round | (share == 0.0)[None] | (jnp.abs(turn) > config.min_turn)
     front = jnp.where(is_round, depth, depth * jnp.cos(turn) + width * jnp.abs(jnp.sin(turn)))
 
-    round_drop = np.asarray(config.round_drops, np.float32)[way % len(config.round_drops)]
+    round_drop = np.asarray(config.round_drops, np.float32)[box % len(config.round_drops)]
     drop = jnp.where(is_round, round_drop[None], box_drop[None])
     z = jnp.maximum(prints.high[:, None] - drop, shelf.board + LOWEST)
-    # The palm must not run into what stands up before it: the object's front, or its top if the palm reaches that high.
+    # The palm must not hit the object: its front, or its top edge if the palm reaches that high.
     c, t = np.cos(tilt), np.tan(tilt)
     above = jnp.clip(prints.high[:, None] - z, 0.0, jnp.float32(PALM * np.sin(tilt) + PALM * c)[None])
     reach = jnp.float32(PALM / c)[None] - above * jnp.float32(t)[None] - PASSING_GAP

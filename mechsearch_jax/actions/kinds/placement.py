@@ -1,4 +1,4 @@
-"""Where a picked object can be put: places that are drawn, and whether arm and object get there."""
+"""Places for a picked object: random ones, and whether arm and object get there."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from mechsearch_jax.robot.entry import CLOSE_CROSSINGS, crossing_length, ways_in
 from mechsearch_jax.robot.gripper import arm_hits_shelf
 from mechsearch_jax.workspace.shelf import cloud_hits_shelf, hits_shelf
 
-# How far a joint may turn between where an object is taken out of the shelf and where it is brought in [rad].
+# Largest turn of a joint between taking an object out of the shelf and bringing it back in [rad].
 LARGEST_TRANSFER = 2.0
-# At how many places of its crossing an object in the hand is tested. Crossings are at most 28 cm long, which leaves
-# 2.3 cm from place to place: less than the thinnest object measures.
+# Number of places where an object in the hand is tested on its crossing. Crossings are at most 28 cm long, so that
+# places are at most 2.3 cm apart: less than the thinnest object measures.
 OBJECT_PLACES = 12
 
 
@@ -45,7 +45,7 @@ class ObjectGrasp(NamedTuple):
       object: its index.
       T_world_gripper: pose of the gripper, shape (4, 4).
       wrist: index of the wrist angle.
-      wanted: whether anything is to be computed of it.
+      wanted: whether a place is to be computed.
     """
 
     object: Int[Array, ""]
@@ -55,12 +55,12 @@ class ObjectGrasp(NamedTuple):
 
 
 class Ends(NamedTuple):
-    """Where an object in the hand may be taken from and to: the grasp first, then the places; W of them.
+    """Both ends of possible transfers of an object in the hand: the grasp first, then the places; W in all.
 
     Attributes:
       T_world_gripper: pose of the gripper, shape (W, 4, 4).
-      T_world_object: pose of the object in it, shape (W, 4, 4).
-      wanted: which are looked at, shape (W,).
+      T_world_object: pose of the object in the hand, shape (W, 4, 4).
+      wanted: which are tested, shape (W,).
     """
 
     T_world_gripper: Float[Array, "w 4 4"]
@@ -75,22 +75,22 @@ def placement(
     possible: PossibleSpace,
     grasp: ObjectGrasp,
 ) -> tuple[Bool[Array, ""], Float[Array, "4 4"], Float[Array, "4 4"]]:
-    """A place for a picked object where it can be put: the first of those that are drawn, if any will do.
+    """The first of several random places where a picked object can be put.
 
     Args:
       key: PRNG key.
       space: what all actions share.
       scene: the objects.
       possible: where the target may be.
-      grasp: of the object; where it is not wanted there is no place.
+      grasp: of the object; if it is not wanted, no place is possible.
 
     Returns:
-      Whether there is one, `T_world_gripper` as the object is released, and `T_world_object` then.
+      Whether a place is possible, `T_world_gripper` at the release, and `T_world_object` there.
     """
     index, T_grasp = grasp.object, grasp.T_world_gripper
     cloud = superquadric.sample_surface(scene.size[index], scene.exponents[index], space.config.object_points)
     position, rotation, turn, stands = _drawn_places(key, space, scene, possible, cloud, grasp)
-    # The object turns about its own centre, and the gripper with it.
+    # The object turns about its centre, and the gripper with it.
     arm = T_grasp[:3, 3] - scene.position[index]
     T_place = make(matmul(yaw_rotation(turn), T_grasp[:3, :3]), rotate(yaw_rotation(turn), arm) + position)
     held = make(in_hand(scene, index, T_grasp), scene.position[index])
@@ -105,7 +105,7 @@ def placement(
 def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: PossibleSpace, cloud, grasp: ObjectGrasp):
     """Random places for a picked object, most promising first: (position, rotation, turn, whether it can stand there).
 
-    Those where it would overlap others or the shelf come last, those in possible space before them.
+    Places that overlap other objects or the shelf come last, and before these the places in possible space.
     """
     shelf, config, index, T_grasp = space.shelf, space.config, grasp.object, grasp.T_world_gripper
     tries, tests = config.placements
@@ -121,9 +121,9 @@ def _drawn_places(key, space: ActionSpace, scene: Superquadrics, possible: Possi
     points = transform(make(rotation, position)[:, None], cloud[None])
     on_board = ~jnp.any(hits_shelf(shelf, points + jnp.array([0.0, 0.0, 1e-3])[None, None]), axis=1)
     on_board &= jnp.min(points[..., 0], axis=1) > shelf.front + config.clearance
-    others = scene.valid & (jnp.arange(scene.capacity) != index) & grasp.wanted
+    obstacles = scene.valid & (jnp.arange(scene.capacity) != index) & grasp.wanted
     wider = scene.replace(size=scene.size + config.clearance)
-    mask = others[None] & on_board[:, None]
+    mask = obstacles[None] & on_board[:, None]
     body = clouds_of(cloud.T[None])
     overlaps = collisions(body, np.zeros(tries, np.int32), make(rotation, position), wider, mask, own=True)
     overlapping = jnp.any(overlaps, axis=1)
@@ -140,93 +140,95 @@ def transfers(
     cloud: Float[Array, "p 3"],
     ends: Ends,
 ) -> Bool[Array, " places"]:
-    """To which of several places an object can be taken from where it is grasped.
+    """To which of several places a grasped object can be taken.
 
-    The arm has to follow both ways closely, in one configuration: between them it is outside the shelf, where it may
-    turn as it likes, but not into another of its configurations: it would fling away what it holds. Links 2 to 5 and
-    the gripper must touch neither the shelf nor another object, the object no other on its way to the place, both
-    nothing on their ways along x, and between them the object has to be outside the shelf.
+    The arm must follow the way out and the way in closely, in the same configuration: between them, outside the shelf,
+    it turns freely, but a change of configuration would fling the object away. Links 2 to 5 and the gripper must touch
+    neither shelf nor objects, the grasped object no other on its way to the place, both nothing on their crossings
+    along x, and between the crossings the object must be outside the shelf.
 
     Args:
       space: what all actions share.
       scene: the objects.
-      grasp: of the one that is picked.
+      grasp: of the picked object.
       cloud: its surface in its own frame [m].
-      ends: where it is grasped, and the places.
+      ends: the grasp, and the places.
     """
     tables, gripper, wrist = space.tables, space.gripper, grasp.wrist
-    others = scene.replace(valid=scene.valid & (jnp.arange(scene.capacity) != grasp.object))
+    obstacles = scene.replace(valid=scene.valid & (jnp.arange(scene.capacity) != grasp.object))
     swept, clouds = cloud_index(tables, OPEN, wrist), gripper_clouds(tables).points
 
     def follows(shared, scene, T):
-        (shelf, clouds), (others, q7, swept) = shared, scene
+        (shelf, clouds), (obstacles, q7, swept) = shared, scene
         q, reachable, outside = ways_in(T, q7, gripper, CLOSE_CROSSINGS, CLOSE_WAYPOINTS)
-        # Poses 5 cm apart at most.
-        touches = jnp.any(arm_hits(q[::2], others)) | jnp.any(arm_hits_shelf(q, shelf))
+        # Poses at most 5 cm apart.
+        touches = jnp.any(arm_hits(q[::2], obstacles)) | jnp.any(arm_hits_shelf(q, shelf))
         touches |= cloud_hits_shelf(shelf, T, taken(clouds, swept[None])[0])
         return reachable & ~touches, q[0], outside
 
-    of_scene = (others, tables.q7[OPEN, wrist], swept)
+    of_scene = (obstacles, tables.q7[OPEN, wrist], swept)
     able, q, outside = masked_vmap(
         follows, ends.wanted, (space.shelf, clouds), of_scene, ends.T_world_gripper, block=32
     )
     able &= jnp.all(jnp.abs(q - q[:1]) < LARGEST_TRANSFER, axis=-1)
     able &= able[0]
-    able &= ~_gripper_meets(space, others, wrist, ends._replace(wanted=able))
-    able &= ~_object_meets(space, others, scene.size[grasp.object], cloud, ends._replace(wanted=able), outside)
+    able &= ~_gripper_meets(space, obstacles, wrist, ends._replace(wanted=able))
+    able &= ~_object_meets(space, obstacles, scene.size[grasp.object], cloud, ends._replace(wanted=able), outside)
     return able[1:] & able[0]
 
 
-def _gripper_meets(space: ActionSpace, others: Superquadrics, wrist: Int[Array, ""], ends: Ends) -> Bool[Array, " w"]:
-    """Whether the gripper hits others on its approach to a place, at a distance from them, or on its way along x.
+def _gripper_meets(
+    space: ActionSpace, obstacles: Superquadrics, wrist: Int[Array, ""], ends: Ends
+) -> Bool[Array, " w"]:
+    """Whether the gripper comes within `clearance` of obstacles as it approaches a place, or hits one on its crossing.
 
-    What it meets on its approach to the grasp, which comes first, was looked at before.
+    The approach to the grasp was tested before.
     """
     T_world_gripper, _, wanted = ends
-    n, ways, tables = others.capacity, len(T_world_gripper), space.tables
+    n, w, tables = obstacles.capacity, len(T_world_gripper), space.tables
     swept, still = (cloud_index(tables, OPEN, wrist, at_rest) for at_rest in (False, True))
-    wider = others.replace(size=others.size + space.config.clearance)
-    objects = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wider, others)
+    wider = obstacles.replace(size=obstacles.size + space.config.clearance)
+    objects = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wider, obstacles)
     crossings, crosses = crossing_places(space, T_world_gripper)
     places = jnp.concatenate([T_world_gripper[1:], crossings.reshape(-1, 4, 4)])
-    at_rest = np.arange(len(places)) >= ways - 1
+    at_rest = np.arange(len(places)) >= w - 1
     near = jnp.where(at_rest[:, None], np.arange(2 * n)[None] >= n, np.arange(2 * n)[None] < n)
     active = jnp.concatenate([wanted[1:], jnp.repeat(wanted & crosses, CROSSING_PLACES)])
     mask = active[:, None] & near & objects.valid[None]
     cloud = jnp.where(at_rest, still, swept)
     hits = jnp.any(collisions(gripper_clouds(tables), cloud, places, objects, mask), axis=1)
-    approach, on_crossing = jnp.split(hits, [ways - 1])
-    return jnp.any(on_crossing.reshape(ways, CROSSING_PLACES), axis=1) | jnp.pad(approach, (1, 0))
+    approach, on_crossing = jnp.split(hits, [w - 1])
+    return jnp.any(on_crossing.reshape(w, CROSSING_PLACES), axis=1) | jnp.pad(approach, (1, 0))
 
 
 def _object_meets(
     space: ActionSpace,
-    others: Superquadrics,
+    obstacles: Superquadrics,
     size: Float[Array, " 3"],
     cloud: Float[Array, "p 3"],
     ends: Ends,
     outside: Float[Array, " w"],
 ) -> Bool[Array, " w"]:
-    """Whether the object in the hand hits others on its way to a place, or along x, or is still in the shelf then.
+    """Whether the object in the hand hits obstacles on its way to a place or its crossing, or does not get outside.
 
-    What it meets on its way from the grasp, which comes first, was looked at before.
+    Its way out of the grasp was tested before.
     """
     T_world_gripper, T_world_object, wanted = ends
-    ways, p, gripper = len(T_world_gripper), OBJECT_PLACES, space.gripper
+    w, p, gripper = len(T_world_gripper), OBJECT_PLACES, space.gripper
     back = -T_world_gripper[:, :3, 2]
     into = swept_places(T_world_object[1:], back[1:], gripper.approach)
     length = crossing_length(T_world_gripper, outside, gripper)
     share = (jnp.arange(p) + 1.0) / p
-    shift = jnp.broadcast_to((gripper.approach * back)[:, None], (ways, p, 3))
+    shift = jnp.broadcast_to((gripper.approach * back)[:, None], (w, p, 3))
     shift = shift.at[..., 0].add(-length[:, None] * share[None])
-    along = translate(jnp.broadcast_to(T_world_object[:, None], (ways, p, 4, 4)), shift)
+    along = translate(jnp.broadcast_to(T_world_object[:, None], (w, p, 4, 4)), shift)
     ahead = jnp.sum(jnp.abs(T_world_object[:, 0, :3]) * size[None], axis=-1)
     inside = along[:, -1, 0, 3] + ahead > space.shelf.front
     places = jnp.concatenate([into.reshape(-1, 4, 4), along.reshape(-1, 4, 4)])
     active = jnp.concatenate([jnp.repeat(wanted[1:], SWEPT_PLACES), jnp.repeat(wanted & (length > 0.0), p)])
-    mask = active[:, None] & others.valid[None]
+    mask = active[:, None] & obstacles.valid[None]
     body = clouds_of(cloud.T[None])
-    hits = jnp.any(collisions(body, np.zeros(len(places), np.int32), places, others, mask, own=True), axis=1)
-    by_sweep, on_crossing = jnp.split(hits, [(ways - 1) * SWEPT_PLACES])
-    met = jnp.any(on_crossing.reshape(ways, p), axis=1) | inside
-    return met | jnp.pad(jnp.any(by_sweep.reshape(ways - 1, SWEPT_PLACES), axis=1), (1, 0))
+    hits = jnp.any(collisions(body, np.zeros(len(places), np.int32), places, obstacles, mask, own=True), axis=1)
+    by_sweep, on_crossing = jnp.split(hits, [(w - 1) * SWEPT_PLACES])
+    met = jnp.any(on_crossing.reshape(w, p), axis=1) | inside
+    return met | jnp.pad(jnp.any(by_sweep.reshape(w - 1, SWEPT_PLACES), axis=1), (1, 0))

@@ -1,4 +1,4 @@
-"""Where pushes begin: the closed hand beside an object, or behind it as seen along the push (paper appendix B.5)."""
+"""Start poses of pushes: the closed hand beside an object, or behind it along the push (paper appendix B.5)."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.geometry.transforms import make, transform
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 
-# A push whose direction is nearer than this to +x or -x begins behind the object, any other beside it [rad].
+# A push within these angles of +x or -x starts behind the object, any other beside it [rad].
 BEHIND = (math.radians(75), math.radians(45))
 
 
 class PushStarts(NamedTuple):
-    """The ways in which a push of an object can begin; constants.
+    """Start poses of pushes relative to an object, V of them; constants.
 
     Attributes:
       heading: unit vector of the push, seen from above, shape (V, 2).
-      across: unit vector across it, away from the robot, shape (V, 2).
-      share: where the finger tips are across the push, as a share of the object's half extent, shape (V,).
-      depth: and how much further [m], shape (V,).
+      across: unit vector across the push, away from the robot, shape (V, 2).
+      share: offset of the finger tips across the push, as a share of the object's half extent, shape (V,).
+      depth: offset across the push in addition [m], shape (V,).
       yaw: angle between the gripper's approach and +x, seen from above [rad], shape (V,).
       wrist: index of the wrist angle, shape (V,).
     """
@@ -51,18 +51,18 @@ def planar_unit(angle: float) -> Float[np.ndarray, "2"]:
 
 
 def away_from_robot(heading: Shaped[Any, "2"], xp: Any) -> Shaped[Any, "2"]:
-    """The unit vector across a planar one that does not point towards the robot, with the arrays of a module `xp`."""
+    """Unit vector across a heading, pointing away from the robot; `xp` is NumPy or `jax.numpy`."""
     return xp.stack([xp.abs(heading[1]), -heading[0] * xp.where(heading[1] < 0, -1.0, 1.0)])
 
 
 def contact_height(
     config: ActionConfig, is_round: Bool[Array, "*batch"], along: Float[Array, "*batch"], tall: Float[Array, "*batch"]
 ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
-    """How high above the board the finger tips are in a push, and how high it may begin to touch [m].
+    """Height of the finger tips above the board in a push, and largest height of the first contact [m].
 
     Args:
       config: static.
-      is_round: of the object that is pushed.
+      is_round: whether the pushed object is round.
       along: its half extent along the push [m].
       tall: its height [m].
     """
@@ -71,10 +71,10 @@ def contact_height(
 
 
 def push_starts(config: ActionConfig, wrists: int) -> PushStarts:
-    """The ways to begin a push: for each direction, each place across it, each yaw of the gripper and wrist.
+    """Start poses of pushes: for each direction, each place across it, and each yaw and wrist of the gripper.
 
     Beside an object the finger tips reach just past its front, or past its centre so that the palm pushes. Behind it
-    there are places along its whole width.
+    the places are spread over its width.
 
     Args:
       config: static.
@@ -97,7 +97,7 @@ def push_starts(config: ActionConfig, wrists: int) -> PushStarts:
 
 
 def _exit_distance(half, is_round, points, direction):
-    """How far points must move along a direction to leave a footprint, in its own frame; 0 if they never are inside."""
+    """How far points must move along a direction to leave a footprint, in its frame; 0 if they never are inside."""
     safe = jnp.where(jnp.abs(direction) < 1e-6, 1e-6, direction)
     a, b = (-half - points) / safe, (half - points) / safe
     enter, leave = jnp.max(jnp.minimum(a, b), axis=-1), jnp.min(jnp.maximum(a, b), axis=-1)
@@ -111,9 +111,9 @@ def _exit_distance(half, is_round, points, direction):
 
 
 def _half_extents(scene: Superquadrics, vectors: Float[np.ndarray, "v 2"]) -> Float[Array, "n v"]:
-    """How far objects reach from their centres along planar unit vectors, of which many are alike [m]."""
-    different, row = np.unique(vectors, axis=0, return_inverse=True)
-    return extents(scene, jnp.asarray(np.pad(different, ((0, 0), (0, 1))).T))[:, row.reshape(-1)]
+    """How far objects reach from their centres along planar unit vectors, many of them equal [m]."""
+    unique, row = np.unique(vectors, axis=0, return_inverse=True)
+    return extents(scene, jnp.asarray(np.pad(unique, ((0, 0), (0, 1))).T))[:, row.reshape(-1)]
 
 
 def object_pushes(
@@ -121,8 +121,8 @@ def object_pushes(
 ) -> tuple[Float[Array, "n v 4 4"], Float[Array, "n v"]]:
     """Gripper poses where pushes start, at `push_gap` from each object, and their sampling weights.
 
-    1 where the push begins so low that leverage cannot topple the object, else 0. Only for `fresh` objects; in the
-    order of `push_starts`.
+    The weight is 1 if the first contact is so low that it cannot topple the object, else 0. Computed for `fresh`
+    objects only, in the order of `push_starts`.
     """
     shelf, config = space.shelf, space.config
     starts = push_starts(config, space.wrists)
@@ -136,7 +136,7 @@ def object_pushes(
     height, leverage = contact_height(config, jnp.broadcast_to(prints.round[:, None], (n, v)), along, tall)
     centre = jnp.concatenate([place, (shelf.board + height)[..., None]], axis=-1)
     T = make(jnp.broadcast_to(rotation[None], (n, v, 3, 3)), centre)
-    # The hand and the fingers are where they are whatever the wrist's angle.
+    # The pose of hand and fingers does not depend on the wrist's angle.
     begins = np.column_stack([starts.heading, starts.share, starts.depth, starts.yaw])
     _, first, alike = np.unique(begins, axis=0, return_index=True, return_inverse=True)
     headings = starts.heading[first]
@@ -147,7 +147,7 @@ def object_pushes(
         level = (world[:, 2] > body.low - config.push_gap) & (world[:, 2] < body.high + config.push_gap)
         local = turned(-body.yaw, world[:, :2] - body.position[None])
         heading = turned(-body.yaw, -heading)
-        # In front of the object the palm may pass close by; only along the push does it keep the whole gap.
+        # The palm may pass close to the object's front; only along the push it keeps the whole gap.
         grown = body.half + PASSING_GAP
         away = _exit_distance(grown[None], body.round, local, jnp.broadcast_to(heading[None], local.shape))
         away = jnp.where(level, away, 0.0)
@@ -156,8 +156,8 @@ def object_pushes(
         lowest = jnp.min(jnp.where(touching, world[:, 2], jnp.inf))
         return farthest + config.push_gap - PASSING_GAP, lowest - shelf.board
 
-    each = jax.tree.map(lambda a: jnp.repeat(a, len(first), axis=0), prints)
-    rows = (each, T[:, first].reshape(-1, 4, 4), np.tile(headings, (n, 1)))
+    bodies = jax.tree.map(lambda a: jnp.repeat(a, len(first), axis=0), prints)
+    rows = (bodies, T[:, first].reshape(-1, 4, 4), np.tile(headings, (n, 1)))
     measured = masked_vmap(clear, jnp.repeat(fresh, len(first)), (shelf, space.tables.pusher), None, rows)
     distance, contact = (a.reshape(n, len(first))[:, alike.reshape(-1)] for a in measured)
     stable = contact <= jnp.maximum(leverage, LOW_CONTACT)

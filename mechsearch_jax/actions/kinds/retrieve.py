@@ -13,7 +13,7 @@ from mechsearch_jax.actions.types import Action, Prediction
 from mechsearch_jax.robot.motion import MotionConfig, Reference, retrieve_reference
 
 CODE = 3
-# Length of the way out that a picture shows, as far as it reaches [m].
+# Length of the way out that a picture shows [m].
 SHOWN_WAY_OUT = 0.5
 
 
@@ -25,7 +25,7 @@ def retrieve_action(
     """The action that takes the target out; any leading axes.
 
     Args:
-      T_world_gripper: pose of the gripper where it closes.
+      T_world_gripper: gripper pose where the grasp closes.
       q7: angle of joint 7 [rad].
       opening: distance between the fingers on the approach [m].
     """
@@ -42,7 +42,7 @@ def retrieve_action(
 
 @dataclasses.dataclass(frozen=True)
 class Retrieve:
-    """A `kind.Kind`; which grasp takes the target out, `retrieval` decides."""
+    """A `kind.Kind`; `retrieval` chooses the grasp."""
 
     code: int = CODE
     name: str = "retrieve"
@@ -60,7 +60,7 @@ class Retrieve:
         return retrieve_reference(action.T_world_gripper, action.q7, action.opening, config)
 
     def sketch(self, scene, after, action: Action) -> Sketch:
-        """The hand at the target, and their way out, drawn level: where it leads is then seen from everywhere."""
+        """The hand at the target, and the way out, drawn horizontally so that its direction shows in every view."""
         T = np.asarray(action.T_world_gripper, float)
         level = np.array([T[0, 2], T[1, 2], 0.0])
         way = -SHOWN_WAY_OUT * level / max(float(np.linalg.norm(level)), 1e-9)
