@@ -1,4 +1,4 @@
-"""Deciding: from an observation and a belief to the next action."""
+"""Planning: from an observation and a belief to the next action."""
 
 from mechsearch_jax.belief.belief import Belief, graspability_map, initial_belief, update_belief
 from mechsearch_jax.config.config import OPTIONS, Config, Option, PlannerConfig, ProblemConfig

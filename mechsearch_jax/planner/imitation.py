@@ -1,4 +1,4 @@
-"""The engine's slots as somebody else's code has them: what a preset takes over that no option says."""
+"""The engine's slots as in the authors' published code: behaviour of a preset that is no option."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from mechsearch_jax.planner.proposal import DrawnIn, Propose, as_predicted
 from mechsearch_jax.planner.state import State
 from mechsearch_jax.problem.problem import Problem
 
-# How much the published code's J minds what is in the way of a grasp; the paper's minds it as much as f.
+# `hindrance` of the published code's J; the paper's is 1.
 HINDRANCE = 0.1
 
 
 class Slots(NamedTuple):
-    """What the engine samples, predicts and makes small with; all static."""
+    """How the engine samples and predicts, and what it minimises; all static."""
 
     propose: Propose
     predict: Predict
@@ -35,16 +35,16 @@ class Slots(NamedTuple):
 
 
 def in_the_present_scene(present: Superquadrics | None, state: State) -> State:
-    """A `DrawnIn` as in the published code: later actions are drawn in the present scene, too, whatever has moved."""
+    """A `DrawnIn` as in the published code: later actions, too, are drawn in the present scene."""
     return state if present is None else state.replace(scene=present.replace(valid=present.valid & state.scene.valid))
 
 
 @dataclasses.dataclass(frozen=True)
 class LaterPlacementsStay:
-    """A `Predict` as in the published code: what is picked after the first action of a sequence stays where it is.
+    """A `Predict` as in the published code: an object picked after the first action of a sequence does not move.
 
     Attributes:
-      inner: predicts everything else.
+      inner: predicts all other actions.
     """
 
     inner: Predict
@@ -59,18 +59,18 @@ class LaterPlacementsStay:
         return prediction.replace(scene=scene, moved=prediction.moved & ~stays)
 
 
-def _own(slots: Slots) -> Slots:
+def _unchanged(slots: Slots) -> Slots:
     return slots
 
 
 def _published_code(slots: Slots) -> Slots:
-    """Later actions are drawn in the present scene, later placements stay, and J minds hindrances less; an objective
-    that is not the paper's stays as it is."""
+    """Later actions are drawn in the present scene, later placements stay, and the objectives of the paper have a
+    smaller `hindrance`."""
     objective = slots.objective
     if isinstance(objective, SearchForGrasp | SearchAndGrasp):
         objective = dataclasses.replace(objective, hindrance=HINDRANCE)
     return Slots(slots.propose, LaterPlacementsStay(slots.predict), objective, in_the_present_scene)
 
 
-# What makes a policy's slots those of `PlannerConfig.imitates`.
-IMITATIONS: Mapping[Imitated, Callable[[Slots], Slots]] = {"nothing": _own, "published-code": _published_code}
+# Changes a policy's slots by `PlannerConfig.imitates`.
+IMITATIONS: Mapping[Imitated, Callable[[Slots], Slots]] = {"nothing": _unchanged, "published-code": _published_code}

@@ -1,4 +1,4 @@
-"""What a search tries to make small: J of equation 2, as a slot of the engine."""
+"""The cost J of equation 2 that a search minimises: the engine's slot `objective`."""
 
 from __future__ import annotations
 
@@ -19,34 +19,34 @@ class Objective(Protocol):
     """The cost of a state; static under jit.
 
     Attributes:
-      reached: the cost of a state in which the target is found and nothing is in the way of its grasp.
+      reached: cost of a state in which the target is found and a grasp hits nothing.
     """
 
     @property
     def reached(self) -> float: ...
 
     def cost(self, problem: Problem, belief: Belief, state: State, weights: Weights) -> Float[Array, ""]:
-        """J of a state; a terminal value may be part of it.
+        """J of a state; it may include a terminal value.
 
         Args:
-          problem: what does not change.
-          belief: what was known at the start.
-          state: whose f and H are up to date.
-          weights: of what is in the way of a grasp.
+          problem: constants of the search.
+          belief: the belief at the start of the plan.
+          state: a state with up-to-date f and H.
+          weights: weights of J's terms.
         """
         ...
 
     def needs_graspability(self, belief: Belief, state: State) -> Bool[Array, " y"]:
-        """At which poses, the candidates and then the found one, J depends on g; f of the state is up to date."""
+        """At which poses J depends on g: candidate poses, then the found pose; f of the state is up to date."""
         ...
 
 
 def _where_and_how_graspable(problem, belief, state):
-    """f, how far each pose is from graspable with g extended below zero (B.4), and how crowded its grasps are.
+    """f, 1 - g with g extended below zero (B.4), and crowding, at all poses.
 
-    g only sees the best grasp of a pose; while nothing changes that one, clearing the way for others is progress too.
-    A found target that is pushed to where it could be hidden counts as if no grasp were feasible: once it is not seen,
-    nothing tells where it really went.
+    g counts only the best grasp of a pose; crowding also rewards clearing the others.
+    A found target that is pushed to where it could be hidden counts as if no grasp were feasible: unseen, its true pose
+    would be unknown.
     """
     f = possible_poses(belief, state.exists, state.target_at).astype(jnp.float32)
     rows = pairs(problem.grasps, belief.grasps.feasible)
@@ -60,7 +60,7 @@ class SearchForGrasp:
     """Where the target can be and how far it is from graspable there, together (the sum of f * (2 - g)).
 
     Attributes:
-      hindrance: how much J minds what is in the way of a grasp: the factor of f (1 - g) in equation 2.
+      hindrance: weight of the objects that a grasp hits: the factor of f (1 - g) in equation 2.
       reached: see `Objective`.
     """
 
@@ -89,8 +89,8 @@ class SearchAndGrasp:
 
     def cost(self, problem, belief, state, weights) -> Float[Array, ""]:
         f, hindered, crowded = _where_and_how_graspable(problem, belief, state)
-        minded = self.hindrance * hindered + weights.crowding * crowded
-        return jnp.where(belief.found, jnp.sum(f * minded), jnp.sum(f))
+        grasp_cost = self.hindrance * hindered + weights.crowding * crowded
+        return jnp.where(belief.found, jnp.sum(f * grasp_cost), jnp.sum(f))
 
     def needs_graspability(self, belief, state) -> Bool[Array, " y"]:
         return possible_poses(belief, state.exists, state.target_at) & belief.found
@@ -98,7 +98,7 @@ class SearchAndGrasp:
 
 @dataclasses.dataclass(frozen=True)
 class Indifferent:
-    """Everything is as good as everything else: the first possible sequence is the best."""
+    """A constant cost: the first possible sequence is the best."""
 
     reached: float = 0.0
 

@@ -1,7 +1,7 @@
-"""Policies: what decides on the next action. Each is a partial application of one engine to slots of its own.
+"""Policies decide on the next action. Each is the same engine with different slots.
 
-A policy is a callable `(key, problem, belief, observation) -> Decision`. Those that are made here are pytrees, too:
-what is continuous in their configuration is data, so that a jitted function takes them as arguments.
+A policy is a callable `(key, problem, belief, observation) -> Decision`. The policies of this file are also pytrees:
+continuous settings are data, so that a jitted function takes a policy as an argument.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ class Policy(Protocol):
     """Decides on the next action."""
 
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
-        """The next action, and why.
+        """Decide on the next action.
 
         Args:
           key: PRNG key of the planner.
-          problem: what does not change.
-          belief: what is known of the target, after the observation.
-          observation: what is seen now.
+          problem: constants of the search.
+          belief: belief about the target after the observation.
+          observation: the present observation.
         """
         ...
 
@@ -65,13 +65,13 @@ class PolicyFactory(Protocol):
         later_push_model: PushModel | None = None,
         tries: bool = False,
     ) -> Policy:
-        """A policy with a configuration and models, of which it may take what it likes.
+        """Make a policy; it may ignore arguments that it does not need.
 
         Args:
-          config: how it decides.
-          push_model: predicts pushes; the learned one if left out.
-          later_push_model: predicts those that are not the first action of a sequence; `push_model` if left out.
-          tries: whether its decisions are to hold what is worth trying out; see `trials`.
+          config: settings of the planner.
+          push_model: predicts pushes; default: the learned model.
+          later_push_model: predicts pushes after the first action of a sequence; default: `push_model`.
+          tries: whether decisions hold alternatives for trials; see `trials`.
         """
         ...
 
@@ -80,21 +80,21 @@ class Plan(Protocol):
     """Plans with the engine's slots; static under jit."""
 
     def __call__(self, rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
-        """The next action, as `rollout.plan` tells it."""
+        """Decide on the next action; see `rollout.plan`."""
         ...
 
 
 class PlanningPolicy(flax.struct.PyTreeNode):
-    """The engine as a `Policy`: takes a found target out as soon as a grasp will do, and else plans.
+    """The engine as a `Policy`: takes a found target out as soon as a grasp hits nothing, and otherwise plans.
 
-    It also is a policy that `trials.AsksTwice`.
+    It also implements `trials.AsksTwice`.
 
     Attributes:
-      config: how it decides.
+      config: settings of the planner.
       propose, predict, objective, drawn_in: the slots; static.
-      plan: how it plans with them; static.
-      tries: whether its decisions hold what is worth trying out; static. What it decides does not depend on that: a
-        grasp has to hit nothing, unless `trials.choose` finds one that succeeds.
+      plan: plans with the slots; static.
+      tries: whether decisions hold alternatives for trials; static. The decision itself does not depend on it: a grasp
+        must hit nothing, unless `trials.choose` prefers one that succeeded in a trial.
     """
 
     config: PlannerConfig
@@ -106,85 +106,85 @@ class PlanningPolicy(flax.struct.PyTreeNode):
     tries: bool = flax.struct.field(pytree_node=False, default=False)
 
     def rollout(self, problem: Problem, belief: Belief) -> Rollout:
-        """The engine with this policy's slots, for what is known."""
+        """The engine with this policy's slots."""
         return Rollout(problem, belief, self.config, self.propose, self.predict, self.objective, self.drawn_in)
 
     @property
     def _planning(self) -> PlanningPolicy:
-        """What a plan depends on: it is the same, and compiled once, whether or not anything is tried out."""
+        """The policy without `tries`, on which a plan does not depend: so it is compiled once."""
         return self.replace(tries=False)
 
     def begin(
         self, key: Array, problem: Problem, belief: Belief, observation: Observation
     ) -> Callable[[], None] | None:
-        """Lower what a plan with such arguments needs, without planning; see `runtime.compiled.Kept.begin`."""
-        return _plan.begin(self._planning, key, problem, _as_known(belief), observation)
+        """Lower the plan for such arguments without planning; see `runtime.compiled.Kept.begin`."""
+        return _plan.begin(self._planning, key, problem, _belief_of_plan(belief), observation)
 
     def is_ready(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> bool:
-        """Whether nothing has to be compiled for a plan with such arguments; see `runtime.compiled.Kept.is_ready`."""
-        return _plan.is_ready(self._planning, key, problem, _as_known(belief), observation)
+        """Whether the plan for such arguments is compiled; see `runtime.compiled.Kept.is_ready`."""
+        return _plan.is_ready(self._planning, key, problem, _belief_of_plan(belief), observation)
 
     def __call__(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
         """See `Policy`."""
         if not isinstance(belief.found, Tracer) and not belief.found:
-            # Outside of any transformation, what is not needed is neither computed nor compiled.
+            # Outside of transformations, grasps of a target that is not found are neither computed nor compiled.
             return self.planned(key, problem, belief, observation)
         grasp = self.retrieval(key, problem, belief, observation)
         able = grasp.action.kind == ActionKind.RETRIEVE
-        # The belief may be known where the observation is traced.
+        # The belief may be concrete while the observation is traced.
         if not isinstance(able, Tracer):
             if able:
                 return grasp
             return _grasps_first(grasp, self.planned(key, problem, belief, observation))
-        # Both are computed, each with next to nothing to do where it does not count. A `cond` would under `vmap` give
-        # every scene of a batch a problem of its own, and what they share could no longer be computed together.
-        rest = observation.objects.replace(valid=observation.objects.valid & ~able)
+        # Both are computed, but the one that does not count has next to nothing to do. Under `vmap`, a `cond` would
+        # give every scene of a batch its own problem, and what they share could no longer be computed together.
+        objects = observation.objects.replace(valid=observation.objects.valid & ~able)
         planned = self.planned(
             key,
             problem,
             belief.replace(exists=belief.exists & ~able, found=belief.found & ~able),
-            observation.replace(objects=rest),
+            observation.replace(objects=objects),
         )
         if planned.alternatives is not None:
-            # What is planned for a target that is taken out has no objects.
+            # The plan was made without objects if the target is taken out.
             planned = planned.replace(alternatives=planned.alternatives.replace(now=observation.objects))
         both = _grasps_first(grasp, planned)
         grasp = grasp.replace(alternatives=both.alternatives)
         return jax.tree.map(lambda a, b: jnp.where(able, a, b), grasp, both)
 
     def retrieval(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
-        """Whether to take the target out where it is found: an action of kind RETRIEVE, or else of kind NONE.
+        """Decide whether to take out a found target: an action of kind RETRIEVE, or else of kind NONE.
 
         Args:
           key, problem, belief, observation: as of a `Policy`; the key is not used.
         """
-        # Called the same as elsewhere where the target is known to be found, so that nothing is compiled twice.
+        # Without a traced `found` the call is the same as elsewhere, so that nothing is compiled twice.
         active = (belief.found,) if isinstance(belief.found, Tracer) else ()
-        look = worth_trying if self.tries else best_grasp
-        grasp = look(problem.target_grasps, observation.objects, belief.found_pose, *active)
+        choose_grasp = worth_trying if self.tries else best_grasp
+        grasp = choose_grasp(problem.target_grasps, observation.objects, belief.found_pose, *active)
         return _retrieval(self, belief, observation, grasp)
 
     def planned(self, key: Array, problem: Problem, belief: Belief, observation: Observation) -> Decision:
-        """What is planned, as if no grasp would do.
+        """Plan as if no grasp could take the target out.
 
         Args:
           key, problem, belief, observation: as of a `Policy`.
         """
-        decision = _plan(self._planning, key, problem, _as_known(belief), observation)
+        decision = _plan(self._planning, key, problem, _belief_of_plan(belief), observation)
         if not self.tries:
             return decision
         reached = jnp.float32(self.objective.reached)
         return decision.replace(alternatives=sequences_to_try(decision.sequences, observation.objects, reached))
 
 
-def _as_known(belief: Belief) -> Belief:
-    """The belief as a plan takes it: for a target that is known not to be found there is a program of its own."""
+def _belief_of_plan(belief: Belief) -> Belief:
+    """The belief that a plan is compiled for: a separate, smaller program if the target is not found."""
     hidden = not isinstance(belief.found, Tracer) and jnp.ndim(belief.found) == 0 and not belief.found
     return without_grasps(belief) if hidden else belief
 
 
 def _grasps_first(grasp: Decision, planned: Decision) -> Decision:
-    """What is planned, where grasps of the target may be tried before."""
+    """The planned decision, with grasps of the target before its own alternatives."""
     if grasp.alternatives is None or planned.alternatives is None:
         return planned
     return planned.replace(alternatives=in_turn(grasp.alternatives, planned.alternatives))
@@ -197,7 +197,7 @@ def _plan(policy: PlanningPolicy, key: Array, problem: Problem, belief: Belief, 
 
 @kept()
 def _retrieval(policy: PlanningPolicy, belief: Belief, observation: Observation, grasp: GraspChoice) -> Decision:
-    """The decision to take a found target out with a grasp, or the first of several, that hits nothing."""
+    """The decision to take a found target out with a grasp (the first if there are several) if it hits nothing."""
     reached, objects = policy.objective.reached, observation.objects
     alternatives = None
     if policy.tries:
@@ -220,7 +220,7 @@ def _planner_config(config: PlannerConfig | None) -> PlannerConfig:
     """The configuration, or the default.
 
     Raises:
-      InputError: it is something else, such as a whole preset.
+      InputError: it is of another type, such as a whole preset.
     """
     if config is not None and not isinstance(config, PlannerConfig):
         raise InputError(f"config: is a {type(config).__name__}; give a PlannerConfig, such as paper().planner")
@@ -240,12 +240,12 @@ def planning_policy(
     """The engine with slots; see `PolicyFactory` for the first arguments.
 
     Args:
-      config: how it decides; the defaults if left out.
+      config: settings of the planner; default: `PlannerConfig()`.
       push_model, later_push_model: predict pushes.
-      tries: whether decisions hold what is worth trying out.
-      objective: what it makes small.
+      tries: whether decisions hold alternatives for trials.
+      objective: the cost that plans minimise.
       propose: samples an action in a state.
-      **changes: fields of `config` that are to be different.
+      **changes: fields of `config` to replace.
 
     Raises:
       InputError: a setting is impossible, or weights are missing or damaged.
@@ -256,17 +256,17 @@ def planning_policy(
     return PlanningPolicy(config=config, tries=tries, **IMITATIONS[config.imitates](slots)._asdict())
 
 
-# Minds the grasp while it searches: f and g together (equation 2).
+# Minimises f and g together while it searches (equation 2).
 search_for_grasp = functools.partial(planning_policy, objective=SearchForGrasp())
-# First finds the target, and then clears the way to it.
+# Minimises f until the target is found, and then g.
 search_and_grasp = functools.partial(planning_policy, objective=SearchAndGrasp())
 
 
 def random_action(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
-    """A baseline: a random possible action, by the sampler's even draw, until the target can be taken out.
+    """A baseline: a random possible action, by an even draw, until the target can be taken out.
 
-    It plans no further, and leaves a found target where it is: of `config`, the horizon, `move_target`, the guided
-    fraction and all penalties are not used.
+    It does not plan ahead and does not move a found target: of `config`, the horizon, `move_target`, the guided
+    fraction and all penalties are ignored.
     """
     even = dataclasses.replace(
         _planner_config(config),
@@ -279,12 +279,13 @@ def random_action(config: PlannerConfig | None = None, **slots: Any) -> Planning
 
 
 def greedy(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
-    """A baseline: the one action that leaves the least of f, as lateral-access X-RAY reduces the area where the target
-    can be; once the target is found, the one that brings it nearest to a free grasp.
+    """A baseline: the action that reduces f most, as lateral-access X-RAY reduces the area where the target can be.
 
-    One step of the first term of J, and of the second at a found target: X-RAY's suction cup needs no free grasp. Draws
-    are even, and nothing but J counts: of `config`, the horizon, the guided fraction, the crowding weight and all
-    penalties are not used.
+    Once the target is found: the action that brings it nearest to a free grasp.
+
+    One step on the first term of J, and on the second at a found target: X-RAY's suction cup needs no free grasp. Draws
+    are even, and only J counts: of `config`, the horizon, the guided fraction, the crowding weight and all penalties
+    are ignored.
     """
     plain = dataclasses.replace(
         _planner_config(config),
@@ -302,7 +303,7 @@ def mctx(config: PlannerConfig | None = None, **slots: Any) -> PlanningPolicy:
     Raises:
       InputError: `mctx` is not installed.
     """
-    # Not everybody has it, and it takes time to import.
+    # An optional dependency that takes time to import.
     from mechsearch_jax.planner.tree_search import import_mctx, tree_plan
 
     import_mctx()
@@ -319,10 +320,10 @@ POLICIES: Mapping[str, PolicyFactory] = {
 
 
 def policy_factory(name: str) -> PolicyFactory:
-    """What makes the policy of a name, one of `POLICIES` or an import path such as "my_lab.policies:Mine".
+    """The factory of a policy, by a name in `POLICIES` or an import path such as "my_lab.policies:Mine".
 
     Raises:
-      InputError: there is none of that name, or it cannot be imported.
+      InputError: the name is unknown, or the path cannot be imported.
     """
     if name in POLICIES:
         return POLICIES[name]

@@ -1,4 +1,4 @@
-"""What a sampled action changes in a state: the engine's slot `predict` (S of equation 4)."""
+"""Prediction of a sampled action's effect: the engine's slot `predict` (S of equation 4)."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Predict(Protocol):
     """Predicts an action; static under jit."""
 
     def __call__(self, problem: Problem, state: State, sample: Sample, first: Bool[Array, ""]) -> Prediction:
-        """What the action does; where it cannot be executed, the scene stays as it was.
+        """The effect of an action; the scene stays unchanged if the action cannot be executed.
 
         Args:
-          problem: what does not change.
-          state: before the action.
+          problem: constants of the search.
+          state: the state before the action.
           sample: the action.
           first: whether it is the first of its sequence.
         """
@@ -34,7 +34,7 @@ class Predict(Protocol):
 
 
 def _either(first: Bool[Array, ""], model: PushModel, later: PushModel) -> PushModel:
-    """The first model where `first` is set, else the other; the other is not run, as long as `first` is not batched."""
+    """`model` if `first`, else `later`; only one of them runs unless `first` is batched."""
     if model == later:
         return model
 
@@ -49,11 +49,11 @@ def _either(first: Bool[Array, ""], model: PushModel, later: PushModel) -> PushM
 class PredictByKind:
     """The default `Predict`: every kind of action predicts itself, pushes with a push model.
 
-    A found target moves only where it is what the action moves, and stays among its candidate poses.
+    A found target moves only as the object of the action, and must stay among its candidate poses.
 
     Attributes:
       push_model: predicts pushes that are the first action of a sequence.
-      later_push_model: predicts the others.
+      later_push_model: predicts later pushes.
     """
 
     push_model: PushModel
@@ -62,7 +62,7 @@ class PredictByKind:
     def __call__(self, problem: Problem, state: State, sample: Sample, first: Bool[Array, ""]) -> Prediction:
         push_model = _either(first, self.push_model, self.later_push_model)
         action, scene = sample.action, state.scene
-        # What is sampled may move the target only by pushing it itself.
+        # An action may move the target only as its own object.
         untouchable = state.is_target & (jnp.arange(scene.capacity) != action.object)
         prediction = Prediction(scene, jnp.zeros_like(scene.valid), jnp.array(False))
         for code, kind in KINDS.items():

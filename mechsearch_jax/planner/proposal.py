@@ -1,4 +1,4 @@
-"""Which action is sampled in a state: the engine's slot `propose`."""
+"""Sampling of an action in a state: the engine's slot `propose`."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from mechsearch_jax.planner.objective import Objective
 from mechsearch_jax.planner.state import State
 from mechsearch_jax.problem.problem import Problem
 
-# How much more an object matters that is in the way alone than one of two that are, one of two than one of three, ...
+# Weight of an object that alone blocks something relative to one of two blockers, of one of two to one of three, ...
 ALONE = 4.0
-# How many objects deep what is in the way of moving an object is looked for.
+# How many times shares pass on to the objects that block the motion of an object.
 DEPTH = 2
-# What is drawn evenly is shared as if by so many, a scene's eight objects and the target, however many slots there are.
+# Number of objects that share the even part of the draws, a scene's eight and the target, for any number of slots.
 EVEN = 9
 
 
@@ -38,54 +38,53 @@ class Propose(Protocol):
         guided_fraction: Array | float,
         state: State,
     ) -> Sample:
-        """One action, of kind NONE where none is possible.
+        """One action, of kind NONE if none is possible.
 
         Args:
           key: PRNG key.
-          problem: what does not change.
-          belief: what was known at the start.
-          objective: what the search makes small.
+          problem: constants of the search.
+          belief: the belief at the start of the plan.
+          objective: the cost that the search minimises.
           guided_fraction: see `PlannerConfig`.
-          state: where it is sampled.
+          state: the state in which to sample.
         """
         ...
 
 
 class DrawnIn(Protocol):
-    """As what a state is taken for where an action is drawn; static under jit."""
+    """Chooses the state in which actions are drawn; static under jit."""
 
     def __call__(self, present: Superquadrics | None, state: State) -> State:
-        """The state in which an action is drawn that is carried out in `state`.
+        """The state in which to draw an action that is executed in `state`.
 
         Args:
           present: the scene in which all sequences begin, fields (N, ...); None outside of sequences.
-          state: as it is predicted.
+          state: the predicted state.
         """
         ...
 
 
 def as_predicted(present: Superquadrics | None, state: State) -> State:
-    """The default `DrawnIn`: an action is drawn in the state that is predicted before it, as the paper says."""
+    """The default `DrawnIn`: an action is drawn in the predicted state before it, as in the paper."""
     return state
 
 
 def blame(in_the_way: Bool[Array, "k n"], counts: Bool[Array, " k"]) -> Float[Array, " n"]:
-    """Each object's share of what is in the way in those rows that count; the fewer share a row, the more it weighs."""
-    others = jnp.sum(in_the_way, axis=1, keepdims=True) - 1.0
-    weight = jnp.where(in_the_way & counts[:, None], ALONE**-others, 0.0)
+    """Each object's share in blocking the rows that count; a row weighs more the fewer objects block it."""
+    other_blockers = jnp.sum(in_the_way, axis=1, keepdims=True) - 1.0
+    weight = jnp.where(in_the_way & counts[:, None], ALONE**-other_blockers, 0.0)
     total = jnp.sum(weight, axis=0)
     return total / jnp.maximum(jnp.sum(total), 1e-12)
 
 
 def passed_on(state: State, share: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Shares of the objects, where those that cannot be moved yet give theirs to what is in the way of moving them.
+    """Pass the share of each object that cannot be moved yet on to the objects that its candidate actions hit.
 
-    What is in the way of that in turn counts, too, `DEPTH` objects deep. The share of an object that arm and shelf do
-    not allow to be moved at all is lost.
+    Repeated `DEPTH` times. The share of an object without any reachable candidate is lost.
 
     Args:
-      state: with its candidate actions.
-      share: of each object, shape (N,).
+      state: a state with its candidate actions.
+      share: share of each object, shape (N,).
     """
     reached = [
         jnp.any(c.reached, axis=-1) & able[:, None] for c, able in zip(state.candidates, state.able, strict=True)
@@ -102,11 +101,11 @@ def passed_on(state: State, share: Float[Array, " n"]) -> Float[Array, " n"]:
 def sampling_weights(
     problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
 ) -> Float[Array, " n"]:
-    """Sampling weight of each object: in part even, in part by what it hides and which grasps it blocks, or by what of
-    that it keeps from being moved.
+    """Sampling weight of each object: partly even, partly by what it hides, which grasps it blocks, and which objects
+    that do so it keeps from being moved.
 
-    A found target that may be pushed is one more object in the way of each of its grasps that is blocked; where none is
-    feasible, it alone is in the way.
+    A found target that may be pushed counts as one more blocker of each of its blocked grasps; if no grasp is feasible,
+    it is the only blocker.
     """
     rows = pairs(problem.grasps, belief.grasps.feasible)
     counts = rows.allowed & objective.needs_graspability(belief, state)[rows.pose]

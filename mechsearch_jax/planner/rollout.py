@@ -1,7 +1,7 @@
 """The engine: sampling-based model predictive control over predicted states (paper sections 3 and 4.4, appendix B.4).
 
-Sequences of actions are sampled from the predicted state of each step, all of them in one vmapped computation, and the
-first action of the best is taken. What is sampled, what it changes and what is to be made small are slots.
+All sequences of actions are sampled in one vmapped computation, each action in the predicted state of its step, and the
+first action of the best sequence is taken. Sampling, prediction and the cost are slots.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from mechsearch_jax.planner.state import Decision, Sequences, State
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.retrieval import found_hits
 
-# A sequence whose value is a smaller share of J gains nothing.
+# Least decrease of J, as a share of J, that counts as a gain.
 GAIN = 0.02
-# Draws an action in a state, and predicts it: one of several.
+# Draws an action in a state and predicts it, given the number of the draw.
 Attempt = Callable[[State, Array], tuple[Sample, Prediction]]
-# What an action changes in a state, and what is then computed for the next one.
+# Fields of a state that an action changes, or that are then computed for the next one.
 CHANGING = ("scene", "target_at", "moved", "available", "alive", "candidates")
 
 
@@ -59,7 +59,7 @@ def sequence_values(
 ) -> tuple[Float[Array, " s"], Int[Array, " s"]]:
     """`prefix_values` of all sequences, which begin in the same state.
 
-    Where none of them gains anything, there are no penalties: what is risky is done rather than nothing.
+    If no sequence gains, penalties are dropped: a risky action is better than none.
     """
     values = jax.vmap(functools.partial(prefix_values, gamma=gamma))
     penalised, free = values(cost, penalty, acted), values(cost, jnp.zeros_like(penalty), acted)
@@ -68,12 +68,12 @@ def sequence_values(
 
 
 def present_state(problem: Problem, belief: Belief, objects: Superquadrics, config: PlannerConfig) -> State:
-    """The state in which sequences begin, of which nothing is computed yet: as if every object had just moved.
+    """The state in which sequences begin, before any computation: as if every object had just moved.
 
     Args:
-      problem, belief: what does not change, and what is known.
-      objects: as recognised, fields (N, ...).
-      config: how the planner decides.
+      problem, belief: constants of the search, and the present belief.
+      objects: the recognised objects, fields (N, ...).
+      config: settings of the planner.
     """
     scene, is_target = with_target(problem, belief, objects)
     count, spread = problem.existence.T_world_target.shape[:2]
@@ -94,13 +94,13 @@ def present_state(problem: Problem, belief: Belief, objects: Superquadrics, conf
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rollout:
-    """What all states of a decision share, and how one leads to the next.
+    """The model of a decision: what all its states share, and the step from one state to the next.
 
     Attributes:
-      problem, belief: what does not change, and what is known.
-      config: how the planner decides.
+      problem, belief: constants of the search, and the present belief.
+      config: settings of the planner.
       propose, predict, objective, drawn_in: the slots.
-      present: the scene in which sequences begin; None outside of them.
+      present: the scene in which sequences begin; None outside of sequences.
     """
 
     problem: Problem
@@ -113,7 +113,7 @@ class Rollout:
     present: Superquadrics | None = None
 
     def root(self, objects: Superquadrics) -> State:
-        """`present_state` with what the rollout knows."""
+        """`present_state` of the rollout's problem and belief."""
         return present_state(self.problem, self.belief, objects, self.config)
 
     def update(self, state: State, moved: Bool[Array, " n"]) -> State:
@@ -126,15 +126,15 @@ class Rollout:
         )
         here = jnp.where(self.belief.found, state.target_at, state.exists)
         exists = existence(problem.existence, problem.camera, views, here, self.belief.allowed, settings)
-        of_candidates, of_found = split_found(
+        at_candidate_poses, at_found_pose = split_found(
             self.objective.needs_graspability(self.belief, state.replace(exists=exists))
         )
         grasps, rows = self.belief.grasps, problem.grasps.pair_pose.shape[0]
-        # Where the target has moved, other rows of H count, of which nothing is known yet.
-        unknown = moved | jnp.any(moved & state.is_target)
-        hits = grasp_hits(problem.grasps, objects, of_candidates, state.hits[:rows], unknown)
-        more = found_hits(problem.target_grasps, grasps, objects, of_found, state.hits[rows:], moved)
-        return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, more]))
+        # After the target moved, other rows of H count, which are not computed yet.
+        stale = moved | jnp.any(moved & state.is_target)
+        hits = grasp_hits(problem.grasps, objects, at_candidate_poses, state.hits[:rows], stale)
+        hits_at_found = found_hits(problem.target_grasps, grasps, objects, at_found_pose, state.hits[rows:], moved)
+        return state.replace(exists=exists, views=views, hits=jnp.concatenate([hits, hits_at_found]))
 
     def candidates(self, state: State, moved: Bool[Array, " n"]) -> AllCandidates:
         """Candidate actions where an action of a state is drawn, brought up to date after some objects moved."""
@@ -152,16 +152,16 @@ class Rollout:
         return sample, self.predict(self.problem, state, sample, first)
 
     def _draw(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[Sample, Prediction]:
-        """An action and what it does; drawn again until it is possible, at most so often as `config` says."""
+        """An action and its prediction, drawn again until it is possible, at most as often as `config` allows."""
         most = max(self.config.draws, self.config.first_draws)
         if most == 1:
             return self._attempt(first, state, key)
         draws = jnp.where(first, most, self.config.draws)
         attempt = lambda state, i: self._attempt(first, state, jax.random.fold_in(key, i))  # noqa: E731
-        return (_one_after_the_other if on_cpu() else _at_once)(attempt, state, draws, most)
+        return (_draw_one_by_one if on_cpu() else _draw_all)(attempt, state, draws, most)
 
     def act(self, first: Bool[Array, ""], state: State, key: Array) -> tuple[dict[str, Any], Action, Array]:
-        """Sample an action and predict what it changes in a state; also its penalty, as a share of J."""
+        """Sample an action in a state: the predicted changes, the action, and its penalty as a share of J."""
         sample, prediction = self._draw(first, state, key)
         acted = prediction.possible & state.alive
         action = sample.action.replace(kind=jnp.where(acted, sample.action.kind, ActionKind.NONE).astype(jnp.int32))
@@ -181,13 +181,13 @@ class Rollout:
         return changes, action, self.config.unseen_contact_penalty * self.contact_probability(state, sample)
 
     def contact_probability(self, state: State, sample: Sample) -> Float[Array, ""]:
-        """Share of the possible poses at which an action would touch the target, where it was drawn."""
+        """Share of the possible poses at which an action would touch the target, in the scene where it was drawn."""
         possible = possible_space(self.problem, self.belief, state.exists)
         scene = self.drawn_in(self.present, state).scene
         return contact_probability(self.problem.space, scene, possible, sample)
 
     def step(self, states: State, keys: Array, time: Int[Array, ""]):
-        """All sequences by one action: the states after it, and what is to be kept of the ones before it."""
+        """Advance all sequences by one action: the states after it, and records of the states before it."""
         count = self.config.sequences
         # All sequences begin in the same state, so only the first computes it.
         first = time == 0
@@ -196,7 +196,7 @@ class Rollout:
         shared = lambda tree: jax.tree.map(lambda a: jnp.where(first, a[:1], a), tree)  # noqa: E731
         states = shared(jax.vmap(self.update)(states.replace(exists=states.exists & computes), moved))
 
-        def go_on():
+        def act_all():
             candidates = shared(jax.vmap(self.candidates)(states, moved))
             act = jax.vmap(functools.partial(self.act, first))
             changes, actions, penalty = act(states.replace(candidates=candidates), keys)
@@ -206,51 +206,48 @@ class Rollout:
             changes = {name: getattr(states, name) for name in CHANGING}
             return changes, repeated(no_action(), count), jnp.zeros(count)
 
-        # After the last action only the cost counts. What the actions do not change does not pass through the branches.
-        changes, actions, penalty = jax.lax.cond(time < self.config.horizon, go_on, stay)
+        # After the last action only the cost counts. Fields that actions do not change stay out of the branches.
+        changes, actions, penalty = jax.lax.cond(time < self.config.horizon, act_all, stay)
         kept = (actions, jax.vmap(self.cost)(states), penalty, changes["scene"])
         return states.replace(**changes), kept
 
 
-def _to_do_in(state: State, counts: Bool[Array, ""]) -> State:
-    """The state for an attempt, which finds no object and nothing that can be moved if it does not count.
-
-    So it has little to do, and nothing to simulate.
-    """
+def _emptied_unless(state: State, counts: Bool[Array, ""]) -> State:
+    """The state for an attempt; if the attempt does not count, without objects, so that it computes little."""
     scene = state.scene.replace(valid=state.scene.valid & counts)
     return state.replace(scene=scene, available=state.available & counts)
 
 
-def _one_after_the_other(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
-    """The first attempt that is possible, and no more of them than it takes: for a CPU, which has enough to do."""
+def _draw_one_by_one(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
+    """The first possible attempt, without computing later ones: fastest on a CPU."""
     shapes, _ = jax.eval_shape(attempt, state, jnp.int32(0))
     nothing = Prediction(state.scene, jnp.zeros_like(state.moved), jnp.array(False))
     blank = (jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), nothing)
 
     def again(carry):
         i, (_, prediction) = carry
-        # In a batch, those that have an action go round with the others.
-        return i + 1, attempt(_to_do_in(state, state.alive & ~prediction.possible), i)
+        # In a batch, sequences that have an action loop with the others.
+        return i + 1, attempt(_emptied_unless(state, state.alive & ~prediction.possible), i)
 
-    def wanted(carry):
+    def goes_on(carry):
         i, (_, prediction) = carry
         return (i < draws) & ~prediction.possible & state.alive
 
-    return jax.lax.while_loop(wanted, again, (jnp.int32(0), blank))[1]
+    return jax.lax.while_loop(goes_on, again, (jnp.int32(0), blank))[1]
 
 
-def _at_once(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
-    """The first attempt that is possible, of all of them: for a GPU, on which waiting for the first takes longer."""
+def _draw_all(attempt: Attempt, state: State, draws: Int[Array, ""], most: int) -> tuple[Sample, Prediction]:
+    """The first possible attempt, computing all at the same time: fastest on a GPU."""
     number = jnp.arange(most, dtype=jnp.int32)
 
-    sample, prediction = jax.vmap(lambda i: attempt(_to_do_in(state, state.alive & (i < draws)), i))(number)
-    works = prediction.possible & (number < draws)
-    sample, prediction = jax.tree.map(lambda a: a[jnp.argmax(works)], (sample, prediction))
-    return sample, prediction.replace(possible=jnp.any(works))
+    sample, prediction = jax.vmap(lambda i: attempt(_emptied_unless(state, state.alive & (i < draws)), i))(number)
+    possible = prediction.possible & (number < draws)
+    sample, prediction = jax.tree.map(lambda a: a[jnp.argmax(possible)], (sample, prediction))
+    return sample, prediction.replace(possible=jnp.any(possible))
 
 
 def repeated(tree: Any, count: int) -> Any:
-    """A pytree with a leading axis of so many equal rows."""
+    """A pytree repeated along a new leading axis of length `count`."""
     return jax.tree.map(lambda a: jnp.broadcast_to(a, (count, *a.shape)), tree)
 
 
@@ -258,12 +255,12 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     """Decide on the next action by sampling sequences and keeping the first action of the best (B.4).
 
     Args:
-      rollout: what is known, and how states lead to states.
+      rollout: problem, belief and slots.
       key: PRNG key of the planner.
-      objects: as recognised, fields (N, ...).
+      objects: the recognised objects, fields (N, ...).
 
     Returns:
-      The decision and everything that was considered. The same arguments give the same decision, also under `vmap`.
+      The decision. The same arguments give the same decision, also under `vmap`.
     """
     config = rollout.config
     count, horizon = config.sequences, config.horizon
@@ -277,7 +274,7 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     actions, penalty = jax.tree.map(lambda a: jnp.swapaxes(a[:-1], 0, 1), (actions, penalty))
     cost, now = jnp.swapaxes(cost, 0, 1), cost[0, 0]
     value, length = sequence_values(cost, penalty * cost[:, :-1], actions.kind != ActionKind.NONE, config.gamma)
-    # Without the target's slot, which comes after those of the objects.
+    # Without the target's slot, the last.
     after = jax.tree.map(lambda a: a[0, :, : objects.capacity], scenes)
     sequences = Sequences(actions, cost[:, 1:], value, length, after)
     order = jnp.argsort(sequences.value, stable=True)
@@ -294,7 +291,7 @@ def plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
 
 
 def no_sequences(config: PlannerConfig, objects: Superquadrics) -> Sequences:
-    """What there is where nothing was sampled, and the objects are as they are."""
+    """Sequences of a decision that samples none: no actions, and the present objects after them."""
     count, horizon = config.sequences, config.horizon
     return Sequences(
         actions=repeated(repeated(no_action(), horizon), count),

@@ -1,4 +1,4 @@
-"""A predicted state on the way through a sequence of actions, and what a decision consists of."""
+"""Predicted states in a sequence of actions, and decisions."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from mechsearch_jax.geometry.superquadric import Superquadrics
 
 
 class State(flax.struct.PyTreeNode):
-    """A predicted state, with what was computed of the one before it.
+    """A predicted state, with quantities computed for the state before it.
 
     Attributes:
       scene: the objects and the target, fields (N, ...).
       is_target: which slot is the target's, shape (N,).
-      exists: f, shape (X,). Once the target is found: the pose that it was pushed to, if it could be hidden there.
-      target_at: the candidate pose that stands for where a found target was pushed to, as a mask, shape (X,); nowhere
-        as long as it was not. See `belief.moved_target`.
+      exists: f, shape (X,). Once the target is found: the pose where it was pushed, if it could be hidden there.
+      target_at: mask of the candidate pose that represents where a found target was pushed, shape (X,); empty before.
+        See `belief.moved_target`.
       views: the objects as the camera sees them.
       hits: H, shape (K, N).
       candidates: candidate actions, of each of `SAMPLED_KINDS`.
       moved: which objects differ from the state before, shape (N,).
-      available: which objects may be moved, shape (N,); the target only by some kinds, see `able`.
-      alive: whether the sequence has found something to do so far.
+      available: which objects may be moved, shape (N,); `able` restricts the target to kinds that may move it.
+      alive: whether every action of the sequence so far was possible.
     """
 
     scene: Superquadrics
@@ -53,13 +53,13 @@ class Sequences(flax.struct.PyTreeNode):
     """Sampled sequences of actions, best first; leading axis S, and M within.
 
     Attributes:
-      actions: shape (S, M), of kind NONE from where a sequence found nothing more to do; all of them where the first
-        was refused because it did harm in a trial.
+      actions: shape (S, M), of kind NONE after the last possible action; all NONE if the first was refused because it
+        did harm in a trial.
       cost: J after each action, shape (S, M).
       value: equation 2 of the best prefix, shape (S,); infinite if there was no first action, or it was refused.
       length: number of actions in that prefix, shape (S,).
-      after: the objects as they are expected to be after the first action of each, without the target, fields (S, N,
-        ...); as they are where there is none.
+      after: the predicted objects after the first action of each, without the target, fields (S, N, ...); the present
+        ones if there is no first action.
     """
 
     actions: Action
@@ -70,14 +70,15 @@ class Sequences(flax.struct.PyTreeNode):
 
 
 class Alternatives(flax.struct.PyTreeNode):
-    """What a decision could be instead, for trials to choose from, the best first; K of them.
+    """Alternative actions of a decision, for trials to choose from, best first; K of them.
 
     Attributes:
       actions: shape (K,).
-      worth: which of them are any, and worth a trial, shape (K,).
-      sequence: which of the decision's sequences each begins, shape (K,); -1 for a grasp that may take the target out.
-      now: the objects as they are, fields (N, ...).
-      reached: J where the target can be taken out.
+      worth: which actions are possible and worth a trial, shape (K,).
+      sequence: index of the decision's sequence that each begins, shape (K,); -1 for a grasp that may take the target
+        out.
+      now: the present objects, fields (N, ...).
+      reached: J if the target can be taken out.
     """
 
     actions: Action
@@ -88,20 +89,20 @@ class Alternatives(flax.struct.PyTreeNode):
 
 
 class Decision(flax.struct.PyTreeNode):
-    """What to do next, and everything that was considered.
+    """The next action, and everything that was considered.
 
     Attributes:
-      action: what to do next; of kind NONE if nothing is possible or all that was tried out was refused, of kind
-        RETRIEVE if the target can be taken out.
-      value: equation 2 of the sequence it begins: the change of the cost, negative is good; 0 for a retrieval, infinite
-        where nothing is done.
+      action: the next action; of kind NONE if none is possible or all that were tried were refused, of kind RETRIEVE if
+        the target can be taken out.
+      value: equation 2 of the sequence that it begins: the change of the cost, negative is good; 0 for a retrieval,
+        infinite without an action.
       cost: J now.
-      predicted_cost: J that is expected after the action; NaN after a retrieval.
-      predicted: the objects as they are expected to be after the action, without the target, fields (N, ...).
-      sequences: all sampled sequences, the chosen one first, then the best; none has a first action where none was
+      predicted_cost: predicted J after the action; NaN after a retrieval.
+      predicted: the predicted objects after the action, without the target, fields (N, ...).
+      sequences: all sampled sequences, the chosen one first, then best first; without first actions if none was
         sampled.
-      refused: how many of the best sequences began with what did harm in a trial.
-      alternatives: what else could be done; None where the policy has not said.
+      refused: number of the best sequences whose first action did harm in a trial.
+      alternatives: actions to try instead; None if the policy gives none.
     """
 
     action: Action

@@ -1,8 +1,8 @@
-"""Monte-Carlo tree search over predicted states: another way to plan with the engine's slots, to compare with.
+"""Monte-Carlo tree search over predicted states, a baseline that plans with the engine's slots.
 
-The search is DeepMind's `mctx` (https://github.com/google-deepmind/mctx), with its Gumbel MuZero policy and the model
-that the planner has. A node is a predicted state; its discrete actions are so many that are sampled there, each drawn
-and predicted when it is first tried. What an action takes off J is its reward, and no more is expected of a leaf.
+The search is DeepMind's `mctx` (https://github.com/google-deepmind/mctx), with its Gumbel MuZero policy and the
+planner's model. A node is a predicted state; its discrete actions are samples, each drawn and predicted when it is
+first tried. The reward of an action is the decrease of J; a leaf has value 0.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class Node(flax.struct.PyTreeNode):
     """A node of the tree.
 
     Attributes:
-      state: as it is predicted, up to date.
-      key: data of the PRNG key that its actions are drawn with.
-      depth: number of actions before it, int32.
-      cost: its J.
-      action: that led to it; of kind NONE where that is impossible, and at the root.
-      penalty: of that action, in units of J.
+      state: the predicted state, up to date.
+      key: data of the PRNG key with which its actions are drawn.
+      depth: number of actions before the node, int32.
+      cost: J of the state.
+      action: the action that led to the node; of kind NONE if it is impossible, and at the root.
+      penalty: penalty of that action, in units of J.
     """
 
     state: State
@@ -48,10 +48,10 @@ class Node(flax.struct.PyTreeNode):
 
 
 def import_mctx() -> ModuleType:
-    """The library, which is not always installed.
+    """Import the library `mctx`.
 
     Raises:
-      InputError: it is not.
+      InputError: it is not installed.
     """
     try:
         import mctx
@@ -63,13 +63,13 @@ def import_mctx() -> ModuleType:
 
 
 def _up_to_date(rollout: Rollout, state: State) -> State:
-    """A state with its f, g and actions, after `state.moved` moved."""
+    """Bring f, g and the candidate actions of a state up to date after `state.moved` moved."""
     state = rollout.update(state, state.moved)
     return state.replace(candidates=rollout.candidates(state, state.moved))
 
 
 def _step(rollout: Rollout, key: Array, index: Array, node: Node) -> Node:
-    """What the action of an index leads to; the same index means the same action whenever it is tried."""
+    """The node that the action of an index leads to; an index always means the same action."""
     draw = jax.random.fold_in(jax.random.wrap_key_data(node.key), index)
     changes, action, penalty = rollout.act(node.depth == 0, node.state, draw)
     state = _up_to_date(rollout, node.state.replace(**changes))
@@ -84,9 +84,9 @@ def _step(rollout: Rollout, key: Array, index: Array, node: Node) -> Node:
 
 
 def width(config: PlannerConfig) -> int:
-    """How many actions a node has: the root of how many are predicted in all, so that each may be tried some times.
+    """Number of actions of a node: the square root of the number of predictions, so that each may be tried repeatedly.
 
-    With as many as there are sequences each would be tried once, and the search would look one action ahead.
+    With as many as sequences, each would be tried once, and the search would look one action ahead.
     """
     return min(config.sequences, max(math.isqrt(config.sequences * config.horizon), 2))
 
@@ -94,15 +94,15 @@ def width(config: PlannerConfig) -> int:
 def tree_plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     """Decide on the next action by tree search; a `policies.Plan`.
 
-    As many actions are predicted in all as sampling has to predict, sequences times horizon; see `width`.
+    It predicts as many actions as sampling does, sequences times horizon; see `width`.
 
     Args:
-      rollout: what is known, and how states lead to states.
+      rollout: problem, belief and slots.
       key: PRNG key of the planner.
-      objects: as recognised, fields (N, ...).
+      objects: the recognised objects, fields (N, ...).
 
     Returns:
-      The decision. Its sequences are the actions that were tried first, best first, each with what its subtree came to.
+      The decision. Its sequences are the root's actions, best first, with the values of their subtrees.
 
     Raises:
       InputError: `mctx` is not installed.
@@ -112,7 +112,7 @@ def tree_plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     state = _up_to_date(rollout, rollout.root(objects))
     cost = rollout.cost(state)
     begin = Node(state, jax.random.key_data(key_root), jnp.int32(0), cost, no_action(), jnp.float32(0.0))
-    # What `mctx` sees has an axis for a batch, here of one.
+    # `mctx` expects a batch axis, here of length 1.
     logits = jnp.zeros((1, width(config)))
 
     def expand(_: Any, key: Array, index: Array, batch: Node):
@@ -143,27 +143,27 @@ def tree_plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
 
 
 def _decision(rollout: Rollout, begin: Node, result: Any, slots: int) -> Decision:
-    """What a search came to; an action that turned out impossible is never chosen."""
+    """The decision of a search; an impossible action is never chosen."""
     tree, config = result.search_tree, rollout.config
     child = tree.children_index[0, tree.ROOT_INDEX]
-    tried = functools.partial(jax.tree.map, lambda a: a[0, jnp.maximum(child, 0)])
+    children = functools.partial(jax.tree.map, lambda a: a[0, jnp.maximum(child, 0)])
     node = tree.embeddings
-    actions, cost, scenes = tried(node.action), tried(node.cost), tried(node.state.scene)
+    actions, cost, scenes = children(node.action), children(node.cost), children(node.state.scene)
     acted = (child >= 0) & (actions.kind != ActionKind.NONE)
     value = jnp.where(acted, -tree.qvalues(jnp.full(1, tree.ROOT_INDEX))[0], jnp.inf)
     actions = actions.replace(kind=jnp.where(acted, actions.kind, ActionKind.NONE).astype(jnp.int32))
-    # The one that the search trusts comes first, wherever its value stands.
-    trusted = (jnp.arange(width(config)) == result.action[0]) & acted
-    order = jnp.argsort(jnp.where(trusted, -jnp.inf, value), stable=True)
+    # The action that the search selects comes first, whatever its value.
+    selected = (jnp.arange(width(config)) == result.action[0]) & acted
+    order = jnp.argsort(jnp.where(selected, -jnp.inf, value), stable=True)
     actions, cost, value, scenes = jax.tree.map(lambda a: a[order], (actions, cost, value, scenes))
 
-    # In the shapes of sampled sequences: of one action each, and fewer than there could be.
+    # In the shapes of sampled sequences: one action each, and fewer of them.
     nothing, count = no_sequences(config, jax.tree.map(lambda a: a[:slots], begin.state.scene)), width(config)
     sequences = nothing.replace(
         actions=jax.tree.map(lambda a, b: b.at[:count, 0].set(a), actions, nothing.actions),
         cost=nothing.cost.at[:count, 0].set(cost),
         value=nothing.value.at[:count].set(value),
-        # Without the target's slot, which comes after those of the objects.
+        # Without the target's slot, the last.
         after=jax.tree.map(lambda a, b: b.at[:count].set(a[:, :slots]), scenes, nothing.after),
     )
     able = jnp.isfinite(value[0])
