@@ -1,14 +1,14 @@
 """The graspability function g: could the target be grasped where it is? (paper appendix B.3; docs/method.md,
 "Graspability")
 
-Everything that a grasp sweeps (hand, fingers, links 7 and 6 on their straight way in, and the target on its way out) is
-a constant point cloud in the target's frame. Which grasps the arm can make at a candidate pose, and which the shelf
-leaves room for, does not depend on the objects, so the pairs of a pose and a grasp that are feasible are listed once,
-and a scene only adds the table H[pair, object] of who is hit. Moving one object recomputes its column.
+The swept volume of a grasp (hand, fingers, links 7 and 6 on their straight way in, and the target on its way out) is a
+constant point cloud in the target's frame. Which grasps arm and shelf allow at a candidate pose does not depend on the
+objects. So the feasible pairs of a candidate pose and a grasp are listed once, and a scene only adds the table
+H[pair, object] of hits. When one object moves, its column is recomputed.
 
-An approximation: where the straight way in begins inside the shelf, the gripper first gets there along x. That the arm
-can is part of what is feasible, but H does not say what stands in the way there, nor what links 2 to 5 touch; for a
-target that has been found `retrieval` does.
+An approximation: if the straight way in begins inside the shelf, the gripper first moves there along x. Feasibility
+includes this motion of the arm, but H includes neither its hits nor those of links 2 to 5; `retrieval` tests both for a
+found target.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ from mechsearch_jax.shapes import shape_of
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# So many points of a cloud are looked at first.
+# Number of points of a cloud that are tested first.
 COARSE = 256
-# What a pose where no grasp is feasible counts for, in objects hit: one more than the eight objects of a scene and its
-# target. It does not depend on how many slots a scene has; whoever hits as many might as well have no grasp.
+# Number of hits that a pose without a feasible grasp counts for: one more than the eight objects of a scene and its
+# target, for any number of slots.
 INFEASIBLE = 10
-# How many feasible pairs there are, and how many at a pose, is rounded up to multiples of these.
+# The numbers of feasible pairs in all, and at a pose, are rounded up to multiples of these.
 PAIRS_STEP, POSE_STEP = 1024, 8
 
 
@@ -54,13 +54,13 @@ class GraspConfig:
       yaws: number of approach directions seen from above, for round objects; boxes are grasped square to their faces.
       max_yaw: largest angle between the approach and +x, seen from above [rad].
       tilts: angles by which the gripper points downwards [rad].
-      wrists: angles of joint 7 relative to 45 degrees [rad]; each holds link 6 elsewhere beside the hand.
-      height: how far above the target's centre it is grasped [m]: higher grasps keep the wrist clear of the board.
+      wrists: angles of joint 7 relative to 45 degrees [rad]; each places link 6 differently beside the hand.
+      height: height of the grasp above the target's centre [m]; higher grasps keep the wrist clear of the board.
       points: points on the swept gripper.
       target_points: points on the swept target.
-      still_points: points on the gripper where it is, and on the target, for the crossing of a found one.
-      waypoints: poses on an approach at which inverse kinematics must succeed.
-      erosion: by how much the target is drawn in for the collision test of its way out [m].
+      still_points: points on the gripper at rest, and on the target, for the crossing with a found target.
+      waypoints: number of poses on an approach at which inverse kinematics must succeed.
+      erosion: by how much the target is shrunk for the collision test of its way out [m].
     """
 
     yaws: int = 7
@@ -85,23 +85,23 @@ class GraspConfig:
 
     @classmethod
     def dense(cls) -> GraspConfig:
-        """Ten times as many grasps as the default, for the one pose at which the target has been found."""
+        """Ten times as many grasps as the default, for the single pose of a found target."""
         tilts, wrists = (20.0, 22.5, 25.0, 27.5, 30.0), (-60.0, -30.0, 0.0, 30.0, 60.0)
         return cls(yaws=25, tilts=tuple(map(math.radians, tilts)), wrists=tuple(map(math.radians, wrists)))
 
 
 class GraspTables(flax.struct.PyTreeNode):
-    """Grasps of the target and what each sweeps: constants of a `Problem`.
+    """Grasps of the target and their swept clouds: constants of a `Problem`. Clouds are rows of coordinates [m].
 
     Attributes:
-      T_target_gripper: where the gripper closes, shape (G, 4, 4).
-      q7: angle of joint 7 in each, shape (G,).
+      T_target_gripper: pose of the gripper where it closes, shape (G, 4, 4).
+      q7: angle of joint 7 in each grasp [rad], shape (G,).
       wrist: index of the wrist's swept gripper cloud, shape (G,).
-      clouds: what gripper and target sweep in each grasp, in the gripper's frame as rows, shape (G, 3, P) [m].
-      low, high: box around each cloud, shape (G, 3) [m].
-      still_gripper: what the open gripper takes up with each wrist, in its own frame as rows, shape (W, 3, S) [m].
-      still_target: surface of the target in its own frame as rows, shape (3, R) [m].
-      gap: how far a point of a cloud may be from the nearest of its first `COARSE` [m].
+      clouds: points that gripper and target sweep in each grasp, in the gripper's frame, shape (G, 3, P).
+      low, high: bounding box of each cloud, shape (G, 3) [m].
+      still_gripper: points on the open gripper with each wrist, in its own frame, shape (W, 3, S).
+      still_target: surface of the target in its own frame, shape (3, R).
+      gap: largest distance of a point of a cloud from the nearest of its first `COARSE` points [m].
     """
 
     T_target_gripper: jax.Array
@@ -125,10 +125,10 @@ class CandidateGrasps(GraspTables):
 
     Attributes:
       T_world_target: candidate poses, shape (X, 4, 4).
-      pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose. After them the last one is repeated, so
-        that the shape seldom changes where the shelf stands a little elsewhere.
-      pair_valid: false for what is repeated, shape (K,).
-      pose_pairs: the pairs of each candidate pose, and K where there are no more, shape (X, P).
+      pair_pose, pair_grasp: the feasible pairs, shape (K,), ordered by pose; padded with the last one, so that the
+        shape seldom changes if the shelf is moved a little.
+      pair_valid: false for padding, shape (K,).
+      pose_pairs: indices of the pairs of each candidate pose, padded with K, shape (X, P).
     """
 
     T_world_target: jax.Array
@@ -161,7 +161,7 @@ def _target_grasps(
 
 
 def swept_target(target: Target, direction: np.ndarray, distance: float, count: int, erosion: float) -> np.ndarray:
-    """Surface of what the target sweeps when it is moved along a direction, in its own frame, shape (count, 3) [m]."""
+    """Surface of the volume that the target sweeps along a direction, in its own frame, shape (count, 3) [m]."""
     mesh = shape_of(target.shape).mesh([h - erosion for h in target.half_size])
     both = np.concatenate([mesh.vertices, mesh.vertices + distance * np.asarray(direction)])
     points = trimesh.sample.sample_surface(trimesh.convex.convex_hull(both), count, seed=0)[0]
@@ -176,11 +176,10 @@ def feasible_grasps(
     T_world_target: Float[Array, "n 4 4"],
     active: Bool[Array, ""] | bool = True,
 ) -> Bool[Array, "n g"]:
-    """Which grasps the arm can make at target poses and the shelf leaves room for, whatever the objects.
+    """Which grasps arm and shelf allow at target poses, regardless of the objects.
 
-    The approach has to be within `max_yaw` of +x, the whole way in from outside the shelf reachable, and neither the
-    arm nor anything that is swept may touch the shelf. None is, and next to nothing is computed, where `active` is
-    false.
+    The approach must be within `max_yaw` of +x, the whole way in from outside the shelf reachable, and neither the arm
+    nor the swept cloud may touch the shelf. If `active` is false, no grasp is feasible and little is computed.
     """
     n, g = T_world_target.shape[0], tables.q7.shape[0]
     T = compose(T_world_target[:, None], tables.T_target_gripper[None])
@@ -192,7 +191,7 @@ def feasible_grasps(
 
 
 def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> GraspTables:
-    """Precompute the target's grasps and what each sweeps.
+    """Precompute the target's grasps and their swept clouds.
 
     Raises:
       InputError: the target is too wide for the gripper.
@@ -202,15 +201,15 @@ def grasp_tables(gripper: Gripper, target: Target, config: GraspConfig) -> Grasp
     swept = [swept_cloud(gripper, gripper.max_opening, a, config.points) for a in angles]
     still = [gripper_cloud(gripper, gripper.max_opening, a, config.still_points[0]) for a in angles]
     outward = -np.asarray(T_target_gripper)[:, :3, 2]
-    # Every first part of a cloud covers the gripper and the target alike.
+    # Every leading part of a cloud covers gripper and target evenly.
     progress = [np.arange(n) / n for n in (config.points, config.target_points)]
     order = np.argsort(np.concatenate(progress), kind="stable")
     clouds, low, high = [], [], []
-    # Grasps that differ in their wrists only take the target out the same way.
-    ways = {d.tobytes(): d for d in outward}
+    # Grasps that differ only in their wrists take the target out in the same direction.
+    directions = {d.tobytes(): d for d in outward}
     swept_targets = {
         key: swept_target(target, direction, gripper.approach, config.target_points, config.erosion)
-        for key, direction in ways.items()
+        for key, direction in directions.items()
     }
     for T, w, direction in zip(np.asarray(T_target_gripper), wrist, outward, strict=True):
         inside = (swept_targets[direction.tobytes()] - T[:3, 3]) @ T[:3, :3]
@@ -241,14 +240,14 @@ def candidate_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: Gra
     """
     tables = grasp_tables(gripper, target, config)
     poses = np.asarray(jax.jit(upright_pose)(target.candidate_poses(shelf), target.height(shelf)))
-    judge = jax.jit(lambda tables, shelf, poses: feasible_grasps(tables, shelf, gripper, config, poses))
-    pose, grasp = np.nonzero(np.asarray(judge(tables, shelf, jax.device_put(poses))))
-    candidates = {"T_world_target": poses, **_padded_pairs(pose, grasp, len(poses))}
-    return CandidateGrasps(**vars(tables), **jax.device_put(candidates))
+    feasible = jax.jit(lambda tables, shelf, poses: feasible_grasps(tables, shelf, gripper, config, poses))
+    pose, grasp = np.nonzero(np.asarray(feasible(tables, shelf, jax.device_put(poses))))
+    fields = {"T_world_target": poses, **_padded_pairs(pose, grasp, len(poses))}
+    return CandidateGrasps(**vars(tables), **jax.device_put(fields))
 
 
 def _padded_pairs(pose: Int[np.ndarray, " pairs"], grasp: Int[np.ndarray, " pairs"], poses: int) -> dict[str, Any]:
-    """The fields of `CandidateGrasps` that say which grasps are feasible at which of the candidate poses."""
+    """The fields of `CandidateGrasps` for the feasible pairs of a candidate pose and a grasp."""
     rows = len(pose) + -len(pose) % PAIRS_STEP
     count = np.bincount(pose, minlength=poses)
     place = np.arange(len(pose)) - np.repeat(np.cumsum(count) - count, count)
@@ -264,31 +263,31 @@ def _padded_pairs(pose: Int[np.ndarray, " pairs"], grasp: Int[np.ndarray, " pair
 
 
 class Pairs(NamedTuple):
-    """What the rows of H stand for: those of the candidates, and after them those of a found target.
+    """Meaning of the rows of H: those of the candidate poses, then those of a found target.
 
     Attributes:
-      pose: index of the pose, the candidates first and then the found one, shape (K,), in ascending order.
+      pose: index of the pose, candidate poses first and then the found pose, shape (K,), in ascending order.
       allowed: whether arm and shelf allow the grasp, shape (K,).
-      pose_pairs: the rows of each candidate pose, and their number where there are no more, shape (X, P).
-      candidates: number of rows of the candidates.
-      found: whether there is the pose of a found target, too.
+      pose_pairs: the rows of each candidate pose, padded with `candidate_pose_rows`, shape (X, P).
+      candidate_pose_rows: number of rows of the candidate poses.
+      found: whether rows of a found target follow.
     """
 
     pose: Int[Array, " k"]
     allowed: Bool[Array, " k"]
     pose_pairs: Int[Array, "x p"]
-    candidates: int
+    candidate_pose_rows: int
     found: bool
 
 
-def pairs(candidates: CandidateGrasps, feasible: Bool[Array, " f"] | None = None) -> Pairs:
+def pairs(tables: CandidateGrasps, feasible: Bool[Array, " f"] | None = None) -> Pairs:
     """The rows of H.
 
     Args:
-      candidates: constants of the problem.
-      feasible: which grasps of a found target are feasible; if left out, the rows are those of the candidates alone.
+      tables: constants of the problem.
+      feasible: which grasps of a found target are feasible; if left out, there are only rows of candidate poses.
     """
-    pose, allowed, table = candidates.pair_pose, candidates.pair_valid, candidates.pose_pairs
+    pose, allowed, table = tables.pair_pose, tables.pair_valid, tables.pose_pairs
     if feasible is None:
         return Pairs(pose, allowed, table, len(pose), False)
     both = jnp.concatenate([pose, jnp.full(feasible.shape, len(table), jnp.int32)])
@@ -296,7 +295,7 @@ def pairs(candidates: CandidateGrasps, feasible: Bool[Array, " f"] | None = None
 
 
 def no_hits(rows: Pairs, capacity: int) -> Bool[Array, "k n"]:
-    """H of so many objects that are yet to be tested."""
+    """H of `capacity` objects before any test: no hits."""
     return jnp.zeros((rows.pose.shape[0], capacity), bool)
 
 
@@ -307,12 +306,12 @@ def grasp_hits(
     previous: Bool[Array, "k n"] | None = None,
     moved: Bool[Array, " n"] | None = None,
 ) -> Bool[Array, "k n"]:
-    """H of the candidates: which objects the grasp of each feasible pair would hit.
+    """H of the candidate poses: which objects the grasp of each feasible pair would hit.
 
     Args:
       tables: constants of the problem.
       scene: the objects, fields (N, ...).
-      exists: at which candidate poses H matters; it reads False elsewhere.
+      exists: candidate poses for which H is computed; it is False elsewhere.
       previous: H before some objects moved.
       moved: which objects moved since; only their columns are computed anew.
 
@@ -330,18 +329,17 @@ def grasp_hits(
 
 
 def _per_pose(reduce: Callable[[Array], Array], rows: Pairs, hits: Bool[Array, "k n"]) -> Shaped[Array, " y"]:
-    """What a function makes of how many objects the grasps of each pose hit: of (*batch, P) numbers, -1 where a grasp
-    is not feasible."""
+    """Reduce the numbers of hits of the grasps at each pose, shape (*batch, P), with -1 for infeasible grasps."""
     count = jnp.where(rows.allowed, jnp.sum(hits, axis=1, dtype=jnp.int32), -1)
-    at_candidates, at_found = jnp.split(count, [rows.candidates])
-    values = reduce(jnp.append(at_candidates, -1)[rows.pose_pairs])
-    return jnp.append(values, reduce(at_found)) if rows.found else values
+    at_candidate_poses, at_found_pose = jnp.split(count, [rows.candidate_pose_rows])
+    values = reduce(jnp.append(at_candidate_poses, -1)[rows.pose_pairs])
+    return jnp.append(values, reduce(at_found_pose)) if rows.found else values
 
 
 def graspability(rows: Pairs, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:
     """g at all poses from H: 1 minus the least number of objects that a feasible grasp hits (equation 17).
 
-    A pose where no grasp is feasible counts as hitting `INFEASIBLE` objects, however many slots there are.
+    A pose without a feasible grasp counts as hitting `INFEASIBLE` objects, for any number of slots.
     """
 
     def least(count):
@@ -351,7 +349,7 @@ def graspability(rows: Pairs, hits: Bool[Array, "k n"]) -> Int[Array, " y"]:
 
 
 def crowding(rows: Pairs, hits: Bool[Array, "k n"]) -> Float[Array, " y"]:
-    """Mean number of objects that the feasible grasps of each pose hit; 0 where none is feasible."""
+    """Mean number of objects that the feasible grasps of each pose hit; 0 if none is feasible."""
 
     def mean(count):
         feasible = jnp.maximum(jnp.sum(count >= 0, axis=-1), 1)
@@ -361,5 +359,5 @@ def crowding(rows: Pairs, hits: Bool[Array, "k n"]) -> Float[Array, " y"]:
 
 
 def split_found(values: Shaped[Array, " y"]) -> tuple[Shaped[Array, " x"], Shaped[Array, ""]]:
-    """What belongs to the candidate poses and what to the found target, in the order of `pairs`."""
+    """Split values at all poses into those at candidate poses and that at the found pose."""
     return values[:-1], values[-1]

@@ -1,10 +1,10 @@
-"""The grasps of a target that has been found: which of them arm and shelf allow, what each hits, and which are best.
+"""The grasps of a found target: which of them arm and shelf allow, which objects each hits, and which are best.
 
-They are ten times as many as the candidates' grasps, and looked at more closely than g does: the way along x in front
-of the straight approach counts too, and so do links 2 to 5.
+There are ten times as many as at candidate poses, and they are tested more closely than in g: the crossing along x
+before the straight approach counts too, and so do links 2 to 5.
 
-A grasp counts if nothing is hit on the whole way in and out. But many that hit something only brush it, or push aside
-what is free to move. So a few grasps are worth trying out, the clearest first; see `planner.trials`.
+A grasp succeeds if nothing is hit on the whole way in and out. But many that hit an object only brush it, or push it
+aside. So a few grasps are worth a trial, the clearest first; see `planner.trials`.
 """
 
 from __future__ import annotations
@@ -35,28 +35,28 @@ from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
-# So many grasps are tried out at most.
+# Largest number of grasps that are tried.
 TRIES = 8
-# Poses on the way along x of each grasp: at fewer the arm may pass a singularity unnoticed.
+# Number of poses on the crossing of each grasp; with fewer the arm may pass a singularity unnoticed.
 CROSSINGS = 15
-# At which poses of the way in the arm is tested against objects: 5.5 cm apart at most, and half of that before the
-# fingers close. Any nearer, it rules out grasps that take the target out: the arm is a little stouter here than it is.
+# Poses of the way in where the arm is tested against objects: at most 5.5 cm apart, and half of that before the fingers
+# close. Closer poses would rule out grasps that succeed, since the arm's model is a little wider than the arm.
 ARM_POSES = np.array([*range(2, CROSSINGS, 4), *range(CROSSINGS, CROSSINGS + CLOSE_WAYPOINTS, 2)])
-# By how much objects are grown to find the grasp that keeps furthest from them [m].
+# Amounts by which objects are grown to find the grasp with the most clearance [m].
 CLEARANCES = (0.004, 0.008, 0.012, 0.02)
-# By how much they are shrunk to find the grasp that runs into them least deep [m].
+# Amounts by which objects are shrunk to find the grasp that hits them least deep [m].
 DEPTHS = (0.006, 0.012, 0.024)
-# Grasps are alike whose approaches differ by less than this, and whose angles of joint 7 do by less than that [rad].
+# Two grasps are alike if their approaches and their angles of joint 7 differ by less than these [rad].
 ALIKE, ALIKE_WRIST = math.radians(10), math.radians(20)
-# More than any rank of a grasp that arm and shelf allow.
+# Larger than the rank of any grasp that arm and shelf allow.
 FAR = 1_000_000
 
 
 class TargetGrasps(flax.struct.PyTreeNode):
-    """The grasps that a found target may be taken out with, and what else decides which of them are feasible.
+    """The grasps for a found target, and the cell that decides which of them are feasible.
 
     Attributes:
-      tables: their constants.
+      tables: constants of the grasps.
       shelf: data.
       gripper, target, config: static.
     """
@@ -69,12 +69,12 @@ class TargetGrasps(flax.struct.PyTreeNode):
 
 
 class FoundGrasps(flax.struct.PyTreeNode):
-    """The grasps of a target that has been found, whose pose need not be a candidate.
+    """Feasibility of the F grasps of a found target, at any pose.
 
     Attributes:
       T_world_target: pose of the target, shape (4, 4).
-      feasible: which grasps the arm and the shelf allow, shape (F,).
-      q: joint angles at a few poses on the way in to each, shape (F, W, 7) [rad].
+      feasible: which grasps arm and shelf allow, shape (F,).
+      q: joint angles at `ARM_POSES` on the way in to each, shape (F, W, 7) [rad].
     """
 
     T_world_target: jax.Array
@@ -86,12 +86,11 @@ class GraspChoice(flax.struct.PyTreeNode):
     """How to take out a found target.
 
     Attributes:
-      success: whether there is a grasp with which neither gripper, target nor arm hits anything on the whole way from
-        outside the shelf and out again.
+      success: whether neither gripper, target nor arm hits anything on the grasp's whole way in and out.
       feasible: whether arm and shelf allow the grasp.
       hits: number of objects that the grasp hits; `graspability.INFEASIBLE` if it is not feasible.
-      action: takes it out with the best grasp: of those that hit fewest the one whose straight way keeps furthest from
-        the objects.
+      action: the retrieval with the grasp; the best grasp is the one with the most clearance on its straight way among
+        those with the fewest hits.
     """
 
     success: jax.Array
@@ -101,7 +100,7 @@ class GraspChoice(flax.struct.PyTreeNode):
 
 
 def target_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: GraspConfig) -> TargetGrasps:
-    """The grasps of a configuration for a target that has been found. Not to be called inside `jit`.
+    """The grasps of a configuration for a found target. Not for use inside `jit`.
 
     Raises:
       InputError: the target is too wide for the gripper.
@@ -110,7 +109,7 @@ def target_grasps(shelf: Shelf, gripper: Gripper, target: Target, config: GraspC
 
 
 def no_grasps(grasps: TargetGrasps) -> FoundGrasps:
-    """Those of a target that has not been found."""
+    """The grasps of a target that is not found: none is feasible."""
     count = grasps.tables.q7.shape[0]
     return FoundGrasps(jnp.eye(4), jnp.zeros(count, bool), jnp.zeros((count, len(ARM_POSES), len(JOINTS))))
 
@@ -118,12 +117,12 @@ def no_grasps(grasps: TargetGrasps) -> FoundGrasps:
 def found_grasps(
     grasps: TargetGrasps, T_world_target: Float[Array, "4 4"], active: Bool[Array, ""] | bool = True
 ) -> FoundGrasps:
-    """The grasps of a target at any pose that the arm and the shelf allow on the whole way in and out.
+    """The grasps of a target at any pose that arm and shelf allow on the whole way in and out.
 
     Args:
-      grasps: those to choose from.
+      grasps: the grasps to choose from.
       T_world_target: pose of the target.
-      active: where false, none is feasible and little is computed: there is no target yet.
+      active: whether the target is found; if not, no grasp is feasible and little is computed.
     """
     tables, gripper, shelf = grasps.tables, grasps.gripper, grasps.shelf
     feasible = feasible_grasps(tables, shelf, gripper, grasps.config, T_world_target[None], active)[0]
@@ -142,17 +141,17 @@ def found_grasps(
 def straight_hits(
     tables: GraspTables, found: FoundGrasps, scene: Superquadrics, active: Bool[Array, ""] | bool = True
 ) -> Bool[Array, "f n"]:
-    """Which objects gripper or target hit on the straight approach of each feasible grasp, and out again.
+    """Which objects gripper or target hit on the straight way in and out of each feasible grasp.
 
     Args:
       tables: the grasps.
-      found: the target.
+      found: their feasibility for the found target.
       scene: the objects, without the target.
-      active: where false, nothing is hit and little is computed.
+      active: if false, nothing is hit and little is computed.
     """
     T_world_gripper = compose(found.T_world_target[None], tables.T_target_gripper)
-    wanted = (found.feasible & jnp.asarray(active))[:, None] & scene.valid[None]
-    return collisions(tables.swept, np.arange(len(tables.q7), dtype=np.int32), T_world_gripper, scene, wanted)
+    mask = (found.feasible & jnp.asarray(active))[:, None] & scene.valid[None]
+    return collisions(tables.swept, np.arange(len(tables.q7), dtype=np.int32), T_world_gripper, scene, mask)
 
 
 def found_hits(
@@ -163,14 +162,14 @@ def found_hits(
     previous: Bool[Array, "f n"] | None = None,
     moved: Bool[Array, " n"] | None = None,
 ) -> Bool[Array, "f n"]:
-    """Which objects the whole way of each grasp of a found target would hit; those that are not feasible hit none.
+    """Which objects each grasp of a found target hits on its whole way; grasps that are not feasible hit none.
 
     Args:
-      grasps: as of `found_grasps`.
-      found: the target.
+      grasps: the grasps, as in `found_grasps`.
+      found: their feasibility for the found target.
       scene: the objects, without the target.
-      active: where false, nothing is hit and little is computed.
-      previous: the same before some objects moved.
+      active: if false, nothing is hit and little is computed.
+      previous: the hits before objects moved.
       moved: which objects moved since; only their columns are computed anew.
     """
     if found.feasible.shape[0] == 0:
@@ -201,8 +200,8 @@ def crossing_hits(
       tables: the grasps.
       gripper: static.
       scene: the objects, without the target.
-      T_world_target: where the target is.
-      feasible: which grasps are looked at.
+      T_world_target: pose of the target.
+      feasible: which grasps are tested.
     """
     g, n, p = tables.q7.shape[0], scene.capacity, CROSSING_PLACES
     T = compose(T_world_target[None], tables.T_target_gripper)
@@ -210,10 +209,10 @@ def crossing_hits(
     places = crossing_poses(T, gripper.nearest_outside, gripper, p)
     target = transform(inverse(tables.T_target_gripper)[:, None], tables.still_target.T[None])
     still = clouds_of(jnp.concatenate([tables.still_gripper[tables.wrist], jnp.swapaxes(target, 1, 2)], axis=-1))
-    # Few grasps cross.
+    # Few grasps have a crossing.
     crosses = feasible & (length > 0.0)
-    wanted = jnp.repeat(crosses[:, None] & scene.valid[None], p, axis=0)
-    hits = collisions(still, jnp.repeat(jnp.arange(g), p), places.reshape(-1, 4, 4), scene, wanted)
+    mask = jnp.repeat(crosses[:, None] & scene.valid[None], p, axis=0)
+    hits = collisions(still, jnp.repeat(jnp.arange(g), p), places.reshape(-1, 4, 4), scene, mask)
     return jnp.any(hits.reshape(g, p, n), axis=1)
 
 
@@ -221,19 +220,20 @@ def crossing_hits(
 def worth_trying(
     grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool = True
 ) -> GraspChoice:
-    """`TRIES` grasps of a target at a pose that differ from each other, leading axis, best first.
+    """`TRIES` different grasps of a target at a pose for trials, leading axis, best first.
 
-    Those that hit nothing come first, ranked as for `best_grasp`, then those that run into objects least deep.
+    Grasps that hit nothing come first, ranked as in `best_grasp`, then those that hit objects least deep.
 
     Args:
       grasps, scene, pose, active: as in `best_grasp`.
     """
     ranked = _ranked(grasps, scene, pose, active, DEPTHS)
-    way, q7 = ranked.T_world_gripper[:, :3, 2], grasps.tables.q7
+    approach, q7 = ranked.T_world_gripper[:, :3, 2], grasps.tables.q7
 
     def pick(order, _):
         i = jnp.argmin(order)
-        alike = (jnp.sum(way * way[i][None], axis=-1) > math.cos(ALIKE)) & (jnp.abs(q7 - q7[i]) < ALIKE_WRIST)
+        cosine = jnp.sum(approach * approach[i][None], axis=-1)
+        alike = (cosine > math.cos(ALIKE)) & (jnp.abs(q7 - q7[i]) < ALIKE_WRIST)
         return (order + jnp.where(alike, FAR, 0)).at[i].add(100 * FAR), i
 
     _, best = jax.lax.scan(pick, ranked.order, length=min(TRIES, len(q7)))
@@ -244,16 +244,16 @@ def worth_trying(
 def best_grasp(
     grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"], active: Bool[Array, ""] | bool = True
 ) -> GraspChoice:
-    """Whether and how a target at a pose can be grasped with some grasps without hitting anything.
+    """Whether and how a target at a pose can be grasped without hitting anything.
 
     Args:
-      grasps: those to choose from.
+      grasps: the grasps to choose from.
       scene: the objects, without the target.
-      pose: of the target as x, y [m], yaw [rad]; need not be a candidate.
-      active: where false, no grasp is feasible and little is computed: there is no target yet.
+      pose: pose of the target as x, y [m], yaw [rad]; need not be a candidate pose.
+      active: whether the target is found; if not, no grasp is feasible and little is computed.
     """
     ranked = _ranked(grasps, scene, pose, active)
-    # Not of the best: who asks for these alone need not know how near others are.
+    # Independent of the ranking: a caller that uses only these does not compute the clearances.
     fewest = jnp.min(ranked.hits)
     choice = _choice(grasps, ranked, jnp.argmin(ranked.order))
     return choice.replace(success=fewest == 0, feasible=jnp.any(ranked.feasible), hits=fewest.astype(jnp.int32))
@@ -261,11 +261,11 @@ def best_grasp(
 
 @functools.partial(jax.jit, static_argnames=("count",))
 def best_grasps(grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "3"], count: int) -> GraspChoice:
-    """The `count` best grasps of a target at a pose, ranked as for `best_grasp`; leading axis, best first.
+    """The `count` best grasps of a target at a pose, ranked as in `best_grasp`; leading axis, best first.
 
     Args:
       grasps, scene, pose: as in `best_grasp`.
-      count: how many; not more than there are.
+      count: number of grasps, at most all.
     """
     ranked = _ranked(grasps, scene, pose, True)
     best = jnp.argsort(ranked.order, stable=True)[:count]
@@ -273,8 +273,7 @@ def best_grasps(grasps: TargetGrasps, scene: Superquadrics, pose: Float[Array, "
 
 
 class _Ranked(NamedTuple):
-    """All grasps: where the gripper closes, whether each is feasible, how many objects it hits, and by what they are
-    ranked, least first."""
+    """All grasps: pose of the gripper, feasibility, number of objects hit, and rank, the best lowest."""
 
     T_world_gripper: Float[Array, "f 4 4"]
     feasible: Bool[Array, " f"]
@@ -289,11 +288,11 @@ def _ranked(
     active: Bool[Array, ""] | bool,
     depths: tuple[float, ...] = (),
 ) -> _Ranked:
-    """All grasps, ranked by how many objects they hit and how near they come to others.
+    """All grasps, ranked by number of hits, then by clearance.
 
     Args:
       grasps, scene, pose, active: as in `best_grasp`.
-      depths: by how much objects are shrunk [m]: what a grasp hits even then goes before how many it hits.
+      depths: amounts by which objects are shrunk [m]; hits of the shrunk objects rank before the number of hits.
     """
     T_world_target = upright_pose(pose, grasps.target.height(grasps.shelf))
     tables = grasps.tables
@@ -309,7 +308,7 @@ def _ranked(
     all_hits, *deeper = jax.lax.map(hit, jnp.float32((0.0, *depths)))
     hits = jnp.where(found.feasible, all_hits, INFEASIBLE)
     crowd = jnp.sum(jax.lax.map(near, jnp.float32(CLEARANCES)), axis=0)
-    # What arm or shelf do not allow comes last, after all that is alike.
+    # Infeasible grasps come last, even after those marked as alike.
     order = jnp.where(found.feasible, 1000 * sum(deeper, jnp.zeros_like(hits)) + 100 * hits + crowd, 10 * FAR)
     return _Ranked(compose(T_world_target[None], tables.T_target_gripper), found.feasible, hits, order)
 
