@@ -1,7 +1,7 @@
-"""The command line: parse, call, print. `mechsearch --help` tells what there is.
+"""The command line: parse, call, print. `mechsearch --help` lists the commands.
 
-Bad input ends a command with one line on standard error and status 2, and leaves existing output as it is. What a
-command needs is imported when it runs, so that help and mistakes are answered at once.
+Bad input ends a command with one line on standard error and status 2, and leaves existing output unchanged. A command
+imports its dependencies when it runs, so that help and errors appear immediately.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ GROUPS: Mapping[str, Commands] = {
 }
 
 
-# What takes a second to be found out, by what a command is declared with.
+# Complete option types, which take a second to make, by the type in a command's signature.
 _OPTIONS: Mapping[type, Callable[[], type]] = {
     EpisodeOptions: with_planner_options,
     SweptOptions: with_swept_options,
@@ -79,8 +79,7 @@ _OPTIONS: Mapping[type, Callable[[], type]] = {
 
 
 def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-    """A function that takes the command's arguments, with all options if it takes any, and only returns what is to be
-    run."""
+    """A function that takes the command's arguments, with all options if it takes any, and returns the call to run."""
 
     # A named function may be wrapped by a checker of annotations, and the parser looks beneath what is wrapped.
     parsed: Any = lambda *args, **kwargs: functools.partial(command, *args, **kwargs)  # noqa: E731
@@ -92,7 +91,7 @@ def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]
         hints["options"] = Annotated[options, tyro.conf.arg(name="")]
         parameters["options"] = parameters["options"].replace(default=options())
     for name, parameter in parameters.items():
-        # What happens without such an option its help says.
+        # The help of such an option describes its default.
         given_by_place = parameter.kind is inspect.Parameter.POSITIONAL_ONLY
         if parameter.default is None or parameter.default == () or given_by_place:
             hints[name] = Annotated[hints[name], tyro.conf.arg(help_behavior_hint="")]
@@ -102,11 +101,11 @@ def _deferred(command: Callable[..., None]) -> Callable[..., Callable[[], None]]
 
 
 def one_line(complaint: str) -> str:
-    """The message in the box that the parser draws around it, on one line, with the option that it takes for meant."""
+    """The message in the parser's box as one line, with the option that the parser suggests."""
     plain = re.sub(r"\x1b\[[0-9;]*m", "", complaint)
     rows = [row.strip("│╭╰╮╯ \t") for row in plain.splitlines()]
     title, *rows = [row for row in rows if row] or ["the arguments are wrong"]
-    # Where the terminal knows no box, the title has a line beneath it.
+    # Without box characters, the title is underlined.
     while rows and not rows[0].strip("─-"):
         del rows[0]
     body: list[str] = []
@@ -120,7 +119,7 @@ def one_line(complaint: str) -> str:
 
 
 def parse(arguments: Sequence[str]) -> Callable[[], None]:
-    """The command that arguments ask for, ready to be called.
+    """The command with its arguments, ready to be called.
 
     Raises:
       InputError: the arguments are wrong.
@@ -139,7 +138,7 @@ def parse(arguments: Sequence[str]) -> Callable[[], None]:
         raise InputError(
             f'there is no command "{program} {name}"; {nearest(name, commands)} ({program} --help tells more)'
         )
-    # What options there are takes long to find out, and is of no use to other commands.
+    # Only the given command needs its options, which take long to make.
     parsed = {n: _deferred(c) if n == name else _only_described(c.__doc__) for n, c in commands.items()}
     complaint = io.StringIO()
     try:
@@ -168,7 +167,7 @@ def main() -> None:
         print("mechsearch: stopped", file=sys.stderr)
         raise SystemExit(130) from None
     except BrokenPipeError:
-        # Who reads has seen enough, as `head` has. What is left is written nowhere when Python ends.
+        # The reader, such as `head`, has closed the pipe. Discard the rest that Python writes at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(141) from None
 

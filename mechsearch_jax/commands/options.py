@@ -51,7 +51,7 @@ class EpisodeOptions:
     protocol: Literal["strict", "published-code"] = "strict"
 
     def settings(self) -> Settings:
-        """The configuration file's settings, with what is given in their place.
+        """The configuration file's settings, overridden by the options that are given.
 
         Raises:
           InputError: the file cannot be used, or an option is impossible.
@@ -63,16 +63,15 @@ class EpisodeOptions:
         return settings_of(self.config_file).with_options(getattr(self, "preset", None), **given)
 
     def methods(self, policies: Sequence[str], engine: EngineName = "NativeSimulator") -> list[Method]:
-        """What episodes are run with: one for each policy.
+        """The method of each policy.
 
         Raises:
-          InputError: a policy, an option, the push model or the recognition cannot be used; told of now, not by every
-            episode.
+          InputError: a policy, an option, the push model or the recognition cannot be used.
         """
         from mechsearch_jax.envs.episode.method import Method
 
         if any(":" in policy for policy in policies) and "" not in sys.path:
-            # As Python itself does for a program that is not installed.
+            # As Python does for a program that is not installed.
             sys.path.append("")
         settings = self.settings()
         methods = [
@@ -87,10 +86,10 @@ class EpisodeOptions:
         """The simulator that runs many episodes.
 
         Args:
-          gpu: whether there is a GPU where they run; asked where it matters. Of this machine if None.
+          gpu: returns whether there is a GPU where they run; called only if needed. Default: on this machine.
 
         Raises:
-          InputError: it is not installed.
+          InputError: the simulator is not installed.
         """
         if self.simulator == "native" or (self.simulator == "auto" and not (gpu or has_gpu)()):
             return "NativeSimulator"
@@ -107,10 +106,10 @@ class EpisodeOptions:
         return "MjxSimulator"
 
     def only_native(self, command: str) -> None:
-        """Refuse the batch simulator where one episode is run.
+        """Refuse the batch simulator in a command that runs one episode.
 
         Raises:
-          InputError: it was asked for.
+          InputError: the simulator is "mjx".
         """
         if self.simulator == "mjx":
             raise InputError(
@@ -118,7 +117,7 @@ class EpisodeOptions:
             )
 
 
-# What a command's parameter `options` is until `with_planner_options` knows the rest.
+# Default of a command's parameter `options`, before `with_planner_options` adds the planner's.
 DEFAULTS = EpisodeOptions()
 
 
@@ -126,7 +125,7 @@ DEFAULTS = EpisodeOptions()
 def with_planner_options() -> type[EpisodeOptions]:
     """`EpisodeOptions` with one more field for the preset and for each of the planner's options, None if not given.
 
-    They are those of the configuration, which takes a second to import.
+    Importing the configuration, which defines them, takes a second.
     """
     from mechsearch_jax.planner import DEFAULT_PRESET, OPTIONS, PRESETS
 
@@ -144,24 +143,24 @@ def _annotation(option: Option) -> Any:
     """The type of a command line's option that may be left out."""
     kind = Literal[option.choices] if option.choices else option.type
     shown = "{" + ",".join(option.choices) + "}" if option.choices else _METAVARS.get(option.type)
-    # What the paper's is, the presets say.
+    # The hint shows the presets' values, also the paper's.
     text = re.sub(r"; (the paper's .*|not in the paper)$", "", option.help)
     about = tyro.conf.arg(metavar=shown, help=f"{text}.", help_behavior_hint=_usual(option))
     return Annotated[kind | None, about]
 
 
 def _usual(option: Option) -> str:
-    """What an option is where it is not given."""
+    """The hint for an option's default: the default preset's value, and other presets' where they differ."""
     from mechsearch_jax.planner import DEFAULT_PRESET, PRESETS
 
     values = {name: preset().options()[option.name] for name, preset in PRESETS.items()}
     shown = {name: " ".join(map(_short, value)) if isinstance(value, list) else value for name, value in values.items()}
     usual = shown.pop(DEFAULT_PRESET)
-    others: dict[Any, list[str]] = {}
+    presets_by_value: dict[Any, list[str]] = {}
     for name, value in shown.items():
         if value != usual:
-            others.setdefault(value, []).append(name)
-    exceptions = [f", in preset {' and '.join(names)} {value}" for value, names in others.items()]
+            presets_by_value.setdefault(value, []).append(name)
+    exceptions = [f", in preset {' and '.join(names)} {value}" for value, names in presets_by_value.items()]
     return f"(default: {usual}{''.join(exceptions)})"
 
 
@@ -179,7 +178,7 @@ _METAVARS: dict[Any, str] = {
 
 
 def settings_of(file: Path | None) -> Settings:
-    """What a configuration file says; the defaults without one.
+    """The settings of a configuration file; the defaults without one.
 
     Raises:
       InputError: the file cannot be used.
@@ -190,7 +189,7 @@ def settings_of(file: Path | None) -> Settings:
 
 
 def chosen_policies(command: str, method: Sequence[str] | None, policy: Sequence[str] | None) -> Sequence[str]:
-    """The policies that `--policy`, or `--method` for short, name; search-for-grasp where neither is given.
+    """The policies that `--policy` or `--method` names; default: search-for-grasp.
 
     Raises:
       InputError: both are given.
@@ -201,7 +200,7 @@ def chosen_policies(command: str, method: Sequence[str] | None, policy: Sequence
 
 
 def has_gpu() -> bool:
-    """Whether JAX computes on something else than the CPU."""
+    """Whether JAX uses an accelerator."""
     import jax
 
     return jax.default_backend() != "cpu"
@@ -242,10 +241,10 @@ WeightsFile = Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")]
 
 
 def at_least_one(command: str, **options: int | None) -> None:
-    """Refuse counts below 1; None stands for what is not given.
+    """Check that counts are at least 1; None means not given.
 
     Raises:
-      InputError: one is.
+      InputError: a count is below 1.
     """
     for name, value in options.items():
         if value is not None and value < 1:
@@ -253,10 +252,10 @@ def at_least_one(command: str, **options: int | None) -> None:
 
 
 def check_files(*files: Path | None) -> None:
-    """Fail before the work begins rather than after it, if a file that is asked for cannot be written.
+    """Check before any work that output files can be written.
 
     Raises:
-      InputError: one cannot.
+      InputError: a file cannot be written.
     """
     for file in files:
         if file is not None:
@@ -264,24 +263,24 @@ def check_files(*files: Path | None) -> None:
 
 
 def forget_kept_compilations() -> None:
-    """Compile everything anew: what was read from disk would not tell how long compiling takes."""
+    """Turn the compilation cache off, to measure how long compiling takes."""
     import jax
 
     jax.config.update("jax_enable_compilation_cache", False)
 
 
 def find_scenario(name: str) -> Path:
-    """The file that a scenario's path, or the name of one that ships with the package or is in a scene set, stands for.
+    """The file of a scenario, by its path, or by its name among shipped scenarios and scene sets.
 
     Raises:
-      InputError: there is none.
+      InputError: there is no such scenario.
     """
     from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene
     from mechsearch_jax.workspace.scenario import example_scenarios
 
     shipped = example_scenarios()
     if is_file(name):
-        _tell_what_is_taken(name)
+        _warn_of_same_name(name)
         return Path(name)
     if name in shipped:
         return shipped[name]
@@ -300,18 +299,18 @@ def find_scenario(name: str) -> Path:
 def find_scenarios(names: Sequence[str]) -> list[Path]:
     """The files that paths, folders and names stand for.
 
-    A folder without scenario files stands for the folders in it. JSON files in a folder that are plainly something
-    else, as the episode.json that `search` writes beside its scenario, are left out; each is named on standard error.
+    A folder without scenario files stands for its subfolders. JSON files of another format in a folder, such as the
+    episode.json that `search` writes beside its scenario, are skipped; each is named on standard error.
 
     Raises:
-      InputError: there is nothing for one of them.
+      InputError: there is no scenario for a name.
     """
     from mechsearch_jax.envs.scenes.scene_sets import SETS, set_scenes
 
     files: list[Path] = []
     for name in names:
         if is_folder(name):
-            _tell_what_is_taken(name)
+            _warn_of_same_name(name)
             files += _files_in(Path(name))
         elif name in SETS and not is_file(name):
             files += files_of(set_scenes(SETS[name]))
@@ -322,8 +321,8 @@ def find_scenarios(names: Sequence[str]) -> list[Path]:
     return files
 
 
-def _tell_what_is_taken(name: str) -> None:
-    """Say so where what a path leads to goes before a scene set, or a scene of one, of the same name."""
+def _warn_of_same_name(name: str) -> None:
+    """Print a notice if a path takes precedence over a scene set, or a scene of one, of the same name."""
     from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene
 
     if name in SETS or find_scene(name):
@@ -341,11 +340,11 @@ def _files_in(folder: Path) -> list[Path]:
 
     for pattern in ("*.json", "*/**/*.json"):
         inside = sorted(folder.glob(pattern))
-        others = [file for file in inside if is_another_format(file)]
-        for file in others:
+        skipped = [file for file in inside if is_another_format(file)]
+        for file in skipped:
             print(f"{file}: is not a scenario file and is left out", file=sys.stderr)
-        if len(inside) > len(others):
-            return [file for file in inside if file not in others]
+        if len(inside) > len(skipped):
+            return [file for file in inside if file not in skipped]
     raise InputError(f"{folder}: there are no scenario files (*.json) in this folder or those in it")
 
 
@@ -367,7 +366,7 @@ def files_of(scenes: Sequence[tuple[Block, int]]) -> list[Path]:
 
 
 def tell_strange(scenes: Sequence[str]) -> None:
-    """Say so where scenes of sets are not what is on record."""
+    """Print a notice about scenes of sets that differ from the record."""
     if scenes:
         who = f"{scenes[0]} and {len(scenes) - 1} more" if scenes[1:] else scenes[0]
         print(

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.session.step import SearchStep
     from mechsearch_jax.workspace.camera import Camera
 
-# What stands for no object in a mask of 8 bits, if not said otherwise.
+# Default number for no object in a mask of 8 bits.
 BACKGROUND = 255
 
 
@@ -48,10 +48,10 @@ class ImageFiles:
     example: bool = False
 
     def check(self) -> None:
-        """Refuse what does not fit together.
+        """Check that the options fit together.
 
         Raises:
-          InputError: something does not.
+          InputError: they do not.
         """
         if self.example == (self.depth is not None):
             raise InputError("plan: give either --depth IMAGE or --example, not both")
@@ -151,7 +151,7 @@ def plan(
 
 
 def _finished(searcher: Searcher, state: Path | None, failed: bool) -> bool:
-    """Take up the search of an earlier call, if there is one, after its last motion; whether it is finished."""
+    """Resume the search of an earlier call, if there is one, after its last motion; return whether it is finished."""
     from mechsearch_jax.runtime.files import is_file
 
     if state is not None and is_file(state):
@@ -162,7 +162,7 @@ def _finished(searcher: Searcher, state: Path | None, failed: bool) -> bool:
 
 
 def _report(console: Console, step: SearchStep, check: Check, files: list[Path]) -> None:
-    """Print what is to be done, why, and where it is written."""
+    """Print the action, its reason, and the files."""
     for notice in check.notices:
         console.print(f"note: {notice}", soft_wrap=True)
     for warning in dict.fromkeys((*check.warnings, *step.warnings)):
@@ -185,9 +185,9 @@ def _example(out: Path) -> tuple[dict[str, Any], Camera]:
 
 
 def _write(step: SearchStep, check: Check, out: Path) -> list[Path]:
-    """Write a step and what is known of the cell; the files.
+    """Write a step and the check of the cell; return the files.
 
-    Without a trajectory those of an earlier one are removed: nobody is to follow it.
+    Without a trajectory, files of an earlier one are removed, so that nobody executes it.
     """
     from mechsearch_jax.robot.trajectory_files import save_csv, save_ros
     from mechsearch_jax.runtime.files import save_json

@@ -82,8 +82,8 @@ def report(
         console.print(f"{out / 'report.html'}\n{out / 'report.md'}", soft_wrap=True)
 
 
-def _print(console: Console, report: Report, own_columns: bool) -> None:
-    """Print rates, and what the report has of curve, differences and, unless columns were chosen, events."""
+def _print(console: Console, report: Report, columns_chosen: bool) -> None:
+    """Print the report's rates, curve, differences and, unless columns were chosen, events."""
     from mechsearch_jax.benchmarks.report.episode_tables import differences_table, events_summary_table, print_summary
 
     print_summary(console, report.rates, report.key)
@@ -93,25 +93,25 @@ def _print(console: Console, report: Report, own_columns: bool) -> None:
     if report.differences:
         console.print()
         console.print(differences_table(report.differences, report.key, str(report.baseline)))
-    if report.events and not own_columns:
+    if report.events and not columns_chosen:
         console.print()
         console.print(events_summary_table(report.events, report.key))
 
 
 def _drawer(scenes: Sequence[str], status: Callable[[str], None]) -> Draw:
-    """What draws an episode's filmstrip, its scenario found among these, the shipped ones or those of scene sets."""
+    """A function that draws an episode's filmstrip; its scenario is one of `scenes`, shipped, or of a scene set."""
     from mechsearch_jax.benchmarks.report.films import replay
     from mechsearch_jax.problem.cache import keep_compilations
     from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
     keep_compilations()
-    given: dict[str, Scenario] = {}
+    by_name: dict[str, Scenario] = {}
     for file in find_scenarios(scenes) if scenes else ():
         scenario = load_scenario(file)
-        given[scenario.name] = scenario
+        by_name[scenario.name] = scenario
 
     def draw(row: Row, file: Path) -> str:
         status(f"running {row.scenario} again, seed {row.seed}")
-        return replay(row, given.get(row.scenario) or load_scenario(find_scenario(row.scenario)), file)
+        return replay(row, by_name.get(row.scenario) or load_scenario(find_scenario(row.scenario)), file)
 
     return draw

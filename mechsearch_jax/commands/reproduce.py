@@ -36,7 +36,7 @@ def _settings(
     preset: Sequence[str],
     protocol: Sequence[str],
 ) -> list[Setting]:
-    """What the cells of a table run with."""
+    """The settings of a table's cells."""
     from mechsearch_jax.benchmarks.paper.reproduce import Setting
     from mechsearch_jax.planner import PRESETS
 
@@ -126,20 +126,21 @@ def reproduce(
         protocol or ("strict",),
     )
     jobs = _jobs(settings, files, seed, simulator, engine)
-    every = [job for own in jobs.values() for job in own]
+    all_jobs = [job for jobs_of_setting in jobs.values() for job in jobs_of_setting]
     if run.dry_run:
         print(f"{chosen.name}: {chosen.about}; {len(files)} scenes")
-        for setting, own in jobs.items():
-            print(f"{len(own)} episodes: {', '.join(['+'.join(p) if isinstance(p, tuple) else p for p in setting])}")
+        for setting, jobs_of_setting in jobs.items():
+            names = ["+".join(p) if isinstance(p, tuple) else p for p in setting]
+            print(f"{len(jobs_of_setting)} episodes: {', '.join(names)}")
 
     def draw(console: Console, rows: Sequence[Row]) -> None:
         _draw(console, chosen, jobs, out)
 
-    run_jobs("reproduce", every, out, run, simulator, draw)
+    run_jobs("reproduce", all_jobs, out, run, simulator, draw)
 
 
 def _draw(console: Console, table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], out: Path) -> None:
-    """Print and write the table from what is in the folder."""
+    """Print and write the table from the folder's results."""
     from mechsearch_jax.benchmarks.paper.reproduce import results_of, screen, write_table
     from mechsearch_jax.benchmarks.store.shards import Results
 

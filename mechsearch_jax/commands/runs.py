@@ -1,4 +1,4 @@
-"""What the commands share that run many episodes: how and where they are run, whatever they come to."""
+"""Shared by commands that run many episodes: how and where episodes are run."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ class RunOptions:
     dry_run: bool = False
 
     def check(self, command: str, simulator: str) -> None:
-        """Fail before anything is begun, with a simulator as `EpisodeOptions` has it.
+        """Check the options before any work, with a simulator of `EpisodeOptions`.
 
         Raises:
-          InputError: an option is impossible, or does not go with another, wherever the episodes run.
+          InputError: an option is impossible or contradicts another.
         """
         parsed_shard(command, self.shard)
         self.site(command)
@@ -70,25 +70,25 @@ class RunOptions:
             raise InputError(f"{command}: --time-limit {self.time_limit:g} must be a number of seconds above 0")
 
     def in_processes(self, command: str, simulator: str) -> bool:
-        """Whether worker processes run the episodes, with a simulator as `EpisodeOptions` has it.
+        """Whether worker processes run the episodes, with a simulator of `EpisodeOptions`.
 
         Raises:
-          InputError: as `check`, or there is a limit of time for batches.
+          InputError: as `check`, or a time limit is given for batches.
         """
         self.check(command, simulator)
         site = self.site(command)
-        workers = self.workers is not None or (self.batch is None and simulator != "mjx" and not site.has_gpu())
-        if self.time_limit is not None and not workers:
+        in_processes = self.workers is not None or (self.batch is None and simulator != "mjx" and not site.has_gpu())
+        if self.time_limit is not None and not in_processes:
             raise InputError(
                 f"{command}: --time-limit is for worker processes, not for batches; leave it out, or --workers N"
             )
-        return workers
+        return in_processes
 
     def engine(self, command: str, options: EpisodeOptions) -> EngineName:
         """The simulator that the episodes run in.
 
         Raises:
-          InputError: as `in_processes`, the place where they run cannot be reached, or the simulator is not installed.
+          InputError: as `in_processes`, the site cannot be reached, or the simulator is not installed.
         """
         self.check(command, options.simulator)
         site = self.site(command)
@@ -99,7 +99,7 @@ class RunOptions:
         """Where the episodes are run.
 
         Raises:
-          InputError: there is no such place, or it cannot be told what they would take there.
+          InputError: there is no such site, or a dry run is given for a cluster.
         """
         if self.cluster is None:
             return Here()
@@ -118,7 +118,7 @@ class Site(Protocol):
     """Where episodes are run."""
 
     def enter(self) -> None:
-        """Go there; before anything is computed.
+        """Connect to the site, before any computation.
 
         Raises:
           InputError: it cannot be reached.
@@ -130,12 +130,12 @@ class Site(Protocol):
         ...
 
     def runner(self, run: RunOptions, in_processes: bool, progress: EpisodeProgress) -> Runner:
-        """What runs them.
+        """The runner of the episodes.
 
         Args:
           run: how they are run.
-          in_processes: as `RunOptions.in_processes` says it.
-          progress: shown meanwhile.
+          in_processes: the result of `RunOptions.in_processes`.
+          progress: the progress display.
         """
         ...
 
@@ -145,7 +145,7 @@ class Here:
     """This machine."""
 
     def enter(self) -> None:
-        """Nothing: this is there."""
+        """Nothing to do."""
 
     def has_gpu(self) -> bool:
         """See `Site`."""
@@ -168,19 +168,19 @@ class OnRay:
     """A Ray cluster.
 
     Attributes:
-      address: as `benchmarks.running.cluster.join` has it.
+      address: argument of `benchmarks.running.cluster.join`.
     """
 
     address: str
 
     def enter(self) -> None:
-        """Join it, and leave its GPUs to its workers."""
+        """Join the cluster, and leave its GPUs to its workers."""
         import jax
 
         from mechsearch_jax.benchmarks.running.cluster import join
 
         join(self.address)
-        # Were it to use a GPU of this machine, this process would take most of its memory.
+        # On a GPU of this machine, this process would take most of its memory.
         jax.config.update("jax_platforms", "cpu")
 
     def has_gpu(self) -> bool:
@@ -199,15 +199,15 @@ class OnRay:
         return RayCluster(kind, self.address)
 
 
-# As the commands run them where nothing is given.
+# The default.
 USUAL_RUN = RunOptions()
 
 
 def parsed_shard(command: str, text: str | None) -> tuple[int, int]:
-    """The numbers K and N of "K/N"; 1 and 1 where nothing is given.
+    """The numbers K and N of "K/N"; 1 and 1 for None.
 
     Raises:
-      InputError: it is something else.
+      InputError: the text has another form.
     """
     parts = (text or "1/1").split("/")
     if len(parts) != 2 or not all(part.isdecimal() for part in parts) or not 1 <= int(parts[0]) <= int(parts[1]):
@@ -227,22 +227,22 @@ def run_episodes_of(
     """Run every scenario with every policy at every point and with every seed, and print the rates.
 
     Args:
-      command: its name, for complaints.
-      scenarios: as commands take them.
-      points: what episodes run with; one simulator and one configuration file for all.
-      policies: their names or import paths.
-      seeds: of the episodes.
+      command: name of the command, for error messages.
+      scenarios: scenario arguments of the command line.
+      points: options of episodes; all have the same simulator and configuration file.
+      policies: names or import paths of policies.
+      seeds: seeds of the episodes.
       out: folder of the results.
-      run: how they are run.
+      run: how the episodes are run.
 
     Raises:
-      InputError: something that is given cannot be used.
+      InputError: an argument cannot be used.
     """
     from mechsearch_jax.benchmarks.report.episode_tables import print_rates
     from mechsearch_jax.benchmarks.running.evaluate import make_jobs
 
     engine = run.engine(command, points[0])
-    # The same settings may come from several points.
+    # Several points may give the same settings.
     methods = dict.fromkeys(method for point in points for method in point.methods(policies, engine))
     jobs = make_jobs(find_scenarios(scenarios), list(methods), list(dict.fromkeys(seeds)))
     run_jobs(command, jobs, out, run, points[0].simulator, print_rates)
@@ -254,20 +254,20 @@ def run_jobs(
     out: Path,
     run: RunOptions,
     simulator: str,
-    show: Callable[[Console, Sequence[Row]], None],
+    print_results: Callable[[Console, Sequence[Row]], None],
 ) -> None:
-    """Run this machine's part of jobs, or only say what that would take.
+    """Run this machine's part of the jobs, or only print an estimate of their cost.
 
     Args:
-      command: its name, for complaints.
-      jobs: the episodes of all machines; their engine is `run.engine`'s.
+      command: name of the command, for error messages.
+      jobs: the episodes of all machines, with the engine of `run.engine`.
       out: folder of the results.
-      run: how they are run.
-      simulator: as `EpisodeOptions` has it.
-      show: prints what they came to, where there are any.
+      run: how the episodes are run.
+      simulator: the simulator of `EpisodeOptions`.
+      print_results: prints the rows of the episodes, if there are any.
 
     Raises:
-      InputError: something that is given cannot be used.
+      InputError: an argument cannot be used.
     """
     from rich.console import Console
 
@@ -287,7 +287,7 @@ def run_jobs(
         runner = run.site(command).runner(run, in_processes, progress)
         rows = evaluate(jobs, out, runner, progress.ended, progress.waiting, run.retry_errors)
     if rows:
-        show(console, rows)
+        print_results(console, rows)
     if errors := sum(row.is_error for row in rows):
         print(
             f"{command}: {errors} of {len(rows)} episodes ended in an error; --retry-errors runs them again",

@@ -74,7 +74,7 @@ class Kept:
 
 
 def _save(out: Path, scene: Scenario, episode: Episode, problem: Problem, narrator: Narrator) -> None:
-    """Write what there is of every episode."""
+    """Write the filmstrip, the scenario and the episode."""
     from mechsearch_jax.envs.episode.records import save_episode
     from mechsearch_jax.envs.recording.narration import verdict
     from mechsearch_jax.viz.drawing import save_figure
@@ -90,7 +90,7 @@ def _save(out: Path, scene: Scenario, episode: Episode, problem: Problem, narrat
 def _run(
     console: Console, status: Status, chosen: Method, scene: Scenario, problem: Problem, seed: int
 ) -> tuple[Episode, Narrator, Recorder]:
-    """Run the episode; what was told of it, and what was recorded."""
+    """Run the episode; return it with its narrator and its recorder."""
     from mechsearch_jax.envs.episode.episodes import run_episode
     from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
     from mechsearch_jax.session.preparing import first_decision, prepared
@@ -98,7 +98,7 @@ def _run(
     policy, workcell = chosen.policy(), chosen.workcell
     first = first_decision(problem, policy, SimulatorConfig().motion)
     with prepared(first, lambda text: console.print(text, style="dim")):
-        # These take long to import, and meanwhile what the first decision needs is read or compiled.
+        # These take long to import; meanwhile the first decision's program is read or compiled.
         from mechsearch_jax.envs.camera.recognisers import recogniser
         from mechsearch_jax.envs.recording.narration import Narrator
         from mechsearch_jax.envs.recording.recording import TRACE_EVERY, Recorder
@@ -171,7 +171,7 @@ def search(
         )
         problem = chosen.workcell.problem(target_of(scene, chosen.workcell.target), chosen.problem_config)
         episode, narrator, recorder = _run(console, status, chosen, scene, problem, seed)
-        # Not before: these take long to import.
+        # Imported late: they take long.
         from mechsearch_jax.envs.recording.narration import verdict
         from mechsearch_jax.envs.recording.recording import NAME, save_recording
 
@@ -189,7 +189,7 @@ def search(
 def _scene(
     scenario: str | None, generated: Generated, seed: int, settings: Settings, shelf: Shelf
 ) -> Callable[[], Scenario]:
-    """What makes the scene; a scenario file is read at once.
+    """A function that makes the scene; a scenario file is read immediately.
 
     Raises:
       InputError: the file cannot be used.

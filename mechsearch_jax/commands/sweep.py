@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 Recognition = Literal["oracle", "masks", "full"]
 ProtocolName = Literal["strict", "published-code"]
 SimulatorName = Literal["auto", "native", "mjx"]
-# Keys of a sweep's file that are no options of the planner, with what they hold; lists of it, but for the last two.
+# Types of the keys of a sweep's file that are no options of the planner; all but the last two may be lists.
 _KEYS: Mapping[str, Any] = {
     **dict.fromkeys(("scenarios", "policy", "method"), str),
     "seed": int,
@@ -37,7 +37,7 @@ _KEYS: Mapping[str, Any] = {
     "config": str,
 }
 _SINGLE = ("simulator", "config")
-# Those that `SweptOptions` has, and their names there.
+# Keys that are fields of `SweptOptions`, and the names of the fields.
 _FIELDS = {"recognition": "recognition", "protocol": "protocol", "simulator": "simulator", "config": "config_file"}
 
 
@@ -86,8 +86,8 @@ class SweptOptions:
             if values
         }
         file = None if self.config_file is None else Path(self.config_file)
-        once: dict[str, Any] = {"config_file": file, "simulator": self.simulator or "auto"}
-        return [kind(**once, **dict(zip(given, point, strict=True))) for point in itertools.product(*given.values())]
+        fixed: dict[str, Any] = {"config_file": file, "simulator": self.simulator or "auto"}
+        return [kind(**fixed, **dict(zip(given, point, strict=True))) for point in itertools.product(*given.values())]
 
 
 SWEPT_DEFAULTS = SweptOptions()
@@ -100,7 +100,7 @@ def _options() -> dict[str, Option]:
 
 
 def _listed(name: str, value: Any, kind: Any) -> tuple[Any, ...]:
-    """A value that is a list, which the command line has with commas."""
+    """The parts of a value that is itself a list; separated by commas on the command line."""
     if not isinstance(value, str):
         return tuple(value)
     try:
@@ -137,7 +137,7 @@ def with_swept_options() -> type[SweptOptions]:
 
 
 def read_sweep(path: Path) -> dict[str, Any]:
-    """The values that a sweep's file gives, by key, as tuples but for those of which there is one for all.
+    """Read the values of a sweep's file by key: tuples, except for keys with a single value for all episodes.
 
     Raises:
       InputError: the file cannot be read, a key is unknown, or a value is of another type. The message names file, line
@@ -153,22 +153,22 @@ def read_sweep(path: Path) -> dict[str, Any]:
                 f"{document.where(table)} is a table, of which a sweep has none; give its settings by config"
             )
     types = {name: Literal[option.choices] if option.choices else option.type for name, option in _options().items()}
-    keys = {**_KEYS, "preset": Literal[tuple(PRESETS)], **types}
-    given: dict[str, Any] = {}
+    key_types = {**_KEYS, "preset": Literal[tuple(PRESETS)], **types}
+    values_of: dict[str, Any] = {}
     for key, value in document.tables[""].items():
         where = document.where("", key)
-        if key not in keys:
-            raise InputError(f"{where} is unknown; {nearest(key, keys)}")
+        if key not in key_types:
+            raise InputError(f"{where} is unknown; {nearest(key, key_types)}")
         if key in _SINGLE:
-            given[key] = checked(value, keys[key], where)
+            values_of[key] = checked(value, key_types[key], where)
             continue
-        is_list = get_origin(keys[key]) is tuple
+        is_list = get_origin(key_types[key]) is tuple
         several = isinstance(value, list) and (not is_list or any(isinstance(part, list) for part in value))
         values = value if several else [value]
-        given[key] = tuple(
-            checked(each, keys[key], f"{where}[{i}]" if several else where) for i, each in enumerate(values)
+        values_of[key] = tuple(
+            checked(v, key_types[key], f"{where}[{i}]" if several else where) for i, v in enumerate(values)
         )
-    return given
+    return values_of
 
 
 def sweep(
@@ -199,13 +199,13 @@ def sweep(
       run: how the episodes are run.
       options: how the planner decides.
     """
-    of_file = {} if file is None else read_sweep(file)
+    from_file = {} if file is None else read_sweep(file)
     if method or policy:
-        of_file = {key: value for key, value in of_file.items() if key not in ("method", "policy")}
-    policies = chosen_policies("sweep", method or of_file.get("method"), policy or of_file.get("policy"))
-    named = {name: of_file[key] for key, name in _FIELDS.items() if key in of_file}
-    named |= {key: value for key, value in of_file.items() if key not in _KEYS}
-    fresh = {key: value for key, value in named.items() if not getattr(options, key)}
-    points = dataclasses.replace(options, **fresh).points()
-    chosen = scenarios or of_file.get("scenarios", ())
-    run_episodes_of("sweep", chosen, points, policies, seed or of_file.get("seed") or (0,), out, run)
+        from_file = {key: value for key, value in from_file.items() if key not in ("method", "policy")}
+    policies = chosen_policies("sweep", method or from_file.get("method"), policy or from_file.get("policy"))
+    fields = {name: from_file[key] for key, name in _FIELDS.items() if key in from_file}
+    fields |= {key: value for key, value in from_file.items() if key not in _KEYS}
+    not_on_command_line = {key: value for key, value in fields.items() if not getattr(options, key)}
+    points = dataclasses.replace(options, **not_on_command_line).points()
+    chosen = scenarios or from_file.get("scenarios", ())
+    run_episodes_of("sweep", chosen, points, policies, seed or from_file.get("seed") or (0,), out, run)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.envs.recording.recording import Recording
 
 WIDTH, FPS = 960, 15
-# A wider or faster film nobody watches.
+# Largest width [pixels] and rate [frames/s].
 WIDEST, FASTEST = 3840, 60
 
 
@@ -53,7 +53,7 @@ def video(
 
 
 def check_option(command: str, name: str, value: float | int, least: float | int, most: float | int) -> None:
-    """Refuse a value of an option.
+    """Check a value of an option.
 
     Raises:
       InputError: it is out of bounds.
@@ -63,7 +63,7 @@ def check_option(command: str, name: str, value: float | int, least: float | int
 
 
 def check_pace(command: str, fps: int, speed: float | int) -> None:
-    """Refuse so many pictures in a second, or such a speed.
+    """Check the frame rate and the speed.
 
     Raises:
       InputError: one is out of bounds.
@@ -76,7 +76,7 @@ def recording_of(episode: Path) -> Recording:
     """The recording in an episode's folder.
 
     Raises:
-      InputError: there is none, or it cannot be read.
+      InputError: there is no recording, or it cannot be read.
     """
     from mechsearch_jax.envs.recording.recording import NAME, load_recording
     from mechsearch_jax.runtime.files import is_file
@@ -89,7 +89,7 @@ def recording_of(episode: Path) -> Recording:
 def make_film(
     recording: Recording, path: Path, console: Console, width: int = WIDTH, fps: int = FPS, speed: float = 1.0
 ) -> None:
-    """Write a film, and show how far it is.
+    """Write a film, with a progress bar.
 
     Raises:
       InputError: it cannot be written.
