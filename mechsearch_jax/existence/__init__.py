@@ -1,18 +1,18 @@
 """The existence function f: where can the target still be? (paper section 4.2 and appendix B.2;
 docs/method.md, "Existence")
 
-A candidate pose stands for its whole grid cell, so the target is tried at several places of the cell. At each it must
-be hidden (it would show no more pixels than the detector needs) and free of collision. f is 1 if any of the places
-passes. Shapes count as they are recognised, without margins.
+A candidate pose represents its whole grid cell, so the target is tested at several places of the cell. At each it must
+be hidden (it would show no more pixels than the detector needs) and free of collision. f is 1 if any place passes.
+Recognised shapes are used without margins.
 
 Pixels are counted at a fraction of the camera's resolution, where a sliver beside an object may count for several times
-its size. Where few pixels show, what is really seen is therefore counted again, more finely (`allowances`), and a place
-at which the target is hidden after all may go on showing as many coarse pixels: predicted states are judged by the
+its size. Where few pixels show, the observed scene is therefore counted again at a finer resolution (`allowances`). If
+the target is hidden there, the place may keep showing as many coarse pixels, since predicted states are judged by the
 coarse image alone.
 
-A pose whose cell holds any hidden place has to stay possible, or the target is lost. In generated scenes f is 1.13
+A pose whose cell contains any hidden place must stay possible, or the target is lost. In generated scenes f is 1.13
 times as large as that least set (40 scenes, 25 places a cell at full resolution, `mechsearch bench scenes --exact`),
-which is itself 1.63 times what the cells' middles alone make.
+which is itself 1.63 times as large as with the cells' middles alone.
 """
 
 from mechsearch_jax.existence.closer_look import allowances, closer_image, plainly_elsewhere

@@ -1,4 +1,4 @@
-"""A closer look, in a finer image, at places where the coarse one leaves in doubt whether the target would be found."""
+"""A closer look in a finer image, at places where the coarse image leaves visibility of the target in doubt."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.detector import found_pixels
 from mechsearch_jax.workspace.target import Target
 
-# The most coarse pixels that a target may show for a closer look to be worth it; no target that the detector misses was
-# seen to show more than 12.
+# Largest number of coarse pixels for which a closer look is made; no target that the detector missed was observed to
+# show more than 12.
 DOUBTFUL = 16
-# Of a pose's places those that show least are looked at again, this many.
+# Number of places of a pose with the fewest pixels that are counted again.
 CLOSER_PLACES = 3
-# A count at a third of the camera's resolution may be off by as much.
+# Factor by which a count at a third of the camera's resolution may be wrong.
 CLOSER_TOLERANCE = 1.5
-# A target shows so many times what the detector needs where it cannot be missed: neither for a sensor that measures a
-# third of its pixels only, nor behind an object that is recognised 5 mm too narrow along one side of it.
+# Multiple of the detector's threshold above which a target cannot be missed: neither by a sensor that measures only a
+# third of its pixels, nor beside an object that is recognised 5 mm too narrow on one side.
 PLAIN = 3.0
-# An object that is recognised a little elsewhere, or touches the target, reaches no deeper into it than this [m].
+# Largest depth to which an object overlaps the target by an error of its recognised pose, or by touching it [m].
 TOUCHING = 0.01
-# Of a found target's image and the largest one of a candidate.
+# Size of a found target's image relative to the largest image at a candidate pose.
 NEARER = 1.25
-# The edges of superquadrics that stand for boxes and cylinders are rounded: what they hide is that of a larger one [m].
+# Added to objects for the rounded edges of superquadrics that represent boxes and cylinders [m].
 ROUNDED = 1e-3
 
 
@@ -49,17 +49,17 @@ def allowances(
     closer: Float[Array, "h w"],
     config: ExistenceConfig,
 ) -> Int[Array, "x s"]:
-    """How many coarse pixels a target that the detector does not find may show at each place.
+    """How many coarse pixels a hidden target may show at each place.
 
-    As many as the detector's threshold makes; more where no place of a pose shows as few, but a closer look at what the
-    camera sees now says that the target is hidden.
+    By default the detector's threshold; more if no place of a pose shows so few pixels, but a closer look at the
+    present scene shows that the target is hidden.
 
     Args:
       tables: constants of the problem.
       camera: the camera at full resolution.
       target: static.
       views: of the objects that the camera sees.
-      closer: of `closer_image`.
+      closer: image of `closer_image`.
       config: static.
     """
     least = config.allowed(camera)
@@ -88,7 +88,7 @@ def _counted(
     doubtful: Bool[Array, "x s"],
     config: ExistenceConfig,
 ) -> Float[Array, "x s"]:
-    """Pixels of the full resolution that a target shows at doubtful places, by a closer look; 0 at the others."""
+    """Pixels at full resolution that a target shows at doubtful places, by a closer look; 0 elsewhere."""
 
     def counted(shared, closer, T):
         tables, camera = shared
@@ -101,7 +101,7 @@ def _counted(
 def closer_image(
     camera: Camera, scene: Superquadrics, views: ObjectViews, config: ExistenceConfig
 ) -> Float[Array, "h w"]:
-    """The depth image of a closer look [m]; the coarse one where the configuration has none.
+    """The depth image of a closer look [m]; the coarse image if the configuration has no closer look.
 
     Args:
       camera: the camera at full resolution.
@@ -132,16 +132,16 @@ def _pixels(
     config: ExistenceConfig,
     nearer: float = 1.0,
 ) -> Float[Array, ""]:
-    """How many pixels of the full resolution a target would show, counted in the image of a closer look.
+    """How many pixels at full resolution a target would show, counted in the image of a closer look.
 
     Args:
       tables: constants of the problem.
       camera: the camera at full resolution.
       target: static.
-      closer: of `closer_image`.
-      T_world_target: where the target would stand.
+      closer: image of `closer_image`.
+      T_world_target: pose of the target.
       config: static.
-      nearer: how many times as large as the largest candidate its image may be; static.
+      nearer: size of its image relative to the largest image at a candidate pose, at most; static.
     """
     scale = config.closer_step(camera)
     grown = nearer * config.step(camera) / scale
@@ -169,15 +169,15 @@ def plainly_elsewhere(
     config: ExistenceConfig,
 ) -> Bool[Array, ""]:
     """Whether a target that the detector does not see cannot be at a pose: it would be in plain sight there, or an
-    object stands there. In doubt it can.
+    object is there. False in doubt.
 
     Args:
       tables: constants of the problem.
       camera: the camera at full resolution.
       target: static.
       scene: the objects that the camera sees, fields (N, ...).
-      closer: of `closer_image`.
-      T_world_target: the pose, which need not be a candidate.
+      closer: image of `closer_image`.
+      T_world_target: the pose; need not be a candidate pose.
       config: static.
     """
     shows = _pixels(tables, camera, target, closer, T_world_target, config, NEARER)

@@ -1,4 +1,4 @@
-"""How f is decided, and which options that offers."""
+"""Settings of f."""
 
 from __future__ import annotations
 
@@ -16,23 +16,22 @@ from mechsearch_jax.workspace.detector import FOUND_PIXELS, found_pixels, longer
 
 @dataclasses.dataclass(frozen=True)
 class ExistenceConfig:
-    """How f is decided.
+    """Settings of f.
 
     Attributes:
       criterion: what makes the target visible: "detector" counts the pixels it would show at full resolution;
         "depth-mse" is the paper's mean squared difference of the two depth images.
-      found_pixels: more pixels than this of an image of 1280 x 720 and the detector finds the target; of others the
-        same share, see `workspace.detector`.
+      found_pixels: the detector finds the target if it shows more pixels than this in an image of 1280 x 720; in other
+        images the same share, see `workspace.detector`.
       depth_threshold: threshold of "depth-mse" [m^2].
-      downscale: how much coarser than an image of 1280 x 720 f is rendered; with an image of another size by as much
-        more or less as keeps what it shows as large, to whole numbers.
-      cell_reach: a target is tried at the middle of its grid cell and this far on the way to each of the cell's corners
-        in x and y; at the corners themselves (1) it is also turned by half a step in yaw, to either side in turn, and
-        those of the outermost cells lie at the walls.
-      closer_look: how much coarser than an image of 1280 x 720, likewise, doubtful places are looked at again; 0 for
-        not at all.
-      erosion: by how much the target is drawn in for the collision test [m]. One that was pushed touches what pushed
-        it, often on several sides, and hardly any of its cell's places fits in between.
+      downscale: factor by which f is rendered coarser than an image of 1280 x 720; with other images scaled to keep the
+        size of a coarse pixel, rounded to a whole number.
+      cell_reach: the target is tested at the middle of its grid cell and at these shares of the distance to each of the
+        cell's corners in x and y; at the corners themselves (1) it is also turned by half a step in yaw, to alternating
+        sides, and the corners of the outermost cells lie at the walls.
+      closer_look: factor by which the image of a closer look is coarser than 1280 x 720, scaled likewise; 0 for none.
+      erosion: by how much the target is shrunk for the collision test [m]. A pushed target touches objects, often on
+        several sides, so that hardly any place of its cell would be free.
       reopen: whether f is opened again around what an action may have moved unseen; see `belief.unseen_motion`.
       window: rows and columns of the window an object is rendered in, at the coarse resolution.
       points: points on the target's surface for the collision test.
@@ -75,22 +74,22 @@ class ExistenceConfig:
 
     @property
     def places(self) -> np.ndarray:
-        """Where in a cell the target is tried: x, y and yaw as shares of half the cell, shape (S, 3)."""
+        """Places in a cell where the target is tested: x, y and yaw as shares of half the cell, shape (S, 3)."""
         corners = [(a, b, a * b * (share == 1.0)) for share in self.cell_reach for a, b in _corners(share)]
         return np.array([(0.0, 0.0, 0.0), *corners], np.float32)
 
     def step(self, camera: Camera) -> int:
-        """How many rows and columns of a camera's image a coarse pixel stands for."""
+        """Side of a coarse pixel in pixels of a camera's image."""
         return max(round(self.downscale * longer(camera)), 1)
 
     def closer_step(self, camera: Camera) -> int:
-        """The same of a pixel of what is looked at most closely: the coarse image where there is no closer look."""
+        """Side of a pixel of the closer look in pixels of a camera's image; `step` if there is no closer look."""
         if self.criterion != "detector" or not self.closer_look:
             return self.step(camera)
         return max(round(self.closer_look * longer(camera)), 1)
 
     def allowed(self, camera: Camera) -> int:
-        """How many coarse pixels of a camera's image a target may show that the detector does not find."""
+        """How many coarse pixels a target may show that the detector does not find."""
         return int(found_pixels(camera, self.found_pixels) // self.step(camera) ** 2)
 
 

@@ -1,4 +1,4 @@
-"""f itself: where a target would show few enough pixels, and run into nothing."""
+"""The existence function f: where a target would be hidden and free of collision."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mechsearch_jax.geometry.masked import masked_vmap
 from mechsearch_jax.workspace import render
 from mechsearch_jax.workspace.camera import Camera
 
-# What "depth-mse" takes for the depth where no object is seen [m].
+# Depth of the background in "depth-mse" [m].
 FAR = 1.5
 
 
@@ -33,7 +33,7 @@ def existence(
     Args:
       tables: constants of the problem.
       camera: the camera at full resolution.
-      views: of all objects, with the collisions of every pose where `exists` if they count.
+      views: views of all objects, with collisions at every pose where `exists` if collisions count.
       exists: `f_{t-1}`; all True at the start.
       allowed: how many coarse pixels a hidden target may show, see `allowances`.
       config: static.
@@ -59,14 +59,15 @@ def _at_places(
     exists: Bool[Array, " x"],
     measure: Callable[[Array, Array, Array], Array],
 ) -> Shaped[Array, "x s"]:
-    """A measure of the target's window at each place of the poses that matter; 0 at the others.
+    """A measure of the target's window at each place of the poses where `exists`; 0 elsewhere.
 
     Args:
       tables: constants of the problem.
-      coarse: the camera at the coarse resolution, whose size alone counts.
+      coarse: the camera at the coarse resolution; only its size is used.
       image: its depth image of the objects.
-      exists: the poses that matter.
-      measure: of the target's depth, the depth behind it, and which pixels are in the image; closes over no array.
+      exists: poses to measure.
+      measure: function of the target's depth, the depth behind it, and which pixels are in the image; closes over no
+        array.
     """
 
     def at_places(_, image, row):
@@ -75,12 +76,12 @@ def _at_places(
 
         return jax.vmap(at)(*row)
 
-    # All of them at once, for every state of a batch, would be most of a plan's memory.
+    # Without blocks, this would take most of a plan's memory.
     return masked_vmap(at_places, exists, None, image, (tables.depth, tables.corner), block=512)
 
 
 def in_window(camera: Camera, image: Any, corner: Array, window: tuple[int, int]) -> tuple[Array, Array]:
-    """What a camera's image shows in a window, and which of the window's pixels are in the image."""
+    """A camera's image in a window, and which of the window's pixels are in the image."""
     height, width = camera.height, camera.width
     rows = corner[0] + jnp.arange(window[0])[:, None]
     columns = corner[1] + jnp.arange(window[1])[None]
@@ -94,7 +95,7 @@ def shown_pixels(
     image: Float[Array, "h w"],
     exists: Bool[Array, " x"],
 ) -> Int[Array, "x s"]:
-    """How many coarse pixels the target would show at each place of the poses that matter; 0 at the others."""
+    """How many coarse pixels the target would show at each place of the poses where `exists`; 0 elsewhere."""
 
     def shown(depth, behind, inside):
         return jnp.sum(inside & (depth < behind))
@@ -109,7 +110,7 @@ def _alike(
     exists: Bool[Array, " x"],
     config: ExistenceConfig,
 ) -> Bool[Array, "x s"]:
-    """Whether the depth image with the target at each place of the poses that matter is like the one without."""
+    """Whether the depth image hardly changes with the target at each place of the poses where `exists`."""
 
     def alike(depth, behind, inside):
         difference = jnp.where(inside, jnp.maximum(jnp.minimum(behind, FAR) - depth, 0.0), 0.0)

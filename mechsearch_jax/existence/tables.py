@@ -1,4 +1,4 @@
-"""What f needs of the candidate poses, the camera and the target, computed once for a problem."""
+"""Constants of f: the target's images and collision cloud at its candidate poses, computed once for a problem."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from mechsearch_jax.workspace.target import Target
 
 
 class ExistenceTables(flax.struct.PyTreeNode):
-    """What f needs of the candidate poses, the camera and the target: constants of a `Problem`.
+    """Constants of f in a `Problem`, for S places at each of X candidate poses.
 
     Attributes:
-      T_world_target: the places where the target is tried, shape (X, S, 4, 4).
+      T_world_target: poses of the target at the places, shape (X, S, 4, 4).
       depth: the target's depth in a window at each place, infinite around it, shape (X, S, h, w) [m].
       corner: first row and column of that window in the coarse image, shape (X, S, 2).
       middle: row and column of the pixel in the middle of the target's image at the first place, shape (X, 2).
       nearest: the least depth of the target at the first place, shape (X,) [m].
-      cloud: surface of the drawn-in target in its own frame as rows of coordinates, shape (3, P) [m].
-      radius: radius of a sphere that holds the target [m].
+      cloud: surface of the shrunk target in its own frame as rows of coordinates, shape (3, P) [m].
+      radius: radius of a sphere that contains the target [m].
     """
 
     T_world_target: jax.Array
@@ -61,8 +61,8 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
         )
         return render.object_window(coarse, placed, window), render.window_place(coarse, placed, around)[0]
 
-    each = jax.vmap(jax.vmap(view, in_axes=(None, 0)), in_axes=(None, 0))
-    views, first = jax.jit(each)(coarse, T)
+    view_all = jax.vmap(jax.vmap(view, in_axes=(None, 0)), in_axes=(None, 0))
+    views, first = jax.jit(view_all)(coarse, T)
     depth, corner, first = jax.device_get((views.depth, views.corner, first))
     middle = first[:, 0] + np.array(around, np.int32)[None] // 2
     sample = jax.jit(superquadric.sample_surface, static_argnames="count")
@@ -75,22 +75,22 @@ def existence_tables(camera: Camera, shelf: Shelf, target: Target, config: Exist
 
 
 def _window_side(extent: float) -> int:
-    """How many rows or columns of pixels hold an image that is so many pixels long, wherever it begins: an even number.
+    """Number of rows or columns of a window that contains an image of this length in pixels: an even number.
 
-    A camera that was calibrated again sees the target a little larger or smaller. Were this the least number, such a
-    camera would now and then change a shape, and all that is compiled for it.
+    It is even because after a new calibration the target's image is a little larger or smaller: the least number would
+    often change shapes, and everything would compile anew.
     """
-    # What is measured in single precision may be measured as a little more elsewhere.
+    # The extent is computed in single precision and may be slightly larger on another machine.
     return 2 * math.ceil((math.ceil(extent + 1e-3) + 1) / 2)
 
 
 def target_window(
     coarse: Camera, half: Float[np.ndarray, "3"], T_world_target: Float[Array, "*batch 4 4"]
 ) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Rows and columns of a window that holds what a camera sees of a target at each of some poses, and of the least
-    such window, whose middle does not depend on how the other's sides are rounded.
+    """Rows and columns of a window that contains a target's image at each of several poses, and of the least such
+    window, whose middle does not depend on how the other's sides are rounded.
 
-    Hardly larger than the image with one pixel around it, wherever the camera is.
+    The window is hardly larger than the image with a margin of one pixel.
 
     Args:
       coarse, half, T_world_target: as of `target_extent`.
@@ -102,16 +102,16 @@ def target_window(
 def target_extent(
     coarse: Camera, half: Float[np.ndarray, "3"], T_world_target: Float[Array, "*batch 4 4"]
 ) -> tuple[float, float]:
-    """Rows and columns that the largest image of a target at some poses takes, at most those of the camera's image.
+    """Rows and columns of the largest image of a target at several poses, at most those of the camera's image.
 
     Args:
-      coarse: the camera at the resolution that is meant.
+      coarse: the camera at the window's resolution.
       half: half-extents of the target [m].
       T_world_target: the poses.
     """
     corners = np.array(list(itertools.product((-1.0, 1.0), repeat=3)), np.float32) * half
-    pixels = np.asarray(_seen_at(coarse, T_world_target, corners), float)
-    # As far as `render.window_place` follows what is outside of the image.
+    pixels = np.asarray(_pixels_of(coarse, T_world_target, corners), float)
+    # The limit of `render.window_place` outside of the image.
     limit = np.array([coarse.height, coarse.width])
     low, high = (np.clip(bound, -1, limit) for bound in (pixels.min(axis=-2), pixels.max(axis=-2)))
     rows, columns = np.minimum((high - low).reshape(-1, 2).max(axis=0), limit)
@@ -119,6 +119,8 @@ def target_extent(
 
 
 @jax.jit
-def _seen_at(camera: Camera, T: Float[Array, "*batch 4 4"], points: Float[Array, "k 3"]) -> Float[Array, "*batch k 2"]:
-    """Where a camera sees points of bodies that stand at these poses."""
+def _pixels_of(
+    camera: Camera, T: Float[Array, "*batch 4 4"], points: Float[Array, "k 3"]
+) -> Float[Array, "*batch k 2"]:
+    """Pixels of points of bodies at poses T."""
     return project(camera, transform(T[..., None, :, :], points))[0]

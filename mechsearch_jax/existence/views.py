@@ -1,4 +1,4 @@
-"""The objects as f needs them: their images in windows, and where the target would run into them."""
+"""Views of the objects for f: their images in windows, and their collisions with the target."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from mechsearch_jax.workspace.camera import Camera
 
 
 class ObjectViews(flax.struct.PyTreeNode):
-    """Per object, what f needs of it; only what moved has to be computed anew.
+    """Image and collisions of each object; after a motion only those of the moved objects are recomputed.
 
     Attributes:
       windows: the objects' images, with a leading axis N.
-      collides: whether the target at a place would run into the object, shape (X, S, N); None if that does not count.
+      collides: whether the target at a place would collide with the object, shape (X, S, N); None if collisions do not
+        count.
     """
 
     windows: render.Window
@@ -30,10 +31,10 @@ class ObjectViews(flax.struct.PyTreeNode):
 
 
 def no_views(capacity: int, config: ExistenceConfig, places: tuple[int, int] | None = None) -> ObjectViews:
-    """Views of so many objects that are yet to be looked at: they hide nothing, as empty slots never do.
+    """Views of `capacity` objects before any rendering: they hide nothing, like empty slots.
 
     Args:
-      capacity: how many.
+      capacity: number of objects.
       config: static.
       places: number of candidate poses, and of places at each, if collisions count; None if they do not.
     """
@@ -62,10 +63,9 @@ def object_views(
       tables: constants of the problem.
       camera: the camera at full resolution.
       scene: the objects, fields (N, ...).
-      exists: poses that matter; collisions at the others are not computed and read False. None if collisions do not
-        count at all.
+      exists: poses at which collisions are computed; they are False elsewhere. None if collisions do not count.
       config: static.
-      previous: views of the same objects before some of them moved.
+      previous: views of the same objects before objects moved.
       moved: which objects moved since; only they are computed anew.
 
     Returns:
@@ -92,27 +92,27 @@ def object_views(
 
 
 def without_unseen(windows: render.Window, mask: Bool[Array, " n"]) -> render.Window:
-    """Windows, where those outside of the mask show nothing."""
+    """The windows; those outside of the mask show nothing."""
     return windows.replace(
         depth=jnp.where(mask[:, None, None], windows.depth, jnp.inf), stride=jnp.maximum(windows.stride, 1)
     )
 
 
 def _collisions(tables: ExistenceTables, scene: Superquadrics, exists: Array, fresh: Array) -> Bool[Array, "x s n"]:
-    """Whether the target at each place of the poses that matter would run into the objects that are fresh."""
+    """Whether the target at each place of the poses where `exists` would collide with each fresh object."""
     places, spread = tables.T_world_target.shape[:2]
     n = scene.capacity
 
     T = tables.T_world_target.reshape(-1, 4, 4)
-    wanted = jnp.repeat(exists, spread)[:, None] & fresh[None]
-    hits = collisions(clouds_of(tables.cloud[None]), np.zeros(len(T), np.int32), T, scene, wanted)
+    mask = jnp.repeat(exists, spread)[:, None] & fresh[None]
+    hits = collisions(clouds_of(tables.cloud[None]), np.zeros(len(T), np.int32), T, scene, mask)
     return hits.reshape(places, spread, n)
 
 
 def occluders(tables: ExistenceTables, views: ObjectViews) -> Bool[Array, "x n"]:
-    """Which objects hide a target at every candidate pose, judged by the one pixel in the middle of its image.
+    """Which objects hide a target at each candidate pose, judged by the pixel in the middle of its image.
 
-    An approximation, for telling which objects matter; what is visible, `existence` says.
+    An approximation to weight the objects; `existence` decides on visibility.
     """
     windows = views.windows
     pixel = (tables.middle[:, None] - windows.corner[None]) // windows.stride[None, :, None]
