@@ -64,6 +64,7 @@ def summary(measured):
     return {(line["noise"], line["method"], line["visible"]): line for line in measured.summary()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", ["clean", "gaussian"])
 def test_the_truth_scores_as_perfect_and_everything_else_worse(summary, noise):
     truth, shifted = summary[noise, "truth", "all"], summary[noise, "shifted", "all"]
@@ -173,6 +174,7 @@ def test_the_picture_shows_the_worst_answers(bench, measured, tmp_path):
         recognition_figure.worst(measured.rows, "nan", 0)
 
 
+@pytest.mark.slow
 def test_held_out_scenes_are_reproducible_and_their_seeds_checked():
     first, again, other = (images.held_out_scenes(2, seed) for seed in (0, 0, 1))
     for a, b, c in zip(first, again, other, strict=True):

@@ -114,6 +114,7 @@ def test_alone_it_is_as_in_a_batch(outcome):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[1], atol=5e-3), one, outcome)
 
 
+@pytest.mark.slow
 def test_two_maps_are_one_call(outcome, monkeypatch):
     simulate, calls = physics_push.simulate_pushes, []
 
@@ -134,6 +135,7 @@ def test_two_maps_are_one_call(outcome, monkeypatch):
     jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-4), flat, outcome)
 
 
+@pytest.mark.slow
 def test_only_the_first_action_of_a_sequence_is_simulated(monkeypatch):
     simulate, calls = physics_push.simulate_pushes, []
 

@@ -239,14 +239,8 @@ def camera_of(width, height, focal):
     return Camera(width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
 
 
-@pytest.mark.parametrize(
-    "camera",
-    [
-        pytest.param(Camera(), marks=pytest.mark.slow),
-        pytest.param(camera_of(640, 480, 525.0), marks=pytest.mark.slow),
-        camera_of(640, 360, 457.0),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("camera", [Camera(), camera_of(640, 480, 525.0), camera_of(640, 360, 457.0)])
 def test_empty_slots_hide_nothing_in_a_plan(problem, camera):
     """Twelve slots, none or three of which hold objects."""
     settings, policy = problem.config.existence, planner.search_for_grasp()

@@ -114,7 +114,7 @@ def test_one_bad_entry_does_not_touch_the_others():
 # that has no kernel, and the kernel.
 WAYS = ("gauges", "bounds", "loops of a gpu", "kernel")
 # The two that differ most.
-TWO_WAYS = ("bounds", "kernel")
+TWO_WAYS = ("bounds", pytest.param("kernel", marks=pytest.mark.slow))
 
 
 def compiled(way, *axes, own=False, first=0):

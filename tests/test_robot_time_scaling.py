@@ -83,7 +83,9 @@ def line(count=31):
     return q
 
 
-@pytest.mark.parametrize("kind", ["push", "pick and place", pytest.param("retrieve", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", ["push", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("pick and place", "retrieve"))]
+)
 def test_no_joint_exceeds_its_limits_in_the_samples_of_random_motions(kind):
     reference, reachable = references(kind)
     assert reachable.sum() > 25

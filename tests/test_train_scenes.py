@@ -48,6 +48,7 @@ def signed_gap(world, scene, slot, points):
     return np.max(local - half, axis=1)
 
 
+@pytest.mark.slow
 def test_labelled_points_lie_on_the_surface_of_their_object():
     world, seen = clean()
     checked = 0
@@ -115,6 +116,7 @@ def quaternion(rotation):
     return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
 
 
+@pytest.mark.slow
 def test_scenes_are_as_configured():
     config = dataclasses.replace(CLEAN, objects=(3, 3), known=1.0, lying=0.0, leaning=0.0, target=0.0)
     draw = jax.jit(jax.vmap(lambda k: scenes.random_world(k, config, SHELF)))
