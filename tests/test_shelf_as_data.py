@@ -235,8 +235,8 @@ def test_images_are_recognised_by_one_program_for_both(two):
     assert bool(seen.target_visible) == bool(again.target_visible)
     np.testing.assert_array_equal(seen.objects.valid, again.objects.valid)
     assert int(seen.objects.valid.sum()) > 2
-    # The image is the same, and camera and shelf are said to be elsewhere: so are the objects, but for one that is hardly
-    # seen, whose fit the shelf decides.
+    # The image is the same, and camera and shelf are said to be elsewhere: so are the objects. The fit of one that is
+    # hardly seen depends on the shelf.
     gap = np.abs(seen.objects.position - again.objects.position)[np.asarray(seen.objects.valid)].max(axis=1)
     assert 1e-5 < np.median(gap) < 0.02
 
