@@ -159,7 +159,7 @@ def test_scenarios_that_changed_between_rows_are_named(tmp_path):
     for rows in ([same, other, LOST], [same, unknown, LOST]):
         assert report.changed_scenarios(rows) == ["a"]
         write_report(rows, tmp_path)
-        assert "not the same, or not known, in all rows count as several: a." in page_of(tmp_path)
+        assert "not the same in all rows count as several: a." in page_of(tmp_path)
     many = [dataclasses.replace(row, scenario=f"s{i}") for i in range(7) for row in (same, other)]
     assert report.changed_scenarios_remark(many).endswith("s0, s1, s2, s3, s4 and 2 more.")
     assert report.changed_scenarios_remark([same]) == ""

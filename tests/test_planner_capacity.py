@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mechsearch_jax import planner
-from mechsearch_jax.actions.sampler import BLOCK, _numbers
+from mechsearch_jax.actions.sampler import BLOCK, _gumbel
 from mechsearch_jax.config.config import PlannerConfig, Weights
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.geometry.superquadric import empty, pad
@@ -55,7 +55,7 @@ def test_g_and_j_are_the_same(problem):
 
 def test_an_object_draws_the_same_numbers():
     key = jax.random.key(3)
-    few, usual, many = (np.asarray(_numbers(key, 2, n, 7)) for n in (5, BLOCK, 20))
+    few, usual, many = (np.asarray(_gumbel(key, 2, n, 7)) for n in (5, BLOCK, 20))
     np.testing.assert_array_equal(usual.reshape(-1), jax.random.gumbel(key, (2 * BLOCK * 7,)))
     np.testing.assert_array_equal(few[:, :4], usual[:, :4])
     np.testing.assert_array_equal(many[:, :8], usual[:, :8])
