@@ -1,4 +1,4 @@
-"""The slots in which episodes run side by side, and what happens in a round."""
+"""The closed loop: in a round all slots look, recognise, update the belief, propose, try, choose and act."""
 
 from __future__ import annotations
 

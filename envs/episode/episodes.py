@@ -1,4 +1,4 @@
-"""The closed loop: look, recognise, update the belief, propose, try, choose, act; many episodes at once, or one alone.
+"""Episodes, many at once or one alone: what they are started with, and what is said of them; `closed_loop` runs them.
 
 Each episode has a slot. All slots look, decide and act together; an episode that ends leaves its slot to the next one,
 so that short episodes do not wait for long ones. Each episode has its own random numbers: its decisions depend neither
