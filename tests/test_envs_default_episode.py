@@ -79,6 +79,7 @@ def test_what_succeeds_in_physics_is_made_until_the_target_is_out(problem):
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_the_batch_simulator_takes_the_target_out_by_the_default(problem):
     method, episodes = Method(engine="MjxSimulator"), {}
     trials = Recorded(method.trials())
