@@ -171,14 +171,14 @@ class EpisodePool:
             knowledge = self._planner.look(world, environment_keys, list(logs))
         found, lost = knowledge.found, self._target_troubles(world, list(logs))
         trouble = {r: reason for r, reason in lost.items() if found[r]}
-        sought = [r for r in logs if found[r] and r not in trouble]
+        to_judge = [r for r in logs if found[r] and r not in trouble]
         # After the last action the target may still be taken out, where it is found.
-        deciding = [r for r in logs if r in sought or not (found[r] or logs[r].last)]
+        deciding = [r for r in logs if r in to_judge or not (found[r] or logs[r].last)]
         with clock("plan", deciding):
             choices = self._planner.decide(planner_keys, deciding)
         choices = {r: choice for r, choice in choices.items() if not logs[r].last or takes_target(choice)}
-        with clock("judge", sought):
-            verdicts = self._settings.protocol.judge(self._planner, world, sought)
+        with clock("judge", to_judge):
+            verdicts = self._settings.protocol.judge(self._planner, world, to_judge)
 
         trouble |= {r: reason for r, choice in choices.items() if (reason := distrust(choice))}
         trouble |= self._settings.protocol.ends(self._problem.shelf, world, list(logs), verdicts, choices)

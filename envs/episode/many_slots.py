@@ -292,9 +292,9 @@ def _look(
 ) -> PlannerState:
     """Recognise and update the belief in the slots `rows`, with the sight of the problem's camera."""
 
-    def look(mine, here, key):
+    def look(slot_state, here, key):
         observation = recogniser(key, Snapshot(problem.camera, problem.shelf, here, sight))
-        belief = update_belief(problem, mine.belief, observation, mine.observation, mine.action)
+        belief = update_belief(problem, slot_state.belief, observation, slot_state.observation, slot_state.action)
         return PlannerState(belief, observation, no_action())
 
     new = jax.vmap(look)(_rows_of(state, rows), _some_worlds(world, rows), _rows_of(keys, rows))
@@ -316,18 +316,25 @@ def _propose(
     The numbers in `own`, shape (n,) each, are in place of the policy's own. The question is static.
     """
 
-    def propose(values, key, mine):
+    def propose(values, key, slot_state):
         ask = getattr(with_numbers(policy, values), question.method)
-        return _strong((ask(key, problem, mine.belief, mine.observation), scenes_of(mine.belief, mine.observation)))
+        return _strong(
+            (
+                ask(key, problem, slot_state.belief, slot_state.observation),
+                scenes_of(slot_state.belief, slot_state.observation),
+            )
+        )
 
-    mine, active = _rows_of(state, rows), rows < keys.shape[0]
+    slot_state, active = _rows_of(state, rows), rows < keys.shape[0]
     # Where the target is not found and can be nowhere, and nothing stands, a decision costs next to nothing.
-    belief = mine.belief.replace(exists=mine.belief.exists & active[:, None], found=mine.belief.found & active)
+    belief = slot_state.belief.replace(
+        exists=slot_state.belief.exists & active[:, None], found=slot_state.belief.found & active
+    )
     belief = without_grasps(belief) if question.hidden else belief
-    objects = mine.observation.objects
+    objects = slot_state.observation.objects
     objects = objects.replace(valid=objects.valid & active[:, None])
-    seen = mine.observation.replace(objects=objects)
-    return jax.vmap(propose)(own, _rows_of(keys, rows), mine.replace(belief=belief, observation=seen))
+    seen = slot_state.observation.replace(objects=objects)
+    return jax.vmap(propose)(own, _rows_of(keys, rows), slot_state.replace(belief=belief, observation=seen))
 
 
 @kept()
@@ -342,6 +349,6 @@ def _choose(decisions: Decision, results: Int[Array, "n k"] | None) -> Choice:
 def _swept_free_many(problem: Problem, state: PlannerState, rows: Int[Array, " n"]) -> Bool[Array, " n"]:
     """The same in the slots `rows`; False for rows beyond the end."""
     active = rows < state.belief.found.shape[0]
-    return jax.vmap(lambda mine, active: swept_free_of(problem, mine.observation, active))(
+    return jax.vmap(lambda slot_state, active: swept_free_of(problem, slot_state.observation, active))(
         _rows_of(state, rows), active
     )
