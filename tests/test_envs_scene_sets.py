@@ -21,7 +21,8 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Body, Scenario, load_scenario
 
 # Those that are not a part of another.
-WHOLE = ("c2", "d1", "d2", "d3", "development", "development-box")
+REPORT = tuple(f"report-{letter}" for letter in "abcd")
+WHOLE = ("c2", "d1", "d2", "d3", "development", "development-box", *REPORT)
 BLOCKS = [block for name in WHOLE for block in SETS[name].blocks]
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
@@ -36,7 +37,7 @@ def test_the_sets_are_those_of_the_paper():
     assert blocks["d1"] == [(2, 200, "cylinder")]
     assert blocks["d2"] == [(n, 75, "cylinder") for n in (4, 8)]
     assert blocks["d3"] == [(n, 40, "box") for n in (4, 8)]
-    assert [SETS[name].scenes for name in ("c2", "c2-6", "d2", "d3-8")] == [720, 180, 150, 40]
+    assert [SETS[name].scenes for name in ("c2", "c2-6", "d2", "d3-8", "report-a")] == [720, 180, 150, 40, 400]
     assert {"c2-2", "c2-8", "d2-4", "d3-4", "development-4", "development-box-8"} < set(SETS)
 
 
@@ -62,7 +63,7 @@ def test_no_two_experiments_share_a_seed():
 def test_every_scene_is_on_record_and_no_two_are_alike():
     assert {name: len(hashes) for name, hashes in recorded().items()} == {b.name: b.scenes for b in BLOCKS}
     hashes = [content for each in recorded().values() for content in each]
-    assert len(set(hashes)) == len(hashes) == 1390
+    assert len(set(hashes)) == len(hashes) == 2990
     assert all(re.fullmatch("[0-9a-f]{12}", content) for content in hashes)
 
 
@@ -77,6 +78,10 @@ DIGESTS = {
     "d3": "c533bcf7ecfa",
     "development": "3af2a9ae9f30",
     "development-box": "1bc8aba34a0e",
+    "report-a": "8240eb793c92",
+    "report-b": "9fdf4ce1d5b9",
+    "report-c": "13ad36aa6f21",
+    "report-d": "d353835947b1",
 }
 
 

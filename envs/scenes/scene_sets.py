@@ -83,6 +83,11 @@ _EXPERIMENTS = (
     SceneSet("d3", "the paper's D.3", _blocks("d3", 40, (4, 8), 40_000, "box")),
     SceneSet("development", "for development", _blocks("development", 50, (2, 4, 6, 8), 50_000)),
     SceneSet("development-box", "for development", _blocks("development-box", 20, (4, 8), 60_000, "box")),
+    # One for each larger change that is reported: a set that was looked at is no longer unseen.
+    *(
+        SceneSet(f"report-{letter}", "to report with, once", _blocks(f"report-{letter}", 100, (2, 4, 6, 8), first_seed))
+        for letter, first_seed in (("a", 100_000), ("b", 110_000), ("c", 120_000), ("d", 130_000))
+    ),
 )
 
 
