@@ -1,0 +1,47 @@
+"""What the options of rows say in few words: a preset, and what differs from it."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.planner import PRESETS
+
+# Options that no preset decides.
+_NOT_OF_PRESETS = frozenset(("simulator", "target", "seed"))
+
+
+class Settings(NamedTuple):
+    """The settings of a variant.
+
+    Attributes:
+      preset: the preset that differs from them in the fewest options.
+      differing: what is not as in that preset, with search-for-grasp, true shapes and protocol strict; None is the
+        value of an option that the variant does not have.
+    """
+
+    preset: str
+    differing: Mapping[str, Any]
+
+
+@functools.cache
+def _preset_options(name: str) -> Mapping[str, Any]:
+    return Method(config=PRESETS[name]()).options()
+
+
+def settings_of(options: Mapping[str, Any]) -> Settings:
+    """The settings of a row's options, as `store.rows.options_of` has them.
+
+    An option that the row does not have is of a later version, and is taken to be as in the preset.
+    """
+    candidates = [Settings(name, _differing(options, _preset_options(name))) for name in PRESETS]
+    return min(candidates, key=lambda settings: len(settings.differing))
+
+
+def _differing(options: Mapping[str, Any], preset: Mapping[str, Any]) -> dict[str, Any]:
+    given = {name: value for name, value in options.items() if name not in _NOT_OF_PRESETS}
+    # Settings without a name of their own are left out where they are as usual.
+    unusual = {name: None for name in preset if "." in name and name not in given}
+    return {name: value for name, value in given.items() if name not in preset or preset[name] != value} | unusual

@@ -1,0 +1,184 @@
+"""Stored runs: folders become one small file of rows and one of lines, and what does not belong together is refused."""
+
+import dataclasses
+import json
+import random
+import sys
+
+import pytest
+
+from mechsearch_jax.benchmarks.report import store_run
+from mechsearch_jax.benchmarks.report.store_run import run_of, scene_set_of
+from mechsearch_jax.benchmarks.statistics.intervals import wilson
+from mechsearch_jax.benchmarks.statistics.settings import settings_of
+from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key
+from mechsearch_jax.benchmarks.store.runs import load_run, merged, started, stored_runs, write_run
+from mechsearch_jax.benchmarks.store.shards import ShardWriter
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.planner import PRESETS
+from mechsearch_jax.runtime.errors import InputError
+
+VERSIONS = json.dumps({"jax": "0.11.2", "machine": "x86_64", "mujoco": "3.17.0", "numpy": "2.5.2", "python": "3.12.3"})
+
+
+USUAL = Method()
+
+
+def row_of(scene, method=USUAL, seed=0, **fields):
+    """A row of an episode that found the target, and took it out."""
+    options = {**method.options(), "simulator": "NativeSimulator"}
+    columns = {name: options[name] for name in ("policy", "recognition", "gamma", "horizon", "sequences")}
+    usual = {
+        "scenario": scene,
+        "objects": int(scene.split("-")[1]),
+        "target": "cylinder",
+        **columns,
+        "actions": "+".join(options["actions"]),
+        "seed": seed,
+        "found_step": 1,
+        "graspable_step": 2,
+        "retrieved": True,
+        "steps": 3,
+        "failure": None,
+        "planning_seconds": 1.23456,
+        "simulation_seconds": 2.0,
+        "configuration": configuration(options),
+        "content_hash": "0123456789ab",
+        "looks": 2,
+        "objects_fallen": 0,
+        "paper_graspable": True,
+        "compile_seconds": 0.125,
+        "code": "this code",
+        "device": "cuda: H100",
+        "versions": VERSIONS,
+    }
+    return Row(**usual | fields)
+
+
+def write(folder, rows, writer="me"):
+    with ShardWriter(folder, writer) as shards:
+        shards.append(rows)
+    return folder
+
+
+def test_a_run_is_read_back_and_says_what_came_of_it(tmp_path, monkeypatch, capsys):
+    rows = [row_of("c2-4-001"), row_of("c2-4-100", found_step=None, graspable_step=None, retrieved=False, steps=10)]
+    paper = Method("search-and-grasp", PRESETS["paper"](gamma=0.5), "masks")
+    rows.append(row_of("c2-4-100", paper, objects_fallen=1, paper_graspable=None))
+    folders = [write(tmp_path / name, part) for name, part in (("a", rows[:2]), ("b", rows[1:]))]
+    arguments = [*map(str, folders), "--name", "two", "--command", "mechsearch evaluate c2", "--commit", "abc"]
+    monkeypatch.setattr(sys, "argv", ["store_run", *arguments, "--out", str(tmp_path / "runs")])
+    store_run.main()
+    assert "two.parquet: 0.0" in capsys.readouterr().out
+    (run,) = stored_runs(tmp_path / "runs")
+    rounded = {episode_key(row): dataclasses.replace(row, planning_seconds=1.23, compile_seconds=0.12) for row in rows}
+    assert {episode_key(row): row for row in run.rows} == rounded
+    one, other = sorted(run.lines, key=lambda line: line["preset"] == "paper")
+    assert (one["run"], one["commit"], one["code"], one["command"]) == ("two", "abc", "this code", arguments[5])
+    assert (one["scene_set"], one["objects"], one["seeds"], one["devices"]) == ("c2", 4, [0], ["cuda: H100"])
+    assert (one["preset"], one["settings"], one["episodes"], one["errors"]) == ("standard", {}, 2, 0)
+    assert (one["scenes"], one["scenes_chosen_on"]) == (2, 1)
+    interval = [round(bound, 4) for bound in wilson(1, 2)]
+    assert one["retrieved"] == one["found"] == {"rate": 0.5, "interval": interval}
+    assert (one["drop_free"]["rate"], one["actions"]) == (1.0, 6.5)
+    assert one["on_scenes_not_chosen_on"]["episodes"] == 1
+    assert one["on_scenes_not_chosen_on"]["retrieved"]["rate"] == 0.0
+    assert other["settings"] == {"policy": "search-and-grasp", "recognition": "masks", "gamma": 0.5}
+    assert other["drop_free"]["rate"] == 0.0
+    assert other["paper_graspable"] is None
+
+
+def test_an_error_reaches_nothing():
+    failed = row_of(
+        "c2-4-100", failure="error: no", found_step=None, graspable_step=None, retrieved=False, objects_fallen=None
+    )
+    (line,) = run_of("x", [failed, row_of("c2-4-101")]).lines
+    assert line["errors"] == 1
+    assert {line[name]["rate"] for name in ("found", "graspable", "retrieved", "drop_free")} == {0.5}
+
+
+def test_parts_of_other_code_and_those_that_disagree_are_refused(tmp_path):
+    one = write(tmp_path / "one", [row_of("c2-4-001")])
+    other = write(tmp_path / "other", [row_of("c2-4-002", code="other code")])
+    with pytest.raises(InputError, match=r"run by other code, those of .*one by this code; store them as two runs"):
+        merged([one, other])
+    changed = write(tmp_path / "changed", [row_of("c2-4-001", steps=5, planning_seconds=9.0)])
+    with pytest.raises(InputError, match="'c2-4-001', seed 0, has another steps than the same episode in"):
+        merged([one, changed])
+    (empty := tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="no results in this folder"):
+        merged([empty])
+
+
+def test_what_agrees_counts_once_and_an_error_gives_way(tmp_path):
+    good, failed = row_of("c2-4-001"), row_of("c2-4-001", failure="error: no", retrieved=False)
+    again = dataclasses.replace(good, planning_seconds=7.0, device="cuda: H200")
+    folders = [write(tmp_path / str(i), [row]) for i, row in enumerate((failed, good, again, failed))]
+    assert merged(folders) == [good]
+
+
+def test_the_day_is_that_of_the_first_shard(tmp_path):
+    folders = [write(tmp_path / day, [row_of("c2-4-001")], f"2026{day}T101112-host-abc") for day in ("1125", "1124")]
+    assert started(folders) == "2026-11-24"
+    assert started([write(tmp_path / "x", [row_of("c2-4-001")])]) is None
+
+
+def test_files_that_do_not_belong_together_are_refused(tmp_path):
+    run = run_of("x", [row_of("c2-4-001"), row_of("c2-4-002")])
+    write_run(run, tmp_path)
+    (tmp_path / "x.jsonl").write_text(json.dumps({**run.lines[0], "episodes": 1}) + "\n")
+    with pytest.raises(InputError, match=r"x\.jsonl: tells of 1 episodes, .*x\.parquet has 2"):
+        load_run(tmp_path, "x")
+    with pytest.raises(InputError, match="--name a/b"):
+        write_run(dataclasses.replace(run, name="a/b"), tmp_path)
+
+
+def test_every_preset_is_its_own_settings():
+    for name, preset in PRESETS.items():
+        options = {**Method(config=preset()).options(), "simulator": "MjxSimulator", "target": "box"}
+        assert settings_of(options) == (name, {})
+        assert settings_of({**options, "gamma": 0.5}) == (name, {"gamma": 0.5})
+    later = Method().options()
+    del later["crowding_weight"]
+    assert settings_of(later) == ("standard", {})
+
+
+def test_scenes_are_of_sets():
+    names = ("c2-4-017", "development-box-8-001", "d1-003", "published-2-00", "mine")
+    assert list(map(scene_set_of, names)) == ["c2", "development-box", "d1", "published", "mine"]
+
+
+def test_twenty_thousand_rows_are_small(tmp_path):
+    draw = random.Random(0)
+    methods = [
+        Method(policy, PRESETS[preset](), recognition, protocol=protocol)
+        for policy in ("search-for-grasp", "search-and-grasp")
+        for preset in ("standard", "paper")
+        for recognition in ("oracle", "masks", "full")
+        for protocol in ("strict", "published-code")
+    ]
+    usual = [row_of("c2-4-001", method) for method in methods]
+    rows = [
+        dataclasses.replace(
+            row,
+            scenario=f"c2-{objects}-{number:03d}",
+            content_hash=f"{100_000 * objects + number:012x}",
+            objects=objects,
+            found_step=draw.randrange(9),
+            graspable_step=draw.randrange(9),
+            steps=draw.randrange(10),
+            retrieved=draw.random() < 0.9,
+            looks=draw.randrange(9),
+            objects_fallen=int(draw.random() < 0.05),
+            planning_seconds=draw.lognormvariate(0.0, 1.0),
+            simulation_seconds=draw.lognormvariate(0.0, 1.0),
+            compile_seconds=draw.random(),
+        )
+        for row in usual
+        for objects in (2, 4, 6, 8)
+        for number in range(180)
+    ]
+    files = write_run(run_of("large", rows), tmp_path)
+    assert len(rows) == 17_280
+    assert files[0].stat().st_size < 500_000
+    assert files[1].stat().st_size < 300_000
