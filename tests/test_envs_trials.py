@@ -406,6 +406,22 @@ def test_what_can_be_taken_out_is_and_where_nothing_can_the_search_goes_on(probl
         assert [kind == ActionKind.RETRIEVE for kind in kinds] == [takes, objects is OPEN]
 
 
+def test_without_contact_no_grasp_that_hits_something_takes_the_target_out(problem):
+    _, _, aside = pushes()
+    strict = search_for_grasp(tries=True, retrieval_contact=False).replace(plan=planned(aside))
+    for objects, worth, takes in ((LOOSE, False, False), (FIRM, False, False), (OPEN, True, True)):
+        belief, observation = look(problem, objects)
+        grasps = worth_trying(problem.target_grasps, *objects_and_pose(problem, objects))
+        offered = strict.retrieval(jax.random.key(0), problem, belief, observation).alternatives.worth
+        np.testing.assert_array_equal(offered, grasps.feasible & (grasps.hits == 0))
+        assert bool(offered.any()) == worth
+        # Trials in which every grasp would succeed.
+        decision = made(strict, says(*[DONE] * TRIES), problem, belief, observation)
+        assert (int(decision.action.kind) == ActionKind.RETRIEVE) == takes
+    # A plan does not depend on it.
+    assert strict._planning == strict.replace(config=search_for_grasp().config, tries=False)
+
+
 @pytest.mark.slow
 def test_a_policy_proposes_the_same_alone_and_mapped_over(problem):
     over, _, aside = pushes()

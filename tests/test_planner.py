@@ -89,6 +89,7 @@ def test_the_default_is_the_preset_standard_field_by_field():
         "first_draws": 4,
         "move_again": False,
         "move_target": True,
+        "retrieval_contact": True,
         "predicted_collisions": False,
         "imitates": "nothing",
         "actions": ["push", "pick-and-place"],

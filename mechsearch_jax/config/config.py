@@ -51,6 +51,7 @@ class Weights(NamedTuple):
         "first_draws",
         "move_again",
         "move_target",
+        "retrieval_contact",
         "predicted_collisions",
         "imitates",
     ),
@@ -76,6 +77,8 @@ class PlannerConfig:
       move_again: whether an object may move more than once in a sequence, as in the paper; static.
       move_target: whether a found target may be pushed, too; static. Nothing else helps if every grasp of it hits an
         object that can neither be grasped nor pushed.
+      retrieval_contact: whether a grasp that hits objects may take a found target out if it succeeds in a trial; static.
+        Not so in the paper. If False, only grasps that hit nothing are tried.
       predicted_collisions: whether f rules out overlaps of the target with objects (equation 14) in predicted states,
         too, as in the paper; static. If False, poses that an object is moved to stay possible: a target there would be
         pushed along.
@@ -98,6 +101,9 @@ class PlannerConfig:
     first_draws: int = option(4, "the same for the first action of a sequence, where that is more")
     move_again: bool = option(False, "whether an object may move more than once in a sequence, as in the paper")
     move_target: bool = option(True, "whether a found target may be pushed, too; not in the paper")
+    retrieval_contact: bool = option(
+        True, "whether trials may take a found target out with a grasp that touches objects; not in the paper"
+    )
     predicted_collisions: bool = option(
         False, "whether f rules out overlaps with objects in predicted states too, as in the paper"
     )

@@ -94,7 +94,8 @@ class PlanningPolicy(flax.struct.PyTreeNode):
       propose, predict, objective, drawn_in: the slots; static.
       plan: plans with the slots; static.
       tries: whether decisions hold alternatives for trials; static. The decision itself does not depend on it: a grasp
-        must hit nothing, unless `trials.choose` prefers one that succeeded in a trial.
+        must hit nothing, unless `trials.choose` prefers one that succeeded in a trial; `config.retrieval_contact` says
+        whether there are such alternatives.
     """
 
     config: PlannerConfig
@@ -111,8 +112,8 @@ class PlanningPolicy(flax.struct.PyTreeNode):
 
     @property
     def _planning(self) -> PlanningPolicy:
-        """The policy without `tries`, on which a plan does not depend: so it is compiled once."""
-        return self.replace(tries=False)
+        """The policy with the usual `tries` and `retrieval_contact`, on which a plan does not depend: compiled once."""
+        return self.replace(tries=False, config=dataclasses.replace(self.config, retrieval_contact=True))
 
     def begin(
         self, key: Array, problem: Problem, belief: Belief, observation: Observation
@@ -201,7 +202,8 @@ def _retrieval(policy: PlanningPolicy, belief: Belief, observation: Observation,
     reached, objects = policy.objective.reached, observation.objects
     alternatives = None
     if policy.tries:
-        alternatives = grasps_to_try(grasp.action, grasp.feasible & belief.found, objects, reached)
+        allowed = grasp.feasible if policy.config.retrieval_contact else grasp.success
+        alternatives = grasps_to_try(grasp.action, allowed & belief.found, objects, reached)
         grasp = jax.tree.map(lambda a: a[0], grasp)
     able = belief.found & grasp.success
     return Decision(
