@@ -66,6 +66,7 @@ def test_the_papers_letters():
     assert [paper_figures(table, seen, METHODS[1], BOTH, 8) for seen in ("masks", "full")] == [expected] * 2
     assert paper_figures(table, "masks", METHODS[1], PUSH, 8) is None
     assert paper_figures(TABLES["table3"], "oracle", METHODS[1], BOTH, 2) is None
+    assert paper_figures(table, "informed", METHODS[1], BOTH, 8) is None
 
 
 def test_the_scenes_of_a_table():

@@ -13,7 +13,7 @@ from stage import BOX, CYLINDER, HIDDEN, OPEN, TWO, UPRIGHT, Stage, grab, idle, 
 from mechsearch_jax.actions import kind_of
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.benchmarks.store.rows import Row
-from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
+from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import load_episode, save_episode
@@ -29,6 +29,12 @@ from mechsearch_jax.workspace.shelf import Shelf
 from mechsearch_jax.workspace.target import Target
 
 METHOD = Method().options()
+# Heavy boxes on both sides of the target and one before it: it is hidden, and every grasp hits something.
+BLOCKED = Scenario(
+    "blocked",
+    (BOX, *(dataclasses.replace(BOX, half_size=(0.12, 0.02, 0.08), position=(0.6, y, 0.4845)) for y in (0.0, 0.14))),
+    CYLINDER,
+)
 
 
 class Diary:
@@ -64,6 +70,23 @@ def test_a_target_in_sight_is_taken_out_at_once(problem):
         "simulator": "NativeSimulator",
         "seed": 0,
     }
+
+
+def test_an_informed_planner_has_found_a_hidden_target_before_the_first_action(problem):
+    """It clears the way and takes the target out; what is graspable is still judged on the true state."""
+    diary = Diary()
+    episode = run(problem, HIDDEN, Stage(reveal), recogniser=informed, watcher=diary)
+    assert not Snapshot(problem.camera, problem.shelf, from_scenario(HIDDEN)).target_seen
+    assert (episode.found_step, episode.steps[0].found, episode.retrieved) == (0, True, True)
+    truth = (*HIDDEN.target.position[:2], 0.0)
+    for moment in diary.moments:
+        assert bool(moment.belief.found)
+        np.testing.assert_allclose(moment.belief.found_pose, truth, atol=1e-6)
+    uninformed = run(problem, HIDDEN, Stage(reveal))
+    assert uninformed.found_step == 1
+    blocked = run(problem, BLOCKED, Stage(), recogniser=informed)
+    assert (blocked.found_step, blocked.graspable_step, blocked.retrieved) == (0, None, False)
+    assert blocked.failure == "found, but not graspable"
 
 
 @pytest.mark.parametrize("policy", ["grab", "search-for-grasp"])

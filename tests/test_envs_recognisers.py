@@ -9,7 +9,7 @@ import pytest
 
 from mechsearch_jax.envs.camera.recognisers import labelled, large_segments, numbered, recogniser, true_labels
 from mechsearch_jax.envs.camera.simulated_camera import observe
-from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
+from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, true_superquadrics
 from mechsearch_jax.images.cloud import shelf_view
@@ -178,7 +178,8 @@ def test_names_stand_for_one_object_each(masks):
     target = target_of(SCENE)
     assert recogniser("masks", target) is masks
     assert recogniser("oracle", target) is oracle
-    with pytest.raises(InputError, match="unknown; use oracle, masks, full"):
+    assert recogniser("informed", target) is informed
+    with pytest.raises(InputError, match="unknown; use oracle, masks, full, informed"):
         recogniser("eyes", target)
 
 

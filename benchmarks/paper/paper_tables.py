@@ -151,6 +151,8 @@ def paper_figures(
     table: PaperTable, recognition: str, method: str, actions: tuple[str, ...], objects: int
 ) -> Figures | None:
     """What the paper says of a cell; None where it has none."""
+    if recognition not in LETTERS:
+        return None
     return table.figures.get(PaperCell(LETTERS[recognition], method, actions, objects))
 
 

@@ -270,10 +270,10 @@ def bench_perceive(
       batch, scenes, repeats: as in `bench_part`.
 
     Raises:
-      InputError: the oracle recognises nothing, the number of objects does not fit, or the weights are damaged.
+      InputError: a recogniser without an image, the number of objects does not fit, or the weights are damaged.
     """
-    if recognition == "oracle":
-        raise InputError("bench perceive: the oracle recognises nothing; give --recognition masks or full")
+    if recognition not in ("masks", "full"):
+        raise InputError(f"bench perceive: {recognition} recognises nothing; give --recognition masks or full")
     generator = ScenarioGenerator()
     see = recogniser(recognition, generator.target)
     camera, shelf = Camera(), Shelf()

@@ -1,18 +1,20 @@
 """Recognisers of the simulated world, from the true state to nothing but a depth image.
 
+- `informed` returns the true shapes and poses, and the target's from the start.
 - `oracle` returns the true shapes and poses.
 - `masks` receives a noisy depth image with the true segmentation, and with the pixels that show nothing marked.
 - `full` receives the noisy depth image alone and segments it.
 
-`masks` and `full` fit superquadrics as `perception.recogniser.Recogniser` does. For all three the detector decides
-whether the target is seen; only the oracle gets the target's pose. `full` gets the target's pixels once the detector
-sees the target; until then they look to it like those of one more object.
+`masks` and `full` fit superquadrics as `perception.recogniser.Recogniser` does. For all but `informed` the detector
+decides whether the target is seen; of those only the oracle gets the target's pose. `full` gets the target's pixels
+once the detector sees the target; until then they look to it like those of one more object.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Literal, Protocol, get_args
 
 import jax
@@ -20,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from mechsearch_jax.envs.camera.simulated_camera import observe
-from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, oracle
+from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, informed, oracle
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.images.cloud import MARGIN, View, above_board
 from mechsearch_jax.images.labels import FREE, INSTANCES, MISSING, OTHER
@@ -41,7 +43,9 @@ from mechsearch_jax.workspace.target import Target
 # A thinned image may overestimate an object's number of pixels by this factor.
 SAMPLED = 1.5
 
-RecognitionName = Literal["oracle", "masks", "full"]
+RecognitionName = Literal["oracle", "masks", "full", "informed"]
+# The recognisers that see no image.
+_TRUE: Mapping[str, Recogniser] = {"oracle": oracle, "informed": informed}
 
 
 def true_labels(
@@ -207,7 +211,7 @@ def recogniser(name: str, target: Target) -> Recogniser:
     """The recogniser of a name; the same object for the same arguments, so that nothing is compiled twice.
 
     Args:
-      name: "oracle", "masks" or "full".
+      name: one of `RecognitionName`.
       target: whose shape is given.
 
     Raises:
@@ -215,8 +219,8 @@ def recogniser(name: str, target: Target) -> Recogniser:
     """
     if name not in get_args(RecognitionName):
         raise InputError(f'recognition "{name}" is unknown; use {", ".join(get_args(RecognitionName))}')
-    if name == "oracle":
-        return oracle
+    if name in _TRUE:
+        return _TRUE[name]
     shapes = shipped_weights("recognition")
     if name == "masks":
         return ImageRecogniser(target, true_masks, shapes)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.envs.simulators.named import EngineName
 
 TableName = Literal["table1", "table3", "table4", "table5"]
-Recognition = Literal["oracle", "masks", "full"]
+Recognition = Literal["oracle", "masks", "full", "informed"]
 ProtocolName = Literal["strict", "published-code"]
 
 
@@ -83,7 +83,7 @@ def reproduce(
     *,
     out: Path,
     method: Annotated[tuple[PaperMethod, ...], tyro.conf.arg(metavar="{search-and-grasp,search-for-grasp} ...")] = (),
-    recognition: Annotated[tuple[Recognition, ...], tyro.conf.arg(metavar="{oracle,masks,full} ...")] = (),
+    recognition: Annotated[tuple[Recognition, ...], tyro.conf.arg(metavar="{oracle,masks,full,informed} ...")] = (),
     preset: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = (),
     protocol: Annotated[tuple[ProtocolName, ...], tyro.conf.arg(metavar="{strict,published-code} ...")] = (),
     objects: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (),
@@ -103,7 +103,7 @@ def reproduce(
       out: folder for the results, and for NAME.md and NAME.json.
       method: one of them; both by default.
       recognition: what the planner sees: true shapes, a noisy depth image with true masks (the paper's R), or the image
-        alone; all three by default.
+        alone, these three by default; or true shapes and the hidden target.
       preset: where the planner's settings come from, one or more; paper and standard by default.
       protocol: how episodes are run and judged, one or both; strict by default.
       objects: only the scenes with so many.

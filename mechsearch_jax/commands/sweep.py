@@ -24,7 +24,7 @@ from mechsearch_jax.runtime.errors import InputError, nearest
 if TYPE_CHECKING:
     from mechsearch_jax.planner import Option
 
-Recognition = Literal["oracle", "masks", "full"]
+Recognition = Literal["oracle", "masks", "full", "informed"]
 ProtocolName = Literal["strict", "published-code"]
 SimulatorName = Literal["auto", "native", "mjx"]
 # Types of the keys of a sweep's file that are no options of the planner; all but the last two may be lists.
@@ -48,8 +48,8 @@ class SweptOptions:
     Attributes:
       config_file: a file of settings of camera, shelf, gripper, target, objects and planner; what else is given goes
         before it. One for all.
-      recognition: "oracle" knows true shapes and poses; the others see a noisy depth image, "masks" with the true
-        segmentation, "full" without.
+      recognition: "oracle" knows true shapes and poses, "informed" also the hidden target's; the others see a noisy
+        depth image, "masks" with the true segmentation, "full" without.
       protocol: how episodes are run and judged: strictly, or as the authors' published code does.
       simulator: MuJoCo in C ("native") or on the GPU ("mjx"); "auto" takes the latter for batches where there is a GPU.
         One for all.
@@ -58,7 +58,7 @@ class SweptOptions:
     config_file: Annotated[Path | None, tyro.conf.arg(name="config", metavar="FILE.toml", help_behavior_hint="")] = None
     recognition: Annotated[
         tuple[Recognition, ...],
-        tyro.conf.arg(metavar="{oracle,masks,full} ...", help_behavior_hint="(default: oracle)"),
+        tyro.conf.arg(metavar="{oracle,masks,full,informed} ...", help_behavior_hint="(default: oracle)"),
     ] = ()
     protocol: Annotated[
         tuple[ProtocolName, ...],

@@ -77,7 +77,7 @@ class PlannerConfig:
       move_again: whether an object may move more than once in a sequence, as in the paper; static.
       move_target: whether a found target may be pushed, too; static. Nothing else helps if every grasp of it hits an
         object that can neither be grasped nor pushed.
-      retrieval_contact: whether a grasp that hits objects may take a found target out if it succeeds in a trial; static.
+      retrieval_contact: whether a grasp that hits objects may take a found target out if its trial succeeds; static.
         Not so in the paper. If False, only grasps that hit nothing are tried.
       predicted_collisions: whether f rules out overlaps of the target with objects (equation 14) in predicted states,
         too, as in the paper; static. If False, poses that an object is moved to stay possible: a target there would be
