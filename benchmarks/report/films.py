@@ -181,6 +181,7 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
         watcher,
         method.terms,
         method.trials(),
+        method.mismatch,
     )
     save_figure(filmstrip(watcher.frames, problem.camera, problem.shelf, problem.target, verdict(episode)), file)
     again = Row.of_episode(episode)

@@ -128,7 +128,7 @@ class Batches:
 
         def start(job: Job) -> Start:
             policy, max_steps = policy_of(job.method), job.method.config.max_steps
-            return Start(job.scenario, job.seed, policy, max_steps, options_of(job.method))
+            return Start(job.scenario, job.seed, policy, max_steps, options_of(job.method), job.method.mismatch)
 
         def take(episodes: Sequence[tuple[int, Episode]]) -> None:
             if counted := batch.take(episodes):

@@ -57,6 +57,7 @@ class InTurn:
             method.options(),
             protocol=method.terms,
             trials=method.trials(),
+            mismatch=method.mismatch,
         )
         return Row.of_episode(episode, present_code())
 

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from mechsearch_jax.envs.camera.sensing import Sensing, true_camera
 from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, informed, oracle
 from mechsearch_jax.envs.world.world import TARGET, World
@@ -170,7 +171,7 @@ class ImageRecogniser:
         view, shelf = snapshot.view, snapshot.shelf
         keys = jax.random.split(key, 4)
         unseen = found_pixels(snapshot.camera) / view.stride**2
-        image = labelled(keys[:2], self, view, shelf, snapshot.world, snapshot.target_seen, unseen)
+        image = labelled(keys[:2], self, view, shelf, snapshot.world, snapshot.target_seen, unseen, snapshot.sensing)
         shapes = ShapeNetwork.of(self.weights)
         # Compiled on its own, whatever the labels come from.
         objects, pose = recognise_image(keys[2:], image, shapes, view.camera, shelf, self.target, self.refinement)
@@ -186,6 +187,7 @@ def labelled(
     world: World,
     target_seen: Bool[Array, ""],
     unseen: float,
+    sensing: Sensing | None = None,
 ) -> LabelledImage:
     """The labelled image that a recogniser fits shapes to: the part that shows the shelf, as measured.
 
@@ -197,9 +199,11 @@ def labelled(
       world: the true state.
       target_seen: whether the detector sees the target; if not, the image marks no pixels as the target's.
       unseen: a target of at most this many pixels of the view is not detected; static.
+      sensing: see `Snapshot`; the points lie where they seem to be to the planner.
     """
-    image = observe(view.camera, world, shelf)
-    points = recogniser.noise(keys[0], view.camera, image.depth)
+    image = observe(true_camera(view.camera, sensing), world, shelf)
+    noise = recogniser.noise if sensing is None or sensing.noise is None else sensing.noise
+    points = noise(keys[0], view.camera, image.depth)
     masks = true_labels(points, image.segmentation, shelf)
     labels = recogniser.labeller(keys[1], shelf, points, (image.segmentation == TARGET) & target_seen, masks, unseen)
     depth = recogniser.depth(view.camera, image.depth, points)

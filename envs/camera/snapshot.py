@@ -10,6 +10,7 @@ import flax.struct
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from mechsearch_jax.envs.camera.sensing import Sensing, as_seen, true_camera
 from mechsearch_jax.envs.camera.simulated_camera import Image, is_found, observe, target_window
 from mechsearch_jax.envs.world.world import TARGET, World, true_superquadrics
 from mechsearch_jax.geometry.superquadric import Superquadrics
@@ -51,12 +52,14 @@ class Snapshot:
       camera, shelf: of the problem.
       world: the true state.
       sight: of camera and shelf; required where they are traced.
+      sensing: how what is seen differs from what the problem says; None if it does not.
     """
 
     camera: Camera
     shelf: Shelf
     world: World
     sight: Sight | None = None
+    sensing: Sensing | None = None
 
     @property
     def view(self) -> View:
@@ -74,12 +77,18 @@ class Snapshot:
     @functools.cached_property
     def image(self) -> Image:
         """Depth, segmentation and colour at full resolution."""
-        return observe(self.camera, self.world, self.shelf)
+        return observe(true_camera(self.camera, self.sensing), self.world, self.shelf)
 
     @functools.cached_property
     def target_seen(self) -> Bool[Array, ""]:
         """Whether the detector finds the target in the image; much cheaper than casting the image."""
-        return is_found(self.camera, self.world, None if self.sight is None else self.sight.window)
+        window = target_window(self.camera) if self.sight is None else self.sight.window
+        return is_found(true_camera(self.camera, self.sensing), self.world, window)
+
+    @property
+    def target_pose(self) -> Float[Array, " 3"]:
+        """x, y [m] and yaw [rad] of the target, where it seems to be to the planner."""
+        return true_target_pose(as_seen(self.world, self.sensing))
 
 
 @runtime_checkable
@@ -90,8 +99,12 @@ class Recogniser(Protocol):
 
 
 def oracle(key: Array, snapshot: Snapshot) -> Observation:
-    """The `Recogniser` of the true shapes and poses; the target's once the detector sees it. Ignores the key."""
-    return Observation(objects_on_the_board(snapshot), snapshot.target_seen, true_target_pose(snapshot.world))
+    """The `Recogniser` of the true shapes and poses; the target's once the detector sees it. Ignores the key.
+
+    Of a camera that is not where the planner takes it to be, the poses are those that the planner sees.
+    """
+    objects = as_seen(objects_on_the_board(snapshot), snapshot.sensing)
+    return Observation(objects, snapshot.target_seen, snapshot.target_pose)
 
 
 def informed(key: Array, snapshot: Snapshot) -> Observation:

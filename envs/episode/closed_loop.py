@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Int, UInt
 
+from mechsearch_jax.envs.camera.sensing import Sensing, sensing_of
 from mechsearch_jax.envs.camera.snapshot import Recogniser, oracle
 from mechsearch_jax.envs.episode.compile_clock import CompileClock, StageClock
 from mechsearch_jax.envs.episode.episode_log import (
@@ -29,6 +30,7 @@ from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.episode.slots import OneSlot, Slots
 from mechsearch_jax.envs.episode.verdicts import Verdict
 from mechsearch_jax.envs.simulators.simulator import Flowing, Simulator
+from mechsearch_jax.envs.world.mismatch import ASSUMED, ActualCell, Mismatch
 from mechsearch_jax.envs.world.world import TARGET, World
 from mechsearch_jax.planner import Policy, Problem
 from mechsearch_jax.planner.trials import Trials
@@ -47,6 +49,8 @@ class Start:
       seed: of the planner's and of the environment's random numbers, which are independent of each other.
       policy, max_steps, options: where they are not None, instead of those of the run. With several slots the policies
         of a run may differ in numbers alone; see `policy_numbers`.
+      mismatch: how the simulated world differs from what the planner assumes. With several slots all mismatches of a
+        run must have the same `mould`.
     """
 
     scenario: Scenario
@@ -54,6 +58,15 @@ class Start:
     policy: Policy | None = None
     max_steps: int | None = None
     options: Mapping[str, Any] | None = None
+    mismatch: Mismatch = ASSUMED
+
+    def cell(self, problem: Problem) -> ActualCell:
+        """The cell of the episode, where a problem says what the planner assumes."""
+        return self.mismatch.drawn(self.scenario, self.seed, problem.camera, problem.shelf)
+
+    def sensing(self, problem: Problem) -> Sensing | None:
+        """What the camera senses in the episode, where a problem says what the planner assumes."""
+        return sensing_of(self.mismatch, self.cell(problem))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,6 +167,7 @@ class EpisodePool:
             fresh[row] = True
         self._planner.forget(fresh)
         self._planner.decide_by({row: start.policy for row, (_, start) in starts.items()})
+        self._planner.sense_by({row: start.sensing(self._problem) for row, (_, start) in starts.items()})
 
     def round(self) -> list[tuple[int, tuple[int, Episode]]]:
         """Look, decide and act once in the slots that wait for nothing.

@@ -30,7 +30,8 @@ from mechsearch_jax.envs.episode.moments import Watcher
 from mechsearch_jax.envs.episode.protocols import EpisodeProtocol
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.episode.slots import OneSlot, Slots
-from mechsearch_jax.envs.simulators.simulator import Prepares, Simulator
+from mechsearch_jax.envs.simulators.simulator import Prepares, Simulator, TakesCells
+from mechsearch_jax.envs.world.mismatch import ASSUMED, Mismatch
 from mechsearch_jax.envs.world.world import World, from_scenario
 from mechsearch_jax.planner import Policy, Problem
 from mechsearch_jax.planner.trials import Trials
@@ -62,6 +63,7 @@ def run_episode(
     watcher: Watcher | None = None,
     protocol: EpisodeProtocol = STRICT,
     trials: Trials | None = None,
+    mismatch: Mismatch = ASSUMED,
 ) -> Episode:
     """Run one episode to its end.
 
@@ -71,11 +73,12 @@ def run_episode(
       problem, policy, simulator: see `run_episodes`. Neither the policy nor the recogniser need be traceable.
       recogniser, max_steps, options, protocol, trials: see `RunSettings`.
       watcher: follows every step.
+      mismatch: see `Start`.
     """
     episodes: list[tuple[int, Episode]] = []
     settings = RunSettings(recogniser, max_steps, options or {}, protocol, trials)
     listeners = Listeners(episodes.extend, watcher=watcher)
-    run_episodes([Start(scenario, seed)], problem, policy, simulator, 1, listeners, settings)
+    run_episodes([Start(scenario, seed, mismatch=mismatch)], problem, policy, simulator, 1, listeners, settings)
     return episodes[0][1]
 
 
@@ -104,8 +107,8 @@ def run_episodes(
       settings: how episodes are run; the defaults if None.
 
     Raises:
-      InputError: there is no slot, a watcher is given for several, the policy decides on an unknown kind of action, or
-        policies differ in more than numbers.
+      InputError: there is no slot, a watcher is given for several, the policy decides on an unknown kind of action,
+        policies or mismatches differ in more than numbers, or the simulator cannot differ as a mismatch says.
     """
     settings = settings or RunSettings()
     if slots < 1:
@@ -126,6 +129,7 @@ def run_episodes(
                 listeners.ended([pair for _, pair in done])
             fresh = {slot: pair for (slot, _), pair in zip(done, queue, strict=False)}
             if fresh:
+                _set_cells(simulator, problem, {slot: start for slot, (_, start) in fresh.items()})
                 simulator.replace({slot: start.scenario for slot, (_, start) in fresh.items()})
                 pool.begin(fresh)
 
@@ -140,6 +144,7 @@ def _planner_slots(
 ) -> Slots:
     """The planner's slots of the first episodes, for which the simulator is reset and everything is compiled."""
     count, recogniser = len(first), settings.protocol.recogniser(settings.recogniser)
+    _set_cells(simulator, problem, {row: start for row, (_, start) in enumerate(first)})
     scenarios = [start.scenario for _, start in first]
     if count == 1:
         simulator.reset(scenarios)
@@ -150,9 +155,22 @@ def _planner_slots(
     planner_slots = ManySlots(problem, policy, recogniser, shapes, min(settings.at_once, count), settings.trials)
     # Raises before anything is compiled in vain.
     planner_slots.decide_by({row: start.policy for row, (_, start) in enumerate(first)})
+    planner_slots.sense_by({row: start.sensing(problem) for row, (_, start) in enumerate(first)})
     with prepared(batch_programs(planner_slots, simulator, shapes), listeners.compiling):
         simulator.reset(scenarios)
     return planner_slots
+
+
+def _set_cells(simulator: Simulator, problem: Problem, starts: Mapping[int, Start]) -> None:
+    """Tell a simulator the cells of the episodes that begin next in its worlds.
+
+    Raises:
+      InputError: one of them is not as the planner assumes, and the simulator cannot differ.
+    """
+    if isinstance(simulator, TakesCells):
+        simulator.set_cells({row: start.cell(problem) for row, start in starts.items()})
+    elif any(start.mismatch.simulates_otherwise for start in starts.values()):
+        raise InputError(f"{simulator.engine}: cannot differ from what the planner assumes; use the NativeSimulator")
 
 
 def batch_programs(planner_slots: ManySlots, simulator: Simulator, world: World) -> list[Program]:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.belief.belief import without_grasps
+from mechsearch_jax.envs.camera.sensing import Sensing, in_base
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Sight, Snapshot, sight_of
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen, takes_target
 from mechsearch_jax.envs.episode.policy_numbers import as_pytree, mould, numbers, with_numbers
@@ -91,6 +92,9 @@ class ManySlots:
         self._at_once = at_once
         self._count = len(world.kind)
         self._numbers = [numbers(self._policy)] * self._count
+        self._sensings: list[Sensing | None] = [None] * self._count
+        # Of all slots, its fields with a leading axis for them.
+        self._sensing: Sensing | None = None
         # Policies that were looked at, by what tells objects apart while they are kept.
         self._policies: dict[int, tuple[Policy, tuple[np.ndarray, ...]]] = {}
         shapes = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), world)
@@ -130,7 +134,7 @@ class ManySlots:
             *(program("plan", _propose, *call) for call in calls),
             *(self._trials.programs(problem) if isinstance(self._trials, PreparesTrials) else ()),
             *(Program("small ones", lambda: False, functools.partial(choosing, call)) for call in calls),
-            program("look", _look, problem, state, world, keys, rows, self._recogniser, self._sight),
+            program("look", _look, problem, state, world, keys, rows, self._recogniser, self._sight, self._sensing),
             program("judge", graspable_many, judged_sets(problem), problem.camera, few, active),
             program("small ones", sizes_and_truths, problem.poses, state.belief.exists, world),
             program("small ones", _forget, problem, state, fresh),
@@ -154,11 +158,21 @@ class ManySlots:
             self._policies[id(policy)] = policy, numbers(as_pytree(policy))
         return self._policies[id(policy)][1]
 
+    def sense_by(self, sensings: Mapping[int, Sensing | None]) -> None:
+        """See `Slots`."""
+        for row, sensing in sensings.items():
+            self._sensings[row] = sensing
+        if len({jax.tree.structure(sensing) for sensing in self._sensings}) > 1:
+            raise InputError("run_episodes: mismatches of one run that differ in more than numbers need runs each")
+        self._sensing = jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *self._sensings)
+
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> BeliefSummary:
         """See `Slots`."""
         for _, padded in self._chunks(rows):
-            self._state = _look(self._problem, self._state, world, keys, padded, self._recogniser, self._sight)
-        return summary(self._problem, self._state.belief, world)
+            self._state = _look(
+                self._problem, self._state, world, keys, padded, self._recogniser, self._sight, self._sensing
+            )
+        return summary(self._problem, self._state.belief, in_base(world, self._sensing))
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`.
@@ -289,15 +303,18 @@ def _look(
     rows: Int[Array, " n"],
     recogniser: Recogniser,
     sight: Sight,
+    sensing: Sensing | None,
 ) -> PlannerState:
     """Recognise and update the belief in the slots `rows`, with the sight of the problem's camera."""
 
-    def look(slot_state, here, key):
-        observation = recogniser(key, Snapshot(problem.camera, problem.shelf, here, sight))
+    def look(slot_state, here, key, sensed):
+        observation = recogniser(key, Snapshot(problem.camera, problem.shelf, here, sight, sensed))
         belief = update_belief(problem, slot_state.belief, observation, slot_state.observation, slot_state.action)
         return PlannerState(belief, observation, no_action())
 
-    new = jax.vmap(look)(_rows_of(state, rows), _some_worlds(world, rows), _rows_of(keys, rows))
+    new = jax.vmap(look)(
+        _rows_of(state, rows), _some_worlds(world, rows), _rows_of(keys, rows), _rows_of(sensing, rows)
+    )
     return jax.tree.map(lambda a, b: a.at[rows].set(b, mode="drop"), state, new)
 
 

@@ -14,6 +14,7 @@ from mechsearch_jax.envs.episode.protocols import PROTOCOLS, EpisodeProtocol, Pr
 from mechsearch_jax.envs.pushing.push_models import push_models
 from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.envs.trials.named import rehearsal
+from mechsearch_jax.envs.world.mismatch import ASSUMED, Mismatch
 from mechsearch_jax.planner import OPTIONS, PRESETS, Config, Policy, ProblemConfig, policy_factory
 from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.problem.workcell import Workcell
@@ -25,7 +26,7 @@ _OF_EPISODES = frozenset(("policy", "recognition", "protocol", "simulator", "tar
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """A policy with all its settings, a recogniser, a simulator, a workcell and a protocol; hashable.
+    """A policy with all its settings, a recogniser, a simulator, a workcell, a protocol and a mismatch; hashable.
 
     Attributes:
       name: of the policy, as `planner.policy_factory` takes it: one of `planner.POLICIES`, or the import path of
@@ -35,6 +36,7 @@ class Method:
       engine: name of the simulator.
       workcell: of the episodes; its target sets the resolution of candidate poses.
       protocol: how its episodes are run and judged, one of `protocols.PROTOCOLS`.
+      mismatch: how the simulated world differs from what the planner assumes.
     """
 
     name: str = "search-for-grasp"
@@ -43,6 +45,7 @@ class Method:
     engine: EngineName = "NativeSimulator"
     workcell: Workcell = dataclasses.field(default_factory=Workcell)
     protocol: ProtocolName = "strict"
+    mismatch: Mismatch = ASSUMED
 
     def policy(self) -> Policy:
         """The policy, with the models that the configuration names.
@@ -74,21 +77,23 @@ class Method:
     def mould(self) -> Hashable:
         """A key of the programs compiled for episodes of one target.
 
-        It is equal for methods that differ only in numbers of their policies, such as gamma, or in the number of steps.
+        It is equal for methods that differ only in numbers of their policies, such as gamma, in the number of steps, or
+        in a mismatch that compiles nothing.
 
         Raises:
           InputError: as `policy`.
         """
         shared = self.workcell, self.config.problem, self.recognition, self.engine, self.protocol
-        return *shared, self.config.rehearsal, mould(self.policy())
+        return *shared, self.config.rehearsal, self.mismatch.mould(), mould(self.policy())
 
     def check(self) -> None:
         """Fail before the first episode rather than in every one.
 
         Raises:
           InputError: as `policy`, or there is no such kind of action, or the weights that the recogniser needs are
-            missing or damaged.
+            missing or damaged, or recogniser or simulator cannot have the mismatch.
         """
+        self.mismatch.check(self.recognition, self.engine)
         check_kinds(self.config.problem.actions.actions)
         self.policy()
         recogniser(self.recognition, self.workcell.target)
@@ -97,10 +102,14 @@ class Method:
         """The options that identify this method, flat and as JSON values.
 
         They are policy, recognition, protocol, every option of the configuration by its name, and by their paths all
-        other settings that differ from the preset `standard` or from the default workcell.
+        other settings that differ from the preset `standard`, the default workcell or no mismatch.
         """
         named = {".".join(option.path) for option in OPTIONS}
-        pairs = ((self.config, PRESETS["standard"](), ""), (self.workcell, Workcell(), "workcell."))
+        pairs = (
+            (self.config, PRESETS["standard"](), ""),
+            (self.workcell, Workcell(), "workcell."),
+            (self.mismatch, ASSUMED, "mismatch."),
+        )
         unusual: dict[str, Any] = {}
         for config, standard, prefix in pairs:
             usual = dict(_settings(standard, prefix))
@@ -121,18 +130,18 @@ class Method:
         if unknown:
             raise InputError(f"option {unknown[0]} is unknown to this version: what ran with it cannot be run again")
         config = PRESETS["standard"](**{name: value for name, value in options.items() if name in option_names})
-        parts: dict[str, Any] = {"config": config, "workcell": Workcell()}
+        parts: dict[str, Any] = {"config": config, "workcell": Workcell(), "mismatch": ASSUMED}
         for path, value in options.items():
             first, *rest = path.split(".")
-            if rest and first == "workcell":
-                parts["workcell"] = _with_setting(parts["workcell"], rest, value)
+            if rest and first in ("workcell", "mismatch"):
+                parts[first] = _with_setting(parts[first], rest, value)
             elif rest:
                 parts["config"] = _with_setting(parts["config"], path.split("."), value)
         protocol = options.get("protocol", "strict")
         return cls(options["policy"], recognition=options["recognition"], protocol=protocol, **parts)
 
 
-def _settings(config: Config | Workcell, prefix: str) -> Iterator[tuple[str, Any]]:
+def _settings(config: Config | Workcell | Mismatch, prefix: str) -> Iterator[tuple[str, Any]]:
     """Every setting as a JSON value, by its path after a prefix, such as "problem.grasps.wrists"."""
 
     def inside(value: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:

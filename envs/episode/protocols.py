@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, true_target_pose
+from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot
 from mechsearch_jax.envs.episode.episode_log import Choice, takes_target
 from mechsearch_jax.envs.episode.slots import Slots
 from mechsearch_jax.envs.episode.verdicts import Verdict
@@ -172,12 +172,12 @@ PROTOCOLS: Mapping[str, EpisodeProtocol] = {"strict": Strict(), "published-code"
 
 @dataclasses.dataclass(frozen=True)
 class WithTruePose:
-    """A `Recogniser` that replaces the pose of a seen target by the true one."""
+    """A `Recogniser` that replaces the pose of a seen target by the true one, as the oracle sees it."""
 
     inner: Recogniser
 
     def __call__(self, key: Array, snapshot: Snapshot) -> Observation:
-        return self.inner(key, snapshot).replace(target_pose=true_target_pose(snapshot.world))
+        return self.inner(key, snapshot).replace(target_pose=snapshot.target_pose)
 
 
 def _executed(simulator: Simulator, choices: Mapping[int, Choice]) -> Outcome:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Int
 
 from mechsearch_jax.actions import Action, no_action
 from mechsearch_jax.belief.moved_target import nearest_candidate
+from mechsearch_jax.envs.camera.sensing import Sensing, in_base
 from mechsearch_jax.envs.camera.snapshot import Recogniser, Snapshot, true_target_pose
 from mechsearch_jax.envs.episode.episode_log import Choice, chosen
 from mechsearch_jax.envs.episode.verdicts import Verdict, judge, swept_free
@@ -57,6 +58,14 @@ class Slots(Protocol):
 
         Raises:
           InputError: a policy cannot decide together with the others: it differs from them in more than numbers.
+        """
+        ...
+
+    def sense_by(self, sensings: Mapping[int, Sensing | None]) -> None:
+        """Set what the camera senses in slots; None for what the problem says.
+
+        Raises:
+          InputError: it differs between slots in more than numbers.
         """
         ...
 
@@ -111,6 +120,7 @@ class OneSlot:
         self.action: Action = no_action()
         self._problem, self._usual, self._recogniser = problem, policy, recogniser
         self._policy, self._trials = policy, trials
+        self._sensing: Sensing | None = None
 
     def forget(self, fresh: Bool[np.ndarray, " 1"]) -> None:
         """See `Slots`."""
@@ -123,16 +133,21 @@ class OneSlot:
         for policy in policies.values():
             self._policy = self._usual if policy is None else policy
 
+    def sense_by(self, sensings: Mapping[int, Sensing | None]) -> None:
+        """See `Slots`."""
+        self._sensing = sensings.get(0, self._sensing)
+
     def look(self, world: World, keys: Array, rows: Sequence[int]) -> BeliefSummary:
         """See `Slots`."""
-        snapshot = self._snapshot(world)
+        snapshot = dataclasses.replace(self._snapshot(world), sensing=self._sensing)
         observation = self._recogniser(keys[0], snapshot)
         # The first look, before any action, makes the same call, so that nothing is compiled twice.
         before = observation if self.observation is None else self.observation
         self.belief = update_belief(self._problem, self.belief, observation, before, self.action)
         self.action = no_action()
         self.snapshot, self.observation, self.decision = snapshot, observation, None
-        return summary(self._problem, jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), self.belief), world)
+        belief: Belief = jax.tree.map(lambda a: jax.device_put(np.asarray(a)[None]), self.belief)
+        return summary(self._problem, belief, in_base(world, self._sensing))
 
     def decide(self, keys: Array, rows: Sequence[int]) -> dict[int, Choice]:
         """See `Slots`."""
@@ -163,7 +178,7 @@ class OneSlot:
 
 
 def summary(problem: Problem, belief: Belief, world: World) -> BeliefSummary:
-    """The beliefs of all slots; fields of belief and world have a leading axis for them."""
+    """The beliefs of all slots; fields of belief and world, in the base's frame, have a leading axis for them."""
     size, truth = sizes_and_truths(problem.poses, belief.exists, world)
     return BeliefSummary(*jax.device_get((belief.found, size, truth, belief.restarts)))
 

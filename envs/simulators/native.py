@@ -20,6 +20,7 @@ from mechsearch_jax.actions import Action
 from mechsearch_jax.envs.simulators.native_world import NativeWorld, outcome_of
 from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, check_actions
 from mechsearch_jax.envs.simulators.trace import Trace
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import BODIES, World
 from mechsearch_jax.runtime.cores import cores
@@ -57,6 +58,7 @@ class NativeSimulator:
         self._config, self._shelf, self._camera = config, shelf, camera
         self._threads = threads or cores()
         self._worlds: list[NativeWorld] = []
+        self._cells: dict[int, ActualCell] = {}
 
     @property
     def traces(self) -> list[Trace]:
@@ -82,8 +84,12 @@ class NativeSimulator:
         """
         self._check_reset()
         for i, scenario in scenarios.items():
-            self._worlds[i].reset(scenario)
+            self._worlds[i].reset(scenario, self._cells.get(i, ASSUMED_CELL))
         return self._gather()
+
+    def set_cells(self, cells: Mapping[int, ActualCell]) -> None:
+        """Set the cells of worlds for the next `reset` or `replace`; see `TakesCells`."""
+        self._cells.update(cells)
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
         """Set the state of all worlds, or of those in `only`; see `Simulator.load`.

@@ -22,9 +22,11 @@ from jaxtyping import Bool, Float
 
 from mechsearch_jax.actions import Action, Kind, kind_of
 from mechsearch_jax.actions.trajectory import reference_motion
-from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig, controls
+from mechsearch_jax.envs.simulators.physics import PHYSICS
+from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig, controls, resampled
 from mechsearch_jax.envs.simulators.trace import Recorder, Trace
 from mechsearch_jax.envs.world import model as models
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import BODIES, TARGET, World, bodies_of, fallen_over, from_scenario, slots
 from mechsearch_jax.robot.kinematics import HOME
@@ -61,6 +63,7 @@ class NativeWorld:
         self._data = mujoco.MjData(self._blank)
         self._model = self._blank
         self._bodies: list[Body | None] = [None] * BODIES
+        self._cell = ASSUMED_CELL
         self._recorder = Recorder(self._data, self.config.trace_every)
 
     @property
@@ -68,12 +71,17 @@ class NativeWorld:
         """What happened during the last action."""
         return self._recorder.trace(self._model)
 
-    def reset(self, scenario: Scenario) -> World:
+    def reset(self, scenario: Scenario, cell: ActualCell = ASSUMED_CELL) -> World:
         """Start an episode; see `Simulator.reset`.
+
+        Args:
+          scenario: of the episode.
+          cell: until the next reset.
 
         Raises:
           InputError: there are more objects than slots.
         """
+        self._cell = cell
         return self._begin(slots(scenario), from_scenario(scenario))
 
     def load(self, world: World) -> World:
@@ -129,16 +137,18 @@ class NativeWorld:
         target = bodies.pop(TARGET)
         return Scenario(name, tuple(bodies.values()), target)
 
-    def place(self, bodies: list[Body | None], friction: float = 1.0, mass: float = 1.0) -> None:
+    def place(self, bodies: list[Body | None], cell: ActualCell = ASSUMED_CELL) -> None:
         """Start from bodies, everything at rest and the robot at home; `world` stays what it was.
 
         Args:
           bodies: in their slots.
-          friction, mass: sliding friction of everything, and masses of the bodies, as multiples of what they are.
+          cell: with the factors on sliding frictions and masses, the physics, and where the robot stands.
         """
         self._bodies = bodies
-        self._model = models.with_bodies(self._blank, bodies, mass=mass)
-        self._model.geom_friction[:, 0] *= friction
+        self._model = models.with_bodies(self._blank, bodies, mass=cell.mass)
+        self._model.geom_friction[:, 0] *= cell.friction
+        models.move_robot(self._model, cell.T_world_base)
+        PHYSICS[cell.physics](self._model)
         self._data = models.initial_state(self._model, bodies)
         self._go_home()
 
@@ -187,6 +197,7 @@ class NativeWorld:
 
     def _perform(self, kind: Kind, reference: Reference, index: int) -> tuple[Failure, float, bool]:
         """Run a motion and let everything come to rest: why it failed, the tracking error [rad], and whether all is."""
+        reference = resampled(reference, self.config.motion.timestep, self._model.opt.timestep)
         states = self._follow(reference)
         error = self._tracking_error(states, reference)
         dropped = kind.holds_object and not self._slip(states, reference, index) < self.config.slip
@@ -197,7 +208,7 @@ class NativeWorld:
         return Failure.HELD_UP if error > self.config.tracking_bound else failure, error, settled
 
     def _begin(self, bodies: list[Body | None], world: World) -> World:
-        self.place(bodies)
+        self.place(bodies, self._cell)
         self.world = world
         return world
 
@@ -239,7 +250,8 @@ class NativeWorld:
     def _come_to_rest(self) -> bool:
         """Hold the robot still until the bodies are at rest; whether they are. Their last motion is then stopped."""
         limit = self.config.rest_speed * np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
-        hold = np.tile(self._data.ctrl, (self.config.settle_block, 1))
+        block = round(self.config.settle_block * self.config.motion.timestep / self._model.opt.timestep)
+        hold = np.tile(self._data.ctrl, (block, 1))
         first = 1 + self._model.nq + ROBOT
         settled = False
         for _ in range(self.config.settle_steps // self.config.settle_block):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, kind_of
 from mechsearch_jax.envs.world import model as models
+from mechsearch_jax.envs.world.mismatch import ActualCell
 from mechsearch_jax.envs.world.outcome import Outcome
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.robot.kinematics import HOME
@@ -144,6 +145,15 @@ class Flowing(Protocol):
 
 
 @runtime_checkable
+class TakesCells(Protocol):
+    """A `Simulator` whose worlds may differ from what the planner assumes."""
+
+    def set_cells(self, cells: Mapping[int, ActualCell]) -> None:
+        """Set the cells of worlds, by their numbers, for the next episodes that begin in them."""
+        ...
+
+
+@runtime_checkable
 class Prepares(Protocol):
     """An object that can list the programs that it will call, so that they are compiled beforehand."""
 
@@ -184,6 +194,39 @@ def controls(reference: Reference) -> Float[np.ndarray, "steps 9"]:
     q, velocity, fingers = (np.asarray(a, float)[:length] for a in jax.device_get(fields))
     arm, fingers = q + LAG * velocity, fingers[:, None]
     return np.concatenate([arm, fingers, fingers], axis=1)
+
+
+def resampled(reference: Reference, timestep: float, other: float) -> Reference:
+    """A reference for steps of another length, linear between the rows of the given one; the same for the same length.
+
+    Args:
+      reference: of a single motion, without leading axes.
+      timestep: between its rows [s].
+      other: between the rows of the result [s].
+    """
+    if timestep == other:
+        return reference
+    host: Any = jax.device_get(reference)
+    length = int(host.length)
+    rows = round(length * timestep / other)
+    before, times = timestep * np.arange(length + 1), other * np.arange(1, rows + 1)
+
+    def between(start: np.ndarray, values: np.ndarray) -> np.ndarray:
+        columns = np.concatenate([start[None], values[:length]]).reshape(length + 1, -1)
+        sampled = np.stack([np.interp(times, before, column) for column in columns.T], axis=1)
+        return sampled.reshape(rows, *values.shape[1:])
+
+    def steps(count: np.ndarray) -> np.signedinteger:
+        return np.int32(np.round(count * timestep / other))
+
+    return host.replace(
+        q=between(host.start[:ARM], host.q),
+        velocity=between(np.zeros(ARM), host.velocity),
+        fingers=between(host.start[ARM], host.fingers),
+        length=np.int32(rows),
+        closed=steps(host.closed),
+        opens=steps(host.opens),
+    )
 
 
 def unhindered(

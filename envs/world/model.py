@@ -346,6 +346,17 @@ def with_bodies(
     return model
 
 
+def move_robot(model: mujoco.MjModel, T_world_base: Float[np.ndarray, "4 4"]) -> None:
+    """Put the robot's base elsewhere in a model, which is changed; nothing changes if it is where it was."""
+    if np.array_equal(T_world_base, np.eye(4)):
+        return
+    link = model.body("link1").id
+    turn = Rotation.from_matrix(T_world_base[:3, :3])
+    model.body_pos[link] = turn.apply(model.body_pos[link]) + T_world_base[:3, 3]
+    at_base = Rotation.from_quat(model.body_quat[link], scalar_first=True)
+    model.body_quat[link] = (turn * at_base).as_quat(scalar_first=True)
+
+
 def initial_state(model: mujoco.MjModel, bodies: Sequence[Body | None]) -> mujoco.MjData:
     """The robot at home with closed fingers and the bodies at their poses, all at rest."""
     data = mujoco.MjData(model)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.scenes.scene_sets import Block
     from mechsearch_jax.envs.simulators.named import EngineName
+    from mechsearch_jax.envs.world.mismatch import Mismatch
     from mechsearch_jax.planner import Option
     from mechsearch_jax.problem.settings import Settings
 
@@ -62,20 +63,31 @@ class EpisodeOptions:
         given = {name: value for name, value in named.items() if value is not None}
         return settings_of(self.config_file).with_options(getattr(self, "preset", None), **given)
 
+    def mismatch(self) -> Mismatch:
+        """How the simulated world differs from what the planner assumes.
+
+        Raises:
+          InputError: an option is impossible.
+        """
+        from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS, Mismatch
+
+        named = {option.path[0]: getattr(self, option.name, None) for option in MISMATCH_OPTIONS}
+        return Mismatch(**{name: value for name, value in named.items() if value is not None})
+
     def methods(self, policies: Sequence[str], engine: EngineName = "NativeSimulator") -> list[Method]:
         """The method of each policy.
 
         Raises:
-          InputError: a policy, an option, the push model or the recognition cannot be used.
+          InputError: a policy, an option, the push model, the recognition or the mismatch cannot be used.
         """
         from mechsearch_jax.envs.episode.method import Method
 
         if any(":" in policy for policy in policies) and "" not in sys.path:
             # As Python does for a program that is not installed.
             sys.path.append("")
-        settings = self.settings()
+        settings, mismatch = self.settings(), self.mismatch()
         methods = [
-            Method(name, settings.config, self.recognition, engine, settings.workcell, self.protocol)
+            Method(name, settings.config, self.recognition, engine, settings.workcell, self.protocol, mismatch)
             for name in policies
         ]
         for method in methods:
@@ -123,10 +135,11 @@ DEFAULTS = EpisodeOptions()
 
 @functools.cache
 def with_planner_options() -> type[EpisodeOptions]:
-    """`EpisodeOptions` with one more field for the preset and for each of the planner's options, None if not given.
+    """`EpisodeOptions` with a field for the preset and for each option of planner and mismatch, None if not given.
 
     Importing the configuration, which defines them, takes a second.
     """
+    from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS, Mismatch
     from mechsearch_jax.planner import DEFAULT_PRESET, OPTIONS, PRESETS
 
     preset = tyro.conf.arg(
@@ -135,17 +148,20 @@ def with_planner_options() -> type[EpisodeOptions]:
         help_behavior_hint=f"(default: {DEFAULT_PRESET})",
     )
     fields: list[tuple[str, Any, Any]] = [("preset", Annotated[Literal[tuple(PRESETS)] | None, preset], None)]
-    fields += [(option.name, _annotation(option), None) for option in OPTIONS]
+    fields += [(option.name, _annotation(option, _usual(option)), None) for option in OPTIONS]
+    for option in MISMATCH_OPTIONS:
+        hint = f"(default: {getattr(Mismatch(), option.path[0])})"
+        fields.append((option.name, _annotation(option, hint), None))
     return dataclasses.make_dataclass("Options", fields, bases=(EpisodeOptions,), frozen=True, kw_only=True)
 
 
-def _annotation(option: Option) -> Any:
+def _annotation(option: Option, hint: str) -> Any:
     """The type of a command line's option that may be left out."""
     kind = Literal[option.choices] if option.choices else option.type
     shown = "{" + ",".join(option.choices) + "}" if option.choices else _METAVARS.get(option.type)
     # The hint shows the presets' values, also the paper's.
     text = re.sub(r"; (the paper's .*|not in the paper)$", "", option.help)
-    about = tyro.conf.arg(metavar=shown, help=f"{text}.", help_behavior_hint=_usual(option))
+    about = tyro.conf.arg(metavar=shown, help=f"{text}.", help_behavior_hint=hint)
     return Annotated[kind | None, about]
 
 

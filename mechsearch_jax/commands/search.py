@@ -121,6 +121,7 @@ def _run(
             narrator,
             chosen.terms,
             chosen.trials(),
+            chosen.mismatch,
         )
     return episode, narrator, recorder
 

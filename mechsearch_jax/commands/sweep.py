@@ -94,9 +94,11 @@ SWEPT_DEFAULTS = SweptOptions()
 
 
 def _options() -> dict[str, Option]:
+    """The options of planner and mismatch by their names."""
+    from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS
     from mechsearch_jax.planner import OPTIONS
 
-    return {option.name: option for option in OPTIONS}
+    return {option.name: option for option in (*OPTIONS, *MISMATCH_OPTIONS)}
 
 
 def _listed(name: str, value: Any, kind: Any) -> tuple[Any, ...]:
@@ -114,8 +116,8 @@ def _listed(name: str, value: Any, kind: Any) -> tuple[Any, ...]:
 
 @functools.cache
 def with_swept_options() -> type[SweptOptions]:
-    """`SweptOptions` with one more field for the preset and for each of the planner's options, empty if not given."""
-    from mechsearch_jax.planner import OPTIONS, PRESETS
+    """`SweptOptions` with a field for the preset and for each option of planner and mismatch, empty if not given."""
+    from mechsearch_jax.planner import PRESETS
 
     def several(kind: Any, metavar: str, about: str) -> Any:
         shown = tyro.conf.arg(metavar=f"{metavar} ...", help=about, help_behavior_hint="")
@@ -124,7 +126,7 @@ def with_swept_options() -> type[SweptOptions]:
     names = ",".join(PRESETS)
     preset = several(Literal[tuple(PRESETS)], f"{{{names}}}", "where settings come from that are not given.")
     fields: list[tuple[str, Any, Any]] = [("preset", preset, ())]
-    for option in OPTIONS:
+    for option in _options().values():
         if get_origin(option.type) is tuple:
             part = "NAME" if get_args(option.type)[0] is str else "FLOAT"
             kind, metavar = str, f"{part},..."

@@ -52,6 +52,16 @@ def measured_depth(camera: Camera, depth: Float[Array, "h w"], points: Float[Arr
     return jnp.where(jnp.isnan(measured) & ~jnp.isfinite(depth), jnp.inf, measured)
 
 
+def scattered(
+    key: Key[Array, ""], points: Float[Array, "h w 3"], deviation: float | Float[Array, ""]
+) -> Float[Array, "h w 3"]:
+    """Points moved along random directions by Gaussian distances with a standard deviation [m]."""
+    towards, along = jax.random.split(key)
+    direction = jax.random.normal(towards, points.shape)
+    direction = direction / jnp.maximum(jnp.linalg.norm(direction, axis=-1, keepdims=True), 1e-9)
+    return points + deviation * jax.random.normal(along, points.shape[:-1])[..., None] * direction
+
+
 @dataclasses.dataclass(frozen=True)
 class RandomDirection:
     """The paper's noise: each point moves along a random direction by a Gaussian distance (appendix B.1).
@@ -67,11 +77,7 @@ class RandomDirection:
             raise InputError(f"RandomDirection: deviation {self.deviation} must be at least 0 m")
 
     def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
-        points = back_project(camera, depth)
-        towards, along = jax.random.split(key)
-        direction = jax.random.normal(towards, points.shape)
-        direction = direction / jnp.maximum(jnp.linalg.norm(direction, axis=-1, keepdims=True), 1e-9)
-        return points + self.deviation * jax.random.normal(along, depth.shape)[..., None] * direction
+        return scattered(key, back_project(camera, depth), self.deviation)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,105 @@
+"""What a camera senses that is not where the planner takes it to be, or that measures otherwise than usual.
+
+All of it is data, so that a sweep over it compiles once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TypeVar
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from mechsearch_jax.envs.world.mismatch import ActualCell, Mismatch
+from mechsearch_jax.envs.world.world import World
+from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.geometry.transforms import inverse, matmul, transform
+from mechsearch_jax.images.noise import scattered
+from mechsearch_jax.workspace.camera import Camera, back_project
+
+Bodies = TypeVar("Bodies", World, Superquadrics)
+
+
+class Place(flax.struct.PyTreeNode):
+    """Where the world is in the planner's frame, which is that of the robot's base; see `Mismatch`.
+
+    Attributes:
+      T_base_world: pose of the world in the base's frame, shape (..., 4, 4).
+      T_seen_world: where it seems to be to a planner that takes the camera to be elsewhere, shape (..., 4, 4).
+    """
+
+    T_base_world: jax.Array | np.ndarray
+    T_seen_world: jax.Array | np.ndarray
+
+
+class OtherNoise(flax.struct.PyTreeNode):
+    """The `NoiseModel` like `noise.RandomDirection`, but with pixels without a measurement, and all numbers data.
+
+    Attributes:
+      deviation: standard deviation of the points' distance [m].
+      missing: share of pixels without a measurement.
+    """
+
+    deviation: jax.Array | np.ndarray
+    missing: jax.Array | np.ndarray
+
+    def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+        points = scattered(key, back_project(camera, depth), jnp.asarray(self.deviation))
+        lost = jax.random.uniform(jax.random.fold_in(key, 1), depth.shape) < self.missing
+        return jnp.where(lost[..., None], jnp.nan, points)
+
+
+class Sensing(flax.struct.PyTreeNode):
+    """How what is seen in an episode differs from what the planner assumes.
+
+    Attributes:
+      place: where the world is; None where the planner takes it to be.
+      noise: of the depth; None for the recogniser's.
+    """
+
+    place: Place | None = None
+    noise: OtherNoise | None = None
+
+
+def sensing_of(mismatch: Mismatch, cell: ActualCell) -> Sensing | None:
+    """The sensing of an episode, as NumPy arrays; None if it is as the planner assumes."""
+    place, noise = None, None
+    if mismatch.moves_camera:
+        T_base_world = np.linalg.inv(cell.T_world_base)
+        T_seen_world = np.linalg.inv(cell.T_base_moved) @ T_base_world
+        place = Place(*(np.asarray(T, np.float32) for T in (T_base_world, T_seen_world)))
+    if mismatch.measures_otherwise:
+        noise = OtherNoise(*(np.asarray(n, np.float32) for n in (mismatch.depth_noise, mismatch.missing_depth)))
+    return None if place is None and noise is None else Sensing(place, noise)
+
+
+def true_camera(camera: Camera, sensing: Sensing | None) -> Camera:
+    """A camera where it is in the world, from where the planner takes it to be."""
+    if sensing is None or sensing.place is None:
+        return camera
+    T_world_seen = inverse(jnp.asarray(sensing.place.T_seen_world))
+    rotation = matmul(T_world_seen[:3, :3], jnp.array(camera.rotation))
+    position = transform(T_world_seen, jnp.array(camera.position))
+    rows = tuple(tuple(rotation[i, j] for j in range(3)) for i in range(3))
+    return dataclasses.replace(camera, rotation=rows, position=tuple(position[i] for i in range(3)))
+
+
+def as_seen(bodies: Bodies, sensing: Sensing | None) -> Bodies:
+    """Bodies where they seem to be to the planner."""
+    return bodies if sensing is None or sensing.place is None else _moved(bodies, sensing.place.T_seen_world)
+
+
+def in_base(bodies: Bodies, sensing: Sensing | None) -> Bodies:
+    """Bodies where they are in the frame of the robot's base."""
+    return bodies if sensing is None or sensing.place is None else _moved(bodies, sensing.place.T_base_world)
+
+
+def _moved(bodies: Bodies, T: Float[Array | np.ndarray, "*batch 4 4"]) -> Bodies:
+    T = jnp.asarray(T)[..., None, :, :]
+    return bodies.replace(
+        position=transform(T, bodies.position), rotation=matmul(T[..., :3, :3], jnp.asarray(bodies.rotation))
+    )

@@ -1,0 +1,174 @@
+"""Model mismatch: how far a simulated world is from what the planner and its trials assume (docs/method.md,
+"Model mismatch").
+
+The world's frame is that of the true shelf. The planner's frame is the robot's base, from which it takes the shelf to
+stand where its workcell says, and the camera to look from where its workcell says.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Hashable
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.config.config import Option
+from mechsearch_jax.runtime.errors import InputError, check_range
+from mechsearch_jax.runtime.options import option
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.scenario import Scenario
+from mechsearch_jax.workspace.shelf import Shelf
+
+PhysicsName = Literal["usual", "fine-step", "coarse-step", "soft-contacts", "pyramidal-cone"]
+
+# Largest shift of camera and shelf [m], and largest turn [degrees].
+FARTHEST, STEEPEST = 0.2, 20.0
+# Standard deviation of the usual depth noise [m].
+USUAL_NOISE = 0.001
+
+
+@dataclasses.dataclass(frozen=True)
+class Mismatch:
+    """How a simulated world differs from what the planner and its trials assume; by default not at all. Hashable.
+
+    Shifts have a random direction, turns a random axis; see `drawn`.
+
+    Attributes:
+      friction: factor on all sliding frictions.
+      mass: factor on the masses and inertias of all bodies on the shelf.
+      physics: contacts and time step of the simulation, one of `simulators.physics.PHYSICS`.
+      camera_shift, camera_turn: how far the camera stands [m], and how far it is turned about itself [degrees], from
+        where the planner takes it to be.
+      shelf_shift, shelf_turn: the same of robot base and camera together against the shelf and all that is on it: a
+        shift [m], and a turn [degrees] about the middle of the board.
+      depth_noise: standard deviation of the measured points' distance from the true ones [m].
+      missing_depth: share of pixels without a measurement, below 1.
+    """
+
+    friction: float = option(1.0, "factor on the simulated world's sliding frictions")
+    mass: float = option(1.0, "factor on the masses of the simulated bodies")
+    physics: PhysicsName = option("usual", "contacts and time step of the simulated world", get_args(PhysicsName))
+    camera_shift: float = option(0.0, "how far the camera stands from where it is taken to be [m]")
+    camera_turn: float = option(0.0, "by how much the camera is turned about itself [degrees]")
+    shelf_shift: float = option(0.0, "how far the shelf stands from where it is taken to be [m]")
+    shelf_turn: float = option(0.0, "by how much the shelf is turned about its middle [degrees]")
+    depth_noise: float = option(USUAL_NOISE, "standard deviation of the simulated depth camera's noise [m]")
+    missing_depth: float = option(0.0, "share of pixels for which no depth is measured")
+
+    def __post_init__(self):
+        for name, low, high, unit in (
+            ("friction", 0.01, 100.0, ""),
+            ("mass", 0.01, 100.0, ""),
+            ("camera_shift", 0.0, FARTHEST, "m"),
+            ("camera_turn", 0.0, STEEPEST, "degrees"),
+            ("shelf_shift", 0.0, FARTHEST, "m"),
+            ("shelf_turn", 0.0, STEEPEST, "degrees"),
+            ("depth_noise", 0.0, 1.0, "m"),
+            ("missing_depth", 0.0, 0.99, ""),
+        ):
+            check_range(f"Mismatch: {name}", getattr(self, name), low, high, unit)
+            # Convert to one type, for rows keep what was given.
+            object.__setattr__(self, name, float(getattr(self, name)))
+        if self.physics not in get_args(PhysicsName):
+            raise InputError(f'Mismatch: physics "{self.physics}" is unknown; use {", ".join(get_args(PhysicsName))}')
+
+    @property
+    def moves_robot(self) -> bool:
+        """Whether the robot does not stand where the planner takes it to."""
+        return bool(self.shelf_shift or self.shelf_turn)
+
+    @property
+    def moves_camera(self) -> bool:
+        """Whether the camera does not see the shelf from where the planner takes it to."""
+        return bool(self.moves_robot or self.camera_shift or self.camera_turn)
+
+    @property
+    def measures_otherwise(self) -> bool:
+        """Whether measured depth differs from the usual."""
+        return self.depth_noise != USUAL_NOISE or self.missing_depth > 0.0
+
+    @property
+    def simulates_otherwise(self) -> bool:
+        """Whether the simulator has to differ from the usual."""
+        return self.moves_robot or (self.friction, self.mass, self.physics) != (1.0, 1.0, "usual")
+
+    def mould(self) -> Hashable:
+        """A key of what is compiled: equal for mismatches that may share a batch."""
+        return self.moves_camera, self.measures_otherwise
+
+    def check(self, recognition: str, engine: str) -> None:
+        """Check that episodes with a recogniser and a simulator, by their names, can have this mismatch.
+
+        Raises:
+          InputError: they cannot.
+        """
+        if recognition == "oracle" and self.measures_otherwise:
+            raise InputError("--depth-noise and --missing-depth need an image; add --recognition masks or full")
+        if engine != "NativeSimulator" and self.simulates_otherwise:
+            raise InputError(
+                "the batch simulator cannot differ in friction, mass, physics or where the shelf stands; add "
+                "--simulator native"
+            )
+
+    def drawn(self, scenario: Scenario, seed: int, camera: Camera, shelf: Shelf) -> ActualCell:
+        """The cell of an episode, constant until its end.
+
+        Directions and axes are uniformly distributed and drawn from what the scenario holds and the episode's seed.
+        They do not depend on how far anything is shifted or turned, so that a sweep compares like with like.
+
+        Args:
+          scenario, seed: of the episode.
+          camera, shelf: as the planner takes them to be.
+        """
+        random = np.random.default_rng([abs(seed), int(scenario.content_hash, 16)])
+        vectors = random.normal(size=(4, 3))
+        camera_way, camera_axis, shelf_way, shelf_axis = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+        middle = np.array([(shelf.front + shelf.back) / 2, (shelf.right + shelf.left) / 2, shelf.board])
+        # To move robot and camera one way is to move the shelf the other way.
+        T_world_base = _motion(-self.shelf_shift * shelf_way, -self.shelf_turn * shelf_axis, middle)
+        T_base_moved = _motion(
+            self.camera_shift * camera_way, self.camera_turn * camera_axis, np.array(camera.position)
+        )
+        return ActualCell(self.friction, self.mass, self.physics, T_world_base, T_base_moved)
+
+
+class ActualCell(NamedTuple):
+    """The cell of one episode; by default as the planner assumes.
+
+    Attributes:
+      friction, mass, physics: as of `Mismatch`.
+      T_world_base: where the robot's base stands; the identity where the planner takes it to.
+      T_base_moved: what moves the camera, in the base's frame, from where the planner takes it to be to where it is.
+    """
+
+    friction: float = 1.0
+    mass: float = 1.0
+    physics: PhysicsName = "usual"
+    T_world_base: Float[np.ndarray, "4 4"] = np.eye(4)
+    T_base_moved: Float[np.ndarray, "4 4"] = np.eye(4)
+
+
+# As the planner assumes.
+ASSUMED = Mismatch()
+ASSUMED_CELL = ActualCell()
+
+
+def _motion(shift: np.ndarray, turn: np.ndarray, pivot: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """The motion that turns about a point by a rotation vector [degrees], and shifts [m]."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(np.radians(turn)).as_matrix()
+    T[:3, 3] = pivot - T[:3, :3] @ pivot + shift
+    return T
+
+
+def _option(field: dataclasses.Field[Any]) -> Option:
+    name = f"world_{field.name}" if field.name in ("friction", "mass", "physics") else field.name
+    choices = field.metadata["choices"]
+    return Option(name, (field.name,), str if choices else float, field.metadata["help"], choices)
+
+
+# On the command line; paths lead from a `Mismatch`.
+MISMATCH_OPTIONS: tuple[Option, ...] = tuple(map(_option, dataclasses.fields(Mismatch)))

@@ -1,0 +1,281 @@
+"""Worlds that are not as the planner assumes: what the simulator and the camera make of a `Mismatch`."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from stage import HIDDEN, Stage
+
+from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
+from mechsearch_jax.envs.camera.sensing import sensing_of, true_camera
+from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
+from mechsearch_jax.envs.episode.closed_loop import Listeners, Start
+from mechsearch_jax.envs.episode.episodes import run_episodes, target_of
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.simulators.native import NativeSimulator
+from mechsearch_jax.envs.simulators.native_world import NativeWorld
+from mechsearch_jax.envs.simulators.physics import COARSE_STEP, FINE_STEP, PHYSICS
+from mechsearch_jax.envs.simulators.simulator import controls, resampled
+from mechsearch_jax.envs.world.mismatch import ASSUMED, ASSUMED_CELL, MISMATCH_OPTIONS, Mismatch
+from mechsearch_jax.envs.world.world import TARGET, from_scenario
+from mechsearch_jax.images.cloud import shelf_view
+from mechsearch_jax.images.noise import no_noise
+from mechsearch_jax.robot.motion import Reference
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.shapes import in_order
+from mechsearch_jax.workspace import scenario
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+CAMERA, SHELF = Camera(), Shelf()
+SCENE = scenario.load_scenario(scenario.example_scenarios()["first-light"])
+MIDDLE = np.array([(SHELF.front + SHELF.back) / 2, (SHELF.right + SHELF.left) / 2, SHELF.board])
+
+
+def cell_of(mismatch, scene=SCENE, seed=0):
+    return mismatch.drawn(scene, seed, CAMERA, SHELF)
+
+
+def sensed(mismatch, seed=0):
+    return sensing_of(mismatch, cell_of(mismatch, seed=seed))
+
+
+def snapshot(mismatch=ASSUMED):
+    return Snapshot(CAMERA, SHELF, from_scenario(SCENE), sensing=sensed(mismatch))
+
+
+def degrees(rotation):
+    return np.degrees(np.arccos(np.clip((np.trace(np.asarray(rotation, float)) - 1) / 2, -1, 1)))
+
+
+def model_of(cell):
+    world = NativeWorld()
+    world.reset(SCENE, cell)
+    return world._model, world._data
+
+
+def test_by_default_nothing_differs():
+    cell = cell_of(ASSUMED)
+    np.testing.assert_array_equal(cell.T_world_base, np.eye(4))
+    np.testing.assert_array_equal(cell.T_base_moved, np.eye(4))
+    assert sensing_of(ASSUMED, cell) is None
+    assert true_camera(CAMERA, None) is CAMERA
+    usual, neutral = (model_of(c)[0] for c in (ASSUMED_CELL, cell))
+    buffers = [np.empty(mujoco.mj_sizeModel(usual), np.uint8) for _ in range(2)]
+    for compiled, buffer in zip((usual, neutral), buffers, strict=True):
+        mujoco.mj_saveModel(compiled, None, buffer)
+    np.testing.assert_array_equal(*buffers)
+
+
+def test_friction_and_mass_are_what_mujoco_sees():
+    usual, _ = model_of(ASSUMED_CELL)
+    other, _ = model_of(cell_of(Mismatch(friction=2.0, mass=0.5)))
+    np.testing.assert_allclose(other.geom_friction[:, 0], 2.0 * usual.geom_friction[:, 0])
+    np.testing.assert_array_equal(other.geom_friction[:, 1:], usual.geom_friction[:, 1:])
+    used = [usual.body(f"body{i}").id for i in (0, TARGET)]
+    np.testing.assert_allclose(other.body_mass[used], 0.5 * usual.body_mass[used])
+    np.testing.assert_allclose(other.body_inertia[used], 0.5 * usual.body_inertia[used])
+    links = [usual.body(f"link{i}").id for i in range(1, 8)]
+    np.testing.assert_array_equal(other.body_mass[links], usual.body_mass[links])
+
+
+def test_directions_belong_to_scene_and_seed_not_to_lengths():
+    near, far = (cell_of(Mismatch(shelf_shift=d, camera_shift=2 * d)) for d in (0.01, 0.02))
+    np.testing.assert_allclose(2 * near.T_world_base[:3, 3], far.T_world_base[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(2 * near.T_base_moved[:3, 3], far.T_base_moved[:3, 3], atol=1e-12)
+    assert np.linalg.norm(far.T_base_moved[:3, 3]) == pytest.approx(0.04)
+    same = cell_of(Mismatch(shelf_shift=0.01), dataclasses.replace(SCENE, name="renamed"))
+    np.testing.assert_array_equal(same.T_world_base, near.T_world_base)
+    for other in (cell_of(Mismatch(shelf_shift=0.01), seed=1), cell_of(Mismatch(shelf_shift=0.01), HIDDEN)):
+        assert np.abs(other.T_world_base - near.T_world_base).max() > 1e-4
+
+
+def test_a_base_that_is_turned_moves_the_hand_against_the_shelf():
+    _, usual = model_of(ASSUMED_CELL)
+    mismatch = Mismatch(shelf_shift=0.02, shelf_turn=3.0)
+    cell = cell_of(mismatch)
+    _, other = model_of(cell)
+    before, after = (data.site("gripper") for data in (usual, other))
+    expected = cell.T_world_base @ np.append(before.xpos, 1.0)
+    np.testing.assert_allclose(after.xpos, expected[:3], atol=1e-12)
+    turn = after.xmat.reshape(3, 3) @ before.xmat.reshape(3, 3).T
+    np.testing.assert_allclose(turn, cell.T_world_base[:3, :3], atol=1e-12)
+    assert degrees(turn) == pytest.approx(3.0)
+    # What stands on the board stays, and so does the board's middle but for the shift.
+    np.testing.assert_array_equal(other.joint("body0").qpos, usual.joint("body0").qpos)
+    moved = cell.T_world_base[:3, :3] @ MIDDLE + cell.T_world_base[:3, 3] - MIDDLE
+    assert np.linalg.norm(moved) == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("name", ["camera_shift", "shelf_shift"])
+def test_a_shift_moves_what_the_oracle_sees_by_as_much(name):
+    seen, truth = oracle(jax.random.key(0), snapshot(Mismatch(**{name: 0.03}))), oracle(jax.random.key(0), snapshot())
+    shift = np.asarray(seen.objects.position - truth.objects.position)[np.asarray(truth.objects.valid)]
+    np.testing.assert_allclose(np.linalg.norm(shift, axis=1), 0.03, atol=1e-6)
+    np.testing.assert_allclose(seen.target_pose[:2] - truth.target_pose[:2], shift[0, :2], atol=1e-6)
+    np.testing.assert_array_equal(seen.objects.valid, truth.objects.valid)
+    cell = cell_of(Mismatch(**{name: 0.03}))
+    way = -(cell.T_base_moved if name == "camera_shift" else cell.T_world_base)[:3, 3]
+    np.testing.assert_allclose(shift, np.broadcast_to(way, shift.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize("mismatch", [Mismatch(camera_turn=2.0, camera_shift=0.02), Mismatch(shelf_turn=2.0)])
+def test_an_image_shows_bodies_where_the_oracle_sees_them(mismatch):
+    masks = dataclasses.replace(recogniser("masks", target_of(SCENE)), noise=no_noise)
+    shot, keys = snapshot(mismatch), jax.random.split(jax.random.key(0))
+    image = labelled(keys, masks, shelf_view(CAMERA, SHELF), SHELF, shot.world, jnp.array(False), 0.0, shot.sensing)
+    points, labels = np.asarray(image.points), np.asarray(image.labels)
+    seen, there = oracle(jax.random.key(0), shot).objects, snapshot().world
+    for slot in np.flatnonzero(seen.valid):
+        inside = points[labels == slot]
+        assert len(inside) > 100
+        outside = np.array(
+            [beyond(at.rotation[slot], at.position[slot], shot.world, slot, inside) for at in (seen, there)]
+        )
+        assert np.abs(outside[0]).max() < 1e-4
+        assert np.abs(outside[1]).max() > 5e-3
+
+
+def beyond(rotation, position, world, slot, points):
+    """How far points lie outside of a body's faces at a pose [m]."""
+    local = (points - np.asarray(position)) @ np.asarray(rotation)
+    half = np.asarray(world.half_size[slot])
+    if in_order()[int(world.kind[slot])].name == "cylinder":
+        return np.maximum(np.linalg.norm(local[:, :2], axis=1) - half[0], np.abs(local[:, 2]) - half[2])
+    return (np.abs(local) - half).max(axis=1)
+
+
+def test_a_camera_that_is_shifted_shifts_recognised_poses():
+    masks = recogniser("masks", target_of(SCENE))
+    shift = Mismatch(camera_shift=0.03)
+    seen, truth = (masks(jax.random.key(0), snapshot(mismatch)).objects for mismatch in (shift, ASSUMED))
+    way = -cell_of(shift).T_base_moved[:3, 3]
+    both = np.asarray(seen.valid & truth.valid)
+    assert both.any()
+    # Recognised objects stand on the board, wherever they seem to be.
+    offset = np.median(np.asarray(seen.position - truth.position)[both], axis=0)
+    np.testing.assert_allclose(offset[:2], way[:2], atol=0.01)
+
+
+def test_depth_noise_and_missing_depth_are_as_given():
+    masks, view = recogniser("masks", target_of(SCENE)), shelf_view(CAMERA, SHELF)
+    keys = jax.random.split(jax.random.key(0))
+
+    def points(mismatch):
+        shot = snapshot(mismatch)
+        return np.asarray(labelled(keys, masks, view, SHELF, shot.world, jnp.array(False), 0.0, shot.sensing).points)
+
+    usual, exact, noisy = points(ASSUMED), points(Mismatch(depth_noise=0.0)), points(Mismatch(depth_noise=0.005))
+    lost = points(Mismatch(missing_depth=0.2))
+    there = np.isfinite(exact).all(axis=-1)
+    for measured, deviation in ((usual, 0.001), (noisy, 0.005)):
+        distance = np.linalg.norm((measured - exact)[there], axis=-1)
+        assert np.sqrt(np.mean(distance**2)) == pytest.approx(deviation, rel=0.03)
+    missing = ~np.isfinite(lost).all(axis=-1)
+    assert missing[there].mean() == pytest.approx(0.2, abs=0.01)
+    # The other pixels measure what they do without.
+    np.testing.assert_allclose(lost[there & ~missing], usual[there & ~missing], atol=1e-6)
+
+
+def test_what_cannot_be_simulated_is_refused():
+    with pytest.raises(InputError, match="friction"):
+        Mismatch(friction=0.0)
+    with pytest.raises(InputError, match="camera_turn"):
+        Mismatch(camera_turn=90.0)
+    with pytest.raises(InputError, match='"jelly" is unknown; use usual'):
+        Mismatch(physics="jelly")
+    for mismatch in (Mismatch(depth_noise=0.002), Mismatch(missing_depth=0.1)):
+        with pytest.raises(InputError, match="--recognition masks or full"):
+            Method(mismatch=mismatch).check()
+        Method(recognition="masks", mismatch=mismatch).check()
+    physical = (Mismatch(friction=2.0), Mismatch(mass=2.0), Mismatch(shelf_shift=0.01), Mismatch(physics="fine-step"))
+    for mismatch in physical:
+        with pytest.raises(InputError, match="add --simulator native"):
+            Method(engine="MjxSimulator", mismatch=mismatch).check()
+        Method(mismatch=mismatch).check()
+    Method(engine="MjxSimulator", mismatch=Mismatch(camera_shift=0.01)).check()
+
+
+def test_rows_keep_what_differs_alone():
+    assert Method(mismatch=Mismatch()).options() == Method().options()
+    method = Method(recognition="masks", mismatch=Mismatch(friction=2, camera_turn=1.5, physics="soft-contacts"))
+    added = {name: value for name, value in method.options().items() if name not in Method().options()}
+    assert added == {"mismatch.friction": 2.0, "mismatch.camera_turn": 1.5, "mismatch.physics": "soft-contacts"}
+    assert Method.of_options(method.options()) == method
+    assert {option.path[0] for option in MISMATCH_OPTIONS} == {f.name for f in dataclasses.fields(Mismatch)}
+
+
+def test_what_is_data_compiles_nothing():
+    def mould(**mismatch):
+        return Method(recognition="masks", mismatch=Mismatch(**mismatch)).mould()
+
+    assert mould(friction=0.5) == mould(friction=2.0, mass=2.0, physics="fine-step") == mould()
+    assert mould(camera_shift=0.01) == mould(camera_turn=2.0, friction=2.0) == mould(shelf_shift=0.01)
+    assert mould(depth_noise=0.002) == mould(missing_depth=0.1)
+    assert len({mould(), mould(camera_shift=0.01), mould(depth_noise=0.002)}) == 3
+
+
+def test_every_world_of_a_simulator_has_its_own_cell():
+    simulator = NativeSimulator()
+    simulator.set_cells({0: cell_of(Mismatch(friction=2.0))})
+    world = simulator.reset([SCENE, SCENE])
+    frictions = [w._model.geom_friction[:, 0] for w in simulator._worlds]
+    np.testing.assert_allclose(frictions[0], 2.0 * frictions[1])
+    # An action that is undone is undone in the same cell.
+    simulator.load(world, np.array([True, True]))
+    np.testing.assert_allclose(simulator._worlds[0]._model.geom_friction[:, 0], frictions[0])
+    simulator.set_cells({0: ASSUMED_CELL})
+    simulator.replace({0: SCENE})
+    np.testing.assert_array_equal(simulator._worlds[0]._model.geom_friction[:, 0], frictions[1])
+
+
+def test_another_simulator_refuses_another_cell(problem):
+    starts = [Start(HIDDEN, 0, mismatch=Mismatch(mass=2.0))]
+    with pytest.raises(InputError, match="Stage: cannot differ"):
+        run_episodes(starts, problem, None, Stage(), 1, Listeners(lambda ended: None))
+
+
+def test_a_reference_may_have_other_steps():
+    t = 0.004 * np.arange(1, 101)
+    q = np.sin(t)[:, None] * np.ones(7)
+    reference = Reference(
+        q=np.concatenate([q, q[-1:]]),
+        velocity=np.concatenate([np.cos(t)[:, None] * np.ones(7), np.zeros((1, 7))]),
+        fingers=np.linspace(0.04, 0.0, 101),
+        start=np.append(np.zeros(7), 0.04),
+        length=np.int32(100),
+        closed=np.int32(50),
+        opens=np.int32(100),
+    )
+    assert resampled(reference, 0.004, 0.004) is reference
+    for step in (0.002, 0.005):
+        other = resampled(reference, 0.004, step)
+        rows = round(0.4 / step)
+        assert (int(other.length), int(other.closed), int(other.opens)) == (rows, rows // 2, rows)
+        np.testing.assert_allclose(other.q[:, 3], np.sin(step * np.arange(1, rows + 1)), atol=1e-5)
+        assert controls(other).shape == (rows, 9)
+
+
+def test_physics_change_the_model():
+    usual, _ = model_of(ASSUMED_CELL)
+    changed = {name: model_of(cell_of(Mismatch(physics=name)))[0] for name in PHYSICS}
+    assert changed["fine-step"].opt.timestep == FINE_STEP
+    assert changed["coarse-step"].opt.timestep == COARSE_STEP
+    assert changed["pyramidal-cone"].opt.cone != usual.opt.cone
+    assert (changed["soft-contacts"].geom_solref[:, 0] > usual.geom_solref[:, 0]).all()
+    assert usual.opt.timestep == changed["usual"].opt.timestep == 0.004
+
+
+@pytest.mark.parametrize("name", PHYSICS)
+def test_all_physics_come_to_rest(name):
+    world = NativeWorld()
+    world.reset(SCENE, cell_of(Mismatch(physics=name)))
+    outcome = world.settle()
+    assert outcome.settled
+    assert not outcome.fallen.any()
+    before = from_scenario(SCENE)
+    shift = np.linalg.norm(np.asarray(world.world.position - before.position), axis=1)[np.asarray(before.valid)]
+    assert shift.max() < 0.003
