@@ -26,12 +26,12 @@ from mechsearch_jax.commands.evaluate import evaluate
 from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
 from mechsearch_jax.commands.options import EpisodeOptions, with_planner_options
 from mechsearch_jax.commands.plan import plan
+from mechsearch_jax.commands.recordings import video, view
 from mechsearch_jax.commands.report import report
 from mechsearch_jax.commands.reproduce import reproduce
 from mechsearch_jax.commands.search import search
+from mechsearch_jax.commands.study import study
 from mechsearch_jax.commands.sweep import SweptOptions, sweep, with_swept_options
-from mechsearch_jax.commands.video import video
-from mechsearch_jax.commands.view import view
 from mechsearch_jax.runtime.errors import InputError, nearest
 
 Commands = Mapping[str, Callable[..., None]]
@@ -55,6 +55,7 @@ COMMANDS: Commands = {
     "evaluate": evaluate,
     "sweep": sweep,
     "reproduce": reproduce,
+    "study": study,
     "report": report,
     "config": print_config,
     "doctor": doctor,

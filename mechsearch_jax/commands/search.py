@@ -17,7 +17,7 @@ from mechsearch_jax.commands.options import (
     GivenShape,
     find_scenario,
 )
-from mechsearch_jax.commands.video import make_film
+from mechsearch_jax.commands.recordings import make_film
 from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:

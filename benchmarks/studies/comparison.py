@@ -1,0 +1,171 @@
+"""What a study's rows say: rates of its variants, paired differences from the first, and one sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Hashable, Mapping, Sequence
+
+from rich.table import Table
+
+from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_interval, share_interval
+from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
+from mechsearch_jax.benchmarks.statistics.rates import scene_of
+from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.studies.studies import Study, Variant
+
+# What is compared, in the words of tables: a number for each episode.
+MEASURES: Mapping[str, Callable[[Row], float]] = {
+    "found": lambda row: row.found_step is not None,
+    "graspable": lambda row: row.graspable_step is not None,
+    "retrieved": lambda row: row.retrieved,
+    "nothing dropped": lambda row: not row.objects_fallen and not row.is_error,
+    "actions": lambda row: row.steps,
+}
+SHARES = ("found", "graspable", "retrieved", "nothing dropped")
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """A variant beside the first of its study.
+
+    Attributes:
+      variant: the method.
+      episodes, scenes: how many.
+      errors: how many of the episodes could not be run to their end; they count as failures.
+      means: of each of `MEASURES` over episodes.
+      intervals: their 95% intervals, which resample scenes; None from fewer than two scenes.
+      changes: how much more than the first variant, over the scenes and seeds that both have; empty for the first.
+      decision_seconds: mean wall time of planning for an action, on the device that ran the rows [s].
+    """
+
+    variant: Variant
+    episodes: int
+    scenes: int
+    errors: int
+    means: Mapping[str, float]
+    intervals: Mapping[str, Interval | None]
+    changes: Mapping[str, PairedDifference]
+    decision_seconds: float
+
+
+def compare(study: Study, rows: Sequence[Row], objects: int | None = None) -> list[Comparison]:
+    """The variants of which there are rows, in the order of the study.
+
+    Args:
+      study: the question.
+      rows: of any studies.
+      objects: only episodes with so many objects; all if None.
+    """
+    chosen = [row for row in rows if objects in (None, row.objects)]
+    groups = study.rows_of(chosen)
+    base = groups.get(study.baseline.label, [])
+    return [
+        _comparison(variant, groups[variant.label], base if variant is not study.baseline else [])
+        for variant in study.variants
+        if variant.label in groups
+    ]
+
+
+def _comparison(variant: Variant, rows: Sequence[Row], base: Sequence[Row]) -> Comparison:
+    scenes = list(map(scene_of, rows))
+    means, intervals, changes = {}, {}, {}
+    partners = {(scene_of(row), row.seed): row for row in base}
+    pairs = [(row, partner) for row in rows if (partner := partners.get((scene_of(row), row.seed)))]
+    shared: list[Hashable] = [scene_of(row) for row, _ in pairs]
+    for name, measure in MEASURES.items():
+        values = list(map(measure, rows))
+        means[name] = sum(values) / len(values)
+        interval = share_interval(list(map(bool, values)), scenes) if name in SHARES else mean_interval(values, scenes)
+        intervals[name] = interval
+        if pairs:
+            changes[name] = PairedDifference.of([measure(row) - measure(other) for row, other in pairs], shared)
+    actions = max(sum(row.steps for row in rows), 1)
+    return Comparison(
+        variant,
+        len(rows),
+        len(set(scenes)),
+        sum(row.is_error for row in rows),
+        means,
+        intervals,
+        changes,
+        sum(row.planning_seconds for row in rows) / actions,
+    )
+
+
+def verdict(change: PairedDifference) -> int:
+    """1 where a change is certainly above 0, -1 where it is below, 0 where its 95% interval holds 0."""
+    if change.interval is None:
+        return 0
+    low, high = change.interval
+    return int(low > 0) - int(high < 0)
+
+
+def points(change: PairedDifference) -> str:
+    """A change of a share in percentage points, with its interval."""
+    assert change.mean is not None
+    bounds = "" if change.interval is None else f" ({100 * change.interval[0]:+.1f} to {100 * change.interval[1]:+.1f})"
+    return f"{100 * change.mean:+.1f}{bounds}"
+
+
+def sentence(study: Study, comparisons: Sequence[Comparison]) -> str:
+    """What the study says of `retrieved`, in words."""
+    others = [each for each in comparisons if each.changes]
+    if not others:
+        return "There are no rows of it yet."
+    by_verdict: dict[int, list[str]] = {1: [], -1: [], 0: []}
+    for each in others:
+        change = each.changes["retrieved"]
+        shown = f"{each.variant.label} {points(change)}"
+        by_verdict[verdict(change)].append(shown if verdict(change) else each.variant.label)
+    parts = []
+    if by_verdict[-1]:
+        parts.append(f"fewer are retrieved with {_listed(by_verdict[-1])}")
+    if by_verdict[1]:
+        parts.append(f"more are retrieved with {_listed(by_verdict[1])}")
+    if by_verdict[0]:
+        parts.append(f"no difference is certain with {_listed(by_verdict[0])}")
+    text = "; ".join(parts)
+    return f"Against {study.baseline.label}, in points of retrieved: {text}."
+
+
+def _listed(parts: Sequence[str]) -> str:
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+HEADER = ("variant", "episodes", *SHARES, "actions", "retrieved, change", "graspable, change", "actions, change")
+
+
+def cells(comparison: Comparison) -> list[str]:
+    """The cells of a variant under `HEADER`."""
+    errors = f", {comparison.errors} errors" if comparison.errors else ""
+    line = [comparison.variant.label, f"{comparison.episodes}{errors}"]
+    for name in SHARES:
+        line.append(_with_interval(comparison.means[name], comparison.intervals[name], 2))
+    line.append(f"{comparison.means['actions']:.1f}")
+    if not comparison.changes:
+        return [*line, "", "", ""]
+    actions = comparison.changes["actions"]
+    assert actions.mean is not None
+    shares = [points(comparison.changes[name]) for name in ("retrieved", "graspable")]
+    return [*line, *shares, _with_interval(actions.mean, actions.interval, 1, "+")]
+
+
+def _with_interval(mean: float, interval: Interval | None, digits: int, sign: str = "") -> str:
+    bounds = "" if interval is None else f" ({interval[0]:{sign}.{digits}f} to {interval[1]:{sign}.{digits}f})"
+    return f"{mean:{sign}.{digits}f}{bounds}"
+
+
+def screen(study: Study, rows: Sequence[Row]) -> Table:
+    """The study as it is printed."""
+    comparisons = compare(study, rows)
+    title = f"\n{study.name}: {study.question}\n{sentence(study, comparisons)}"
+    table = Table(
+        box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left"
+    )
+    for name in ("", "episodes", "found", "graspable", "retrieved", "actions", "change of retrieved"):
+        table.add_column(name, justify="right" if name else "left")
+    for each in comparisons:
+        shares = [f"{each.means[name]:.2f}" for name in ("found", "graspable", "retrieved")]
+        change = points(each.changes["retrieved"]) if each.changes else ""
+        table.add_row(each.variant.label, str(each.episodes), *shares, f"{each.means['actions']:.1f}", change)
+    return table

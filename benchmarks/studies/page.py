@@ -1,0 +1,111 @@
+"""Writes docs/studies.md and its pictures from the stored runs: `python -m mechsearch_jax.benchmarks.studies.page`.
+
+Start it in a checkout. A study is shown from the stored run that has most of its variants.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from mechsearch_jax.benchmarks.pages.pages import Block, Heading, Paragraph, Picture, Table, as_markdown
+from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
+from mechsearch_jax.benchmarks.studies.comparison import HEADER, Comparison, cells, compare, sentence
+from mechsearch_jax.benchmarks.studies.declared import GROUPS
+from mechsearch_jax.benchmarks.studies.pictures import picture
+from mechsearch_jax.benchmarks.studies.studies import Study
+from mechsearch_jax.envs.scenes.scene_sets import find_set, is_chosen_on
+from mechsearch_jax.runtime.files import replacing
+
+INTRODUCTION = (
+    "Each study asks one question and compares variants of one method on the same scenes and seeds. "
+    "`python -m mechsearch_jax.benchmarks.studies.page` makes this page and its pictures from the rows in "
+    "[benchmarks/results/runs](../benchmarks/results/runs); `mechsearch study NAME --out FOLDER` runs a study, "
+    "`--dry-run` says what it would take, and `python -m mechsearch_jax.benchmarks.store.runs` stores its rows.",
+    "Unless a variant says otherwise: search-for-grasp, preset `standard`, true shapes, protocol `strict`, at most 10 "
+    "actions. Words are in the [glossary](glossary.md), verdicts in [method.md](method.md#verdicts). In brackets stand "
+    "95% intervals that resample scenes. A change is a paired difference from the first variant, over the scenes and "
+    "seeds that both have: of shares in percentage points, of actions in actions. The simulator that tries actions out "
+    "is the one that judges them, but for the studies under Robustness.",
+)
+
+
+def shown_run(study: Study, runs: Sequence[StoredRun]) -> StoredRun | None:
+    """The run that has most of a study's variants, its first one among them; the last of several; None without one."""
+    counts = [
+        (len(groups), i) for i, run in enumerate(runs) if study.baseline.label in (groups := study.rows_of(run.rows))
+    ]
+    return runs[max(counts)[1]] if counts else None
+
+
+def blocks(study: Study, run: StoredRun | None) -> list[Block]:
+    """What the page says of a study."""
+    heading = [Heading(study.name, 3), Paragraph(f"**{study.question}**")]
+    command = f"`mechsearch study {study.name} --out rows`"
+    comparisons = [] if run is None else compare(study, run.rows)
+    if run is None or len(comparisons) < 2:
+        return [*heading, Paragraph(f"Not run yet: {command}, on the scene set `{study.scenes}`.")]
+    return [
+        *heading,
+        Paragraph(sentence(study, comparisons)),
+        Picture(f"studies/{study.name}.png", study.question),
+        Table.of(HEADER, list(map(cells, comparisons))),
+        Paragraph(_source(study, run, comparisons, command)),
+    ]
+
+
+def _source(study: Study, run: StoredRun, comparisons: Sequence[Comparison], command: str) -> str:
+    rows = [row for group in study.rows_of(run.rows).values() for row in group]
+    seeds = sorted({row.seed for row in rows})
+    first = find_set(study.scenes).blocks[0].scene_name(0)
+    which = "settings were chosen on" if is_chosen_on(first) else "nothing was chosen on"
+    missing = [v.label for v in study.variants if v.label not in {c.variant.label for c in comparisons}]
+    lacks = f" Not run: {', '.join(missing)}." if missing else ""
+    devices = ", ".join(sorted({row.device or "unknown" for row in rows}))
+    return (
+        f"{command} with seed{'s' if seeds[1:] else ''} {', '.join(map(str, seeds))}; `{study.scenes}`, scenes that "
+        f"{which}; {devices}; {', '.join(sorted({row.code for row in rows}))}; "
+        f"[{run.name}](../benchmarks/results/runs/{run.name}.jsonl).{lacks}"
+    )
+
+
+def page(runs: Sequence[StoredRun]) -> str:
+    """The page in Markdown."""
+    parts: list[Block] = [Heading("Studies: ablations, baselines, robustness", 1), *map(Paragraph, INTRODUCTION)]
+    for group, studies in GROUPS.items():
+        parts.append(Heading(group))
+        for study in studies:
+            parts += blocks(study, shown_run(study, runs))
+    return as_markdown(parts)
+
+
+def pictures(runs: Sequence[StoredRun]) -> Mapping[str, tuple[Study, Sequence[Comparison]]]:
+    """The studies of which there is a picture, with what it shows, by name."""
+    shown = {}
+    for study in (study for studies in GROUPS.values() for study in studies):
+        run = shown_run(study, runs)
+        comparisons = [] if run is None else compare(study, run.rows)
+        if len(comparisons) > 1:
+            shown[study.name] = study, comparisons
+    return shown
+
+
+def main() -> None:
+    """Rewrite the page and its pictures."""
+    parser = argparse.ArgumentParser(description="Write docs/studies.md and its pictures from the stored runs.")
+    parser.add_argument("--runs", default=RUNS, type=Path, help="folder of the stored runs")
+    parser.add_argument("--out", default="docs/studies.md", type=Path, help="the page; its pictures come beside it")
+    arguments = parser.parse_args()
+    runs = stored_runs(arguments.runs)
+    folder = arguments.out.with_suffix("")
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, (study, comparisons) in pictures(runs).items():
+        with replacing(folder / f"{name}.png") as file:
+            picture(study, comparisons).savefig(file, format="png", dpi=110)
+    with replacing(arguments.out) as file:
+        file.write(page(runs).encode())
+
+
+if __name__ == "__main__":
+    main()

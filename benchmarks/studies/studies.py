@@ -1,0 +1,146 @@
+"""What a study is: a question, the scenes that it is answered on, and variants of one method."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+from mechsearch_jax.benchmarks.store.rows import Row, options_of
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.scenes.scene_sets import Block, find_set, set_scenes
+from mechsearch_jax.envs.simulators.named import EngineName
+from mechsearch_jax.problem.settings import Settings, load_settings
+from mechsearch_jax.runtime.errors import InputError, nearest
+
+# Options of a variant that are no options of the planner, by their fields of `Method`.
+_OF_METHODS = ("recognition", "protocol", "mismatch")
+# What differs between the episodes of one method.
+_OF_EPISODES = frozenset(("seed", "simulator", "target"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """A method of a study.
+
+    Attributes:
+      label: in tables and pictures.
+      options: how it differs from `search-for-grasp` in preset `standard` with true shapes: the planner's options by
+        name, `preset`, and fields of `Method` (`recognition`, `protocol`, `mismatch`).
+      policy: its name.
+      value: its place on the study's axis, where that is a number.
+      config: a configuration file of another camera; the default one's settings if None.
+      engine: the simulator that it needs; any if None.
+      scenes: only the first so many of each number of objects; all if None.
+    """
+
+    label: str
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    policy: str = "search-for-grasp"
+    value: float | None = None
+    config: Path | None = None
+    engine: EngineName | None = None
+    scenes: int | None = None
+
+    def method(self, engine: EngineName = "NativeSimulator") -> Method:
+        """The method, in a simulator unless the variant needs another.
+
+        Raises:
+          InputError: an option is impossible, or what it needs is not installed.
+        """
+        settings = Settings() if self.config is None else load_settings(self.config)
+        own = {name: self.options[name] for name in _OF_METHODS if name in self.options}
+        settings = settings.with_options(**{name: v for name, v in self.options.items() if name not in own})
+        return Method(self.policy, settings.config, engine=self.engine or engine, workcell=settings.workcell, **own)
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """A question, and the variants that answer it.
+
+    Attributes:
+      name: as commands take it.
+      question: in one sentence.
+      scenes: name of a scene set.
+      variants: the first is what the others are compared with.
+      axis: what `Variant.value` is, in words and with its unit; None where variants are not on an axis.
+      logarithmic: whether the axis is.
+      by_time: whether its picture shows success against planning time.
+    """
+
+    name: str
+    question: str
+    scenes: str
+    variants: tuple[Variant, ...]
+    axis: str | None = None
+    logarithmic: bool = False
+    by_time: bool = False
+
+    @property
+    def baseline(self) -> Variant:
+        """What the others are compared with."""
+        return self.variants[0]
+
+    def scene_list(self, variant: Variant) -> list[tuple[Block, int]]:
+        """The scenes of a variant, for `scene_sets.scene_files`."""
+        scenes = set_scenes(find_set(self.scenes))
+        return [(block, index) for block, index in scenes if variant.scenes is None or index < variant.scenes]
+
+    def rows_of(self, rows: Sequence[Row]) -> dict[str, list[Row]]:
+        """The rows of each variant on the study's scenes, by its label; a variant without rows is left out.
+
+        A row is a variant's if it differs from the default in the same options. Where a variant may run in any
+        simulator, the rows of the one that ran most of them count.
+        """
+        blocks = {block.name for block in find_set(self.scenes).blocks}
+        groups: dict[tuple[Differences, str], list[Row]] = {}
+        for row in rows:
+            if row.scenario.rpartition("-")[0] in blocks:
+                options = options_of(row)
+                groups.setdefault((differences(options), options["simulator"]), []).append(row)
+        wanted = {variant.label: _differences_of(variant) for variant in self.variants}
+        ran = Counter({engine: 0 for engine in get_args(EngineName)})
+        for (difference, engine), group in groups.items():
+            ran[engine] += len(group) if difference in wanted.values() else 0
+        usual = ran.most_common(1)[0][0]
+        keys = {variant.label: (wanted[variant.label], variant.engine or usual) for variant in self.variants}
+        return {label: groups[key] for label, key in keys.items() if key in groups}
+
+
+# Options that differ from the default's, by name, as JSON.
+Differences = frozenset[tuple[str, str]]
+
+
+def differences(options: Mapping[str, Any]) -> Differences:
+    """In which options, and how, an episode differs from `search-for-grasp` in preset `standard` with true shapes."""
+    usual = _usual()
+    texts = {name: json.dumps(value) for name, value in options.items() if name not in _OF_EPISODES}
+    return frozenset((name, text) for name, text in texts.items() if text != usual.get(name))
+
+
+@functools.cache
+def _usual() -> Mapping[str, str]:
+    return {name: json.dumps(value) for name, value in Method().options().items()}
+
+
+def _differences_of(variant: Variant) -> Differences:
+    return differences(variant.method().options())
+
+
+def find_studies(names: Sequence[str], studies: Mapping[str, Study]) -> list[Study]:
+    """The studies of names, each once; "all" is every one.
+
+    Raises:
+      InputError: there is no name, or no study of a name.
+    """
+    if not names:
+        raise InputError(f"study: name one or more of {', '.join(studies)}, or all")
+    unknown = [name for name in names if name not in studies and name != "all"]
+    if unknown:
+        raise InputError(f"study: {unknown[0]} is unknown; {nearest(unknown[0], [*studies, 'all'])}")
+    chosen = studies if "all" in names else names
+    return [studies[name] for name in dict.fromkeys(chosen)]

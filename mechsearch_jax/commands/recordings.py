@@ -1,0 +1,151 @@
+"""`mechsearch video` and `mechsearch view`: a recorded episode as a film, and in the browser."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from mechsearch_jax.runtime.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mechsearch_jax.envs.recording.recording import Recording
+
+WIDTH, FPS = 960, 15
+# Largest width [pixels] and rate [frames/s].
+WIDEST, FASTEST = 3840, 60
+
+
+def video(
+    episode: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    /,
+    *,
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE.mp4|FILE.webp")],
+    width: int = WIDTH,
+    fps: int = FPS,
+    speed: float = 1.0,
+) -> None:
+    """Make the film of an episode from its recording: the robot acting, the map of f and g, what the camera saw.
+
+    Args:
+      episode: folder of `search --record` or `search --video`.
+      out: the film; its ending says what it is, H.264 or an animated WebP for a page.
+      width: of the film [pixels].
+      fps: pictures in a second.
+      speed: how many times as fast as it was everything goes.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.problem.cache import keep_compilations
+    from mechsearch_jax.runtime.files import check_writable
+    from mechsearch_jax.viz.movie import check_movie_path
+
+    check_option("video", "width", width, 320, WIDEST)
+    check_pace("video", fps, speed)
+    check_movie_path(out)
+    recording = recording_of(episode)
+    check_writable(out.parent)
+    keep_compilations()
+    make_film(recording, out, Console(highlight=False), width, fps, speed)
+
+
+def view(
+    episode: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
+    /,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    fps: int = FPS,
+    speed: float = 1.0,
+) -> None:
+    """Show an episode in the browser from its recording: the robot, what was believed, and every decision.
+
+    Args:
+      episode: folder of `search --record` or `search --video`.
+      host: address that is listened at; 0.0.0.0 is every one of this machine, for browsers on others.
+      port: of the page; the next free one where it is taken.
+      fps: moments in a second.
+      speed: how many times as fast as it was everything goes.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.viz.web import import_viser
+
+    check_option("view", "port", port, 1, 65535)
+    check_pace("view", fps, speed)
+    viser = import_viser()
+    recording = recording_of(episode)
+    from mechsearch_jax.envs.recording.viewer import Viewer
+    from mechsearch_jax.problem.cache import keep_compilations
+
+    keep_compilations()
+    console = Console(highlight=False)
+    with console.status("preparing"):
+        # It would tell its address before there is anything to be seen.
+        with contextlib.redirect_stdout(io.StringIO()):
+            server = viser.ViserServer(host, port, label=recording.heading, verbose=False)
+        viewer = Viewer(recording, server, fps, speed)
+    shown = "localhost" if host in ("127.0.0.1", "0.0.0.0") else host
+    console.print(f"http://{shown}:{server.get_port()}  (Ctrl-C ends it)", soft_wrap=True)
+    try:
+        with contextlib.suppress(KeyboardInterrupt):
+            viewer.run()
+    finally:
+        server.stop()
+
+
+def check_option(command: str, name: str, value: float | int, least: float | int, most: float | int) -> None:
+    """Check a value of an option.
+
+    Raises:
+      InputError: it is out of bounds.
+    """
+    if not least <= value <= most:
+        raise InputError(f"{command}: --{name} {value} is not between {least} and {most}")
+
+
+def check_pace(command: str, fps: int, speed: float | int) -> None:
+    """Check the frame rate and the speed.
+
+    Raises:
+      InputError: one is out of bounds.
+    """
+    check_option(command, "fps", fps, 1, FASTEST)
+    check_option(command, "speed", speed, 0.1, 20)
+
+
+def recording_of(episode: Path) -> Recording:
+    """The recording in an episode's folder.
+
+    Raises:
+      InputError: there is no recording, or it cannot be read.
+    """
+    from mechsearch_jax.envs.recording.recording import NAME, load_recording
+    from mechsearch_jax.runtime.files import is_file
+
+    if not is_file(episode / NAME):
+        raise InputError(f"{episode / NAME}: there is none; search once more with --record")
+    return load_recording(episode / NAME)
+
+
+def make_film(
+    recording: Recording, path: Path, console: Console, width: int = WIDTH, fps: int = FPS, speed: float = 1.0
+) -> None:
+    """Write a film, with a progress bar.
+
+    Raises:
+      InputError: it cannot be written.
+    """
+    from rich.progress import track
+
+    from mechsearch_jax.envs.recording.film import Film
+    from mechsearch_jax.viz.movie import save_movie
+
+    film = Film(recording, width, fps, speed)
+    save_movie(track(film, "filming", total=film.count, console=console, transient=True), path, fps)
+    console.print(str(path), soft_wrap=True)

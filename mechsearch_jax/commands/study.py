@@ -1,0 +1,80 @@
+"""`mechsearch study`: declared comparisons of variants: ablations, baselines, robustness."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from mechsearch_jax.commands.options import EpisodeOptions, at_least_one, files_of
+from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, run_jobs
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.running.evaluate import Job
+    from mechsearch_jax.benchmarks.store.rows import Row
+    from mechsearch_jax.benchmarks.studies.studies import Study
+    from mechsearch_jax.envs.simulators.named import EngineName
+
+
+def study(
+    names: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="NAME|all ...")],
+    /,
+    *,
+    out: Path,
+    scenes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    seed: tuple[int, ...] = (0,),
+    simulator: Literal["auto", "native", "mjx"] = "auto",
+    run: Annotated[RunOptions, tyro.conf.arg(name="")] = USUAL_RUN,
+) -> None:
+    """Run declared studies: which variants are compared, on which scenes, is in benchmarks/studies/declared.py.
+
+    The rows are those of evaluate, in the same kind of folder: killed and started again, it goes on where it stopped,
+    and what several studies have in common is run once. Each study is then printed, as far as its rows are there.
+
+    Args:
+      names: of studies.
+      out: folder for the results, one row for each episode.
+      scenes: only the first so many of each number of objects, for a quick look.
+      seed: one or more.
+      simulator: as evaluate has it; a variant that needs one runs in that.
+      run: how the episodes are run.
+    """
+    from mechsearch_jax.benchmarks.studies.declared import STUDIES
+    from mechsearch_jax.benchmarks.studies.studies import find_studies
+
+    at_least_one("study", scenes=scenes)
+    chosen = find_studies(names, STUDIES)
+    engine = run.engine("study", EpisodeOptions(simulator=simulator))
+    jobs = _jobs(chosen, scenes, list(dict.fromkeys(seed)), engine)
+    if run.dry_run:
+        for each in chosen:
+            print(f"{each.name}: {each.question} {len(each.variants)} variants on {each.scenes}")
+
+    def show(console: Console, rows: Sequence[Row]) -> None:
+        from mechsearch_jax.benchmarks.studies.comparison import screen
+
+        for each in chosen:
+            console.print(screen(each, rows))
+
+    run_jobs("study", jobs, out, run, simulator, show)
+
+
+def _jobs(studies: Sequence[Study], scenes: int | None, seeds: Sequence[int], engine: EngineName) -> list[Job]:
+    """The episodes of studies, each once.
+
+    Raises:
+      InputError: a variant cannot be used.
+    """
+    from mechsearch_jax.benchmarks.running.evaluate import make_jobs
+
+    jobs: dict[str, Job] = {}
+    for study in studies:
+        for variant in study.variants:
+            listed = [(block, i) for block, i in study.scene_list(variant) if scenes is None or i < scenes]
+            made = make_jobs(files_of(listed), [variant.method(engine)], seeds)
+            jobs |= {job.key: job for job in made if job.key not in jobs}
+    return list(jobs.values())
