@@ -19,11 +19,11 @@ _VIEWS = Path(__file__).parents[1] / "parts" / "views"
 STANDARD = Variant("standard")
 
 
-def _degrees(*angles: float) -> tuple[float, ...]:
+def _degrees(*angles: int) -> tuple[float, ...]:
     return tuple(math.radians(angle) for angle in angles)
 
 
-def _values(option: str, values: Sequence[float], **others: Any) -> tuple[Variant, ...]:
+def _values(option: str, values: Sequence[int | float], **others: Any) -> tuple[Variant, ...]:
     """A variant for each value of an option of the planner, the default's first."""
     return tuple(Variant(f"{option} {value:g}", {option: value, **others}, value=float(value)) for value in values)
 

@@ -22,7 +22,7 @@ INTRODUCTION = (
     "Each study asks one question and compares variants of one method on the same scenes and seeds. "
     "`python -m mechsearch_jax.benchmarks.studies.page` makes this page and its pictures from the rows in "
     "[benchmarks/results/runs](../benchmarks/results/runs); `mechsearch study NAME --out FOLDER` runs a study, "
-    "`--dry-run` says what it would take, and `python -m mechsearch_jax.benchmarks.store.runs` stores its rows.",
+    "`--dry-run` says what it would take, and `python -m mechsearch_jax.benchmarks.report.store_run` stores its rows.",
     "Unless a variant says otherwise: search-for-grasp, preset `standard`, true shapes, protocol `strict`, at most 10 "
     "actions. Words are in the [glossary](glossary.md), verdicts in [method.md](method.md#verdicts). In brackets stand "
     "95% intervals that resample scenes. A change is a paired difference from the first variant, over the scenes and "

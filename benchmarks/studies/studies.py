@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import operator
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from mechsearch_jax.benchmarks.store.rows import Row, options_of
+from mechsearch_jax.benchmarks.statistics.settings import settings_of
+from mechsearch_jax.benchmarks.store.rows import OPTIONS, Row, options_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import Block, find_set, set_scenes
 from mechsearch_jax.envs.simulators.named import EngineName
@@ -19,8 +21,8 @@ from mechsearch_jax.runtime.errors import InputError, nearest
 
 # Options of a variant that are no options of the planner, by their fields of `Method`.
 _OF_METHODS = ("recognition", "protocol", "mismatch")
-# What differs between the episodes of one method.
-_OF_EPISODES = frozenset(("seed", "simulator", "target"))
+# Columns that say what an episode ran with.
+_ran_with = operator.attrgetter("configuration", *OPTIONS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,38 +99,33 @@ class Study:
         simulator, the rows of the one that ran most of them count.
         """
         blocks = {block.name for block in find_set(self.scenes).blocks}
-        groups: dict[tuple[Differences, str], list[Row]] = {}
+        # Thousands of rows have the same few options.
+        keys_of: dict[Hashable, tuple[str, str]] = {}
+        groups: dict[tuple[str, str], list[Row]] = {}
         for row in rows:
             if row.scenario.rpartition("-")[0] in blocks:
-                options = options_of(row)
-                groups.setdefault((differences(options), options["simulator"]), []).append(row)
-        wanted = {variant.label: _differences_of(variant) for variant in self.variants}
+                ran_with = _ran_with(row)
+                if ran_with not in keys_of:
+                    options = options_of(row)
+                    keys_of[ran_with] = _key(options), options["simulator"]
+                groups.setdefault(keys_of[ran_with], []).append(row)
+        wanted = {variant.label: _variant_key(variant.method()) for variant in self.variants}
         ran = Counter({engine: 0 for engine in get_args(EngineName)})
-        for (difference, engine), group in groups.items():
-            ran[engine] += len(group) if difference in wanted.values() else 0
+        for (key, engine), group in groups.items():
+            ran[engine] += len(group) if key in wanted.values() else 0
         usual = ran.most_common(1)[0][0]
         keys = {variant.label: (wanted[variant.label], variant.engine or usual) for variant in self.variants}
         return {label: groups[key] for label, key in keys.items() if key in groups}
 
 
-# Options that differ from the default's, by name, as JSON.
-Differences = frozenset[tuple[str, str]]
+def _key(options: Mapping[str, Any]) -> str:
+    """What tells variants apart, whatever the simulator."""
+    return json.dumps(settings_of(options), sort_keys=True)
 
 
-def differences(options: Mapping[str, Any]) -> Differences:
-    """In which options, and how, an episode differs from `search-for-grasp` in preset `standard` with true shapes."""
-    usual = _usual()
-    texts = {name: json.dumps(value) for name, value in options.items() if name not in _OF_EPISODES}
-    return frozenset((name, text) for name, text in texts.items() if text != usual.get(name))
-
-
-@functools.cache
-def _usual() -> Mapping[str, str]:
-    return {name: json.dumps(value) for name, value in Method().options().items()}
-
-
-def _differences_of(variant: Variant) -> Differences:
-    return differences(variant.method().options())
+@functools.lru_cache(maxsize=4096)
+def _variant_key(method: Method) -> str:
+    return _key(method.options())
 
 
 def find_studies(names: Sequence[str], studies: Mapping[str, Study]) -> list[Study]:

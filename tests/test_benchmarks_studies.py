@@ -1,0 +1,152 @@
+"""Studies: every declared variant can be run, rows go to their variants, and the page says what they say."""
+
+import dataclasses
+import random
+
+import pytest
+from test_benchmarks_stored_runs import row_of
+
+from mechsearch_jax.benchmarks.report.store_run import run_of
+from mechsearch_jax.benchmarks.studies import page
+from mechsearch_jax.benchmarks.studies.comparison import compare, screen, sentence
+from mechsearch_jax.benchmarks.studies.declared import GROUPS, STUDIES
+from mechsearch_jax.benchmarks.studies.pictures import picture
+from mechsearch_jax.benchmarks.studies.studies import Study, Variant, find_studies
+from mechsearch_jax.commands.main import parse
+from mechsearch_jax.envs.scenes.scene_sets import SETS, is_chosen_on
+from mechsearch_jax.runtime.errors import InputError
+
+STUDY = Study("gamma", "Does it matter?", "development", (Variant("0.9"), Variant("0.5", {"gamma": 0.5})), axis="gamma")
+
+
+def rows_of(variant, share, seed=0, engine="MjxSimulator", scenes=25, first=0):
+    """Rows of a variant on scenes of `development`, of which a share is retrieved."""
+    draw = random.Random(first)
+    rows = []
+    for i in range(scenes):
+        for count in (2, 8):
+            reached = draw.random() < share
+            fields = {"retrieved": reached, "steps": 3 if reached else 10}
+            rows.append(row_of(f"development-{count}-{i:03d}", variant.method(), seed, **fields))
+    return [
+        dataclasses.replace(row, configuration=row.configuration.replace('"NativeSimulator"', f'"{engine}"'))
+        for row in rows
+    ]
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=lambda study: study.name)
+def test_every_declared_variant_can_be_run_and_differs_from_the_others(study):
+    assert study.scenes in SETS
+    assert study.question.endswith(("?", "."))
+    labels = [variant.label for variant in study.variants]
+    assert len(set(labels)) == len(labels)
+    methods = {}
+    for variant in study.variants:
+        method = variant.method()
+        options = {**method.options(), "engine": method.engine}
+        assert options not in methods.values(), variant.label
+        methods[variant.label] = options
+    values = [variant.value for variant in study.variants]
+    assert (study.axis is None) == all(value is None for value in values)
+    assert study.axis is None or None not in values
+
+
+def test_ablations_leave_the_scenes_to_report_with_unseen():
+    for group, studies in GROUPS.items():
+        for study in studies:
+            first = SETS[study.scenes].blocks[0].scene_name(0)
+            assert is_chosen_on(first) == (group == "Ablations"), study.name
+
+
+def test_names_are_found_and_others_refused():
+    assert [study.name for study in find_studies(["gamma", "mass", "gamma"], STUDIES)] == ["gamma", "mass"]
+    assert find_studies(["all"], STUDIES) == list(STUDIES.values())
+    for names, told in (([], "name one or more of gamma"), (["gama"], "gama is unknown; did you mean gamma")):
+        with pytest.raises(InputError, match=told):
+            find_studies(names, STUDIES)
+
+
+def test_a_row_goes_to_the_variant_that_it_ran_with():
+    base, other = STUDY.variants
+    strange = rows_of(Variant("", {"gamma": 0.5, "horizon": 2}), 1.0)
+    elsewhere = [row_of("c2-2-000", base.method())]
+    groups = STUDY.rows_of([*rows_of(base, 0.5), *rows_of(other, 0.5), *strange, *elsewhere])
+    assert {label: len(rows) for label, rows in groups.items()} == {"0.9": 50, "0.5": 50}
+    assert {row.gamma for row in groups["0.5"]} == {0.5}
+
+
+def test_rows_of_one_simulator_are_compared():
+    base, other = STUDY.variants
+    native = rows_of(base, 0.0, engine="NativeSimulator", scenes=5)
+    groups = STUDY.rows_of([*native, *rows_of(base, 1.0), *rows_of(other, 1.0)])
+    assert all(row.retrieved for rows in groups.values() for row in rows)
+    needing = dataclasses.replace(base, engine="NativeSimulator")
+    study = dataclasses.replace(STUDY, variants=(needing, other))
+    assert not any(row.retrieved for row in study.rows_of([*native, *rows_of(base, 1.0)])["0.9"])
+
+
+def test_changes_are_those_of_the_same_scenes_and_seeds():
+    base, other = STUDY.variants
+    worse = [dataclasses.replace(row, retrieved=False) if i < 10 else row for i, row in enumerate(rows_of(other, 1.0))]
+    # Rows of another seed have no partner.
+    rows = [*rows_of(base, 1.0), *worse, *rows_of(other, 0.0, seed=1)]
+    first, second = compare(STUDY, rows)
+    assert (first.episodes, first.changes, second.episodes) == (50, {}, 100)
+    change = second.changes["retrieved"]
+    assert (change.pairs, change.losses, change.gains) == (50, 10, 0)
+    assert change.mean == pytest.approx(-0.2)
+    assert first.means["retrieved"] == 1.0
+    assert second.means["retrieved"] == pytest.approx(0.4)
+    assert "fewer are retrieved with 0.5 -20.0 (" in sentence(STUDY, [first, second])
+    (second_8,) = (each for each in compare(STUDY, rows, objects=8) if each.changes)
+    assert second_8.episodes == 50
+    assert screen(STUDY, rows).row_count == 2
+
+
+def test_an_error_is_neither_retrieved_nor_free_of_drops():
+    base = STUDY.variants[0]
+    failed = [
+        dataclasses.replace(row, failure="error: x", objects_fallen=None, retrieved=False) for row in rows_of(base, 1)
+    ]
+    (only,) = compare(STUDY, failed)
+    assert (only.errors, only.means["nothing dropped"]) == (50, 0.0)
+
+
+def test_what_is_the_same_within_chance_is_called_so():
+    base, other = STUDY.variants
+    text = sentence(STUDY, compare(STUDY, [*rows_of(base, 0.5, first=1), *rows_of(other, 0.5, first=2)]))
+    assert text.endswith("no difference is certain with 0.5.")
+
+
+def test_the_page_shows_the_run_that_has_most_of_a_study_and_says_what_is_not_there():
+    gamma = STUDIES["gamma"]
+    old = run_of("old", rows_of(gamma.variants[0], 1.0), command="x")
+    new = run_of("new", [row for variant in gamma.variants[:3] for row in rows_of(variant, 0.8)], command="x")
+    text = page.page([old, new])
+    assert "[new](../benchmarks/results/runs/new.jsonl)" in text
+    assert "runs/old.jsonl" not in text
+    assert "Not run: gamma 0.7, gamma 0.8, gamma 1." in text
+    assert text.count("Not run yet") == len(STUDIES) - 1
+    assert "scenes that settings were chosen on" in text
+    assert set(page.pictures([old, new])) == {"gamma"}
+
+
+@pytest.mark.parametrize("name", ["gamma", "actions", "baselines"])
+def test_pictures_are_drawn(name, tmp_path):
+    study = STUDIES[name]
+    scenes = dataclasses.replace(study, scenes="development")
+    rows = [row for variant in study.variants[:4] for row in rows_of(variant, 0.7)]
+    figure = picture(scenes, compare(scenes, rows))
+    figure.savefig(tmp_path / "x.png")
+    (axes,) = figure.axes
+    assert axes.get_xlabel()
+    assert (tmp_path / "x.png").stat().st_size > 5000
+
+
+def test_the_command_says_what_it_would_do(capsys, tmp_path):
+    parse(["study", "gamma", "--scenes", "1", "--out", str(tmp_path / "rows"), "--dry-run", "--simulator", "native"])()
+    told = capsys.readouterr().out
+    assert "gamma: Does the discount of later actions matter? 6 variants on development" in told
+    assert "6 variants, 24 episodes" in told
+    assert "1 compilation" in told
+    assert not (tmp_path / "rows").exists()
