@@ -597,7 +597,7 @@ def test_impossible_options_are_refused_with_what_would_do(changes, message):
     [
         (
             "guess",
-            'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, greedy, mctx, or an import',
+            'policy "guess" is unknown; use search-for-grasp, search-and-grasp, random, greedy, most-occluding, mctx',
         ),
         ("no_such_lab.policies:Mine", "cannot be imported .*no_such_lab"),
         ("mechsearch_jax.planner:Nobody", "cannot be imported .*Nobody"),
@@ -625,6 +625,7 @@ def test_a_found_target_that_nothing_blocks_is_taken_out(problem):
         (planner.search_and_grasp, 0.0),
         (planner.random_action, 0.0),
         (planner.greedy, 0.0),
+        (planner.most_occluding, 0.0),
     ):
         decision = factory()(jax.random.key(0), problem, belief, seen(nothing, True, pose))
         assert int(decision.action.kind) == ActionKind.RETRIEVE

@@ -142,6 +142,11 @@ class Rollout:
         scene = self.drawn_in(self.present, state).scene
         return all_candidates(self.problem.space, scene, possible, state.candidates, moved, state.able)
 
+    def up_to_date(self, state: State) -> State:
+        """Bring f, g and the candidate actions of a state up to date after `state.moved` moved."""
+        state = self.update(state, state.moved)
+        return state.replace(candidates=self.candidates(state, state.moved))
+
     def cost(self, state: State) -> Float[Array, ""]:
         """J of a state that is up to date."""
         return self.objective.cost(self.problem, self.belief, state, self.config.weights)

@@ -62,17 +62,11 @@ def import_mctx() -> ModuleType:
     return mctx
 
 
-def _up_to_date(rollout: Rollout, state: State) -> State:
-    """Bring f, g and the candidate actions of a state up to date after `state.moved` moved."""
-    state = rollout.update(state, state.moved)
-    return state.replace(candidates=rollout.candidates(state, state.moved))
-
-
 def _step(rollout: Rollout, key: Array, index: Array, node: Node) -> Node:
     """The node that the action of an index leads to; an index always means the same action."""
     draw = jax.random.fold_in(jax.random.wrap_key_data(node.key), index)
     changes, action, penalty = rollout.act(node.depth == 0, node.state, draw)
-    state = _up_to_date(rollout, node.state.replace(**changes))
+    state = rollout.up_to_date(node.state.replace(**changes))
     return Node(
         state=state,
         key=jax.random.key_data(key),
@@ -109,7 +103,7 @@ def tree_plan(rollout: Rollout, key: Array, objects: Superquadrics) -> Decision:
     """
     mctx, config = import_mctx(), rollout.config
     key_root, key_search = jax.random.split(key)
-    state = _up_to_date(rollout, rollout.root(objects))
+    state = rollout.up_to_date(rollout.root(objects))
     cost = rollout.cost(state)
     begin = Node(state, jax.random.key_data(key_root), jnp.int32(0), cost, no_action(), jnp.float32(0.0))
     # `mctx` expects a batch axis, here of length 1.

@@ -1,0 +1,135 @@
+"""The baseline that moves the object that occludes most: which object that is, and which is next if it cannot move."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mechsearch_jax import planner
+from mechsearch_jax.actions import ActionKind
+from mechsearch_jax.dynamics.quasi_static import QuasiStatic
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.planner.occlusion import EACH, NEXT, most_occluding_first, weights_in_order
+from mechsearch_jax.planner.prediction import PredictByKind
+from mechsearch_jax.workspace import scenario
+
+# Far from each other: one that hides much, one that hides some, one that hides little.
+SIZES = {"wide": ((0.03, 0.06, 0.08), 0.1), "narrow": ((0.025, 0.03, 0.06), 0.3), "low": ((0.02, 0.02, 0.05), -0.15)}
+ORDERS = (("wide", "narrow", "low"), ("low", "wide", "narrow"), ("narrow", "low", "wide"))
+POLICY = planner.most_occluding(push_model=QuasiStatic(), sequences=12)
+
+
+def body(name):
+    half_size, y = SIZES[name]
+    return scenario.Body("box", half_size, (0.5, y, 0.4045 + half_size[2]), (1.0, 0.0, 0.0, 0.0))
+
+
+def seen(names, pose=None):
+    """What is observed of objects, and of a target at a pose; of a hidden target without one."""
+    objects = scenario.superquadrics([body(name) for name in names])
+    return Observation(objects, jnp.array(pose is not None), jnp.float32(pose or (0.0, 0.0, 0.0)))
+
+
+def look(problem, observation):
+    return planner.update_belief(problem, planner.initial_belief(problem), observation)
+
+
+def decided(problem, names, seed=0, policy=POLICY, pose=None):
+    observation = seen(names, pose)
+    return policy.planned(jax.random.key(seed), problem, look(problem, observation), observation)
+
+
+def object_of(decision, names):
+    assert int(decision.action.kind) in (ActionKind.PUSH, ActionKind.PICK_AND_PLACE)
+    return names[int(decision.action.object)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stuck:
+    """A model in which the object at an index cannot be moved."""
+
+    index: int
+
+    def __call__(self, problem, state, sample, first):
+        prediction = PredictByKind(QuasiStatic(), QuasiStatic())(problem, state, sample, first)
+        return prediction.replace(possible=prediction.possible & (sample.action.object != self.index))
+
+
+def test_weights_fall_from_each_object_to_the_next_and_ties_have_the_same():
+    occluded = jnp.float32([3.0, 40.0, 0.0, 3.0, 12.0])
+    expected = np.float32([NEXT**2, 1.0, NEXT**4, NEXT**2, NEXT])
+    np.testing.assert_allclose(weights_in_order(occluded), expected)
+    order = np.array([4, 2, 0, 1, 3])
+    np.testing.assert_allclose(weights_in_order(occluded[order]), expected[order])
+
+
+def test_actions_come_by_their_objects_and_few_of_each():
+    push, none = int(ActionKind.PUSH), int(ActionKind.NONE)
+    index = jnp.int32([1, 0, 0, 0, 2, 0, 0, 0, 1])
+    kind = jnp.int32([push, push, none, push, push, push, push, push, push])
+    value = np.asarray(most_occluding_first(kind, index, jnp.float32([30.0, 5.0, 0.0])))
+    assert EACH == 4
+    # The impossible one counts for nothing, and the fifth possible one of object 0 is left out.
+    np.testing.assert_array_equal(value, [-5.0, -30.0, np.inf, -30.0, 0.0, -30.0, -30.0, np.inf, -5.0])
+
+
+@pytest.mark.slow
+def test_the_object_that_hides_most_is_moved_in_any_order_of_the_objects(problem):
+    alone = {name: int(look(problem, seen((name,))).exists.sum()) for name in SIZES}
+    assert alone["wide"] > 1.5 * alone["narrow"] > 1.5 * alone["low"]
+    for names in ORDERS:
+        for seed in range(3):
+            decision = decided(problem, names, seed)
+            assert object_of(decision, names) == "wide"
+        hidden = {names[i]: -float(v) for i, v in first_values(decision).items()}
+        assert sorted(hidden, key=hidden.get, reverse=True) == [n for n in ("wide", "narrow", "low") if n in hidden]
+        # It hides about as much as where it stands alone.
+        assert hidden["wide"] == pytest.approx(alone["wide"], rel=0.4)
+        assert float(decision.cost) == int(look(problem, seen(names)).exists.sum())
+        assert float(decision.predicted_cost) == float(decision.cost) - hidden["wide"]
+
+
+def first_values(decision):
+    """The value of the first action of each object."""
+    sequences = jax.device_get(decision.sequences)
+    rows = [(int(i), v) for i, v in zip(sequences.actions.object[:, 0], sequences.value, strict=True) if np.isfinite(v)]
+    return dict(reversed(rows))
+
+
+@pytest.mark.slow
+def test_where_it_cannot_be_moved_the_next_one_is(problem):
+    names = ORDERS[1]
+    stuck = POLICY.replace(predict=Stuck(names.index("wide")))
+    assert {object_of(decided(problem, names, seed, stuck), names) for seed in range(3)} == {"narrow"}
+
+
+@pytest.mark.slow
+def test_once_the_target_is_found_the_object_that_blocks_most_of_its_grasps_is_moved(problem):
+    for names in ORDERS[:2]:
+        for behind in ("narrow", "wide"):
+            pose = (0.62, SIZES[behind][1], 0.0)
+            decision = decided(problem, names, pose=pose)
+            assert object_of(decision, names) == behind
+            assert float(decision.value) < 0.0
+        # The target itself is never moved.
+        assert not (decision.sequences.actions.object == len(decision.predicted.valid)).any()
+
+
+@pytest.mark.slow
+def test_in_a_batch_it_decides_as_alone(problem):
+    rows = [seen(ORDERS[0]), seen(ORDERS[1], (0.62, 0.3, 0.0)), seen(ORDERS[2])]
+    beliefs, observations = (
+        jax.tree.map(lambda *a: jnp.stack(a), *trees) for trees in ([look(problem, row) for row in rows], rows)
+    )
+    keys = jax.random.split(jax.random.key(0), len(rows))
+    together = jax.jit(jax.vmap(functools.partial(POLICY.planned, problem=problem)))(
+        keys, belief=beliefs, observation=observations
+    )
+    for i, row in enumerate(rows):
+        alone = POLICY.planned(keys[i], problem, look(problem, row), row)
+        assert int(together.action.kind[i]) == int(alone.action.kind)
+        assert int(together.action.object[i]) == int(alone.action.object)
+        np.testing.assert_allclose(together.action.T_world_gripper[i], alone.action.T_world_gripper, atol=1e-5)
