@@ -75,6 +75,23 @@ def test_a_sweep_of_one_point_is_what_evaluate_runs(jobs_of):
     assert settings_of(jobs_of("sweep", "one.json")) == settings_of(jobs_of("evaluate", "one.json"))
 
 
+def test_worlds_that_differ_are_swept_and_share_a_compilation(jobs_of):
+    plain = jobs_of("sweep", "one.json")
+    jobs = jobs_of("sweep", "one.json", "--world-friction", "0.5", "1", "2", "--world-physics", "usual", "fine-step")
+    expected = {(f, p) for f in (0.5, 1.0, 2.0) for p in ("usual", "fine-step")}
+    assert {(job.method.mismatch.friction, job.method.mismatch.physics) for job in jobs} == expected
+    assert len({job.method.mould() for job in jobs}) == 1
+    assert len({job.key for job in jobs}) == len(jobs) == 6
+    assert [job.key for job in jobs if job.method == Method()] == [job.key for job in plain]
+    (swept,), (evaluated,) = (jobs_of(command, "one.json", "--shelf-turn", "2") for command in ("sweep", "evaluate"))
+    assert swept.key == evaluated.key
+    assert swept.options["mismatch.shelf_turn"] == 2.0
+    with pytest.raises(InputError, match="add --recognition masks or full"):
+        jobs_of("sweep", "one.json", "--missing-depth", "0.1")
+    with pytest.raises(InputError, match=r"camera_shift \(1.0\) must be from 0 to 0.2 m"):
+        jobs_of("evaluate", "one.json", "--camera-shift", "1")
+
+
 def test_settings_that_come_to_the_same_are_run_once(jobs_of):
     jobs = jobs_of("sweep", "one.json", "--preset", "paper", "standard", "--actions", "paper", "--gamma", "0.9", "0.9")
     assert len(jobs) == len({job.key for job in jobs}) == 2
@@ -169,6 +186,9 @@ def test_what_a_run_would_take_is_told_and_nothing_is_run(folder, capsys):
     assert "192 x 8 s in 2 processes" in output
     assert "assumed" in output
     cli.parse(["sweep", *common, "--gamma", "0.5", "1", "--horizon", "2", "3", "--max-steps", "5", "10"])()
+    assert "8 variants, 16 episodes, 0 of them there already, 16 left\n2 compilations" in capsys.readouterr().out
+    shifts = ("--recognition", "masks", "--camera-shift", "0.01", "0.02", "--depth-noise", "0.001", "0.002")
+    cli.parse(["sweep", *common, *shifts, "--world-mass", "1", "2"])()
     assert "8 variants, 16 episodes, 0 of them there already, 16 left\n2 compilations" in capsys.readouterr().out
     cli.parse(["evaluate", *common, "--shard", "1/2"])()
     assert capsys.readouterr().out.startswith("1 variant, 1 episode, 0 of them there already, 1 left\n")

@@ -15,6 +15,7 @@ from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, 
 from mechsearch_jax.benchmarks.report import results_page
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
 from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, is_chosen_on, recorded
+from mechsearch_jax.envs.world.mismatch import ASSUMED, MISMATCH_OPTIONS
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.workspace.detector import FOUND_PIXELS
 
@@ -130,6 +131,13 @@ def test_the_options_of_the_command_line_are_all_there_with_their_defaults():
             value = PRESETS[preset]().options().get(name)
             if value is not None and name not in ("actions", "push_distances"):
                 assert said(cell) == (pytest.approx(value) if isinstance(value, list) else value), f"{name}: {cell}"
+
+
+def test_what_a_simulated_world_may_differ_in_is_all_there_with_its_default():
+    table = rows("docs/commands.md", "| option | what it sets | if not given |")
+    stated = {name: said(row[-1]) for row in table for name in re.findall(r"--([\w-]+)`", row[0])}
+    usual = {option.name.replace("_", "-"): getattr(ASSUMED, option.path[0]) for option in MISMATCH_OPTIONS}
+    assert stated == usual
 
 
 def test_the_scene_sets_are_those_that_there_are():

@@ -7,14 +7,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from stage import HIDDEN, Stage
+from stage import HIDDEN, OPEN, Stage, grab
 
 from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
 from mechsearch_jax.envs.camera.sensing import sensing_of, true_camera
 from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
-from mechsearch_jax.envs.episode.closed_loop import Listeners, Start
-from mechsearch_jax.envs.episode.episodes import run_episodes, target_of
+from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
+from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
+from mechsearch_jax.envs.episode.many_slots import ManySlots, _look
 from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.slots import OneSlot
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.simulators.physics import COARSE_STEP, FINE_STEP, PHYSICS
@@ -136,7 +138,7 @@ def test_an_image_shows_bodies_where_the_oracle_sees_them(mismatch):
             [beyond(at.rotation[slot], at.position[slot], shot.world, slot, inside) for at in (seen, there)]
         )
         assert np.abs(outside[0]).max() < 1e-4
-        assert np.abs(outside[1]).max() > 5e-3
+        assert np.abs(outside[1]).max() > 1e-3
 
 
 def beyond(rotation, position, world, slot, points):
@@ -235,7 +237,7 @@ def test_every_world_of_a_simulator_has_its_own_cell():
 def test_another_simulator_refuses_another_cell(problem):
     starts = [Start(HIDDEN, 0, mismatch=Mismatch(mass=2.0))]
     with pytest.raises(InputError, match="Stage: cannot differ"):
-        run_episodes(starts, problem, None, Stage(), 1, Listeners(lambda ended: None))
+        run_episodes(starts, problem, Method().policy(), Stage(), 1, Listeners(lambda ended: None))
 
 
 def test_a_reference_may_have_other_steps():
@@ -279,3 +281,45 @@ def test_all_physics_come_to_rest(name):
     before = from_scenario(SCENE)
     shift = np.linalg.norm(np.asarray(world.world.position - before.position), axis=1)[np.asarray(before.valid)]
     assert shift.max() < 0.003
+
+
+def seen_in(slots, problem, world, mismatches):
+    """The poses that slots see at once, of a mismatch each."""
+    slots.sense_by({row: Start(SCENE, 0, mismatch=m).sensing(problem) for row, m in enumerate(mismatches)})
+    summary = slots.look(world, jax.random.split(jax.random.key(0), len(mismatches)), range(len(mismatches)))
+    return slots._state.observation.objects.position, summary
+
+
+@pytest.mark.slow
+def test_every_slot_senses_by_itself_and_numbers_compile_nothing(problem):
+    mismatches = [Mismatch(camera_shift=0.01, shelf_shift=0.02), Mismatch(camera_shift=0.03)]
+    world = jax.tree.map(lambda a: jnp.stack([a, a]), from_scenario(SCENE))
+    slots = ManySlots(problem, Method().policy(), oracle, world, 2)
+    many, summary = seen_in(slots, problem, world, mismatches)
+    for row, mismatch in enumerate(mismatches):
+        one = OneSlot(problem, Method().policy(), oracle)
+        one.sense_by({0: Start(SCENE, 0, mismatch=mismatch).sensing(problem)})
+        alone = one.look(jax.tree.map(lambda a: a[:1], world), jax.random.split(jax.random.key(0), 1), [0])
+        np.testing.assert_allclose(many[row], one.observation.objects.position, atol=1e-6)
+        assert (alone.size[0], alone.truth[0]) == (summary.size[row], summary.truth[row])
+    compiled = _look.jitted._cache_size()
+    other, _ = seen_in(slots, problem, world, [Mismatch(camera_turn=1.0)] * 2)
+    assert np.abs(np.asarray(other - many)).max() > 1e-3
+    assert _look.jitted._cache_size() == compiled
+    with pytest.raises(InputError, match="mismatches of one run that differ in more than numbers"):
+        seen_in(slots, problem, world, [mismatches[0], ASSUMED])
+
+
+@pytest.mark.slow
+def test_episodes_with_a_mismatch_are_the_same_alone_and_in_a_batch(problem):
+    mismatches = [Mismatch(friction=2.0), ASSUMED, Mismatch(physics="fine-step"), Mismatch(mass=0.5)]
+    starts = [Start(OPEN, 0, mismatch=mismatch) for mismatch in mismatches]
+    settings, episodes = RunSettings(max_steps=2, at_once=2), []
+    simulator = NativeSimulator(threads=1)
+    run_episodes(starts, problem, grab, simulator, 2, Listeners(episodes.extend), settings)
+    for place, episode in episodes:
+        again = run_episode(0, OPEN, problem, grab, NativeSimulator(), max_steps=2, mismatch=mismatches[place])
+        assert episode.retrieved == again.retrieved
+        assert [step.tracking_error for step in episode.steps] == [step.tracking_error for step in again.steps]
+    errors = {place: episode.steps[-1].tracking_error for place, episode in episodes}
+    assert len(set(errors.values())) == 4

@@ -13,7 +13,8 @@ from mechsearch_jax.benchmarks.running.evaluate import Job, check_code
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.store.shards import Results
 from mechsearch_jax.envs.episode.episodes import target_of
-from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.method import MISMATCH_PREFIX, Method
+from mechsearch_jax.envs.world.mismatch import Mismatch
 from mechsearch_jax.planner import PlannerConfig
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.versions import versions
@@ -123,5 +124,8 @@ def _measured(rows: Sequence[Row], at_once: int) -> tuple[float, float]:
 def _discrete(configuration: str, target: str) -> str:
     """What is compiled, as far as the options tell."""
     options = json.loads(configuration)
-    kept = {name: value for name, value in options.items() if name not in CONTINUOUS and name != "max_steps"}
-    return json.dumps([kept, target], sort_keys=True)
+    differs = {name: value for name, value in options.items() if name.startswith(MISMATCH_PREFIX)}
+    mismatch = Mismatch(**{name.removeprefix(MISMATCH_PREFIX): value for name, value in differs.items()})
+    data = CONTINUOUS | differs.keys() | {"max_steps"}
+    kept = {name: value for name, value in options.items() if name not in data}
+    return json.dumps([kept, mismatch.mould(), target], sort_keys=True)

@@ -23,6 +23,9 @@ from mechsearch_jax.runtime.errors import InputError
 # What the options of an episode hold beside the configuration's.
 _OF_EPISODES = frozenset(("policy", "recognition", "protocol", "simulator", "target", "seed"))
 
+# Of the paths of a mismatch's settings among the options.
+MISMATCH_PREFIX = "mismatch."
+
 
 @dataclasses.dataclass(frozen=True)
 class Method:
@@ -108,7 +111,7 @@ class Method:
         pairs = (
             (self.config, PRESETS["standard"](), ""),
             (self.workcell, Workcell(), "workcell."),
-            (self.mismatch, ASSUMED, "mismatch."),
+            (self.mismatch, ASSUMED, MISMATCH_PREFIX),
         )
         unusual: dict[str, Any] = {}
         for config, standard, prefix in pairs:

@@ -222,7 +222,7 @@ def resampled(reference: Reference, timestep: float, other: float) -> Reference:
     return host.replace(
         q=between(host.start[:ARM], host.q),
         velocity=between(np.zeros(ARM), host.velocity),
-        fingers=between(host.start[ARM], host.fingers),
+        fingers=between(np.asarray(host.start[ARM]), host.fingers),
         length=np.int32(rows),
         closed=steps(host.closed),
         opens=steps(host.opens),
