@@ -81,6 +81,10 @@ WRONG = {
         ["search", "good.json", "--out", "out", "--gama", "1"],
         "--gama, 1; did you mean --gamma? (mechsearch search --help tells more)",
     ),
+    "mismatch where nothing is simulated": (
+        ["inspect", "first-light", "--out", "maps", "--world-friction", "2"],
+        "inspect: simulates no world that could differ; leave --world-... and the like out",
+    ),
     "help of the subcommand": (["bench", "plan", "--batch", "x"], "(mechsearch bench plan --help tells more)"),
     "no configuration file": (["search", "good.json", "--out", "out", "--config", "none.toml"], "none.toml: cannot be"),
     "configuration of a set": (

@@ -36,6 +36,7 @@ def inspect(
     from mechsearch_jax.workspace.scenario import Scenario, load_scenario
 
     options.only_native("inspect")
+    options.without_mismatch("inspect")
     (method,) = options.methods(("search-for-grasp",))
     workcell = method.workcell
     scenes: dict[str, Scenario] = {}

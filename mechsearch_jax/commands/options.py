@@ -128,6 +128,15 @@ class EpisodeOptions:
                 f"{command}: --simulator mjx is for batches (mechsearch evaluate); leave it out for one episode"
             )
 
+    def without_mismatch(self, command: str) -> None:
+        """Refuse a mismatch in a command that simulates no episode.
+
+        Raises:
+          InputError: an option of it is given.
+        """
+        if self.mismatch() != type(self.mismatch())():
+            raise InputError(f"{command}: simulates no world that could differ; leave --world-... and the like out")
+
 
 # Default of a command's parameter `options`, before `with_planner_options` adds the planner's.
 DEFAULTS = EpisodeOptions()

@@ -59,6 +59,7 @@ def _timing_of(subject: Literal["existence", "graspability"], what: str) -> Call
         from mechsearch_jax.benchmarks.parts import bench as benches
 
         at_least_one(f"bench {subject}", repeats=repeats, batch=batch)
+        options.without_mismatch(f"bench {subject}")
         settings = options.settings()
         _print_timing(subject, out, lambda: benches.bench_part(subject, objects, settings, batch, repeats=repeats))
 
@@ -97,6 +98,7 @@ def bench_plan(
     from mechsearch_jax.benchmarks.parts import bench as benches
 
     at_least_one("bench plan", repeats=repeats, batch=batch)
+    options.without_mismatch("bench plan")
     (chosen,) = options.methods(decides.chosen("bench plan"))
     sizes = options.settings().objects
     _print_timing("plan", out, lambda: benches.bench_plan(objects, chosen, batch, repeats=repeats, sizes=sizes))
