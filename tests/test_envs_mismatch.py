@@ -11,7 +11,7 @@ from stage import HIDDEN, OPEN, Stage, grab
 
 from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
 from mechsearch_jax.envs.camera.sensing import sensing_of, true_camera
-from mechsearch_jax.envs.camera.snapshot import Snapshot, oracle
+from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
 from mechsearch_jax.envs.episode.many_slots import ManySlots, _look
@@ -112,9 +112,10 @@ def test_a_base_that_is_turned_moves_the_hand_against_the_shelf():
     assert np.linalg.norm(moved) == pytest.approx(0.02)
 
 
+@pytest.mark.parametrize("eyes", [oracle, informed])
 @pytest.mark.parametrize("name", ["camera_shift", "shelf_shift"])
-def test_a_shift_moves_what_the_oracle_sees_by_as_much(name):
-    seen, truth = oracle(jax.random.key(0), snapshot(Mismatch(**{name: 0.03}))), oracle(jax.random.key(0), snapshot())
+def test_a_shift_moves_what_the_oracle_sees_by_as_much(eyes, name):
+    seen, truth = (eyes(jax.random.key(0), snapshot(m)) for m in (Mismatch(**{name: 0.03}), ASSUMED))
     shift = np.asarray(seen.objects.position - truth.objects.position)[np.asarray(truth.objects.valid)]
     np.testing.assert_allclose(np.linalg.norm(shift, axis=1), 0.03, atol=1e-6)
     np.testing.assert_allclose(seen.target_pose[:2] - truth.target_pose[:2], shift[0, :2], atol=1e-6)
@@ -190,8 +191,9 @@ def test_what_cannot_be_simulated_is_refused():
     with pytest.raises(InputError, match='"jelly" is unknown; use usual'):
         Mismatch(physics="jelly")
     for mismatch in (Mismatch(depth_noise=0.002), Mismatch(missing_depth=0.1)):
-        with pytest.raises(InputError, match="--recognition masks or full"):
-            Method(mismatch=mismatch).check()
+        for recognition in ("oracle", "informed"):
+            with pytest.raises(InputError, match="--recognition masks or full"):
+                Method(recognition=recognition, mismatch=mismatch).check()
         Method(recognition="masks", mismatch=mismatch).check()
     physical = (Mismatch(friction=2.0), Mismatch(mass=2.0), Mismatch(shelf_shift=0.01), Mismatch(physics="fine-step"))
     for mismatch in physical:

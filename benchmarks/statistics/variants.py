@@ -33,6 +33,11 @@ def _label(policy: str, differing: Mapping[str, str]) -> str:
     return ", ".join([policy, *(f"{name} {value}" for name, value in differing.items())])
 
 
+def _left_out(name: str) -> str:
+    """What stands for an option that a row does not have; settings by their paths are left out where they are usual."""
+    return "usual" if "." in name else "unknown"
+
+
 def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dict[str, str]]]]:
     """For each row its variant, and for each variant the policy and the options that differ."""
     variants = list(map(_variant, rows))
@@ -43,7 +48,7 @@ def _differing(rows: Sequence[Row]) -> tuple[list[Any], dict[Any, tuple[str, dic
     parts = {
         variant: (
             str(options["policy"]),
-            {name.replace("_", " "): _text(options.get(name, "unknown")) for name in differing},
+            {name.replace("_", " "): _text(options.get(name, _left_out(name))) for name in differing},
         )
         for variant, options in each.items()
     }

@@ -113,7 +113,8 @@ def informed(key: Array, snapshot: Snapshot) -> Observation:
     An upper bound on searching: the target counts as visible in every observation, so that it is found from the start.
     Ignores the key.
     """
-    return Observation(objects_on_the_board(snapshot), jnp.array(True), true_target_pose(snapshot.world))
+    objects = as_seen(objects_on_the_board(snapshot), snapshot.sensing)
+    return Observation(objects, jnp.array(True), snapshot.target_pose)
 
 
 def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:

@@ -105,7 +105,7 @@ class Mismatch:
         Raises:
           InputError: they cannot.
         """
-        if recognition == "oracle" and self.measures_otherwise:
+        if recognition in ("oracle", "informed") and self.measures_otherwise:
             raise InputError("--depth-noise and --missing-depth need an image; add --recognition masks or full")
         if engine != "NativeSimulator" and self.simulates_otherwise:
             raise InputError(
