@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
+from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, mean_intervals, share_interval, wilson
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
 
 DRAWS = 2000
@@ -107,3 +107,18 @@ def test_a_paired_difference_is_of_scenes():
     alone = PairedDifference.of([2.0], ["a"])
     assert (alone.mean, alone.standard_error, alone.interval) == (2.0, None, None)
     assert PairedDifference.of([], []).mean is None
+
+
+def test_many_intervals_at_once_are_those_of_each_alone(monkeypatch):
+    """Of as many scenes and of others, in stacks of several and of one; whole numbers to the bit."""
+    rng = np.random.default_rng(3)
+    samples = [
+        (rng.integers(0, 11, 2 * scenes).tolist(), [f"s{i}" for i in range(scenes)] * 2)
+        for scenes in (7, 30, 7, 1, 7, 0)
+    ]
+    alone = [mean_interval(*sample) for sample in samples]
+    assert mean_intervals(samples) == alone
+    assert [interval is None for interval in alone] == [False, False, False, True, False, True]
+    monkeypatch.setattr("mechsearch_jax.benchmarks.statistics.intervals.STACKED", 14)
+    assert mean_intervals(samples) == alone
+    assert mean_intervals([]) == []

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 
 import numpy as np
 import scipy.stats
@@ -17,6 +17,8 @@ from jaxtyping import Float
 
 # How often the bootstrap draws scenes, how many draws it holds in memory at once, and its seed.
 RESAMPLES, BATCH, SEED = 2000, 250, 0
+# Scenes of all samples that are drawn together: BATCH draws of them take 32 MB.
+STACKED = 16_000
 # Quantile of the normal distribution for a 95% interval.
 _Z = float(scipy.stats.norm.ppf(0.975))
 Interval = tuple[float, float]
@@ -99,17 +101,46 @@ def mean_interval(values: Sequence[int | float], scenes: Sequence[Hashable]) -> 
     Returns:
       Low and high; None below two scenes, from which it is not known how scenes differ.
     """
-    sums, counts = by_scene(values, scenes)
-    if len(sums) < 2:
-        return None
+    return mean_intervals([(values, scenes)])[0]
+
+
+def mean_intervals(
+    samples: Iterable[tuple[Sequence[int | float], Sequence[Hashable]]],
+) -> list[Interval | None]:
+    """The `mean_interval` of each of many samples, which takes less time than one after the other.
+
+    Every sample is drawn with the same seed, so that samples of the same number of scenes have their draws in common.
+
+    Args:
+      samples: values and scenes, as `mean_interval` has them.
+    """
+    pairs = [by_scene(values, scenes) for values, scenes in samples]
+    intervals: list[Interval | None] = [None] * len(pairs)
+    places: dict[int, list[int]] = {}
+    for place, (sums, _) in enumerate(pairs):
+        places.setdefault(len(sums), []).append(place)
+    for scenes, members in places.items():
+        most = max(STACKED // max(scenes, 1), 1)
+        for first in range(0, len(members) if scenes > 1 else 0, most):
+            stack = members[first : first + most]
+            for place, interval in zip(stack, _drawn_intervals([pairs[place] for place in stack]), strict=True):
+                intervals[place] = interval
+    return intervals
+
+
+def _drawn_intervals(
+    pairs: Sequence[tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]],
+) -> list[Interval]:
+    """The intervals of samples of the same number of scenes, from the sums and numbers of the scenes' values."""
     interval = scipy.stats.bootstrap(
-        (sums, counts),
+        tuple(np.stack(parts) for parts in zip(*pairs, strict=True)),
         lambda sums, counts, axis: np.sum(sums, axis) / np.sum(counts, axis),
         paired=True,
         vectorized=True,
+        axis=-1,
         n_resamples=RESAMPLES,
         batch=BATCH,
         method="percentile",
         rng=SEED,
     ).confidence_interval
-    return float(interval.low), float(interval.high)
+    return list(zip(interval.low.tolist(), interval.high.tolist(), strict=True))

@@ -94,26 +94,26 @@ def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) 
         raise InputError(f"report: no other variant shares {', '.join(names)} with the baseline {baseline}")
     # The places of the scenario's name and content in a pair; without them each pair is a scene.
     places = [names.index("scenario"), -1] if "scenario" in names else range(len(names))
-    return {
-        label: {
+    goals = (*GOALS, *(f"{goal}_steps" for goal in GOALS))
+    base_means = {goal: {pair: _mean(episodes, goal) for pair, episodes in base.items()} for goal in goals}
+    differences: dict[str, dict[str, PairedDifference]] = {}
+    for label in sorted(variants, key=natural):
+        scenes = [tuple(pair[i] for i in places) for pair in common[label]]
+        differences[label] = {
             goal: _change(
-                goal,
-                [(variants[label][pair], base[pair]) for pair in common[label]],
-                [tuple(pair[i] for i in places) for pair in common[label]],
+                [(_mean(variants[label][pair], goal), base_means[goal][pair]) for pair in common[label]], scenes
             )
-            for goal in (*GOALS, *(f"{goal}_steps" for goal in GOALS))
+            for goal in goals
         }
-        for label in sorted(variants, key=natural)
-    }
+    return differences
 
 
-def _change(
-    goal: str, pairs: Sequence[tuple[Sequence[Row], Sequence[Row]]], scenes: Sequence[Hashable]
-) -> PairedDifference:
-    """The difference in a goal over pairs of episodes that count as one each."""
-    values = [(_mean(rows, goal), _mean(base, goal)) for rows, base in pairs]
+def _change(means: Sequence[tuple[float | None, float | None]], scenes: Sequence[Hashable]) -> PairedDifference:
+    """The difference over pairs of means, each on a scene; a pair of which one mean is None is left out."""
     differences = [
-        (a - b, scene) for (a, b), scene in zip(values, scenes, strict=True) if a is not None and b is not None
+        (mean - base, scene)
+        for (mean, base), scene in zip(means, scenes, strict=True)
+        if mean is not None and base is not None
     ]
     return PairedDifference.of([value for value, _ in differences], [scene for _, scene in differences])
 

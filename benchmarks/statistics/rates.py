@@ -8,7 +8,7 @@ import math
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
-from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_interval, share_interval
+from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_intervals, share_interval
 from mechsearch_jax.benchmarks.statistics.variants import VARIANT, canonical, grouped
 from mechsearch_jax.benchmarks.store.rows import Row
 
@@ -130,16 +130,29 @@ def summarise(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")
     Raises:
       InputError: there is no such column.
     """
-    return [_rates(group, members) for group, members in _groups(rows, columns)]
+    groups = list(_groups(rows, columns))
+    intervals = mean_intervals(_steps_and_scenes(members, goal) for _, members in groups for goal in GOALS)
+    return [
+        _rates(group, members, intervals[place : place + len(GOALS)])
+        for place, (group, members) in zip(range(0, len(intervals), len(GOALS)), groups, strict=True)
+    ]
 
 
-def _rates(group: Mapping[str, Hashable], rows: Sequence[Row]) -> Rates:
+def _steps_and_scenes(rows: Sequence[Row], goal: str) -> tuple[list[int], list[Hashable]]:
+    """The actions until a goal and the scene of each episode that reached it."""
+    reached = [(step, scene_of(row)) for row in rows if (step := step_of(row, goal)) is not None]
+    return [step for step, _ in reached], [scene for _, scene in reached]
+
+
+def _rates(group: Mapping[str, Hashable], rows: Sequence[Row], steps_intervals: Sequence[Interval | None]) -> Rates:
+    """The rates of a group, with the intervals of the mean number of actions until each of `GOALS`."""
     count, actions = len(rows), max(sum(row.steps for row in rows), 1)
     by_paper = [row for row in rows if row.paper_graspable is not None]
     paper_graspable = [bool(row.paper_graspable) for row in by_paper]
+    scenes = list(map(scene_of, rows))
     goals: dict[str, Any] = {}
-    for goal in GOALS:
-        goals |= _goal(rows, goal)
+    for goal, interval in zip(GOALS, steps_intervals, strict=True):
+        goals |= {**_goal(rows, scenes, goal), f"{goal}_steps_interval": interval}
     return Rates(
         group=group,
         episodes=count,
@@ -154,19 +167,15 @@ def _rates(group: Mapping[str, Hashable], rows: Sequence[Row]) -> Rates:
     )
 
 
-def _goal(rows: Sequence[Row], goal: str) -> dict[str, Any]:
-    """The fields of `Rates` that belong to a goal."""
-    names = goal, f"{goal}_interval", f"{goal}_steps", f"{goal}_steps_interval"
-    scenes, steps = list(map(scene_of, rows)), [step_of(row, goal) for row in rows]
-    reached = [step is not None for step in steps]
+def _goal(rows: Sequence[Row], scenes: Sequence[Hashable], goal: str) -> dict[str, Any]:
+    """The fields of `Rates` that belong to a goal, without the interval of its steps."""
+    steps = [step_of(row, goal) for row in rows]
     known_steps = [step for step in steps if step is not None]
-    values = (
-        len(known_steps) / len(rows),
-        share_interval(reached, scenes),
-        sum(known_steps) / len(known_steps) if known_steps else None,
-        mean_interval(known_steps, list(itertools.compress(scenes, reached))),
-    )
-    return dict(zip(names, values, strict=True))
+    return {
+        goal: len(known_steps) / len(rows),
+        f"{goal}_interval": share_interval([step is not None for step in steps], scenes),
+        f"{goal}_steps": sum(known_steps) / len(known_steps) if known_steps else None,
+    }
 
 
 def summarise_events(rows: Sequence[Row], columns: Sequence[str] = (VARIANT, "objects")) -> list[Events]:

@@ -168,6 +168,28 @@ def bench_simulate(*, worlds: int = 1024, steps: int = 500, repeats: int = 5, ou
     _print_timing("simulate", out, lambda: timed(worlds, steps, repeats))
 
 
+def bench_report(*, rows: int = 100_000, out: JsonFile = None) -> None:
+    """Time reports of rows that are drawn at random, as a sweep of 96 variants would leave them: time and memory.
+
+    Args:
+      rows: how many.
+      out: JSON file for the result.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.report import report_bench
+    from mechsearch_jax.runtime.files import save_json
+
+    at_least_one("bench report", rows=rows)
+    check_files(out)
+    console = Console(highlight=False)
+    with console.status("drawing rows") as status:
+        value = report_bench.bench_report(rows, status.update)
+    console.print(report_bench.timings_table(value))
+    if out is not None:
+        save_json(value, out)
+
+
 COMMANDS = {
     "existence": _timing_of("existence", "f"),
     "graspability": _timing_of("graspability", "g where f = 1"),
@@ -175,4 +197,5 @@ COMMANDS = {
     "predict": bench_predict,
     "perceive": bench_perceive,
     "simulate": bench_simulate,
+    "report": bench_report,
 }
