@@ -31,7 +31,7 @@ from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.running.in_turn import InTurn
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.problem.cache import keep_compilations
-from mechsearch_jax.runtime.cores import share_of_cores
+from mechsearch_jax.runtime.cores import VARIABLE, share_of_cores
 from mechsearch_jax.runtime.errors import InputError
 
 # An episode takes seconds, the first of a worker minutes for compilations [s].
@@ -68,11 +68,13 @@ class Processes:
       time_limit: seconds after which an episode, with its compilations, is taken to hang; its worker is killed and
         replaced.
       run: what a worker does with a job; a function of a module.
+      cores: of each worker; its share of this process's cores if None.
     """
 
     workers: int
     time_limit: float = TIME_LIMIT
     run: Callable[[Job], Row] = run_job
+    cores: int | None = None
 
     def __call__(
         self, jobs: Sequence[Job], ended: Callable[[Sequence[Row]], None], begin: Callable[[Job], bool]
@@ -85,7 +87,8 @@ class Processes:
         count = min(self.workers, len(jobs))
         todo, again, deaths = filter(begin, jobs), list[Job](), 0
         with tempfile.TemporaryDirectory() as outputs, contextlib.ExitStack() as stack:
-            context = _context({**ENVIRONMENT, **share_of_cores(count)})
+            share = share_of_cores(count) if self.cores is None else {VARIABLE: str(self.cores)}
+            context = _context({**ENVIRONMENT, **share})
 
             def new_worker() -> pebble.ProcessPool:
                 worker = pebble.ProcessPool(1, initializer=_begin, initargs=(outputs, os.getpid()), context=context)

@@ -215,4 +215,67 @@ def bench_cell(
         raise SystemExit(1)
 
 
-COMMANDS = {"ceiling": bench_ceiling, "guard": bench_guard, "cell": bench_cell}
+Counts = Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")]
+# Of each worker, where nothing is said: on a CPU, and on a GPU.
+USUAL_EPISODES, USUAL_BATCHES = 8, 600
+
+
+def bench_scaling(
+    *,
+    workers: Counts = (),
+    shards: Counts = (),
+    ray: Counts = (),
+    episodes_per_worker: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    cores_each: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
+    out: JsonFile = None,
+) -> None:
+    """Measure episodes per second of one worker and of several, each with as many cores and episodes, once all is
+    compiled.
+
+    Args:
+      workers: numbers of worker processes on the CPU, as "1 16".
+      shards: numbers of GPUs, a process with --shard for each.
+      ray: numbers of GPUs, all in one process with --cluster ray.
+      episodes_per_worker: 8 by default, and 600 of a GPU, where they are rounded up to all 200 scenes with some seeds.
+      cores_each: of each worker or GPU; by default what each has where there are most of them.
+      out: file for a line of JSON for each number, added to those that are there.
+    """
+    import jax
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.parts import scaling
+    from mechsearch_jax.workspace.scenario import load_scenario
+
+    counts = {"workers": workers, "shards": shards, "ray": ray}
+    if not any(counts.values()):
+        raise InputError(
+            "bench scaling: nothing is to be measured; give --workers, --shards or --ray, as --workers 1 16"
+        )
+    at_least_one("bench scaling", episodes_per_worker=episodes_per_worker, cores_each=cores_each)
+    for name, numbers in counts.items():
+        at_least_one("bench scaling", **{f"{name} {number}": number for number in numbers})
+    check_files(out)
+    # The GPUs are the workers'.
+    jax.config.update("jax_platforms", "cpu")
+    episodes = {"workers": episodes_per_worker or USUAL_EPISODES}
+    scenarios = list(map(load_scenario, files_of(scaling.scenes(episodes["workers"])))) if workers else []
+    measured = [] if out is None else scaling.read_measured(out)
+    console = Console(highlight=False)
+    with console.status("starting") as status:
+        if workers:
+            scaling.keep_what_is_compiled(scenarios, status.update)
+        for case in scaling.CASES:
+            for count in counts[case]:
+                share = cores_each or max(cores() // max(counts[case]), 1)
+                if case == "workers":
+                    result = scaling.measure_workers(scenarios, count, share, _command(), status.update)
+                else:
+                    of_gpu = episodes_per_worker or USUAL_BATCHES
+                    result = scaling.measure_gpus(case, count, of_gpu, share, _command(), status.update)
+                measured.append(result)
+                if out is not None:
+                    scaling.add_measured(result, out)
+    console.print(scaling.scaling_table(measured))
+
+
+COMMANDS = {"ceiling": bench_ceiling, "guard": bench_guard, "cell": bench_cell, "scaling": bench_scaling}
