@@ -165,7 +165,7 @@ _BASELINES = (
             Variant("search-and-grasp", policy="search-and-grasp"),
             Variant("random", policy="random"),
             Variant("greedy", policy="greedy"),
-            Variant("nearest-blocker", policy="nearest-blocker"),
+            Variant("most-occluding", policy="most-occluding"),
             Variant("mctx", policy="mctx"),
             Variant("preset paper", {"preset": "paper"}),
             Variant("preset published-code", {"preset": "published-code"}),
