@@ -269,6 +269,7 @@ def test_physics_change_the_model():
     assert changed["fine-step"].opt.timestep == FINE_STEP
     assert changed["coarse-step"].opt.timestep == COARSE_STEP
     assert changed["pyramidal-cone"].opt.cone != usual.opt.cone
+    assert changed["soft-friction"].opt.impratio == 1.0
     assert (changed["soft-contacts"].geom_solref[:, 0] > usual.geom_solref[:, 0]).all()
     assert usual.opt.timestep == changed["usual"].opt.timestep == 0.004
 
@@ -314,7 +315,8 @@ def test_every_slot_senses_by_itself_and_numbers_compile_nothing(problem):
 
 @pytest.mark.slow
 def test_episodes_with_a_mismatch_are_the_same_alone_and_in_a_batch(problem):
-    mismatches = [Mismatch(friction=2.0), ASSUMED, Mismatch(physics="fine-step"), Mismatch(mass=0.5)]
+    others = [Mismatch(friction=2.0), ASSUMED, Mismatch(physics="fine-step"), Mismatch(shelf_shift=0.004)]
+    mismatches = [dataclasses.replace(mismatch, camera_shift=0.001) for mismatch in others]
     starts = [Start(OPEN, 0, mismatch=mismatch) for mismatch in mismatches]
     settings, episodes = RunSettings(max_steps=2, at_once=2), []
     simulator = NativeSimulator(threads=1)
@@ -324,4 +326,4 @@ def test_episodes_with_a_mismatch_are_the_same_alone_and_in_a_batch(problem):
         assert episode.retrieved == again.retrieved
         assert [step.tracking_error for step in episode.steps] == [step.tracking_error for step in again.steps]
     errors = {place: episode.steps[-1].tracking_error for place, episode in episodes}
-    assert errors[2] != errors[1]
+    assert len({errors[i] for i in (1, 2, 3)}) == 3

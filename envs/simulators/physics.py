@@ -14,6 +14,8 @@ from mechsearch_jax.envs.world.mismatch import PhysicsName
 FINE_STEP, COARSE_STEP = 0.002, 0.005
 # Time constants of contacts, twice MuJoCo's default and twice that of the robot's contacts [s].
 SOFT, SOFT_ROBOT = 0.04, 0.02
+# Iterations of MuJoCo's solver against slip.
+NO_SLIP = 10
 
 
 def _fine(model: mujoco.MjModel) -> None:
@@ -30,8 +32,14 @@ def _soft(model: mujoco.MjModel) -> None:
     model.geom_solref[robot, 0] = SOFT_ROBOT
 
 
+def _soft_friction(model: mujoco.MjModel) -> None:
+    model.opt.impratio = 1.0
+
+
 def _pyramidal(model: mujoco.MjModel) -> None:
     model.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    # Without them most of what is grasped slips out of the hand.
+    model.opt.noslip_iterations = NO_SLIP
 
 
 # Each changes a model of the usual physics.
@@ -40,5 +48,6 @@ PHYSICS: Mapping[PhysicsName, Callable[[mujoco.MjModel], None]] = {
     "fine-step": _fine,
     "coarse-step": _coarse,
     "soft-contacts": _soft,
+    "soft-friction": _soft_friction,
     "pyramidal-cone": _pyramidal,
 }

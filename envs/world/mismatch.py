@@ -22,7 +22,7 @@ from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import Scenario
 from mechsearch_jax.workspace.shelf import Shelf
 
-PhysicsName = Literal["usual", "fine-step", "coarse-step", "soft-contacts", "pyramidal-cone"]
+PhysicsName = Literal["usual", "fine-step", "coarse-step", "soft-contacts", "soft-friction", "pyramidal-cone"]
 
 # Largest shift of camera and shelf [m], and largest turn [degrees].
 FARTHEST, STEEPEST = 0.2, 20.0
