@@ -8,6 +8,7 @@ import re
 import pytest
 from rich.console import Console
 
+from mechsearch_jax import planner
 from mechsearch_jax.benchmarks.paper.paper_tables import (
     BOTH,
     METHODS,
@@ -17,15 +18,26 @@ from mechsearch_jax.benchmarks.paper.paper_tables import (
     paper_figures,
     table_scenes,
 )
-from mechsearch_jax.benchmarks.paper.reproduce import Mean, Results, Setting, markdown, screen
+from mechsearch_jax.benchmarks.paper.reproduce import (
+    ANY,
+    COLLISION_FREE,
+    CONTACT,
+    Mean,
+    Results,
+    Setting,
+    markdown,
+    screen,
+)
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.running.evaluate import present_code
+from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, wilson
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.rows import Row, configuration
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands import reproduce as command
 from mechsearch_jax.envs.scenes.scene_sets import SETS
+from mechsearch_jax.planner import Option
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.scenario import Body, Scenario, save_scenario
 
@@ -211,8 +223,78 @@ def test_a_dry_run_says_what_it_would_be(run, tmp_path):
     jobs, printed = run("table1", "--scenes", "2", "--objects", "2", "8", "--preset", "standard", "--dry-run")
     assert not jobs
     assert not (tmp_path / "rows").exists()
-    assert "4 episodes: search-for-grasp, masks, push+pick-and-place, standard, strict" in printed.out
+    assert "4 episodes: search-for-grasp, masks, push+pick-and-place, standard, strict, any" in printed.out
     assert "6 variants, 24 episodes, 0 of them there already, 24 left" in printed.out
+    assert re.search(r"^  standard, full, with trials: 8 x [\d.]+ s, 2 x [\d.]+ s of compiling \(", printed.out, re.M)
+
+
+def test_a_dry_run_knows_what_is_there_and_makes_no_scene(run, tmp_path, monkeypatch):
+    common = ("table3", "--scenes", "2", "--recognition", "oracle", "--preset", "paper")
+
+    def no_files(scenes):
+        raise AssertionError
+
+    monkeypatch.setattr(command, "files_of", no_files)
+    jobs, printed = run(*common, "--seed", "0", "1", "--dry-run")
+    assert not jobs
+    assert "4 episodes: search-for-grasp, oracle" in printed.out
+    scenes = [SceneOutline.of_block(*scene) for scene in table_scenes(TABLES["table3"], (), 2)]
+    settings = command._settings(TABLES["table3"], METHODS, ["oracle"], ["paper"], ["strict"], [True])
+    planned = planned_jobs(scenes, list(command._methods(settings, "auto", "NativeSimulator").values()), (0,))
+    rows = [
+        dataclasses.replace(ROW, scenario=job.scene.name, content_hash=job.scene.content_hash, policy=job.method.name)
+        for job in planned
+    ]
+    rows = [
+        dataclasses.replace(
+            row,
+            code=present_code(),
+            configuration=configuration({**job.method.options(), "simulator": job.method.engine}),
+        )
+        for row, job in zip(rows, planned, strict=True)
+    ]
+    with ShardWriter("rows", "me") as writer:
+        writer.append(rows)
+    _, printed = run(*common, "--seed", "0", "1", "--dry-run")
+    assert "2 variants, 8 episodes, 4 of them there already, 4 left" in printed.out
+
+
+def test_cells_without_a_figure_say_that_it_is_not_in_the_paper():
+    rows = [row("a", 1, 2), row("b", None, None)]
+    told = results({FOR._replace(recognition=seen): rows for seen in ("oracle", "masks", "full")}, "table3")
+    page = markdown(told, "mechsearch reproduce table3")
+    lines = {line.split("|")[1].strip(): line for line in page.splitlines() if "| both" in line}
+    assert lines["oracle"].count("not in the paper") == 4
+    # The paper does not say in how many of these scenes the target was found.
+    for recognition in ("masks", "full"):
+        assert lines[recognition].count("not in the paper") == 1
+        assert "0.995" in lines[recognition]
+    console = Console(record=True, width=80)
+    console.print(screen(told))
+    assert re.search(r"^oracle search-for-grasp +2 +2 +0.50/none +0.50/none", console.export_text(), re.MULTILINE)
+
+
+def test_rows_of_several_seeds_are_in_one_table(run, tmp_path):
+    common = ("table3", "--scenes", "2", "--recognition", "oracle", "--preset", "paper")
+    jobs, _ = run(*common, "--seed", "0", "1", "1")
+    assert len(jobs) == 2 * 2 * 2
+    cells = json.loads((tmp_path / "rows" / "table3.json").read_text())["cells"]
+    assert [cell["episodes"] for cell in cells] == [4, 4]
+
+
+def test_collision_free_grasps_are_a_column_of_their_own(monkeypatch):
+    wanted = (TABLES["table3"], METHODS, ["masks"], ["standard"], ["strict"])
+    monkeypatch.setattr(planner, "OPTIONS", [option for option in planner.OPTIONS if option.name != CONTACT])
+    with pytest.raises(InputError, match="--retrieval-contact False: this version has no such option"):
+        command._settings(*wanted, [False])
+    monkeypatch.setattr(planner, "OPTIONS", [*planner.OPTIONS, Option(CONTACT, (), bool, "", None)])
+    settings = command._settings(*wanted, [True, False])
+    assert [setting.grasps for setting in settings] == [ANY, ANY, COLLISION_FREE, COLLISION_FREE]
+    rows = {setting: [row("a", 1, 2), row("b", None, None)] for setting in settings}
+    told = results(rows, "table3")
+    assert [one.factor for one in told.differences()] == ["method", "method", "grasps", "grasps"]
+    page = markdown(told, "mechsearch reproduce table3")
+    assert "## Preset standard, protocol strict, collision-free grasps" in page
 
 
 @pytest.mark.parametrize(

@@ -3,15 +3,25 @@ take."""
 
 import dataclasses
 import itertools
+import json
+import re
+from pathlib import Path
 
 import pytest
 
+from mechsearch_jax.benchmarks.running import estimate as estimates
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
+from mechsearch_jax.benchmarks.running.episode_seconds import FILE as SECONDS_FILE
+from mechsearch_jax.benchmarks.running.episode_seconds import Kind, Measured, StoredSeconds, entries
 from mechsearch_jax.benchmarks.running.estimate import CONTINUOUS, estimate
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs, present_code
+from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
+from mechsearch_jax.benchmarks.store.runs import stored_runs
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
+from mechsearch_jax.commands.runs import outlines_of
 from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.scenes.scene_sets import find_set, recorded
 from mechsearch_jax.planner import OPTIONS, PRESETS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.versions import versions
@@ -183,8 +193,8 @@ def test_what_a_run_would_take_is_told_and_nothing_is_run(folder, capsys):
     assert output.startswith(
         "96 variants, 192 episodes, 0 of them there already, 192 left\n1 compilation of the planner"
     )
-    assert "192 x 8 s in 2 processes" in output
-    assert "assumed" in output
+    assert "hours in 2 processes" in output
+    assert re.search(r"^  standard, oracle, with trials: 192 x [\d.]+ s, 1 x [\d.]+ s of compiling \(", output, re.M)
     cli.parse(["sweep", *common, "--gamma", "0.5", "1", "--horizon", "2", "3", "--max-steps", "5", "10"])()
     assert "8 variants, 16 episodes, 0 of them there already, 16 left\n2 compilations" in capsys.readouterr().out
     shifts = ("--recognition", "masks", "--camera-shift", "0.01", "0.02", "--depth-noise", "0.001", "0.002")
@@ -214,18 +224,56 @@ def test_an_estimate_is_of_the_rows_that_are_there(folder):
     ]
     with ShardWriter("rows", "me") as writer:
         writer.append(rows)
-    estimated = estimate(jobs, "rows", 2)
-    assert (estimated.variants, estimated.episodes, estimated.there, estimated.compilations, estimated.measured) == (
-        2,
-        4,
-        3,
-        1,
-        2,
-    )
-    assert (estimated.episode_seconds, estimated.compile_seconds) == (3.5, 75.0)
+    outlines = [SceneOutline.of_scenario(job.scenario) for job in jobs[::2]]
+    planned = planned_jobs(outlines, methods, (0,))
+    assert [job.key for job in planned] == [job.key for job in jobs]
+    estimated = estimate(planned, "rows", 2)
+    assert (estimated.variants, estimated.episodes, estimated.there, estimated.compilations) == (2, 4, 3, 1)
+    (part,) = estimated.parts
+    assert (part.kind, part.seconds) == (Kind("standard", "oracle", True), Measured(3.5, 75.0, 2))
+    assert part.grounds == "from 2 rows of the folder"
     assert estimated.hours == pytest.approx((1 * 3.5 / 2 + 75.0) / 3600)
-    assert estimate(jobs, "rows", 2, retry_errors=True).there == 2
+    assert estimate(planned, "rows", 2, retry_errors=True).there == 2
     with ShardWriter("other", "me") as writer:
         writer.append([dataclasses.replace(rows[0], code="other")])
     with pytest.raises(InputError, match="its episodes were run by other"):
-        estimate(jobs, "other", 2)
+        estimate(planned, "other", 2)
+
+
+def test_what_other_episodes_took_says_what_it_is_of(folder, monkeypatch):
+    clock = StoredSeconds("gpu: H100", Kind("standard", "oracle", True), Measured(0.1, 90.0, 720), "one.json")
+    slow = dataclasses.replace(clock, kind=Kind("paper", "masks", False), seconds=Measured(2.0, 60.0, 9))
+    monkeypatch.setattr(estimates, "stored_seconds", lambda: [clock, slow])
+    methods = [Method(), Method(config=PRESETS["paper"](), recognition="masks"), Method(recognition="full")]
+    outlines = [SceneOutline.of_block(find_set("d1").blocks[0], 0)]
+
+    def told(device):
+        monkeypatch.setattr(estimates, "versions", lambda: {"device": device})
+        parts = estimate(planned_jobs(outlines, methods, (0, 1)), "none", None).parts
+        return [(part.left, part.seconds.episode_seconds, part.grounds) for part in parts]
+
+    assert told("gpu: H100") == [
+        (2, 0.1, "from one.json"),
+        (2, 2.0, "from one.json"),
+        (2, 0.1, "from one.json, of oracle"),
+    ]
+    assert told("gpu: A100")[0] == (2, 0.1, "from one.json on H100")
+    assert told("cpu: cpu")[0] == (2, 8.0, "assumed: nothing was measured on such a device")
+
+
+def test_the_seconds_of_the_package_are_those_of_the_stored_runs():
+    results = Path(__file__).parents[1] / "benchmarks/results"
+    written = json.loads(SECONDS_FILE.read_text(encoding="utf-8"))
+    assert written == entries(results, stored_runs(results / "runs")), f"run `python -m {entries.__module__}`"
+    assert {"gpu: NVIDIA H100 80GB HBM3"} <= {entry["device"] for entry in written}
+
+
+def test_outlines_of_sets_are_those_of_their_files(folder):
+    (outline,) = outlines_of(["d1-003"])
+    assert (outline.name, len(outline.objects), outline.target.shape) == ("d1-003", 2, "cylinder")
+    assert outline.content_hash == recorded()["d1"][3]
+    assert [outline.name for outline in outlines_of(["one.json", "d3-4"])][:2] == ["one", "d3-4-000"]
+    with pytest.raises(InputError, match="two scenarios have the name 'd1-003'"):
+        planned_jobs([outline, outline], [Method()], (0,))
+    with pytest.raises(InputError, match="no scenario is given"):
+        outlines_of([])

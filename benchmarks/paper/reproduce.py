@@ -20,7 +20,12 @@ from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.runtime.files import PathLike, check_writable, replacing
 
 # What cells differ in. Differences are from the first value of each.
-FACTORS = ("method", "recognition", "actions", "preset", "protocol")
+FACTORS = ("method", "recognition", "actions", "preset", "protocol", "grasps")
+# Grasps that take the target out: any that is tried out first, or only those that touch nothing, the paper's; and the
+# option that says so.
+ANY, COLLISION_FREE, CONTACT = "any", "collision-free", "retrieval_contact"
+# In place of a figure.
+NOT_IN_THE_PAPER = "not in the paper"
 # What the paper calls the goals, and what rows do.
 GOALS = {"find": "found", "grasp": "graspable"}
 
@@ -33,6 +38,13 @@ class Setting(NamedTuple):
     actions: tuple[str, ...]
     preset: str
     protocol: str
+    grasps: str = ANY
+
+    @property
+    def part(self) -> str:
+        """What the cells of one part of a table have in common."""
+        grasps = "" if self.grasps == ANY else f", {self.grasps} grasps"
+        return f"preset {self.preset}, protocol {self.protocol}{grasps}"
 
 
 class Mean(NamedTuple):
@@ -207,7 +219,8 @@ CELL_COLUMNS = (
     *("steps to find", "paper", "steps to grasp", "paper"),
 )
 DIFFERENCE_COLUMNS = (
-    *("of", "against", "method", "recognition", "actions", "preset", "protocol", "objects", "pairs"),
+    *("of", "against", "method", "recognition", "actions", "preset", "protocol", "grasps"),
+    *("objects", "pairs"),
     *("find", "grasp", "steps to find", "steps to grasp"),
 )
 
@@ -218,7 +231,7 @@ def _cell_line(cell: Cell) -> list[str]:
     line.append(f"{cell.episodes}" + (f", {cell.errors} errors" if cell.errors else ""))
     for name in Figures._fields:
         form = "{:.2f}" if "steps" in name else "{:.3f}"
-        line += [_text(getattr(cell, name), form), f"{getattr(paper, name) or '-'}"]
+        line += [_text(getattr(cell, name), form), f"{getattr(paper, name) or NOT_IN_THE_PAPER}"]
     return line
 
 
@@ -235,13 +248,13 @@ def _difference_line(difference: Difference) -> list[str]:
 def screen(results: Results) -> Group:
     """The tables as they are printed, ours and the paper's figures without intervals: one for each preset, protocol and
     set of actions."""
-    parts: dict[tuple[str, str, str], list[Cell]] = {}
+    parts: dict[tuple[str, str], list[Cell]] = {}
     for cell in results.cells():
-        parts.setdefault((cell.setting.preset, cell.setting.protocol, _actions(cell.setting)), []).append(cell)
+        parts.setdefault((cell.setting.part, _actions(cell.setting)), []).append(cell)
     tables = []
-    for (preset, protocol, actions), cells in parts.items():
+    for (part, actions), cells in parts.items():
         only = "" if len(results.table.actions) == 1 else f", actions {actions}"
-        title = f"\n{results.table.name}, preset {preset}, protocol {protocol}{only}: here/in the paper"
+        title = f"\n{results.table.name}, {part}{only}: here/in the paper (none: {NOT_IN_THE_PAPER})"
         table = Table(
             box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left"
         )
@@ -258,11 +271,11 @@ def screen(results: Results) -> Group:
 def _beside(cell: Cell) -> list[str]:
     """Ours and the paper's figures."""
 
-    def text(value: float | None) -> str:
-        return "-" if value is None else f"{value:.2f}"
+    def text(value: float | None, otherwise: str) -> str:
+        return otherwise if value is None else f"{value:.2f}"
 
     paper = cell.paper or Figures(None, None, None, None)
-    return [f"{text(getattr(cell, name).value)}/{text(getattr(paper, name))}" for name in Figures._fields]
+    return [f"{text(getattr(cell, name).value, '-')}/{text(getattr(paper, name), 'none')}" for name in Figures._fields]
 
 
 def markdown(results: Results, command: str) -> str:
@@ -277,15 +290,16 @@ def markdown(results: Results, command: str) -> str:
         pages.Paragraph(
             "Shares of all episodes, with Wilson's 95% interval for as many independent episodes as those of the same "
             "scenes are worth; steps are the mean number of actions in the episodes that got there, with a 95% "
-            "interval from resampling scenes. The paper's R stands beside `masks`, its own setting, and `full`."
+            "interval from resampling scenes (-: none got there). The paper's R stands beside `masks`, its setting, "
+            "and `full`."
         ),
     ]
-    parts: dict[tuple[str, str], list[Cell]] = {}
+    parts: dict[str, list[Cell]] = {}
     for cell in results.cells():
-        parts.setdefault((cell.setting.preset, cell.setting.protocol), []).append(cell)
-    for (preset, protocol), cells in parts.items():
+        parts.setdefault(cell.setting.part, []).append(cell)
+    for part, cells in parts.items():
         lines = list(map(_cell_line, cells))
-        page += [pages.Heading(f"Preset {preset}, protocol {protocol}"), pages.Table.of(CELL_COLUMNS, lines, texts=3)]
+        page += [pages.Heading(part.capitalize()), pages.Table.of(CELL_COLUMNS, lines, texts=3)]
     lines = list(map(_difference_line, results.differences()))
     page += [
         pages.Heading("Paired differences"),
@@ -293,7 +307,7 @@ def markdown(results: Results, command: str) -> str:
             "Over the same scenes and seeds, a scene's seeds averaged first, with 95% intervals from resampling "
             "scenes; steps where both got there."
         ),
-        pages.Table.of(DIFFERENCE_COLUMNS, lines, texts=7),
+        pages.Table.of(DIFFERENCE_COLUMNS, lines, texts=8),
     ]
     return pages.as_markdown(page)
 

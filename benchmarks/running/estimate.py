@@ -5,25 +5,44 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 
-from mechsearch_jax.benchmarks.running.evaluate import Job, check_code
+from mechsearch_jax.benchmarks.running.episode_seconds import Kind, Measured, kind_of, measured, stored_seconds
+from mechsearch_jax.benchmarks.running.evaluate import check_code
+from mechsearch_jax.benchmarks.running.planned import PlannedJob
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.store.shards import Results
-from mechsearch_jax.envs.episode.episodes import target_of
 from mechsearch_jax.envs.episode.method import MISMATCH_PREFIX, Method
 from mechsearch_jax.envs.world.mismatch import Mismatch
 from mechsearch_jax.planner import PlannerConfig
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.versions import versions
 
-# Of an episode and of a compilation where nothing was measured [s]: on one CPU core, and in batches on one H200
-# (docs/results.md, "Speed").
-ASSUMED = {"cpu": (8.0, 60.0), "gpu": (0.14, 120.0)}
+# Of an episode and of a compilation where nothing was measured [s]: on one CPU core, and in batches on a GPU.
+ASSUMED = {"cpu": Measured(8.0, 60.0, 0), "gpu": Measured(0.14, 90.0, 0)}
 # The options that are data in what is compiled.
 CONTINUOUS = frozenset(path[0].name for path, _ in jax.tree_util.tree_flatten_with_path(PlannerConfig())[0])
+
+
+class Part(NamedTuple):
+    """The episodes of a run that take about as long as each other.
+
+    Attributes:
+      kind: what they have in common.
+      left: how many are still to be run.
+      compilations: in how many ways they differ in more than continuous settings and max_steps.
+      seconds: what an episode and a compilation take, by the folder's rows, by stored runs or assumed.
+      grounds: where the seconds are from.
+    """
+
+    kind: Kind
+    left: int
+    compilations: int
+    seconds: Measured
+    grounds: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,50 +53,55 @@ class Estimate:
       variants: how many methods with all their settings there are.
       episodes: how many are wanted.
       there: of how many of them the folder holds the row.
-      compilations: in how many ways those that are left differ in more than continuous settings and max_steps.
-      episode_seconds, compile_seconds: what one takes [s].
       workers: how many processes share the episodes; None for batches.
-      measured: how many rows of the folder say so; where none do, the seconds are assumed.
+      parts: those that are left.
     """
 
     variants: int
     episodes: int
     there: int
-    compilations: int
-    episode_seconds: float
-    compile_seconds: float
     workers: int | None
-    measured: int
+    parts: Sequence[Part]
+
+    @property
+    def compilations(self) -> int:
+        """How many compilations of the planner those that are left need."""
+        return sum(part.compilations for part in self.parts)
 
     @property
     def hours(self) -> float:
         """How long it would take, if nothing was compiled before."""
-        running = (self.episodes - self.there) * self.episode_seconds / (self.workers or 1)
-        return (running + self.compilations * self.compile_seconds) / 3600.0
+        return sum(map(self._seconds, self.parts)) / 3600.0
+
+    def _seconds(self, part: Part) -> float:
+        running = part.left * part.seconds.episode_seconds / (self.workers or 1)
+        return running + part.compilations * part.seconds.compile_seconds
 
     def __str__(self) -> str:
         left = self.episodes - self.there
-        grounds = (
-            f"from {_counted(self.measured, 'row')} of this kind of device in the folder"
-            if self.measured
-            else "assumed: the folder holds no rows of this kind of device"
-        )
         where = "in batches" if self.workers is None else f"in {_counted(self.workers, 'process')}"
-        return (
+        lines = [
             f"{_counted(self.variants, 'variant')}, {_counted(self.episodes, 'episode')}, "
-            f"{self.there} of them there already, {left} left\n"
+            f"{self.there} of them there already, {left} left",
             f"{_counted(self.compilations, 'compilation')} of the planner: "
-            "what differs in continuous settings alone shares one\n"
-            f"about {self.hours:.2g} hours: {left} x {self.episode_seconds:.3g} s {where}, "
-            f"{self.compilations} x {self.compile_seconds:.3g} s of compiling ({grounds})"
-        )
+            "what differs in continuous settings alone shares one",
+            f"about {self.hours:.2g} hours {where}, if nothing was compiled before",
+        ]
+        for part in self.parts:
+            trials = "with trials" if part.kind.trials else "no trials"
+            lines.append(
+                f"  {part.kind.preset}, {part.kind.recognition}, {trials}: {part.left} x "
+                f"{part.seconds.episode_seconds:.3g} s, {part.compilations} x {part.seconds.compile_seconds:.3g} s of "
+                f"compiling ({part.grounds})"
+            )
+        return "\n".join(lines)
 
 
 def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 'es' if what.endswith('s') else 's'}"
 
 
-def estimate(jobs: Sequence[Job], out: PathLike, workers: int | None, retry_errors: bool = False) -> Estimate:
+def estimate(jobs: Sequence[PlannedJob], out: PathLike, workers: int | None, retry_errors: bool = False) -> Estimate:
     """What `evaluate` would take for jobs.
 
     Args:
@@ -94,30 +118,66 @@ def estimate(jobs: Sequence[Job], out: PathLike, workers: int | None, retry_erro
     over = {key for key, row in results.rows.items() if not (retry_errors and row.is_error)}
     wanted = {job.key: job for job in jobs}
     left = [job for key, job in wanted.items() if key not in over]
-    mould = functools.cache(Method.mould)
-    moulds = {(target_of(job.scenario, job.method.workcell.target), mould(job.method)) for job in left}
     device = versions()["device"]
     rows = [row for row in results.rows.values() if row.device == device and not row.is_error]
-    episode, compiling = (
-        _measured(rows, workers or 1) if rows else ASSUMED["cpu" if device.startswith("cpu") else "gpu"]
-    )
-    return Estimate(
-        variants=len({job.method for job in jobs}),
-        episodes=len(wanted),
-        there=len(wanted) - len(left),
-        compilations=len(moulds),
-        episode_seconds=episode,
-        compile_seconds=compiling,
-        workers=workers,
-        measured=len(rows),
-    )
+    by_kind: dict[Kind, list[PlannedJob]] = {}
+    kinds = functools.cache(lambda method: kind_of(method.options()))
+    for job in left:
+        by_kind.setdefault(kinds(job.method), []).append(job)
+    clocks = _Clocks(rows, device, workers or 1)
+    mould = functools.cache(Method.mould)
+    seen: set[object] = set()
+    parts = []
+    for kind, members in by_kind.items():
+        moulds = {(job.target, mould(job.method)) for job in members} - seen
+        seen |= moulds
+        parts.append(Part(kind, len(members), len(moulds), *clocks.of(kind)))
+    return Estimate(len({job.method for job in jobs}), len(wanted), len(wanted) - len(left), workers, parts)
 
 
-def _measured(rows: Sequence[Row], at_once: int) -> tuple[float, float]:
-    """Mean seconds of an episode, and of a compilation if as many processes as now waited for each."""
-    running = sum(row.planning_seconds + row.simulation_seconds for row in rows) / len(rows)
-    compiled = {_discrete(row.configuration, row.target) for row in rows}
-    return running, sum(row.compile_seconds or 0.0 for row in rows) / len(compiled) / at_once
+class _Clocks:
+    """What episodes take: by a folder's rows, else by stored runs, else by what is assumed."""
+
+    def __init__(self, rows: Sequence[Row], device: str, at_once: int) -> None:
+        """Args:
+        rows: of the folder, of the device.
+        device: as `versions` says it.
+        at_once: how many processes wait for each compilation.
+        """
+        self._device, self._at_once = device, at_once
+        self._folder: dict[Kind, list[Row]] = {}
+        for row in rows:
+            self._folder.setdefault(kind_of(row.configuration), []).append(row)
+        self._stored = stored_seconds()
+
+    def of(self, kind: Kind) -> tuple[Measured, str]:
+        """What an episode of a kind and its compilation take, and how that is known."""
+        if self._folder:
+            nearest = min(self._folder, key=kind.distance)
+            rows = self._folder[nearest]
+            seconds = measured(rows, _compilations(rows), self._at_once)
+            return seconds, f"from {_counted(len(rows), 'row')} of the folder{_of(nearest, kind)}"
+        platform = self._device.partition(":")[0]
+        alike = [each for each in self._stored if each.device == self._device] or [
+            each for each in self._stored if each.device.partition(":")[0] == platform
+        ]
+        if not alike:
+            return ASSUMED["cpu" if platform == "cpu" else "gpu"], "assumed: nothing was measured on such a device"
+        best = min(alike, key=lambda each: kind.distance(each.kind))
+        where = f" on {best.device.partition(': ')[2]}" if best.device != self._device else ""
+        return best.seconds, f"from {best.source}{where}{_of(best.kind, kind)}"
+
+
+def _of(measured_kind: Kind, kind: Kind) -> str:
+    """What was measured instead of a kind; empty where it is the kind itself."""
+    differing = [str(value) for value, own in zip(measured_kind[:2], kind[:2], strict=True) if value != own]
+    differing += [] if measured_kind.trials == kind.trials else ["with trials" if measured_kind.trials else "no trials"]
+    return f", of {', '.join(differing)}" if differing else ""
+
+
+def _compilations(rows: Iterable[Row]) -> int:
+    """How many compilations rows needed, as far as their options tell."""
+    return len({_discrete(row.configuration, row.target) for row in rows})
 
 
 @functools.lru_cache(maxsize=4096)

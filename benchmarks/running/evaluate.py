@@ -14,8 +14,9 @@ import importlib.metadata
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
+from mechsearch_jax.benchmarks.running.planned import PlannedJob
 from mechsearch_jax.benchmarks.store.claims import Claims
 from mechsearch_jax.benchmarks.store.rows import Row, episode_key
 from mechsearch_jax.benchmarks.store.shards import CLOSED_ENDING, Results, ShardWriter
@@ -99,7 +100,10 @@ def make_jobs(
     return jobs
 
 
-def shard_of(jobs: Sequence[Job], shard: int, shards: int) -> list[Job]:
+AnyJob = TypeVar("AnyJob", Job, PlannedJob)
+
+
+def shard_of(jobs: Sequence[AnyJob], shard: int, shards: int) -> list[AnyJob]:
     """The jobs of one of several machines: each job is in one shard, and shards differ in size by one job at most.
 
     Which job is in which depends on nothing but the jobs, and not on their order. Jobs that differ in one thing alone,

@@ -9,8 +9,8 @@ import json
 import operator
 import os
 import types
-from collections.abc import Mapping, Sequence
-from typing import Any, get_args, get_origin, get_type_hints
+from collections.abc import Mapping, Sequence, Sized
+from typing import Any, Protocol, get_args, get_origin, get_type_hints
 
 import pyarrow
 import pyarrow.parquet
@@ -19,7 +19,6 @@ from mechsearch_jax.envs.episode.records import Episode, Step
 from mechsearch_jax.planner import OPTIONS as PLANNER_OPTIONS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
-from mechsearch_jax.workspace.scenario import Scenario
 
 # The stages of a step that the robot spends thinking; simulation is another.
 PLANNING = ("recognise", "believe", "grasp", "plan", "judge")
@@ -38,6 +37,25 @@ EVENTS = (
 ERROR = "error: "
 # Between kinds of action in their column.
 ACTIONS_BETWEEN = "+"
+
+
+class Scene(Protocol):
+    """What a row says of the scenario of an episode that could not be run to its end."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        ...
+
+    @property
+    def content_hash(self) -> str:
+        """Of what it holds."""
+        ...
+
+    @property
+    def objects(self) -> Sized:
+        """The surrounding objects."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +155,7 @@ class Row:
         )
 
     @classmethod
-    def failed(cls, scenario: Scenario, options: Mapping[str, Any], reason: str, code: str = "") -> Row:
+    def failed(cls, scenario: Scene, options: Mapping[str, Any], reason: str, code: str = "") -> Row:
         """The row of an episode that could not be run to its end; `options` are as in `Episode.config`."""
         return cls(
             scenario=scenario.name,

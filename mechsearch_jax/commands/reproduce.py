@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from mechsearch_jax.commands.options import EpisodeOptions, PaperMethod, at_least_one, files_of, with_planner_options
-from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, run_jobs
+from mechsearch_jax.commands.runs import USUAL_RUN, RunOptions, print_estimate, run_jobs
 from mechsearch_jax.runtime.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.benchmarks.paper.reproduce import Setting
     from mechsearch_jax.benchmarks.running.evaluate import Job
     from mechsearch_jax.benchmarks.store.rows import Row
+    from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.simulators.named import EngineName
 
 TableName = Literal["table1", "table3", "table4", "table5"]
@@ -35,43 +36,62 @@ def _settings(
     recognition: Sequence[str],
     preset: Sequence[str],
     protocol: Sequence[str],
+    retrieval_contact: Sequence[bool],
 ) -> list[Setting]:
-    """The settings of a table's cells."""
-    from mechsearch_jax.benchmarks.paper.reproduce import Setting
-    from mechsearch_jax.planner import PRESETS
+    """The settings of a table's cells.
+
+    Raises:
+      InputError: a preset is unknown, or this version lacks an option.
+    """
+    from mechsearch_jax.benchmarks.paper.reproduce import ANY, COLLISION_FREE, CONTACT, Setting
+    from mechsearch_jax.planner import OPTIONS, PRESETS
 
     unknown = [name for name in preset if name not in PRESETS]
     if unknown:
         raise InputError(f"reproduce: preset {unknown[0]} is unknown; use {', '.join(PRESETS)}")
-    product = itertools.product(preset, protocol, recognition, method, table.actions)
-    return [Setting(m, r, actions, p, terms) for p, terms, r, m, actions in dict.fromkeys(product)]
+    if not all(retrieval_contact) and CONTACT not in {option.name for option in OPTIONS}:
+        raise InputError("reproduce: --retrieval-contact False: this version has no such option; leave it out")
+    grasps = [ANY if contact else COLLISION_FREE for contact in retrieval_contact]
+    product = itertools.product(preset, protocol, grasps, recognition, method, table.actions)
+    return [Setting(m, r, actions, p, terms, g) for p, terms, g, r, m, actions in dict.fromkeys(product)]
 
 
-def _jobs(
-    settings: Sequence[Setting], scenarios: Sequence[Path], seeds: Sequence[int], simulator: str, engine: EngineName
-) -> dict[Setting, list[Job]]:
-    """The episodes of every setting.
+def _methods(settings: Sequence[Setting], simulator: str, engine: EngineName) -> dict[Setting, Method]:
+    """The method of every setting.
 
     Raises:
       InputError: a setting cannot be used.
     """
-    from mechsearch_jax.benchmarks.running.evaluate import make_jobs
+    from mechsearch_jax.benchmarks.paper.reproduce import COLLISION_FREE, CONTACT
 
     options: Any = with_planner_options()
 
-    def method_of(setting: Setting) -> Any:
+    def method_of(setting: Setting) -> Method:
         point = options(
             preset=setting.preset,
             recognition=setting.recognition,
             protocol=setting.protocol,
             actions=setting.actions,
             simulator=simulator,
+            **({CONTACT: False} if setting.grasps == COLLISION_FREE else {}),
         )
         return point.methods([setting.method], engine)[0]
 
-    methods = {setting: method_of(setting) for setting in settings}
-    jobs = make_jobs(scenarios, list(methods.values()), list(dict.fromkeys(seeds)))
-    by_method: dict[Any, list[Job]] = {}
+    return {setting: method_of(setting) for setting in settings}
+
+
+def _jobs(
+    methods: Mapping[Setting, Method], scenarios: Sequence[Path], seeds: Sequence[int]
+) -> dict[Setting, list[Job]]:
+    """The episodes of every setting.
+
+    Raises:
+      InputError: a scenario cannot be used.
+    """
+    from mechsearch_jax.benchmarks.running.evaluate import make_jobs
+
+    jobs = make_jobs(scenarios, list(methods.values()), seeds)
+    by_method: dict[Method, list[Job]] = {}
     for job in jobs:
         by_method.setdefault(job.method, []).append(job)
     return {setting: by_method[method] for setting, method in methods.items()}
@@ -86,6 +106,7 @@ def reproduce(
     recognition: Annotated[tuple[Recognition, ...], tyro.conf.arg(metavar="{oracle,masks,full,informed} ...")] = (),
     preset: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = (),
     protocol: Annotated[tuple[ProtocolName, ...], tyro.conf.arg(metavar="{strict,published-code} ...")] = (),
+    retrieval_contact: Annotated[tuple[bool, ...], tyro.conf.arg(metavar="{True,False} ...")] = (),
     objects: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (),
     scenes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
     seed: tuple[int, ...] = (0,),
@@ -106,6 +127,8 @@ def reproduce(
         alone, these three by default; or true shapes and the hidden target.
       preset: where the planner's settings come from, one or more; paper and standard by default.
       protocol: how episodes are run and judged, one or both; strict by default.
+      retrieval_contact: whether the target may be taken out with a grasp that brushes something, where it is tried out
+        first; only False is the paper's grasp. True by default; both for either.
       objects: only the scenes with so many.
       scenes: only the first so many of each number of objects, for a quick look.
       seed: one or more.
@@ -117,26 +140,36 @@ def reproduce(
     at_least_one("reproduce", scenes=scenes)
     chosen = TABLES[table]
     engine = run.engine("reproduce", EpisodeOptions(simulator=simulator))
-    files = files_of(table_scenes(chosen, objects, scenes))
+    scene_list, seeds = table_scenes(chosen, objects, scenes), list(dict.fromkeys(seed))
     settings = _settings(
         chosen,
         method or METHODS,
         recognition or ("oracle", "masks", "full"),
         preset or ("paper", "standard"),
         protocol or ("strict",),
+        retrieval_contact or (True,),
     )
-    jobs = _jobs(settings, files, seed, simulator, engine)
-    all_jobs = [job for jobs_of_setting in jobs.values() for job in jobs_of_setting]
+    methods = _methods(settings, simulator, engine)
     if run.dry_run:
-        print(f"{chosen.name}: {chosen.about}; {len(files)} scenes")
-        for setting, jobs_of_setting in jobs.items():
-            names = ["+".join(p) if isinstance(p, tuple) else p for p in setting]
-            print(f"{len(jobs_of_setting)} episodes: {', '.join(names)}")
+        from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
+
+        print(f"{chosen.name}: {chosen.about}; {len(scene_list)} scenes")
+        for setting in settings:
+            print(f"{len(scene_list) * len(seeds)} episodes: {', '.join(map(_named, setting))}")
+        outlines = [SceneOutline.of_block(*scene) for scene in scene_list]
+        print_estimate("reproduce", planned_jobs(outlines, list(methods.values()), seeds), out, run, simulator)
+        return
+    jobs = _jobs(methods, files_of(scene_list), seeds)
+    all_jobs = [job for jobs_of_setting in jobs.values() for job in jobs_of_setting]
 
     def draw(console: Console, rows: Sequence[Row]) -> None:
         _draw(console, chosen, jobs, out)
 
     run_jobs("reproduce", all_jobs, out, run, simulator, draw)
+
+
+def _named(value: str | tuple[str, ...]) -> str:
+    return value if isinstance(value, str) else "+".join(value)
 
 
 def _draw(console: Console, table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], out: Path) -> None:

@@ -14,12 +14,14 @@ import tyro
 from mechsearch_jax.commands.options import EpisodeOptions, at_least_one, find_scenarios, has_gpu
 from mechsearch_jax.runtime.cores import cores
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.files import is_file, is_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from mechsearch_jax.benchmarks.report.console_tables import EpisodeProgress
     from mechsearch_jax.benchmarks.running.evaluate import Job, Runner
+    from mechsearch_jax.benchmarks.running.planned import PlannedJob, SceneOutline
     from mechsearch_jax.benchmarks.store.rows import Row
     from mechsearch_jax.envs.simulators.named import EngineName
 
@@ -243,9 +245,59 @@ def run_episodes_of(
 
     engine = run.engine(command, points[0])
     # Several points may give the same settings.
-    methods = dict.fromkeys(method for point in points for method in point.methods(policies, engine))
-    jobs = make_jobs(find_scenarios(scenarios), list(methods), list(dict.fromkeys(seeds)))
+    methods = list(dict.fromkeys(method for point in points for method in point.methods(policies, engine)))
+    seeds = list(dict.fromkeys(seeds))
+    if run.dry_run:
+        from mechsearch_jax.benchmarks.running.planned import planned_jobs
+
+        planned = planned_jobs(outlines_of(scenarios), methods, seeds)
+        print_estimate(command, planned, out, run, points[0].simulator)
+        return
+    jobs = make_jobs(find_scenarios(scenarios), methods, seeds)
     run_jobs(command, jobs, out, run, points[0].simulator, print_rates)
+
+
+def outlines_of(names: Sequence[str]) -> list[SceneOutline]:
+    """What is known of the scenes that scenario arguments stand for; those of scene sets are not made.
+
+    Raises:
+      InputError: there is no scenario for a name.
+    """
+    from mechsearch_jax.benchmarks.running.planned import SceneOutline
+    from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene, set_scenes
+    from mechsearch_jax.workspace.scenario import example_scenarios, load_scenario
+
+    outlines = []
+    for name in names:
+        scene, is_path = find_scene(name), is_file(name) or is_folder(name)
+        if name in SETS and not is_path:
+            outlines += [SceneOutline.of_block(*each) for each in set_scenes(SETS[name])]
+        elif scene and not is_path and name not in example_scenarios():
+            outlines.append(SceneOutline.of_block(*scene))
+        else:
+            outlines += [SceneOutline.of_scenario(load_scenario(file)) for file in find_scenarios([name])]
+    return outlines or [SceneOutline.of_scenario(load_scenario(file)) for file in find_scenarios(names)]
+
+
+def print_estimate(command: str, jobs: Sequence[PlannedJob], out: Path, run: RunOptions, simulator: str) -> None:
+    """Print what this machine's part of the jobs would take.
+
+    Args:
+      command: name of the command, for error messages.
+      jobs: the episodes of all machines, with the engine of `run.engine`.
+      out: folder of the results, which need not be there.
+      run: how the episodes would be run.
+      simulator: the simulator of `EpisodeOptions`.
+
+    Raises:
+      InputError: an argument cannot be used.
+    """
+    from mechsearch_jax.benchmarks.running.estimate import estimate
+    from mechsearch_jax.benchmarks.running.evaluate import shard_of
+
+    jobs = shard_of(jobs, *parsed_shard(command, run.shard))
+    workers = run.workers or cores()
+    print(estimate(jobs, out, workers if run.in_processes(command, simulator) else None, run.retry_errors))
 
 
 def run_jobs(
@@ -256,7 +308,7 @@ def run_jobs(
     simulator: str,
     print_results: Callable[[Console, Sequence[Row]], None],
 ) -> None:
-    """Run this machine's part of the jobs, or only print an estimate of their cost.
+    """Run this machine's part of the jobs.
 
     Args:
       command: name of the command, for error messages.
@@ -276,12 +328,6 @@ def run_jobs(
 
     jobs = shard_of(jobs, *parsed_shard(command, run.shard))
     in_processes = run.in_processes(command, simulator)
-    if run.dry_run:
-        from mechsearch_jax.benchmarks.running.estimate import estimate
-
-        workers = run.workers or cores()
-        print(estimate(jobs, out, workers if in_processes else None, run.retry_errors))
-        return
     console = Console(highlight=False)
     with EpisodeProgress(console, len(jobs)) as progress:
         runner = run.site(command).runner(run, in_processes, progress)

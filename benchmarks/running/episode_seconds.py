@@ -1,0 +1,166 @@
+"""How long episodes took in stored runs: `python -m mechsearch_jax.benchmarks.running.episode_seconds` in a checkout
+writes `episode_seconds.json` beside this file, which travels with the package.
+
+Every entry names the run that it is of. Of several runs of a device the newest counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mechsearch_jax.benchmarks.statistics.settings import settings_of
+from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
+from mechsearch_jax.runtime.files import PathLike, replacing
+
+FILE = Path(__file__).with_name("episode_seconds.json")
+# The run before rows were stored: on one H100 with 16 cores, in batches.
+EARLIER = "standard-h100.json"
+
+
+class Kind(NamedTuple):
+    """What decides most about how long an episode takes.
+
+    Attributes:
+      preset: that its settings are nearest to.
+      recognition: what the planner sees the objects through.
+      trials: whether actions are tried before one is executed.
+    """
+
+    preset: str
+    recognition: str
+    trials: bool
+
+    def distance(self, other: Kind) -> tuple[bool, bool, bool]:
+        """How far another kind is from telling how long this one takes: trials cost the most."""
+        return self.trials != other.trials, self.recognition != other.recognition, self.preset != other.preset
+
+
+class Measured(NamedTuple):
+    """Mean wall times.
+
+    Attributes:
+      episode_seconds: of an episode in a process or, in a batch, its share of the batch's time [s].
+      compile_seconds: of compiling what its episodes need [s].
+      episodes: how many were measured.
+    """
+
+    episode_seconds: float
+    compile_seconds: float
+    episodes: int
+
+
+@dataclasses.dataclass(frozen=True)
+class StoredSeconds:
+    """What episodes of a kind took on a device, by a stored run.
+
+    Attributes:
+      device: as `runtime.versions.versions` says it.
+      kind: of the episodes.
+      seconds: what they took.
+      source: the file of the run.
+    """
+
+    device: str
+    kind: Kind
+    seconds: Measured
+    source: str
+
+
+def kind_of(options: Mapping[str, Any] | str) -> Kind:
+    """The kind of the episodes of a method's options, or of a `Row.configuration`."""
+    return _kind_of(options if isinstance(options, str) else json.dumps(options, sort_keys=True))
+
+
+@functools.lru_cache(maxsize=4096)
+def _kind_of(configuration: str) -> Kind:
+    options = json.loads(configuration)
+    trials = options.get("rehearsal", "none") != "none"
+    return Kind(settings_of(options).preset, options.get("recognition", "oracle"), trials)
+
+
+def measured(rows: Sequence[Row], compilations: int, at_once: int = 1) -> Measured:
+    """Mean seconds of an episode, and of a compilation if as many processes waited for each at once."""
+    running = sum(row.planning_seconds + row.simulation_seconds for row in rows) / len(rows)
+    return Measured(running, sum(row.compile_seconds or 0.0 for row in rows) / compilations / at_once, len(rows))
+
+
+@functools.cache
+def stored_seconds() -> Sequence[StoredSeconds]:
+    """The entries of `FILE`."""
+    return [
+        StoredSeconds(
+            entry["device"],
+            Kind(entry["preset"], entry["recognition"], entry["trials"]),
+            Measured(entry["episode_seconds"], entry["compile_seconds"], entry["episodes"]),
+            entry["source"],
+        )
+        for entry in json.loads(FILE.read_text(encoding="utf-8"))
+    ]
+
+
+def seconds_of(run: StoredRun) -> list[StoredSeconds]:
+    """What the episodes of a run took, by device and kind."""
+    groups: dict[tuple[str, Kind], list[Row]] = {}
+    for row in run.rows:
+        if row.device and not row.is_error:
+            groups.setdefault((row.device, kind_of(row.configuration)), []).append(row)
+    return [
+        StoredSeconds(
+            device,
+            kind,
+            measured(rows, len({(row.configuration, row.target) for row in rows})),
+            f"{RUNS}/{run.name}.parquet",
+        )
+        for (device, kind), rows in groups.items()
+    ]
+
+
+def _earlier(folder: PathLike) -> StoredSeconds:
+    """What the episodes of `EARLIER` took, by the clock: what it compiled first went on beside them."""
+    (run,) = (each for each in json.loads((Path(folder) / EARLIER).read_bytes())["runs"] if each["name"] == "c2")
+    clock = run["clock"]["nothing kept"]
+    episode = (clock["last episode [s]"] - clock["all compiled [s]"]) / len(run["episodes"])
+    compiling = clock["all compiled [s]"] - clock["first line [s]"]
+    return StoredSeconds(
+        "gpu: NVIDIA H100 80GB HBM3",
+        Kind("standard", "oracle", True),
+        Measured(episode, compiling, len(run["episodes"])),
+        f"benchmarks/results/{EARLIER}",
+    )
+
+
+def entries(results: PathLike, runs: Sequence[StoredRun]) -> list[dict[str, Any]]:
+    """What `FILE` holds, of stored results and stored runs."""
+    oldest_first = sorted(runs, key=lambda run: str(run.lines[0].get("started")) if run.lines else "")
+    each = [_earlier(results), *(entry for run in oldest_first for entry in seconds_of(run))]
+    newest = {(entry.device, entry.kind): entry for entry in each}
+    return [
+        {
+            "device": entry.device,
+            **entry.kind._asdict(),
+            **{name: round(value, 3) for name, value in entry.seconds._asdict().items()},
+            "source": entry.source,
+        }
+        for _, entry in sorted(newest.items())
+    ]
+
+
+def main() -> None:
+    """Write the file."""
+    parser = argparse.ArgumentParser(description="Write how long episodes took, from the stored runs.")
+    parser.add_argument("--results", default=str(RUNS.parent), help="folder of the stored results")
+    folder = Path(parser.parse_args().results)
+    lines = ",\n".join(f" {json.dumps(entry)}" for entry in entries(folder, stored_runs(folder / RUNS.name)))
+    with replacing(FILE) as file:
+        file.write(f"[\n{lines}\n]\n".encode())
+
+
+if __name__ == "__main__":
+    main()
