@@ -145,21 +145,23 @@ class Results(NamedTuple):
         """How settings differ from those that have the first value of one factor, and all else in common."""
         return [
             _difference(factor, setting, base, count, pairs)
-            for factor, setting, base in self._pairs()
+            for factor, setting, base in self.pairs()
             for count in self._counts()
-            if (pairs := _paired(self.rows[setting], self.rows[base], count))
+            if (pairs := paired_rows(self.rows[setting], self.rows[base], count))
         ]
 
-    def _pairs(self) -> Iterator[tuple[str, Setting, Setting]]:
+    def pairs(self) -> Iterator[tuple[str, Setting, Setting]]:
+        """Each factor, with a setting and the one that has the factor's first value and all else in common."""
         for factor in FACTORS:
             values = list(dict.fromkeys(getattr(setting, factor) for setting in self.rows))
             for setting in self.rows:
                 base = setting._replace(**{factor: values[0]})
-                if base != setting and base in self.rows:
+                # Of different code they would differ in more than the factor.
+                if base != setting and base in self.rows and self.rows[base][0].code == self.rows[setting][0].code:
                     yield factor, setting, base
 
 
-def _paired(rows: Sequence[Row], base: Sequence[Row], objects: int | None) -> list[tuple[Row, Row]]:
+def paired_rows(rows: Sequence[Row], base: Sequence[Row], objects: int | None = None) -> list[tuple[Row, Row]]:
     """The same episodes in both."""
     partners = {(scene_of(row), row.seed): row for row in base}
     return [
@@ -175,13 +177,13 @@ def _difference(
     means = {}
     for name, goal in GOALS.items():
         steps = [(scene_of(row), step_of(row, goal), step_of(other, goal)) for row, other in pairs]
-        means[name] = _mean_change([(scene, (a is not None) - (b is not None)) for scene, a, b in steps])
+        means[name] = mean_change([(scene, (a is not None) - (b is not None)) for scene, a, b in steps])
         both = [(scene, a - b) for scene, a, b in steps if a is not None and b is not None]
-        means[f"{name}_steps"] = _mean_change(both)
+        means[f"{name}_steps"] = mean_change(both)
     return Difference(factor, setting, getattr(base, factor), objects, len(pairs), **means)
 
 
-def _mean_change(changes: Sequence[tuple[Hashable, int | float]]) -> Mean:
+def mean_change(changes: Sequence[tuple[Hashable, int | float]]) -> Mean:
     """The mean of changes, each with its scene."""
     change = PairedDifference.of([value for _, value in changes], [scene for scene, _ in changes])
     return Mean.of(change.mean, change.interval, change.pairs)
@@ -206,11 +208,13 @@ def _text(mean: Mean, form: str) -> str:
     return f"{form.format(mean.value)}{bounds}"
 
 
-def _actions(setting: Setting) -> str:
+def actions_text(setting: Setting) -> str:
+    """The allowed actions in a table."""
     return "both" if setting.actions == BOTH else "+".join(setting.actions)
 
 
-def _objects(count: int | None) -> str:
+def objects_text(count: int | None) -> str:
+    """The number of objects in a table."""
     return "all" if count is None else str(count)
 
 
@@ -227,7 +231,7 @@ DIFFERENCE_COLUMNS = (
 
 def _cell_line(cell: Cell) -> list[str]:
     paper = cell.paper or Figures(None, None, None, None)
-    line = [cell.setting.recognition, cell.setting.method, _actions(cell.setting), _objects(cell.objects)]
+    line = [cell.setting.recognition, cell.setting.method, actions_text(cell.setting), objects_text(cell.objects)]
     line.append(f"{cell.episodes}" + (f", {cell.errors} errors" if cell.errors else ""))
     for name in Figures._fields:
         form = "{:.2f}" if "steps" in name else "{:.3f}"
@@ -237,12 +241,12 @@ def _cell_line(cell: Cell) -> list[str]:
 
 def _difference_line(difference: Difference) -> list[str]:
     base = difference.setting._replace(**{difference.factor: difference.base})
-    against = _actions(base) if difference.factor == "actions" else str(difference.base)
+    against = actions_text(base) if difference.factor == "actions" else str(difference.base)
     setting = difference.setting
-    line = [difference.factor, against, setting.method, setting.recognition, _actions(setting), *setting[3:]]
+    line = [difference.factor, against, setting.method, setting.recognition, actions_text(setting), *setting[3:]]
     shares = [_text(getattr(difference, goal), "{:+.3f}") for goal in GOALS]
     steps = [_text(getattr(difference, f"{goal}_steps"), "{:+.2f}") for goal in GOALS]
-    return [*line, _objects(difference.objects), str(difference.pairs), *shares, *steps]
+    return [*line, objects_text(difference.objects), str(difference.pairs), *shares, *steps]
 
 
 def screen(results: Results) -> Group:
@@ -250,7 +254,7 @@ def screen(results: Results) -> Group:
     set of actions."""
     parts: dict[tuple[str, str], list[Cell]] = {}
     for cell in results.cells():
-        parts.setdefault((cell.setting.part, _actions(cell.setting)), []).append(cell)
+        parts.setdefault((cell.setting.part, actions_text(cell.setting)), []).append(cell)
     tables = []
     for (part, actions), cells in parts.items():
         only = "" if len(results.table.actions) == 1 else f", actions {actions}"
@@ -263,7 +267,7 @@ def screen(results: Results) -> Group:
             table.add_column(name, justify="right", no_wrap=True)
         for cell in cells:
             name = f"{cell.setting.recognition} {cell.setting.method}"
-            table.add_row(name, _objects(cell.objects), str(cell.episodes), *_beside(cell))
+            table.add_row(name, objects_text(cell.objects), str(cell.episodes), *_beside(cell))
         tables.append(table)
     return Group(*tables)
 

@@ -1,0 +1,225 @@
+"""The page of the paper's experiments: it is what the stored runs say, and findings hold by their rules alone."""
+
+import dataclasses
+import random
+import re
+from pathlib import Path
+
+import pytest
+from test_benchmarks_stored_runs import row_of
+
+from mechsearch_jax.benchmarks.paper.findings import (
+    FAILS,
+    FINDINGS,
+    HOLDS,
+    OPEN,
+    _verdict,
+    verdicts,
+)
+from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, PICK_AND_PLACE, PUSH, TABLES
+from mechsearch_jax.benchmarks.paper.reproduce import CONTACT, Setting
+from mechsearch_jax.benchmarks.paper.stored_tables import results_of_runs, setting_of
+from mechsearch_jax.benchmarks.report import reproduction_page
+from mechsearch_jax.benchmarks.report.store_run import run_of
+from mechsearch_jax.benchmarks.statistics.intervals import wilson
+from mechsearch_jax.benchmarks.store.rows import configuration, options_of
+from mechsearch_jax.benchmarks.store.runs import write_run
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.planner import PRESETS
+
+ROOT = Path(__file__).parents[1]
+
+
+def rows_of(table, scenes, reach, recognitions=("masks",), preset="paper", **fields):
+    """Rows of all methods and actions on the first scenes of each block; `reach` says in which the target was found and
+    graspable after how many actions."""
+    paper_table = TABLES[table]
+    for policy in METHODS:
+        for recognition in recognitions:
+            for actions in paper_table.actions:
+                method = Method(policy, PRESETS[preset](actions=actions), recognition)
+                for objects, block in paper_table.blocks.items():
+                    for number in range(scenes):
+                        found, grasped = reach(policy, recognition, actions, objects, number)
+                        usual = {"found_step": found, "graspable_step": grasped, "retrieved": grasped is not None}
+                        name = f"{block}-{number:03d}"
+                        yield row_of(name, method, objects=objects, content_hash=name.rjust(12, "0"), **usual | fields)
+
+
+def stored(folder, table, rows, name=None, **origin):
+    origin = {"command": f"mechsearch reproduce {table}", "commit": None, "note": None, "started": None} | origin
+    run = run_of(name or table, list(rows), **origin)
+    write_run(run, folder)
+    return run
+
+
+def finding(text):
+    (one,) = (each for each in FINDINGS if text in each.text)
+    return one
+
+
+def test_the_page_is_what_the_stored_runs_say():
+    written = (ROOT / "docs/reproduction.md").read_text(encoding="utf-8")
+    expected = reproduction_page.page(ROOT / "benchmarks/results/runs")
+    assert written == expected, f"run `python -m {reproduction_page.__name__}`"
+
+
+def test_without_runs_every_finding_says_what_to_run(tmp_path):
+    page = reproduction_page.page(tmp_path / "none")
+    assert "Nothing of it is stored yet." in page
+    assert page.count("There are no rows yet: `mechsearch reproduce table") == len(FINDINGS)
+    assert "`mechsearch reproduce table4 --recognition masks --out FOLDER`" in page
+
+
+@pytest.mark.parametrize(
+    ("rule", "interval", "verdict"),
+    [
+        ("more", (0.01, 0.2), HOLDS),
+        ("more", (-0.2, -0.01), FAILS),
+        ("more", (-0.01, 0.2), OPEN),
+        ("fewer", (-0.2, -0.01), HOLDS),
+        ("fewer", (0.01, 0.2), FAILS),
+        ("fewer", (-0.2, 0.01), OPEN),
+        ("no difference", (-0.02, 0.04), HOLDS),
+        ("no difference", (-0.02, 0.06), OPEN),
+        ("no difference", (0.001, 0.01), FAILS),
+        ("no difference", (-0.01, -0.001), FAILS),
+    ],
+)
+def test_a_finding_holds_by_its_interval(rule, interval, verdict):
+    assert _verdict(rule, interval) == verdict
+
+
+def test_findings_are_of_the_rows_that_they_name():
+    def reach(policy, recognition, actions, objects, number):
+        # Search-for-grasp alone grasps every fourth scene with 6 and 8 objects; it grasps the rest as the other does.
+        late = objects > 4 and number % 4 == 0 and policy == METHODS[0]
+        return 1, None if late or number % 5 == 1 else 2
+
+    rows = rows_of("table1", 40, reach, ("oracle", "masks", "full"))
+    tables = {"table1": results_of_runs(TABLES["table1"], [run_of("x", list(rows), command="reproduce table1")])}
+    many = verdicts(finding("With 6 and 8"), tables)
+    assert [(one.recognition, one.verdict, one.change.value, one.change.count) for one in many] == [
+        (seen, HOLDS, pytest.approx(0.2), 80) for seen in ("oracle", "masks")
+    ]
+    # (0.672 - 0.656 + 0.656 - 0.606) / 2 of its R.
+    assert many[1].paper == pytest.approx(0.033)
+    (few,) = {(one.verdict, one.change.value) for one in verdicts(finding("With 2 and 4"), tables)}
+    assert few == (HOLDS, 0.0)
+    for seen in ("masks", "full"):
+        (one,) = verdicts(finding(f"Between `{seen}` and true shapes there is no difference in grasping"), tables)
+        assert (one.verdict, one.change.count) == (HOLDS, 320)
+    assert not verdicts(finding("Pushing alone finds"), tables)
+    assert not verdicts(finding("With 4 objects, boxes"), tables)
+
+
+def test_one_kind_of_action_is_compared_with_both():
+    def reach(policy, recognition, actions, objects, number):
+        found = actions != PICK_AND_PLACE or number % 2
+        grasped = found and (actions != PUSH or number % 4)
+        return (1 if found else None), (2 if grasped else None)
+
+    run = run_of("x", list(rows_of("table4", 20, reach)), command="mechsearch reproduce table4")
+    tables = {"table4": results_of_runs(TABLES["table4"], [run])}
+    expected = {"Pick-and-place alone finds": -0.5, "Pushing alone grasps": -0.25, "Pushing alone finds": 0.5}
+    for text, value in expected.items():
+        (one,) = verdicts(finding(text), tables)
+        assert (one.verdict, one.change.value, one.change.count) == (HOLDS, pytest.approx(value), 80)
+    # Pushes: 0.907 and 0.813, 0.92 and 0.773; pick-and-places: 0.76 and 0.627, 0.76 and 0.693.
+    assert one.paper == pytest.approx((0.907 + 0.813 + 0.92 + 0.773 - 0.76 - 0.627 - 0.76 - 0.693) / 4)
+
+
+def test_boxes_are_compared_with_other_scenes():
+    def boxes(policy, recognition, actions, objects, number):
+        return 1, 2 if number % 2 else None
+
+    runs = [
+        run_of("boxes", list(rows_of("table5", 40, boxes)), command="reproduce table5"),
+        run_of("cylinders", list(rows_of("table1", 40, lambda *_: (1, 2))), command="reproduce table1"),
+    ]
+    tables = {name: results_of_runs(TABLES[name], runs) for name in ("table1", "table5")}
+    (one,) = verdicts(finding("With 4 objects, boxes"), tables)
+    assert (one.verdict, one.change.value) == (HOLDS, -0.5)
+    # Newcombe's method 10, of 40 scenes a side: the two methods of a scene end alike.
+    low, high = wilson(20, 40)
+    least, _ = wilson(40, 40)
+    assert one.change.interval == pytest.approx(
+        (-0.5 - (0.5 - low), -0.5 + ((high - 0.5) ** 2 + (1 - least) ** 2) ** 0.5), abs=0.01
+    )
+    (other,) = verdicts(finding("With 8 objects, boxes"), tables)
+    assert other.verdict == FAILS
+
+
+def test_what_may_touch_something_counts_as_taken_out_and_is_apart():
+    rows = list(rows_of("table3", 4, lambda *_: (1, None), preset="standard", retrieved=True))
+    free = [
+        dataclasses.replace(
+            row, configuration=configuration({**options_of(row), CONTACT: False, "simulator": "MjxSimulator"})
+        )
+        for row in rows
+    ]
+    run = run_of("x", [*rows, *free], command="reproduce table3")
+    results = results_of_runs(TABLES["table3"], [run])
+    assert {setting.grasps for setting in results.rows} == {"any", "collision-free"}
+    to_grasp = finding("needs fewer actions to grasp")
+    (one,) = verdicts(to_grasp, {"table3": results})
+    # With grasps that touch nothing alone, none was graspable: no actions to compare.
+    assert (one.part, one.goal, one.change.value) == ("preset standard, protocol strict", "retrieved", 0.0)
+
+
+def test_variants_that_are_no_cells_are_left_out():
+    line = {"preset": "paper", "settings": {"policy": METHODS[0], "recognition": "masks", "actions": list(PUSH)}}
+    assert setting_of(line) == Setting(METHODS[0], "masks", PUSH, "paper", "strict")
+    assert setting_of({**line, "settings": {"gamma": 0.5}}) is None
+    assert setting_of({**line, "settings": {"policy": "random"}}) is None
+    assert setting_of({"preset": "standard", "settings": {}}) == Setting(
+        METHODS[1], "oracle", BOTH, "standard", "strict"
+    )
+
+
+def test_the_newest_run_of_a_cell_counts():
+    old, new = (
+        [*rows_of("table3", 3, lambda *_, step=step: (step, step), code=code)]
+        for step, code in ((5, "old"), (3, "new"))
+    )
+    head = {"command": "mechsearch reproduce table3"}
+    runs = [run_of("a", old, **head, started="2026-11-25"), run_of("b", new[:3], **head, started="2026-11-26")]
+    results = results_of_runs(TABLES["table3"], [*runs, run_of("c", old, command="mechsearch evaluate d1")])
+    assert {setting.method: rows[0].code for setting, rows in results.rows.items()} == dict(
+        zip(METHODS, ("new", "old"), strict=True)
+    )
+    # What ran with different code is not compared.
+    assert not results.differences()
+
+
+def test_a_page_of_all_tables(tmp_path):
+    draw = random.Random(0)
+
+    def reach(*_):
+        found = draw.randrange(6) if draw.random() < 0.9 else None
+        return found, None if found is None or draw.random() < 0.2 else found + 1
+
+    for table in TABLES:
+        stored(tmp_path, table, rows_of(table, 5, reach, ("oracle", "masks")), commit="abc", note="beside others")
+    stored(tmp_path, "table1", rows_of("table1", 100, reach, preset="standard", objects_fallen=1), "more")
+    page = reproduction_page.page(tmp_path)
+    assert "There are no rows yet" not in re.sub(".*`mechsearch reproduce table1 --recognition oracle full.*", "", page)
+    assert [f"Table {number}" in page for number in "1345"] == [True] * 4
+    assert "### Table 1, preset standard, protocol strict" in page
+    assert "### Table 1 on scenes that nothing was chosen on" in page
+    assert "not in the paper" in page
+    assert "| abc | this code | cuda: H100 |" in page
+    for lines in re.findall(r"(?:^\|.*\|$\n?)+", page, re.MULTILINE):
+        assert len({line.count("|") for line in lines.splitlines()}) == 1
+    assert not re.search(r"\n\n\n", page)
+    assert "Table 1 | 400 | 360 | 40 |" in page
+    assert page == reproduction_page.page(tmp_path)
+
+
+def test_hard_scenes_are_counted():
+    def reach(policy, recognition, actions, objects, number):
+        return 1, 2 if number == 0 or (number == 1 and policy == METHODS[1]) else None
+
+    run = run_of("x", list(rows_of("table3", 4, reach)), command="reproduce table3")
+    table = reproduction_page.difficulty_table({"table3": results_of_runs(TABLES["table3"], [run])})
+    assert table.splitlines()[-1] == "| Table 3 | preset paper, protocol strict | 2 | 4 | 2 | 2 | 0 | 1 | 0 | 0 | 1 |"
