@@ -208,7 +208,9 @@ def test_a_page_of_all_tables(tmp_path):
     assert "### Table 1, preset standard, protocol strict" in page
     assert "### Table 1 on scenes that nothing was chosen on" in page
     assert "not in the paper" in page
-    assert "| abc | this code | cuda: H100 |" in page
+    assert (
+        "| `mechsearch reproduce table3` | abc | this code | cuda: H100 | - | 0 | 20 | 20 | 0 | beside others |" in page
+    )
     for lines in re.findall(r"(?:^\|.*\|$\n?)+", page, re.MULTILINE):
         assert len({line.count("|") for line in lines.splitlines()}) == 1
     assert not re.search(r"\n\n\n", page)

@@ -125,7 +125,8 @@ class Results(NamedTuple):
     table: PaperTable
     rows: Mapping[Setting, Sequence[Row]]
 
-    def _counts(self) -> list[int | None]:
+    def counts(self) -> list[int | None]:
+        """The numbers of objects in the rows, and None for all of them if there are several."""
         counts = sorted({row.objects for rows in self.rows.values() for row in rows})
         return [*counts, None] if len(counts) > 1 else [*counts]
 
@@ -134,19 +135,22 @@ class Results(NamedTuple):
         cells = []
         for setting, rows in self.rows.items():
             rates = {group.group["objects"]: group for group in summarise(rows, ["objects"])}
-            for count in self._counts():
-                paper = None
-                if count is not None:
-                    paper = paper_figures(self.table, setting.recognition, setting.method, setting.actions, count)
-                cells += [_cell(setting, count, rates[count], paper)] if count in rates else []
+            for count in self.counts():
+                cells += [_cell(setting, count, rates[count], self.paper(setting, count))] if count in rates else []
         return cells
+
+    def paper(self, setting: Setting, objects: int | None) -> Figures | None:
+        """What the paper says of a cell; None where nothing, as of all numbers of objects together."""
+        if objects is None:
+            return None
+        return paper_figures(self.table, setting.recognition, setting.method, setting.actions, objects)
 
     def differences(self) -> list[Difference]:
         """How settings differ from those that have the first value of one factor, and all else in common."""
         return [
             _difference(factor, setting, base, count, pairs)
             for factor, setting, base in self.pairs()
-            for count in self._counts()
+            for count in self.counts()
             if (pairs := paired_rows(self.rows[setting], self.rows[base], count))
         ]
 

@@ -20,7 +20,6 @@ from mechsearch_jax.benchmarks.paper.paper_tables import TABLES, Figures
 from mechsearch_jax.benchmarks.paper.reproduce import (
     FACTORS,
     NOT_IN_THE_PAPER,
-    Cell,
     Mean,
     Results,
     Setting,
@@ -63,8 +62,9 @@ def _paper(value: float | None) -> str:
     return NOT_IN_THE_PAPER if value is None else f"{value:g}"
 
 
-def runs_table(runs: Sequence[StoredRun]) -> str:
-    """What was run, how, where and by what code."""
+def runs_table(runs: Sequence[StoredRun], tables: Mapping[str, Results]) -> str:
+    """What was run, how, where and by what code, and how much of it is in the tables."""
+    shown = {id(row) for results in tables.values() for rows in results.rows.values() for row in rows}
     lines = []
     for run in runs:
         first = run.lines[0]
@@ -73,8 +73,21 @@ def runs_table(runs: Sequence[StoredRun]) -> str:
         origin = (first.get("commit") or "-", first["code"], ", ".join(first["devices"]), first.get("started") or "-")
         seeds = ", ".join(map(str, sorted({row.seed for row in run.rows})))
         command = "; ".join(f"`{part.strip()}`" for part in str(first["command"]).split(";"))
-        lines.append([file, command, *origin, seeds, f"{len(run.rows):,}", errors, first.get("note") or "-"])
-    header = ("run", "command", "commit", "code", "device", "started", "seeds", "episodes", "errors", "remarks")
+        counts = (f"{len(run.rows):,}", f"{sum(id(row) in shown for row in run.rows):,}", errors)
+        lines.append([file, command, *origin, seeds, *counts, first.get("note") or "-"])
+    header = (
+        "run",
+        "command",
+        "commit",
+        "code",
+        "device",
+        "started",
+        "seeds",
+        "episodes",
+        "shown",
+        "errors",
+        "remarks",
+    )
     return table(header, lines)
 
 
@@ -100,20 +113,31 @@ def cells_table(results: Results) -> str:
     """Our cells beside the paper's figures."""
     header = ["recognition", "method", "actions", "objects", "episodes", "found", "paper", "graspable", "paper"]
     header += ["with the paper's grasps", "retrieved", "drop-free", "actions to find", "paper", "to grasp", "paper"]
-    return table(header, [_cell_line(cell, results.rows[cell.setting]) for cell in results.cells()])
+    lines = []
+    for setting, rows in results.rows.items():
+        for count in results.counts():
+            own = [row for row in rows if count in (None, row.objects)]
+            if own:
+                paper = results.paper(setting, count) or Figures(None, None, None, None)
+                lines.append(_cell_line(setting, objects_text(count), own, paper))
+    return table(header, lines)
 
 
-def _cell_line(cell: Cell, rows: Sequence[Row]) -> list[object]:
-    rates = rates_of([row for row in rows if cell.objects in (None, row.objects)])
-    paper, setting = cell.paper or Figures(None, None, None, None), cell.setting
-    steps = ["-" if mean.value is None else f"{mean.value:.2f}" for mean in (cell.find_steps, cell.grasp_steps)]
+def _cell_line(setting: Setting, objects: str, rows: Sequence[Row], paper: Figures) -> list[object]:
+    rates, errors = rates_of(rows), sum(row.is_error for row in rows)
     return [
-        *(setting.recognition, setting.method, actions_text(setting), objects_text(cell.objects)),
-        f"{cell.episodes}" + (f", {cell.errors} errors" if cell.errors else ""),
+        *(setting.recognition, setting.method, actions_text(setting), objects),
+        f"{len(rows)}" + (f", {errors} errors" if errors else ""),
         *(_share(rates["found"]), _paper(paper.find), _share(rates["graspable"]), _paper(paper.grasp)),
         *(_share(rates[name]) for name in ("paper_graspable", "retrieved", "drop_free")),
-        *(steps[0], _paper(paper.find_steps), steps[1], _paper(paper.grasp_steps)),
+        *(_mean_steps(rows, "found"), _paper(paper.find_steps)),
+        *(_mean_steps(rows, "graspable"), _paper(paper.grasp_steps)),
     ]
+
+
+def _mean_steps(rows: Sequence[Row], goal: str) -> str:
+    steps = [step for row in rows if (step := step_of(row, goal)) is not None]
+    return f"{sum(steps) / len(steps):.2f}" if steps else "-"
 
 
 def differences_table(results: Results) -> str:
@@ -215,7 +239,7 @@ def page(folder: PathLike) -> str:
     }
     template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
     return template.render(
-        runs=runs_table([run for run in runs if run.name in names]) if names else "",
+        runs=runs_table([run for run in runs if run.name in names], tables) if names else "",
         tables=tables,
         all_tables=TABLES,
         findings=findings(tables),
