@@ -90,8 +90,16 @@ class Measured:
         return {**dataclasses.asdict(self), "episodes_per_second": self.rate}
 
 
-def _measured(case: Case, workers: int, share: int, rows: Sequence[Row], command: str, **times: float) -> Measured:
+def _measured(
+    case: Case, workers: int, share: int, rows: Sequence[Row], command: str, episodes: int, seconds: tuple[float, float]
+) -> Measured:
     """A measurement of rows, with what they say of themselves.
+
+    Args:
+      case: as in `Measured`, and so are `workers`, `command` and `episodes`.
+      share: cores of each worker.
+      rows: of all episodes.
+      seconds: the two times of `Measured` [s].
 
     Raises:
       InputError: an episode could not be run to its end.
@@ -102,13 +110,14 @@ def _measured(case: Case, workers: int, share: int, rows: Sequence[Row], command
         case=case,
         workers=workers,
         cores=share,
+        episodes=episodes,
+        seconds=seconds[0],
+        last_seconds=seconds[1],
         steps=sum(row.steps for row in rows) / len(rows),
         code=rows[0].code,
         device=rows[0].device or "",
         versions=json.loads(rows[0].versions or "{}"),
         command=command,
-        episodes=int(times.pop("episodes")),
-        **times,
     )
 
 
@@ -167,7 +176,7 @@ def keep_what_is_compiled(scenarios: Sequence[Scenario], progress: Progress) -> 
         rows = evaluate(
             jobs, folder, Processes(1), lambda row, tally: progress(f"warming up {tally.ended}/{len(jobs)}")
         )
-    _measured("workers", 1, cores(), rows, "", episodes=len(rows), seconds=1.0, last_seconds=1.0)
+    _measured("workers", 1, cores(), rows, "", len(rows), (1.0, 1.0))
 
 
 def measure_workers(
@@ -197,12 +206,8 @@ def measure_workers(
     if len(of_workers) != workers or any("-first-" not in each[0].scenario for each in of_workers):
         raise InputError("bench scaling: a worker died, and another took its place; run it again")
     firsts, lasts = zip(*((each[0].ended, each[-1].ended) for each in of_workers), strict=True)
-    return _measured(
-        *("workers", workers, share, rows, command),
-        episodes=len(jobs) - workers,
-        seconds=sum(last - first for first, last in zip(firsts, lasts, strict=True)) / workers,
-        last_seconds=max(lasts) - min(firsts),
-    )
+    mean = sum(last - first for first, last in zip(firsts, lasts, strict=True)) / workers
+    return _measured("workers", workers, share, rows, command, len(jobs) - workers, (mean, max(lasts) - min(firsts)))
 
 
 def gpus() -> list[str]:
@@ -307,7 +312,7 @@ def measure_gpus(
         wanted = all_scenes * each * count
         rows, times = _times_of_rows(commands, folder, wanted, lambda what: progress(f"{count} GPUs: {what}"))
     seconds = times[-1] - times[0]
-    return _measured(case, count, share, rows, command, episodes=len(times) - 1, seconds=seconds, last_seconds=seconds)
+    return _measured(case, count, share, rows, command, len(times) - 1, (seconds, seconds))
 
 
 def read_measured(path: PathLike) -> list[Measured]:
