@@ -49,7 +49,7 @@ def workers(monkeypatch):
 
     here = types.SimpleNamespace(getpid=lambda: here.worker, worker=0)
     monkeypatch.setattr(scaling, "os", here)
-    monkeypatch.setattr(scaling, "time", types.SimpleNamespace(monotonic=monotonic))
+    monkeypatch.setattr(scaling, "time", types.SimpleNamespace(monotonic=monotonic, process_time=lambda: 7.0))
     monkeypatch.setattr(scaling, "run_job", ended)
     monkeypatch.setattr(scaling, "Processes", InTwos)
 
@@ -74,7 +74,7 @@ def test_only_what_a_worker_does_once_up_is_timed(workers):
     assert (three.episodes, three.seconds) == (3 * len(SCENES), 2.0 * len(SCENES))
     assert scaling.ratio(three, [one, three]) == pytest.approx(3.0)
     assert scaling.scaling_table([one, three]).row_count == 2
-    assert (three.code, three.device, three.steps) == (present_code(), "cpu: cpu", 4.0)
+    assert (three.cpu_seconds, three.code, three.device, three.steps) == (0.0, present_code(), "cpu: cpu", 4.0)
 
 
 def test_an_episode_that_fails_is_no_measurement(workers, monkeypatch):

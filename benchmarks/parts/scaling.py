@@ -63,6 +63,7 @@ class Measured:
         GPUs from the first row of all to the last [s].
       last_seconds: from the end of the first episode of all to the end of the last: with the time in which some workers
         have nothing left to do [s].
+      cpu_seconds: mean CPU time of an episode in its worker, of all threads [s]; None on GPUs.
       steps: mean number of actions of an episode.
       code, device, versions: as in `Row`.
       command: that was typed.
@@ -74,6 +75,7 @@ class Measured:
     episodes: int
     seconds: float
     last_seconds: float
+    cpu_seconds: float | None
     steps: float
     code: str
     device: str
@@ -91,7 +93,13 @@ class Measured:
 
 
 def _measured(
-    case: Case, workers: int, share: int, rows: Sequence[Row], command: str, episodes: int, seconds: tuple[float, float]
+    case: Case,
+    workers: int,
+    share: int,
+    rows: Sequence[Row],
+    command: str,
+    episodes: int,
+    seconds: tuple[float, float, float | None],
 ) -> Measured:
     """A measurement of rows, with what they say of themselves.
 
@@ -99,7 +107,7 @@ def _measured(
       case: as in `Measured`, and so are `workers`, `command` and `episodes`.
       share: cores of each worker.
       rows: of all episodes.
-      seconds: the two times of `Measured` [s].
+      seconds: the three times of `Measured` [s].
 
     Raises:
       InputError: an episode could not be run to its end.
@@ -113,6 +121,7 @@ def _measured(
         episodes=episodes,
         seconds=seconds[0],
         last_seconds=seconds[1],
+        cpu_seconds=seconds[2],
         steps=sum(row.steps for row in rows) / len(rows),
         code=rows[0].code,
         device=rows[0].device or "",
@@ -129,18 +138,19 @@ def scenes(count: int) -> list[tuple[Block, int]]:
 
 @dataclasses.dataclass(frozen=True)
 class _Spell:
-    """When a worker ran an episode, by a clock that all processes of a machine share [s]."""
+    """When a worker ran an episode, by a clock that all processes of a machine share, and the CPU time of it [s]."""
 
     scenario: str
     begun: float
     ended: float
+    cpu: float
 
 
 def run_timed(folder: str, job: Job) -> Row:
     """`run_job` in a worker, which adds when that was to a file of its own in a folder."""
-    begun = time.monotonic()
+    begun, used = time.monotonic(), time.process_time()
     row = run_job(job)
-    spell = _Spell(job.scenario.name, begun, time.monotonic())
+    spell = _Spell(job.scenario.name, begun, time.monotonic(), time.process_time() - used)
     with open(Path(folder) / f"{os.getpid()}.jsonl", "a") as file:
         file.write(json.dumps(dataclasses.asdict(spell)) + "\n")
     return row
@@ -176,7 +186,7 @@ def keep_what_is_compiled(scenarios: Sequence[Scenario], progress: Progress) -> 
         rows = evaluate(
             jobs, folder, Processes(1), lambda row, tally: progress(f"warming up {tally.ended}/{len(jobs)}")
         )
-    _measured("workers", 1, cores(), rows, "", len(rows), (1.0, 1.0))
+    _measured("workers", 1, cores(), rows, "", len(rows), (1.0, 1.0, None))
 
 
 def measure_workers(
@@ -207,7 +217,9 @@ def measure_workers(
         raise InputError("bench scaling: a worker died, and another took its place; run it again")
     firsts, lasts = zip(*((each[0].ended, each[-1].ended) for each in of_workers), strict=True)
     mean = sum(last - first for first, last in zip(firsts, lasts, strict=True)) / workers
-    return _measured("workers", workers, share, rows, command, len(jobs) - workers, (mean, max(lasts) - min(firsts)))
+    count = len(jobs) - workers
+    cpu = sum(spell.cpu for each in of_workers for spell in each[1:]) / count
+    return _measured("workers", workers, share, rows, command, count, (mean, max(lasts) - min(firsts), cpu))
 
 
 def gpus() -> list[str]:
@@ -312,7 +324,7 @@ def measure_gpus(
         wanted = all_scenes * each * count
         rows, times = _times_of_rows(commands, folder, wanted, lambda what: progress(f"{count} GPUs: {what}"))
     seconds = times[-1] - times[0]
-    return _measured(case, count, share, rows, command, len(times) - 1, (seconds, seconds))
+    return _measured(case, count, share, rows, command, len(times) - 1, (seconds, seconds, None))
 
 
 def read_measured(path: PathLike) -> list[Measured]:
@@ -358,11 +370,12 @@ def _of(measured: Measured) -> tuple[Any, ...]:
 def scaling_table(measured: Sequence[Measured]) -> Table:
     """How fast so many workers were: a row for each measurement."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    for name in ("", "workers", "cores each", "episodes", "seconds", "episodes/s", "times the fewest"):
+    for name in ("", "workers", "cores each", "episodes", "seconds", "episodes/s", "CPU s each", "times the fewest"):
         table.add_column(name, justify="right" if name else "left", no_wrap=True)
     for each in measured:
         numbers = (each.workers, each.cores, each.episodes)
-        figures = (f"{each.seconds:.1f}", f"{each.rate:.3f}", f"{ratio(each, measured):.2f}")
+        cpu = "-" if each.cpu_seconds is None else f"{each.cpu_seconds:.2f}"
+        figures = (f"{each.seconds:.1f}", f"{each.rate:.3f}", cpu, f"{ratio(each, measured):.2f}")
         table.add_row(each.case, *map(str, numbers), *figures)
     return table
 
