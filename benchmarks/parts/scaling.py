@@ -368,9 +368,9 @@ def _of(measured: Measured) -> tuple[Any, ...]:
 
 
 def scaling_table(measured: Sequence[Measured]) -> Table:
-    """How fast so many workers were: a row for each measurement."""
+    """How fast so many workers were, and how many times the rate of the fewest: a row for each measurement."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    for name in ("", "workers", "cores each", "episodes", "seconds", "episodes/s", "CPU s each", "times the fewest"):
+    for name in ("", "workers", "cores", "episodes", "seconds", "episodes/s", "CPU s each", "times"):
         table.add_column(name, justify="right" if name else "left", no_wrap=True)
     for each in measured:
         numbers = (each.workers, each.cores, each.episodes)

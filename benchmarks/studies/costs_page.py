@@ -1,0 +1,203 @@
+"""Writes docs/costs.md, what all experiments cost, in a checkout.
+
+`python -m mechsearch_jax.benchmarks.studies.costs_page` does so. The page is the template `costs_page.md` beside this
+file. Episodes are those of the paper's tables and of the declared studies; what one takes is measured, in the files of
+`benchmarks/results`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import statistics
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, PaperTable
+from mechsearch_jax.benchmarks.parts.scaling import read_measured
+from mechsearch_jax.benchmarks.report.results_page import Stored, table
+from mechsearch_jax.benchmarks.studies.declared import GROUPS
+from mechsearch_jax.benchmarks.studies.studies import Study
+from mechsearch_jax.envs.camera.recognisers import RecognitionName
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.episode.protocols import ProtocolName
+from mechsearch_jax.envs.scenes.scene_sets import SETS
+from mechsearch_jax.planner import PRESETS
+from mechsearch_jax.runtime.files import PathLike, replacing
+
+TEMPLATE = Path(__file__).with_name("costs_page.md")
+RECOGNITIONS: tuple[RecognitionName, ...] = ("oracle", "masks", "full")
+STRICT: tuple[ProtocolName, ...] = ("strict",)
+# Of a table that is run by more than the strict protocol.
+PROTOCOLS: Mapping[str, tuple[ProtocolName, ...]] = {"table1": ("strict", "published-code")}
+# The seeds of Table 1 beside the first, of one variant.
+MORE_SEEDS = 3
+# On a GPU.
+ENGINE = "MjxSimulator"
+HOUR = 3600.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """Episodes that are run together.
+
+    Attributes:
+      name: in the table.
+      episodes: how many each method runs.
+    """
+
+    name: str
+    episodes: dict[Method, int]
+
+    @property
+    def count(self) -> int:
+        """Episodes of all methods."""
+        return sum(self.episodes.values())
+
+    @property
+    def programs(self) -> int:
+        """How many planners are compiled for it: methods that differ in continuous settings alone share one."""
+        return len({method.mould() for method in self.episodes})
+
+
+def _of_table(paper: PaperTable) -> Experiment:
+    """A table of the paper, all of its cells."""
+    cells = itertools.product(
+        METHODS, ("paper", "standard"), RECOGNITIONS, paper.actions, PROTOCOLS.get(paper.name, STRICT)
+    )
+    methods = [
+        Method(policy, PRESETS[preset](actions=actions), recognition, engine=ENGINE, protocol=protocol)
+        for policy, preset, recognition, actions, protocol in cells
+    ]
+    return Experiment(f"Table {paper.name.removeprefix('table')}", dict.fromkeys(methods, _scenes(paper)))
+
+
+def _scenes(paper: PaperTable) -> int:
+    """How many scenes a cell has, over all numbers of objects."""
+    return sum(SETS[block].scenes for block in paper.blocks.values())
+
+
+def _of_studies(name: str, studies: Sequence[Study]) -> Experiment:
+    """Studies, of which each episode is run once."""
+    scenes: dict[Method, set[tuple[str, int]]] = {}
+    for study in studies:
+        for variant in study.variants:
+            listed = {(block.name, index) for block, index in study.scene_list(variant)}
+            scenes.setdefault(variant.method(ENGINE), set()).update(listed)
+    return Experiment(name, {method: len(listed) for method, listed in scenes.items()})
+
+
+def experiments() -> list[Experiment]:
+    """All of them."""
+    more_seeds = Experiment(
+        f"Table 1, `masks`, preset `standard`, {MORE_SEEDS} more seeds",
+        {Method(recognition="masks", engine=ENGINE): _scenes(TABLES["table1"]) * MORE_SEEDS},
+    )
+    studies = [_of_studies(name, group) for name, group in GROUPS.items()]
+    return [*map(_of_table, TABLES.values()), more_seeds, *studies]
+
+
+@dataclasses.dataclass(frozen=True)
+class Measures:
+    """What was measured.
+
+    Attributes:
+      episode: of a GPU, in a batch with true shapes [s].
+      look: what recognising the objects of an image adds, by the name of the recognition [s].
+      looks: mean number of images in an episode.
+      compiling: until all is compiled, where nothing is kept [s].
+      cpu: CPU time of an episode where there is no GPU [s].
+      row: bytes of a row in a folder of results.
+    """
+
+    episode: float
+    look: Mapping[str, float]
+    looks: float
+    compiling: float
+    cpu: float
+    row: float
+
+    @classmethod
+    def of(cls, stored: Stored) -> Measures:
+        """From the stored results."""
+        run = stored.run("standard-h100", "c2")
+        clock = run["clock"]["nothing kept"]
+        look = {
+            name: stored[f"perceive-{name}-h200"]["median_seconds"] / stored[f"perceive-{name}-h200"]["shapes"]["batch"]
+            for name in ("masks", "full")
+        }
+        scaled = read_measured(stored.folder / "scaling-cpu.jsonl")
+        report = stored["report-cpu"]
+        return cls(
+            episode=(clock["last episode [s]"] - clock["all compiled [s]"]) / len(run["episodes"]),
+            look=look,
+            # One before each action, and one after the last.
+            looks=1 + statistics.fmean(each["steps"] for each in run["episodes"]),
+            compiling=clock["all compiled [s]"],
+            cpu=next(each.cpu_seconds for each in scaled if each.workers == 1 and each.cpu_seconds is not None),
+            row=report["bytes"] / report["rows"],
+        )
+
+    def running(self, experiment: Experiment) -> float:
+        """Hours of one GPU that an experiment runs, once compiled."""
+        each = {
+            method: self.episode + self.looks * self.look.get(method.recognition, 0.0) for method in experiment.episodes
+        }
+        return sum(count * each[method] for method, count in experiment.episodes.items()) / HOUR
+
+    def cells(self, name: str, parts: Sequence[Experiment]) -> list[str]:
+        """A line of the table: what experiments cost together."""
+        episodes, programs = sum(part.count for part in parts), sum(part.programs for part in parts)
+        return [
+            name,
+            str(sum(len(part.episodes) for part in parts)),
+            f"{episodes:,}",
+            str(programs),
+            f"{sum(map(self.running, parts)):.1f}",
+            f"{programs * self.compiling / HOUR:.1f}",
+            f"{episodes * self.cpu / HOUR:.0f}",
+            f"{episodes * self.row / 1e6:.1f}",
+        ]
+
+
+def computed(stored: Stored) -> dict[str, Any]:
+    """The fields of the template."""
+    measures, parts = Measures.of(stored), experiments()
+    header = ["experiment", "variants", "episodes", "planners compiled", "GPU hours running", "compiling"]
+    lines = [measures.cells(part.name, [part]) for part in parts]
+    hours = sum(map(measures.running, parts))
+    compiling = sum(part.programs for part in parts) * measures.compiling / HOUR
+    reports = {run["what"]: run for run in stored["report-cpu"]["runs"]}
+    return {
+        "costs": table([*header, "CPU hours instead", "MB of rows"], [*lines, measures.cells("all", parts)]),
+        "measures": measures,
+        "hours": hours + compiling,
+        "eight": (hours + compiling) / 8,
+        "cold": hours / 8 + compiling,
+        "cores": sum(part.count for part in parts) * measures.cpu / HOUR / 64,
+        "report": reports["report"],
+        "rows": stored["report-cpu"]["rows"],
+    }
+
+
+def page(folder: PathLike) -> str:
+    """The page in Markdown, from the folder of stored results."""
+    return TEMPLATE.read_text(encoding="utf-8").format_map(computed(Stored(folder)))
+
+
+def main() -> None:
+    """Rewrite the page."""
+    parser = argparse.ArgumentParser(description="Write docs/costs.md from the stored results.")
+    parser.add_argument("--results", default="benchmarks/results", help="folder of the stored results")
+    parser.add_argument("--out", default="docs/costs.md", help="the page")
+    arguments = parser.parse_args()
+    if not Path(arguments.results).is_dir():
+        parser.error(f"{arguments.results}: is no folder; start it at the root of a checkout, or give --results")
+    with replacing(arguments.out) as file:
+        file.write(page(arguments.results).encode())
+
+
+if __name__ == "__main__":
+    main()
