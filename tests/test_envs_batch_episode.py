@@ -10,6 +10,7 @@ import pytest
 from stage import HIDDEN, OPEN, TWO, Grab, Stage, grab, idle, push_off, reveal, topple
 
 from mechsearch_jax.actions import no_action
+from mechsearch_jax.envs.camera.snapshot import informed
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episode_log import Choice, EpisodeLog, Result, distrust, record
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes
@@ -75,6 +76,19 @@ def test_episodes_are_the_same_alone_and_in_a_batch_whatever_their_slot(problem,
     assert [without_times(e) for e in episodes] == [without_times(e) for e in alone]
     assert {e.scenario for e in episodes if e.retrieved} >= {"open"}
     assert all(step.timings["recognise"] > 0 for e in episodes for step in e.steps)
+
+
+@pytest.mark.slow
+def test_an_informed_planner_knows_a_hidden_target_in_a_batch_as_alone(problem):
+    scenarios, episodes = [HIDDEN, TWO, OPEN], {}
+    settings = RunSettings(informed, max_steps=2, at_once=AT_ONCE)
+    run_episodes(
+        [Start(s, 0) for s in scenarios], problem, grab, Stage(reveal), 2, Listeners(episodes.update), settings
+    )
+    for i, scenario in enumerate(scenarios):
+        alone = run_episode(0, scenario, problem, grab, Stage(reveal), max_steps=2, recogniser=informed)
+        assert without_times(episodes[i]) == without_times(alone)
+        assert (alone.found_step, alone.retrieved) == (0, True)
 
 
 class Counting(Grab):
