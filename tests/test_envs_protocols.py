@@ -190,3 +190,9 @@ def test_methods_differ_in_their_protocol_and_problem():
     assert strict.problem_config == strict.config.problem
     grasps = PRESETS["standard"]().problem.grasps
     assert published.problem_config == dataclasses.replace(strict.config.problem, retrieval=grasps)
+
+
+def test_a_target_that_is_not_to_be_taken_out_is_not_brushed_out_in_trials_either():
+    strict, published = (Method(protocol=name).policy().config for name in ("strict", "published-code"))
+    assert strict.retrieval_contact
+    assert published == dataclasses.replace(strict, retrieval_contact=False)

@@ -60,7 +60,10 @@ class Method:
         """
         first, later = push_models(self.config.push_model, self.workcell.shelf)
         return policy_factory(self.name)(
-            self.config.planner, push_model=first, later_push_model=later, tries=self.config.rehearsal != "none"
+            self.terms.planner(self.config.planner),
+            push_model=first,
+            later_push_model=later,
+            tries=self.config.rehearsal != "none",
         )
 
     def trials(self) -> Trials | None:

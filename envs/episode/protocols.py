@@ -19,7 +19,7 @@ from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import World
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner import ProblemConfig
+from mechsearch_jax.planner import PlannerConfig, ProblemConfig
 from mechsearch_jax.workspace.shelf import Shelf
 
 ProtocolName = Literal["strict", "published-code"]
@@ -53,6 +53,10 @@ class EpisodeProtocol(Protocol):
 
     def problem(self, config: ProblemConfig) -> ProblemConfig:
         """The settings of the episodes' problem, from the method's."""
+        ...
+
+    def planner(self, config: PlannerConfig) -> PlannerConfig:
+        """The settings of the episodes' policy, from the method's."""
         ...
 
     def recogniser(self, inner: Recogniser) -> Recogniser:
@@ -94,6 +98,9 @@ class Strict:
     def problem(self, config: ProblemConfig) -> ProblemConfig:
         return config
 
+    def planner(self, config: PlannerConfig) -> PlannerConfig:
+        return config
+
     def recogniser(self, inner: Recogniser) -> Recogniser:
         return inner
 
@@ -125,6 +132,10 @@ class PublishedCode:
     def problem(self, config: ProblemConfig) -> ProblemConfig:
         """A found target is grasped with the candidates' grasps only."""
         return dataclasses.replace(config, retrieval=config.grasps)
+
+    def planner(self, config: PlannerConfig) -> PlannerConfig:
+        """The target is not to be taken out with a grasp that hits something: that would end the search in vain."""
+        return dataclasses.replace(config, retrieval_contact=False)
 
     def recogniser(self, inner: Recogniser) -> Recogniser:
         return WithTruePose(inner)
