@@ -14,6 +14,7 @@ from mechsearch_jax.benchmarks.guard.guard import read_reference
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.report import results_page
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
+from mechsearch_jax.benchmarks.store.runs import load_run
 from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, is_chosen_on, recorded
 from mechsearch_jax.envs.world.mismatch import ASSUMED, MISMATCH_OPTIONS
 from mechsearch_jax.planner import OPTIONS, PRESETS
@@ -328,6 +329,17 @@ def test_the_times_of_a_decision_are_the_stored_ones():
     for file in (ROOT / "benchmarks/results").glob("plan-rehearsal-*.json"):
         assert f"[{1000 * stored_median(file.name):.0f} ms on" in readme
         assert f"](benchmarks/results/{file.name})" in readme
+
+
+def test_what_is_retrieved_from_images_is_what_is_stored():
+    run = load_run(RESULTS / "runs", "table1-h100")
+    wanted = {"preset": "standard", "settings": {"recognition": "masks"}}
+    lines = [line for line in run.lines if {name: line[name] for name in wanted} == wanted]
+    new = {line["objects"]: line["on_scenes_not_chosen_on"]["retrieved"]["rate"] for line in lines}
+    assert list(new) == [2, 4, 6, 8]
+    two, four, six, eight = (f"{rate:.2f}" for rate in new.values())
+    stated = f"[{two}, {four}, {six} and {eight} are retrieved](docs/results.md#from-images)"
+    assert stated in " ".join(read("README.md").split())
 
 
 def test_what_came_of_searches_in_a_cell_is_what_is_stored():

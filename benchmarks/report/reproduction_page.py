@@ -30,7 +30,7 @@ from mechsearch_jax.benchmarks.paper.reproduce import (
 )
 from mechsearch_jax.benchmarks.paper.stored_tables import results_of_runs, runs_of
 from mechsearch_jax.benchmarks.report.results_page import table
-from mechsearch_jax.benchmarks.report.store_run import OUTCOMES, rates_of
+from mechsearch_jax.benchmarks.report.store_run import OUTCOMES, rates_of, takes_out
 from mechsearch_jax.benchmarks.statistics.rates import scene_of, step_of
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
@@ -41,7 +41,7 @@ from mechsearch_jax.runtime.files import PathLike, replacing
 TEMPLATE = Path(__file__).with_name("reproduction_page.md.jinja")
 # Rates that stand beside each other, by their names in `OUTCOMES`.
 SHARES = {"found": "found", "graspable": "graspable", "retrieved": "retrieved", "drop_free": "drop-free"}
-# Scenes by the share of their episodes in which the target was taken out: the largest share of each column.
+# Scenes by the share of their episodes in which they were solved: the largest share of each column.
 DIFFICULTY = {"none": 0.0, "to 1/4": 0.25, "to 1/2": 0.5, "to 3/4": 0.75, "below all": 1.0 - 1e-9, "all": 1.0}
 
 
@@ -152,7 +152,8 @@ def differences_table(results: Results) -> str:
         changes = []
         for name in SHARES:
             reached = [(scene_of(a), OUTCOMES[name](a), OUTCOMES[name](b)) for a, b in pairs]
-            changes.append(_change(mean_change([(scene, bool(a) - bool(b)) for scene, a, b in reached])))
+            both = [(scene, a - b) for scene, a, b in reached if a is not None and b is not None]
+            changes.append(_change(mean_change(both)))
         for goal in ("found", "graspable"):
             steps = [(scene_of(a), step_of(a, goal), step_of(b, goal)) for a, b in pairs]
             both = [(scene, a - b) for scene, a, b in steps if a is not None and b is not None]
@@ -175,13 +176,14 @@ def unchosen_table(results: Results) -> str:
 
 
 def difficulty_table(tables: Mapping[str, Results]) -> str:
-    """How many scenes are how hard: in which share of their episodes the target was taken out."""
+    """How many scenes are how hard: in which share of their episodes they were solved."""
     groups: dict[tuple[str, str, int], dict[Any, list[bool]]] = {}
     for name, results in tables.items():
         for setting, rows in results.rows.items():
             for row in rows:
                 scenes = groups.setdefault((name, setting.part, row.objects), {})
-                scenes.setdefault(scene_of(row), []).append(row.retrieved)
+                solved = row.retrieved if takes_out(row) else row.graspable_step is not None
+                scenes.setdefault(scene_of(row), []).append(solved)
     lines = []
     for (name, part, objects), scenes in groups.items():
         counts = collections.Counter(_column(sum(ends) / len(ends)) for ends in scenes.values())

@@ -16,6 +16,9 @@ from typing import Any
 
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
+from mechsearch_jax.benchmarks.store.rows import options_of
+from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
+from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on
 from mechsearch_jax.runtime.files import PathLike, replacing
 
@@ -158,6 +161,13 @@ def perception(stored: Stored) -> str:
     return table([*header, "segments, 2 to 8 objects", "segments, 8 objects"], lines)
 
 
+def _from_masks(run: StoredRun) -> list[Episode]:
+    """The episodes of the default with recognition `masks` on scenes that nothing was chosen on."""
+    usual = Method(recognition="masks").options()
+    own = [row for row in run.rows if not is_chosen_on(row.scenario) and row.recognition == usual["recognition"]]
+    return [vars(row) for row in own if all(options_of(row).get(name) == value for name, value in usual.items())]
+
+
 def computed(stored: Stored) -> dict[str, Any]:
     """The fields of the template that are no values of a file."""
     new, published = (stored.run("standard-h100", name) for name in ("c2", "published"))
@@ -168,7 +178,13 @@ def computed(stored: Stored) -> dict[str, Any]:
         "new: `c2` 090 to 179": [each for each in new["episodes"] if not is_chosen_on(each["scenario"])],
         "development: published": published["episodes"],
     }
-    images = {"`masks`, H200": masks, "`full`, H200": full, "`full`, CPU": alone}
+    table1 = load_run(stored.folder / "runs", "table1-h100")
+    images = {
+        "`masks`, H100, new: `c2` 090 to 179": {"episodes": _from_masks(table1)},
+        "`masks`, H200, published": masks,
+        "`full`, H200, published": full,
+        "`full`, CPU, published": alone,
+    }
     clock = new["clock"]["nothing kept"]
     frictions = {"same": "X1", "half": "X5", "double": "X2"}
     starts = stored["scenes-start-cpu"]["summary"]
@@ -176,7 +192,8 @@ def computed(stored: Stored) -> dict[str, Any]:
         **{"new": new, "published": published, "masks": masks, "full": alone, "paper": paper},
         "default_rates": rates("scenes", default),
         "default_mishaps": mishaps(default),
-        "image_rates": rates("recognition, device", {label: run["episodes"] for label, run in images.items()}),
+        "table1": table1.lines[0],
+        "image_rates": rates("recognition, device, scenes", {label: run["episodes"] for label, run in images.items()}),
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),
         "perception": perception(stored),

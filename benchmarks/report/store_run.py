@@ -20,13 +20,19 @@ from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, merged, starte
 from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError
 
+
+def takes_out(row: Row) -> bool:
+    """Whether the episode's protocol takes a target out, and leaves on the floor what fell."""
+    return options_of(row)["protocol"] == "strict"
+
+
 # What an episode reaches, by what lines call it; None where a row does not say. An error reaches nothing.
 OUTCOMES: Mapping[str, Callable[[Row], bool | None]] = {
     "found": lambda row: row.found_step is not None,
     "graspable": lambda row: row.graspable_step is not None,
     "paper_graspable": lambda row: row.paper_graspable,
-    "retrieved": lambda row: row.retrieved,
-    "drop_free": lambda row: False if row.objects_fallen is None else row.objects_fallen == 0,
+    "retrieved": lambda row: row.retrieved if takes_out(row) else None,
+    "drop_free": lambda row: row.objects_fallen == 0 if takes_out(row) else None,
 }
 
 

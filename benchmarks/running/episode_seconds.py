@@ -136,11 +136,17 @@ def _earlier(folder: PathLike) -> StoredSeconds:
     )
 
 
+def _with_compilation(entry: StoredSeconds, each: Sequence[StoredSeconds]) -> StoredSeconds:
+    """An entry with the longest compilation of its device: of a batch, rows do not tell what is compiled beforehand."""
+    longest = max(other.seconds.compile_seconds for other in each if other.device == entry.device)
+    return dataclasses.replace(entry, seconds=entry.seconds._replace(compile_seconds=longest))
+
+
 def entries(results: PathLike, runs: Sequence[StoredRun]) -> list[dict[str, Any]]:
     """What `FILE` holds, of stored results and stored runs."""
     oldest_first = sorted(runs, key=lambda run: str(run.lines[0].get("started")) if run.lines else "")
     each = [_earlier(results), *(entry for run in oldest_first for entry in seconds_of(run))]
-    newest = {(entry.device, entry.kind): entry for entry in each}
+    newest = {(entry.device, entry.kind): _with_compilation(entry, each) for entry in each}
     return [
         {
             "device": entry.device,
