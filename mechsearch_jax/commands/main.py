@@ -60,7 +60,7 @@ COMMANDS: Commands = {
     "config": print_config,
     "doctor": doctor,
     "scenarios": _only_described(
-        "List scene sets, generate and check scenarios: mechsearch scenarios list|generate|check."
+        "List scene sets, generate, check and import scenarios: mechsearch scenarios list|generate|check|import."
     ),
     "train": _only_described("Train the networks: mechsearch train segmentation|recognition|push."),
     "bench": _only_described("Measure the parts, one command each."),

@@ -1,4 +1,4 @@
-"""`mechsearch scenarios`: list scene sets, generate and check scenario files."""
+"""`mechsearch scenarios`: list scene sets, generate, check and import scenario files."""
 
 from __future__ import annotations
 
@@ -129,4 +129,24 @@ def check(scenarios: Scenarios, /, *, config: ConfigFile = None) -> None:
         raise SystemExit(2)
 
 
-COMMANDS = {"list": list_sets, "generate": generate, "check": check}
+def import_published(
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")], /, *, out: Path
+) -> None:
+    """Make scenario files of the scenes that the paper's authors published, from a copy of their repository.
+
+    Args:
+      folder: exp_configs of their repository, which holds objects_N/initial_scenario_K.pkl.
+      out: folder for the files.
+    """
+    from mechsearch_jax.envs.scenes.published import published_files, read_published
+    from mechsearch_jax.runtime.files import check_writable
+    from mechsearch_jax.workspace.scenario import save_scenario
+
+    scenarios = [read_published(file) for file in published_files(folder)]
+    check_writable(out)
+    for scenario in scenarios:
+        save_scenario(scenario, out / f"{scenario.name}.json")
+    print(f"{len(scenarios)} scenarios: {out}")
+
+
+COMMANDS = {"list": list_sets, "generate": generate, "check": check, "import": import_published}
