@@ -173,6 +173,9 @@ _BASELINES = (
             Variant("10 sequences", {"sequences": 10}),
             Variant("300 sequences", {"sequences": 300}),
             Variant("informed", {"recognition": "informed"}),
+            # With grasps that hit nothing, as the paper counts.
+            Variant("collision-free", {"retrieval_contact": False}),
+            Variant("informed, collision-free", {"recognition": "informed", "retrieval_contact": False}),
         ),
         by_time=True,
     ),
@@ -256,6 +259,7 @@ _ROBUSTNESS = (
                     "time step 2 ms": Mismatch(physics="fine-step"),
                     "time step 5 ms": Mismatch(physics="coarse-step"),
                     "softer contacts": Mismatch(physics="soft-contacts"),
+                    "softer friction": Mismatch(physics="soft-friction"),
                     "pyramidal friction cone": Mismatch(physics="pyramidal-cone"),
                 },
             ),
