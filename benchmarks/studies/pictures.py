@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, StrMethodFormatter
 
 from mechsearch_jax.benchmarks.statistics.intervals import Interval
 from mechsearch_jax.benchmarks.studies.comparison import Comparison
@@ -87,16 +88,19 @@ def _changes(comparisons: Sequence[Comparison]) -> Figure:
 
 
 def _against_time(comparisons: Sequence[Comparison]) -> Figure:
-    figure = Figure(figsize=(5.6, 3.4), layout="constrained")
+    figure = Figure(figsize=(7.4, 3.6), layout="constrained")
     axes = figure.subplots()
-    for c in comparisons:
+    for i, c in enumerate(comparisons, start=1):
         x, y = 1000 * max(c.decision_seconds, 1e-6), c.means["retrieved"]
-        axes.errorbar(
-            x, y, _bars([y], [c.intervals["retrieved"]]), color=RETRIEVED, marker="o", markersize=4, capsize=2
-        )
-        axes.annotate(c.variant.label, (x, y), (4, 4), textcoords="offset points", fontsize=7, color=INK)
+        axes.errorbar(x, y, _bars([y], [c.intervals["retrieved"]]), color=MUTED, capsize=2, linewidth=0.8, zorder=1)
+        marker = f"${i}$"
+        axes.plot(x, y, linestyle="", marker=marker, markersize=8, color=RETRIEVED, label=c.variant.label)
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.minorticks_off()
     axes.set_xlabel("planning time of an action in a batch, ms", fontsize=9, color=INK)
     axes.set_ylabel("share retrieved", fontsize=9, color=INK)
+    figure.legend(loc="outside right center", frameon=False, fontsize=8)
     _plain(axes)
     return figure
