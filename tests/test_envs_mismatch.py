@@ -10,7 +10,7 @@ import pytest
 from stage import HIDDEN, OPEN, Stage, grab
 
 from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
-from mechsearch_jax.envs.camera.sensing import sensing_of, true_camera
+from mechsearch_jax.envs.camera.sensing import OtherNoise, sensing_of, true_camera
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
 from mechsearch_jax.envs.episode.closed_loop import Listeners, RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, run_episodes, target_of
@@ -29,7 +29,7 @@ from mechsearch_jax.robot.motion import Reference
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import in_order
 from mechsearch_jax.workspace import scenario
-from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.camera import Camera, back_project
 from mechsearch_jax.workspace.shelf import Shelf
 
 CAMERA, SHELF = Camera(), Shelf()
@@ -181,6 +181,14 @@ def test_depth_noise_and_missing_depth_are_as_given():
     assert missing[there].mean() == pytest.approx(0.2, abs=0.01)
     # The other pixels measure what they do without.
     np.testing.assert_allclose(lost[there & ~missing], usual[there & ~missing], atol=1e-6)
+
+
+def test_whether_a_pixel_is_lost_does_not_depend_on_its_noise():
+    camera, depth = dataclasses.replace(CAMERA, width=300, height=300), jnp.full((300, 300), 0.7)
+    measured = OtherNoise(np.float32(0.001), np.float32(0.3))(jax.random.key(0), camera, depth)
+    distance = np.linalg.norm(np.asarray(measured - back_project(camera, depth)), axis=-1)
+    assert np.isnan(distance).mean() == pytest.approx(0.3, abs=0.01)
+    assert np.sqrt(np.nanmean(distance**2)) == pytest.approx(0.001, rel=0.02)
 
 
 def test_what_cannot_be_simulated_is_refused():

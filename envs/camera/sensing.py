@@ -49,7 +49,8 @@ class OtherNoise(flax.struct.PyTreeNode):
 
     def __call__(self, key: Key[Array, ""], camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
         points = scattered(key, back_project(camera, depth), jnp.asarray(self.deviation))
-        lost = jax.random.uniform(jax.random.fold_in(key, 1), depth.shape) < self.missing
+        # 0 and 1 would give the keys that `scattered` splits off: what is lost would depend on the noise.
+        lost = jax.random.uniform(jax.random.fold_in(key, 2), depth.shape) < self.missing
         return jnp.where(lost[..., None], jnp.nan, points)
 
 
