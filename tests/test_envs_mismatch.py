@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from stage import HIDDEN, OPEN, Stage, grab
 
+from mechsearch_jax.actions import KINDS, ActionKind
 from mechsearch_jax.envs.camera.recognisers import labelled, recogniser
 from mechsearch_jax.envs.camera.sensing import OtherNoise, sensing_of, true_camera
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
@@ -20,12 +21,12 @@ from mechsearch_jax.envs.episode.slots import OneSlot
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.simulators.physics import COARSE_STEP, FINE_STEP, PHYSICS
-from mechsearch_jax.envs.simulators.simulator import controls, resampled
+from mechsearch_jax.envs.simulators.simulator import SimulatorConfig, controls, resampled
 from mechsearch_jax.envs.world.mismatch import ASSUMED, ASSUMED_CELL, MISMATCH_OPTIONS, Mismatch
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.images.cloud import shelf_view
 from mechsearch_jax.images.noise import no_noise
-from mechsearch_jax.robot.motion import Reference
+from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes import in_order
 from mechsearch_jax.workspace import scenario
@@ -239,7 +240,7 @@ def test_every_world_of_a_simulator_has_its_own_cell():
     # An action that is undone is undone in the same cell.
     simulator.load(world, np.array([True, True]))
     np.testing.assert_allclose(simulator._worlds[0]._model.geom_friction[:, 0], frictions[0])
-    simulator.set_cells({0: ASSUMED_CELL})
+    # The next episode has its own cell, the usual one if none is set.
     simulator.replace({0: SCENE})
     np.testing.assert_array_equal(simulator._worlds[0]._model.geom_friction[:, 0], frictions[1])
 
@@ -250,10 +251,11 @@ def test_another_simulator_refuses_another_cell(problem):
         run_episodes(starts, problem, Method().policy(), Stage(), 1, Listeners(lambda ended: None))
 
 
-def test_a_reference_may_have_other_steps():
+def waving():
+    """A motion of 0.4 s in steps of 4 ms, in which every joint's angle is the sine of the time."""
     t = 0.004 * np.arange(1, 101)
     q = np.sin(t)[:, None] * np.ones(7)
-    reference = Reference(
+    return Reference(
         q=np.concatenate([q, q[-1:]]),
         velocity=np.concatenate([np.cos(t)[:, None] * np.ones(7), np.zeros((1, 7))]),
         fingers=np.linspace(0.04, 0.0, 101),
@@ -262,6 +264,10 @@ def test_a_reference_may_have_other_steps():
         closed=np.int32(50),
         opens=np.int32(100),
     )
+
+
+def test_a_reference_may_have_other_steps():
+    reference = waving()
     assert resampled(reference, 0.004, 0.004) is reference
     for step in (0.002, 0.005):
         other = resampled(reference, 0.004, step)
@@ -269,6 +275,22 @@ def test_a_reference_may_have_other_steps():
         assert (int(other.length), int(other.closed), int(other.opens)) == (rows, rows // 2, rows)
         np.testing.assert_allclose(other.q[:, 3], np.sin(step * np.arange(1, rows + 1)), atol=1e-5)
         assert controls(other).shape == (rows, 9)
+
+
+def test_with_the_usual_physics_no_reference_is_resampled(monkeypatch):
+    # The model is compiled with fewer digits than this time step has.
+    world = NativeWorld(config=SimulatorConfig(motion=MotionConfig(timestep=0.01 / 3)))
+    world.reset(SCENE)
+    followed, reference = [], waving()
+
+    def follow(given):
+        followed.append(given)
+        raise StopIteration
+
+    monkeypatch.setattr(world, "_follow", follow)
+    with pytest.raises(StopIteration):
+        world._perform(KINDS[ActionKind.PUSH], reference, 0)
+    assert followed[0] is reference
 
 
 def test_physics_change_the_model():

@@ -84,11 +84,11 @@ class NativeSimulator:
         """
         self._check_reset()
         for i, scenario in scenarios.items():
-            self._worlds[i].reset(scenario, self._cells.get(i, ASSUMED_CELL))
+            self._worlds[i].reset(scenario, self._cells.pop(i, ASSUMED_CELL))
         return self._gather()
 
     def set_cells(self, cells: Mapping[int, ActualCell]) -> None:
-        """Set the cells of worlds for the next `reset` or `replace`; see `TakesCells`."""
+        """Set the cells of worlds for the next `reset` or `replace` alone; see `TakesCells`."""
         self._cells.update(cells)
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:

@@ -197,7 +197,8 @@ class NativeWorld:
 
     def _perform(self, kind: Kind, reference: Reference, index: int) -> tuple[Failure, float, bool]:
         """Run a motion and let everything come to rest: why it failed, the tracking error [rad], and whether all is."""
-        reference = resampled(reference, self.config.motion.timestep, self._model.opt.timestep)
+        # The blank model's step has as many digits as MuJoCo was given, and is the usual one.
+        reference = resampled(reference, self._blank.opt.timestep, self._model.opt.timestep)
         states = self._follow(reference)
         error = self._tracking_error(states, reference)
         dropped = kind.holds_object and not self._slip(states, reference, index) < self.config.slip
