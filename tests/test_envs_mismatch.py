@@ -212,6 +212,13 @@ def test_what_cannot_be_simulated_is_refused():
     Method(engine="MjxSimulator", mismatch=Mismatch(camera_shift=0.01)).check()
 
 
+@pytest.mark.parametrize("eyes", [oracle, informed])
+def test_recognisers_without_an_image_refuse_other_depth(eyes):
+    for mismatch in (Mismatch(depth_noise=0.002), Mismatch(missing_depth=0.1, camera_shift=0.01)):
+        with pytest.raises(InputError, match="need an image"):
+            eyes(jax.random.key(0), snapshot(mismatch))
+
+
 def test_rows_keep_what_differs_alone():
     assert Method(mismatch=Mismatch()).options() == Method().options()
     method = Method(recognition="masks", mismatch=Mismatch(friction=2, camera_turn=1.5, physics="soft-contacts"))

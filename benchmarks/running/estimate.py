@@ -33,7 +33,8 @@ class Part(NamedTuple):
     Attributes:
       kind: what they have in common.
       left: how many are still to be run.
-      compilations: in how many ways they differ in more than continuous settings and max_steps.
+      compilations: in how many ways they differ in more than continuous settings and max_steps, without those of
+        earlier parts.
       seconds: what an episode and a compilation take, by the folder's rows, by stored runs or assumed.
       grounds: where the seconds are from.
     """

@@ -103,8 +103,7 @@ def oracle(key: Array, snapshot: Snapshot) -> Observation:
 
     Of a camera that is not where the planner takes it to be, the poses are those that the planner sees.
     """
-    objects = as_seen(objects_on_the_board(snapshot), snapshot.sensing)
-    return Observation(objects, snapshot.target_seen, snapshot.target_pose)
+    return Observation(_seen_objects(snapshot), snapshot.target_seen, snapshot.target_pose)
 
 
 def informed(key: Array, snapshot: Snapshot) -> Observation:
@@ -113,8 +112,18 @@ def informed(key: Array, snapshot: Snapshot) -> Observation:
     An upper bound on searching: the target counts as visible in every observation, so that it is found from the start.
     Ignores the key.
     """
-    objects = as_seen(objects_on_the_board(snapshot), snapshot.sensing)
-    return Observation(objects, jnp.array(True), snapshot.target_pose)
+    return Observation(_seen_objects(snapshot), jnp.array(True), snapshot.target_pose)
+
+
+def _seen_objects(snapshot: Snapshot) -> Superquadrics:
+    """The true objects on the board, where they seem to be to the planner.
+
+    Raises:
+      InputError: the depth is measured otherwise, which without an image would change nothing.
+    """
+    if snapshot.sensing is not None and snapshot.sensing.noise is not None:
+        raise InputError("depth_noise and missing_depth need an image; take the recogniser masks or full")
+    return as_seen(objects_on_the_board(snapshot), snapshot.sensing)
 
 
 def objects_on_the_board(snapshot: Snapshot) -> Superquadrics:
