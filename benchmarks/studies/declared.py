@@ -234,7 +234,7 @@ _ROBUSTNESS = (
     ),
     Study(
         "sensor",
-        "What if the depth image is noisier, or has holes?",
+        "What if the depth image is noisier, or lacks pixels?",
         REPORT_SCENES,
         _in_worlds("", _USUAL_WORLD | _SENSOR, recognition="masks"),
     ),
