@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from test_benchmarks_stored_runs import row_of
+from stored_rows import row_of
 
 from mechsearch_jax.benchmarks.paper.findings import (
     FAILS,

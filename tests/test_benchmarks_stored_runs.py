@@ -6,53 +6,18 @@ import random
 import sys
 
 import pytest
+from stored_rows import row_of
 
 from mechsearch_jax.benchmarks.report import store_run
 from mechsearch_jax.benchmarks.report.store_run import run_of, scene_set_of
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
 from mechsearch_jax.benchmarks.statistics.settings import settings_of
-from mechsearch_jax.benchmarks.store.rows import Row, configuration, episode_key
+from mechsearch_jax.benchmarks.store.rows import episode_key
 from mechsearch_jax.benchmarks.store.runs import load_run, merged, started, stored_runs, write_run
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.errors import InputError
-
-VERSIONS = json.dumps({"jax": "0.11.2", "machine": "x86_64", "mujoco": "3.17.0", "numpy": "2.5.2", "python": "3.12.3"})
-
-
-USUAL = Method()
-
-
-def row_of(scene, method=USUAL, seed=0, **fields):
-    """A row of an episode that found the target, and took it out."""
-    options = {**method.options(), "simulator": "NativeSimulator"}
-    columns = {name: options[name] for name in ("policy", "recognition", "gamma", "horizon", "sequences")}
-    usual = {
-        "scenario": scene,
-        "objects": int(scene.split("-")[1]),
-        "target": "cylinder",
-        **columns,
-        "actions": "+".join(options["actions"]),
-        "seed": seed,
-        "found_step": 1,
-        "graspable_step": 2,
-        "retrieved": True,
-        "steps": 3,
-        "failure": None,
-        "planning_seconds": 1.23456,
-        "simulation_seconds": 2.0,
-        "configuration": configuration(options),
-        "content_hash": "0123456789ab",
-        "looks": 2,
-        "objects_fallen": 0,
-        "paper_graspable": True,
-        "compile_seconds": 0.125,
-        "code": "this code",
-        "device": "cuda: H100",
-        "versions": VERSIONS,
-    }
-    return Row(**usual | fields)
 
 
 def write(folder, rows, writer="me"):

@@ -4,7 +4,7 @@ import dataclasses
 import random
 
 import pytest
-from test_benchmarks_stored_runs import row_of
+from stored_rows import row_of
 
 from mechsearch_jax.benchmarks.report.store_run import run_of
 from mechsearch_jax.benchmarks.studies import page
