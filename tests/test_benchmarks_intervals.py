@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, mean_intervals, share_interval, wilson
+from mechsearch_jax.benchmarks.statistics.intervals import (
+    mean_interval,
+    mean_intervals,
+    share_interval,
+    wilson,
+    with_interval,
+)
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
 
 DRAWS = 2000
@@ -122,3 +128,9 @@ def test_many_intervals_at_once_are_those_of_each_alone(monkeypatch):
     monkeypatch.setattr("mechsearch_jax.benchmarks.statistics.intervals.STACKED", 14)
     assert mean_intervals(samples) == alone
     assert mean_intervals([]) == []
+
+
+def test_a_value_stands_with_its_interval():
+    assert with_interval(0.5, (0.4, 0.6)) == "0.500 (0.400 to 0.600)"
+    assert with_interval(2, None, "{:+.1f}") == with_interval(2, (None, None), "{:+.1f}") == "+2.0"
+    assert with_interval(None, None) == "-"

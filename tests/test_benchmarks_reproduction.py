@@ -30,7 +30,7 @@ from mechsearch_jax.planner import PRESETS
 ROOT = Path(__file__).parents[1]
 
 
-def rows_of(table, scenes, reach, recognitions=("masks",), preset="paper", **fields):
+def rows_of(table, scenes, reach, recognitions=("masks",), preset="paper", protocol="strict", **fields):
     """Rows of all methods and actions on scenes of each block, by their numbers or so many of the first.
 
     `reach` says after how many actions the target was found and graspable.
@@ -39,7 +39,7 @@ def rows_of(table, scenes, reach, recognitions=("masks",), preset="paper", **fie
     for policy in METHODS:
         for recognition in recognitions:
             for actions in paper_table.actions:
-                method = Method(policy, PRESETS[preset](actions=actions), recognition)
+                method = Method(policy, PRESETS[preset](actions=actions), recognition, protocol=protocol)
                 for objects, block in paper_table.blocks.items():
                     for number in range(scenes) if isinstance(scenes, int) else scenes:
                         found, grasped = reach(policy, recognition, actions, objects, number)
@@ -100,18 +100,20 @@ def test_findings_are_of_the_rows_that_they_name():
 
     rows = rows_of("table1", 20, reach, ("oracle", "masks", "full"))
     tables = {"table1": results_of_runs(TABLES["table1"], [run_of("x", list(rows), command="reproduce table1")])}
-    many = verdicts(finding("With 6 and 8"), tables)
+    many = verdicts(finding("With 6 and 8 objects, search-for-grasp grasps"), tables)
     assert [(one.recognition, one.verdict, one.change.value, one.change.count) for one in many] == [
         (seen, HOLDS, pytest.approx(0.2), 40) for seen in ("oracle", "masks")
     ]
     # (0.672 - 0.656 + 0.656 - 0.606) / 2 of its R.
     assert many[1].paper == pytest.approx(0.033)
-    (few,) = {(one.verdict, one.change.value) for one in verdicts(finding("With 2 and 4"), tables)}
+    (few,) = {
+        (one.verdict, one.change.value) for one in verdicts(finding("With 2 and 4 objects, both methods grasp"), tables)
+    }
     assert few == (HOLDS, 0.0)
     for seen in ("masks", "full"):
         (one,) = verdicts(finding(f"Between `{seen}` and true shapes there is no difference in grasping"), tables)
         assert (one.verdict, one.change.count) == (HOLDS, 160)
-    assert not verdicts(finding("Pushing alone finds"), tables)
+    assert not verdicts(finding("Pushing alone finds more"), tables)
     assert not verdicts(finding("With 4 objects, boxes"), tables)
 
 
@@ -123,7 +125,7 @@ def test_one_kind_of_action_is_compared_with_both():
 
     run = run_of("x", list(rows_of("table4", 20, reach)), command="mechsearch reproduce table4")
     tables = {"table4": results_of_runs(TABLES["table4"], [run])}
-    expected = {"Pick-and-place alone finds": -0.5, "Pushing alone grasps": -0.25, "Pushing alone finds": 0.5}
+    expected = {"Pick-and-place alone finds": -0.5, "Pushing alone grasps": -0.25, "Pushing alone finds more": 0.5}
     for text, value in expected.items():
         (one,) = verdicts(finding(text), tables)
         assert (one.verdict, one.change.value, one.change.count) == (HOLDS, pytest.approx(value), 80)
@@ -167,6 +169,68 @@ def test_what_may_touch_something_counts_as_taken_out_and_is_apart():
     (one,) = verdicts(to_grasp, {"table3": results})
     # With grasps that touch nothing alone, none was graspable: no actions to compare.
     assert (one.part, one.goal, one.change.value) == ("preset standard, protocol strict", "retrieved", 0.0)
+
+
+def test_where_nothing_is_taken_out_a_grasp_is_that_the_target_is_graspable():
+    def reach(policy, *_):
+        return 1, 2 if policy == METHODS[1] else None
+
+    rows = rows_of("table1", 20, reach, preset="standard", protocol="published-code", retrieved=False)
+    tables = {"table1": results_of_runs(TABLES["table1"], [run_of("x", list(rows), command="reproduce table1")])}
+    (one,) = verdicts(finding("With 6 and 8 objects, search-for-grasp grasps"), tables)
+    assert (one.goal, one.verdict, one.change.value) == ("graspable", HOLDS, 1.0)
+
+
+def in_simulator(rows, name):
+    return [
+        dataclasses.replace(row, configuration=configuration({**options_of(row), "simulator": name})) for row in rows
+    ]
+
+
+def test_what_ran_in_another_simulator_is_not_compared():
+    oracle, masks = (list(rows_of("table1", 3, lambda *_: (1, 2), (seen,))) for seen in ("oracle", "masks"))
+    text = finding("Between `masks` and true shapes there is no difference in finding")
+    for simulator, lines in (("NativeSimulator", 1), ("MjxSimulator", 0)):
+        run = run_of("x", [*oracle, *in_simulator(masks, simulator)], command="reproduce table1")
+        results = results_of_runs(TABLES["table1"], [run])
+        assert len(verdicts(text, {"table1": results})) == lines
+        assert {one.factor for one in results.differences()} == {"method", *(["recognition"] * lines)}
+
+
+def test_a_cell_is_of_one_simulator():
+    rows = list(rows_of("table3", 3, lambda *_: (1, 2)))
+    few = in_simulator(rows_of("table3", 2, lambda *_: (3, 4)), "MjxSimulator")
+    results = results_of_runs(TABLES["table3"], [run_of("x", [*few, *rows], command="reproduce table3")])
+    assert [[row.found_step for row in own] for own in results.rows.values()] == [[1, 1, 1]] * 2
+
+
+def test_a_finding_of_one_method_alone_says_so(tmp_path):
+    rows = list(rows_of("table1", 3, lambda *_: (1, 2), ("oracle", "masks")))
+    half = [row for row in rows if (row.recognition, row.policy) != ("masks", METHODS[1])]
+    for kept, text in ((rows, "`masks`: **holds**"), (half, f"`masks`, {METHODS[0]} alone: **holds**")):
+        stored(tmp_path, "table1", kept)
+        assert f"    - preset paper, protocol strict, {text}, found +0.000" in reproduction_page.page(tmp_path)
+
+
+def test_tables_have_no_columns_that_say_nothing(tmp_path):
+    rows = rows_of("table1", 3, lambda *_: (1, 2), protocol="published-code")
+    stored(tmp_path, "table1", rows)
+    stored(tmp_path, "table4", rows_of("table4", 3, lambda *_: (1, 2)))
+    page = reproduction_page.page(tmp_path)
+    before, after = page.split("## Table 4")
+    assert (
+        "| recognition | method | objects | episodes | found | paper | graspable | paper | with the paper's grasps |\n"
+        in before
+    )
+    assert "| recognition | method | actions | objects | episodes |" in after
+    assert "Rows: [table4](../benchmarks/results/runs/table4.jsonl); NativeSimulator." in after
+
+
+def test_another_folder_is_no_page_without_runs(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        reproduction_page.main(["--runs", str(tmp_path / "none"), "--out", str(tmp_path / "page.md")])
+    assert "none: is no folder; start it at the root of a checkout, or give --runs" in capsys.readouterr().err
+    assert not (tmp_path / "page.md").exists()
 
 
 def test_variants_that_are_no_cells_are_left_out():

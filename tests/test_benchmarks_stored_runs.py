@@ -11,6 +11,7 @@ from stored_rows import row_of
 from mechsearch_jax.benchmarks.report import store_run
 from mechsearch_jax.benchmarks.report.store_run import run_of, scene_set_of
 from mechsearch_jax.benchmarks.statistics.intervals import wilson
+from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.settings import settings_of
 from mechsearch_jax.benchmarks.store.rows import episode_key
 from mechsearch_jax.benchmarks.store.runs import load_run, merged, started, stored_runs, write_run
@@ -60,6 +61,13 @@ def test_an_error_reaches_nothing():
     (line,) = run_of("x", [failed, row_of("c2-4-101")]).lines
     assert line["errors"] == 1
     assert {line[name]["rate"] for name in ("found", "graspable", "retrieved", "drop_free")} == {0.5}
+
+
+def test_what_a_row_does_not_say_is_no_share():
+    older, published = row_of("c2-4-100", objects_fallen=None), row_of("c2-4-100", Method(protocol="published-code"))
+    for row, unsaid in ((older, {"drop_free"}), (published, {"retrieved", "drop_free"})):
+        (line,) = run_of("x", [row]).lines
+        assert {name for name in OUTCOMES if line[name] is None} == unsaid
 
 
 def test_parts_of_other_code_and_those_that_disagree_are_refused(tmp_path):

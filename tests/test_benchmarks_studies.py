@@ -2,6 +2,7 @@
 
 import dataclasses
 import random
+import sys
 
 import pytest
 from stored_rows import row_of
@@ -109,7 +110,21 @@ def test_an_error_is_neither_retrieved_nor_free_of_drops():
         dataclasses.replace(row, failure="error: x", objects_fallen=None, retrieved=False) for row in rows_of(base, 1)
     ]
     (only,) = compare(STUDY, failed)
-    assert (only.errors, only.means["nothing dropped"]) == (50, 0.0)
+    assert (only.errors, only.means["drop-free"]) == (50, 0.0)
+
+
+def test_without_partners_the_sentence_says_whose_rows_lack():
+    base, other = STUDY.variants
+    assert sentence(STUDY, compare(STUDY, rows_of(base, 1.0))) == "There are no rows of another variant yet."
+    assert sentence(STUDY, compare(STUDY, rows_of(other, 1.0))) == "There are no rows of 0.9 yet."
+
+
+def test_another_folder_is_no_page_without_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["page", "--runs", str(tmp_path / "none"), "--out", str(tmp_path / "studies.md")])
+    with pytest.raises(SystemExit):
+        page.main()
+    assert "none: is no folder; start it at the root of a checkout" in capsys.readouterr().err
+    assert not (tmp_path / "studies.md").exists()
 
 
 def test_what_is_the_same_within_chance_is_called_so():

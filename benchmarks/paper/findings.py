@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, PICK_AND_PLACE, PUSH, TABLES, paper_figures
-from mechsearch_jax.benchmarks.paper.reproduce import ANY, Results, Setting, mean_change, paired_rows
+from mechsearch_jax.benchmarks.paper.reproduce import ANY, Results, Setting, ran_alike
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, share_interval
+from mechsearch_jax.benchmarks.statistics.outcomes import takes_out
+from mechsearch_jax.benchmarks.statistics.paired import reached_change, same_episodes, steps_change
 from mechsearch_jax.benchmarks.statistics.rates import scene_of, step_of
 from mechsearch_jax.benchmarks.store.rows import Row, options_of
 
@@ -26,11 +28,18 @@ MARGIN = 0.05
 
 
 class Change(NamedTuple):
-    """A difference with its 95% interval, over so many pairs of episodes, or so many episodes on either side."""
+    """A difference.
+
+    Attributes:
+      value, interval: the difference and its 95% interval.
+      count: over how many pairs of episodes; between tables, how many episodes of the finding's own one.
+      methods: that they are of.
+    """
 
     value: float
     interval: Interval
     count: int
+    methods: tuple[str, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +87,9 @@ def _method(text: str, source: str, rule: Rule, quantity: Quantity, table: str, 
 
 def _seen(recognition: str, name: str, quantity: Quantity) -> Finding:
     text = f"Between `{recognition}` and true shapes there is no difference in {name}"
-    return Finding(text, "5.1", "no difference", quantity, "table1", "recognition", recognition, "oracle", ())
+    # In the paper's simulation segments are always true.
+    source = "5.1" if recognition == "masks" else "5.1, there with true segments"
+    return Finding(text, source, "no difference", quantity, "table1", "recognition", recognition, "oracle", ())
 
 
 def _kinds(
@@ -92,7 +103,9 @@ def _boxes(text: str, rule: Rule, count: int) -> Finding:
 
 
 FINDINGS = (
+    _method("With 6 and 8 objects, search-for-grasp finds more often", "5.1", "more", "find", "table1", 6, 8),
     _method("With 6 and 8 objects, search-for-grasp grasps more often", "5.1", "more", "grasp", "table1", 6, 8),
+    _method("With 2 and 4 objects, both methods find as often", "5.1", "no difference", "find", "table1", 2, 4),
     _method("With 2 and 4 objects, both methods grasp as often", "5.1", "no difference", "grasp", "table1", 2, 4),
     _seen("masks", "finding", "find"),
     _seen("masks", "grasping", "grasp"),
@@ -101,8 +114,13 @@ FINDINGS = (
     _method("In the toy scene, search-for-grasp needs fewer actions to grasp", "D.1", "fewer", "grasp_steps", "table3"),
     _method("In the toy scene, it needs more actions to find", "D.1", "more", "find_steps", "table3"),
     _kinds("Pick-and-place alone finds less often than both kinds of action", "fewer", "find", PICK_AND_PLACE),
+    _kinds("Pick-and-place alone grasps less often than both kinds of action", "fewer", "grasp", PICK_AND_PLACE),
+    _kinds("Pushing alone finds less often than both kinds of action", "fewer", "find", PUSH),
     _kinds("Pushing alone grasps less often than both kinds of action", "fewer", "grasp", PUSH),
     _kinds("Pushing alone finds more often than pick-and-place alone", "more", "find", PUSH, PICK_AND_PLACE),
+    _kinds(
+        "Pushing alone takes more actions to find than pick-and-place alone", "more", "find_steps", PUSH, PICK_AND_PLACE
+    ),
     _boxes("With 4 objects, boxes are grasped less often than cylinders", "fewer", 4),
     _boxes("With 8 objects, boxes are grasped as often as cylinders", "no difference", 8),
 )
@@ -132,12 +150,12 @@ def goal_of(quantity: Quantity, setting: Setting, row: Row) -> str:
     """What counts as the paper's goal, of `rates.GOALS`.
 
     With trials the target is often taken out with a grasp that brushes something, before it is graspable; so it counts
-    there that it was taken out, unless only grasps that touch nothing are used.
+    there that it was taken out, unless only grasps that touch nothing are used, or the protocol takes nothing out.
     """
     if quantity.startswith("find"):
         return "found"
     trials = options_of(row).get("rehearsal", "none") != "none"
-    return "retrieved" if trials and setting.grasps == ANY else "graspable"
+    return "retrieved" if trials and setting.grasps == ANY and takes_out(row) else "graspable"
 
 
 def verdicts(finding: Finding, tables: Mapping[str, Results]) -> list[Verdict]:
@@ -175,21 +193,16 @@ def _within(finding: Finding, tables: Mapping[str, Results]) -> _Changes:
     pairs: dict[tuple[str, str, str], list[tuple[Row, Row]]] = {}
     for setting, own in rows.items():
         base = setting._replace(**{finding.factor: finding.base})
-        if getattr(setting, finding.factor) != finding.value or base not in rows or rows[base][0].code != own[0].code:
+        if getattr(setting, finding.factor) != finding.value or base not in rows or not ran_alike(own, rows[base]):
             continue
         if finding.recognitions and setting.recognition not in finding.recognitions:
             continue
         key = setting.part, setting.recognition, goal_of(finding.quantity, setting, own[0])
-        pairs.setdefault(key, []).extend(paired_rows(_with(own, finding.objects), rows[base]))
+        pairs.setdefault(key, []).extend(same_episodes(_with(own, finding.objects), rows[base]))
     for key, each in pairs.items():
-        steps = [(scene_of(row), step_of(row, key[2]), step_of(other, key[2])) for row, other in each]
-        if finding.quantity.endswith("steps"):
-            mean = mean_change([(scene, a - b) for scene, a, b in steps if a is not None and b is not None])
-        else:
-            mean = mean_change([(scene, (a is not None) - (b is not None)) for scene, a, b in steps])
-        low, high = mean.interval
-        if mean.value is not None and low is not None and high is not None:
-            yield *key, Change(mean.value, (low, high), mean.count)
+        change = (steps_change if finding.quantity.endswith("steps") else reached_change)(each, key[2])
+        if change.mean is not None and change.interval is not None:
+            yield *key, Change(change.mean, change.interval, change.pairs, _methods_of(row for row, _ in each))
 
 
 def _between_tables(finding: Finding, tables: Mapping[str, Results]) -> _Changes:
@@ -206,7 +219,11 @@ def _between_tables(finding: Finding, tables: Mapping[str, Results]) -> _Changes
         if key in sides[1]:
             (p, low, high), (q, lowest, highest) = (_share(side[key], key[2]) for side in sides)
             interval = p - q - math.hypot(p - low, highest - q), p - q + math.hypot(high - p, q - lowest)
-            yield *key, Change(p - q, interval, len(sides[0][key]))
+            yield *key, Change(p - q, interval, len(sides[0][key]), _methods_of(sides[0][key]))
+
+
+def _methods_of(rows: Iterable[Row]) -> tuple[str, ...]:
+    return tuple(sorted({row.policy for row in rows}))
 
 
 def _share(rows: Sequence[Row], goal: str) -> tuple[float, float, float]:

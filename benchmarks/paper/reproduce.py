@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,10 +13,10 @@ from rich.table import Table
 
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, Figures, PaperTable, paper_figures
 from mechsearch_jax.benchmarks.running.evaluate import Job
-from mechsearch_jax.benchmarks.statistics.intervals import Interval
-from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
-from mechsearch_jax.benchmarks.statistics.rates import Rates, scene_of, step_of, summarise
-from mechsearch_jax.benchmarks.store.rows import Row
+from mechsearch_jax.benchmarks.statistics.intervals import Interval, with_interval
+from mechsearch_jax.benchmarks.statistics.paired import reached_change, same_episodes, steps_change
+from mechsearch_jax.benchmarks.statistics.rates import Rates, summarise
+from mechsearch_jax.benchmarks.store.rows import Row, options_of
 from mechsearch_jax.runtime.files import PathLike, check_writable, replacing
 
 # What cells differ in. Differences are from the first value of each.
@@ -119,8 +119,18 @@ def _cell(setting: Setting, objects: int | None, rates: Rates, paper: Figures | 
     return Cell(setting, objects, rates.episodes, rates.errors, **means, paper=paper)
 
 
+def origin_of(row: Row) -> tuple[str | None, str | None]:
+    """The code and the simulator that an episode ran with."""
+    return row.code, options_of(row).get("simulator")
+
+
+def ran_alike(rows: Sequence[Row], base: Sequence[Row]) -> bool:
+    """Whether two settings differ in nothing but themselves: not in the code or the simulator, too."""
+    return origin_of(rows[0]) == origin_of(base[0])
+
+
 class Results(NamedTuple):
-    """The rows of an experiment by what they ran with."""
+    """The rows of an experiment by what they ran with; those of a setting have their code and simulator in common."""
 
     table: PaperTable
     rows: Mapping[Setting, Sequence[Row]]
@@ -151,7 +161,7 @@ class Results(NamedTuple):
             _difference(factor, setting, base, count, pairs)
             for factor, setting, base in self.pairs()
             for count in self.counts()
-            if (pairs := paired_rows(self.rows[setting], self.rows[base], count))
+            if (pairs := same_episodes(self.rows[setting], self.rows[base], count))
         ]
 
     def pairs(self) -> Iterator[tuple[str, Setting, Setting]]:
@@ -160,19 +170,8 @@ class Results(NamedTuple):
             values = list(dict.fromkeys(getattr(setting, factor) for setting in self.rows))
             for setting in self.rows:
                 base = setting._replace(**{factor: values[0]})
-                # Of different code they would differ in more than the factor.
-                if base != setting and base in self.rows and self.rows[base][0].code == self.rows[setting][0].code:
+                if base != setting and base in self.rows and ran_alike(self.rows[setting], self.rows[base]):
                     yield factor, setting, base
-
-
-def paired_rows(rows: Sequence[Row], base: Sequence[Row], objects: int | None = None) -> list[tuple[Row, Row]]:
-    """The same episodes in both."""
-    partners = {(scene_of(row), row.seed): row for row in base}
-    return [
-        (row, partner)
-        for row in rows
-        if objects in (None, row.objects) and (partner := partners.get((scene_of(row), row.seed)))
-    ]
 
 
 def _difference(
@@ -180,17 +179,9 @@ def _difference(
 ) -> Difference:
     means = {}
     for name, goal in GOALS.items():
-        steps = [(scene_of(row), step_of(row, goal), step_of(other, goal)) for row, other in pairs]
-        means[name] = mean_change([(scene, (a is not None) - (b is not None)) for scene, a, b in steps])
-        both = [(scene, a - b) for scene, a, b in steps if a is not None and b is not None]
-        means[f"{name}_steps"] = mean_change(both)
+        for field, change in ((name, reached_change(pairs, goal)), (f"{name}_steps", steps_change(pairs, goal))):
+            means[field] = Mean.of(change.mean, change.interval, change.pairs)
     return Difference(factor, setting, getattr(base, factor), objects, len(pairs), **means)
-
-
-def mean_change(changes: Sequence[tuple[Hashable, int | float]]) -> Mean:
-    """The mean of changes, each with its scene."""
-    change = PairedDifference.of([value for _, value in changes], [scene for scene, _ in changes])
-    return Mean.of(change.mean, change.interval, change.pairs)
 
 
 def results_of(table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], rows: Mapping[str, Row]) -> Results:
@@ -203,13 +194,6 @@ def results_of(table: PaperTable, jobs: Mapping[Setting, Sequence[Job]], rows: M
     """
     ended = {setting: [rows[job.key] for job in own if job.key in rows] for setting, own in jobs.items()}
     return Results(table, {setting: own for setting, own in ended.items() if own})
-
-
-def _text(mean: Mean, form: str) -> str:
-    if mean.value is None:
-        return "-"
-    bounds = "" if None in mean.interval else f" ({' to '.join(form.format(bound) for bound in mean.interval)})"
-    return f"{form.format(mean.value)}{bounds}"
 
 
 def actions_text(setting: Setting) -> str:
@@ -239,7 +223,8 @@ def _cell_line(cell: Cell) -> list[str]:
     line.append(f"{cell.episodes}" + (f", {cell.errors} errors" if cell.errors else ""))
     for name in Figures._fields:
         form = "{:.2f}" if "steps" in name else "{:.3f}"
-        line += [_text(getattr(cell, name), form), f"{getattr(paper, name) or NOT_IN_THE_PAPER}"]
+        mean = getattr(cell, name)
+        line += [with_interval(mean.value, mean.interval, form), f"{getattr(paper, name) or NOT_IN_THE_PAPER}"]
     return line
 
 
@@ -248,9 +233,10 @@ def _difference_line(difference: Difference) -> list[str]:
     against = actions_text(base) if difference.factor == "actions" else str(difference.base)
     setting = difference.setting
     line = [difference.factor, against, setting.method, setting.recognition, actions_text(setting), *setting[3:]]
-    shares = [_text(getattr(difference, goal), "{:+.3f}") for goal in GOALS]
-    steps = [_text(getattr(difference, f"{goal}_steps"), "{:+.2f}") for goal in GOALS]
-    return [*line, objects_text(difference.objects), str(difference.pairs), *shares, *steps]
+    means = [(getattr(difference, goal), "{:+.3f}") for goal in GOALS]
+    means += [(getattr(difference, f"{goal}_steps"), "{:+.2f}") for goal in GOALS]
+    changes = [with_interval(mean.value, mean.interval, form) for mean, form in means]
+    return [*line, objects_text(difference.objects), str(difference.pairs), *changes]
 
 
 def screen(results: Results) -> Group:

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import operator
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, PaperTable
-from mechsearch_jax.benchmarks.paper.reproduce import ANY, COLLISION_FREE, CONTACT, FACTORS, Results, Setting
+from mechsearch_jax.benchmarks.paper.reproduce import (
+    ANY,
+    COLLISION_FREE,
+    CONTACT,
+    FACTORS,
+    Results,
+    Setting,
+    origin_of,
+)
 from mechsearch_jax.benchmarks.store.rows import OPTIONS, Row, episode_key
 from mechsearch_jax.benchmarks.store.runs import StoredRun, variant_of
 from mechsearch_jax.envs.scenes.scene_sets import find_scene
@@ -34,16 +43,21 @@ def setting_of(line: Mapping[str, Any]) -> Setting | None:
 
 
 def results_of_runs(table: PaperTable, runs: Sequence[StoredRun]) -> Results:
-    """The rows of an experiment in stored runs: of every setting, those of the code of the newest run that has it."""
+    """The rows of an experiment in stored runs.
+
+    Of every setting those of the newest run that has it, with its code and the simulator that most of them ran in.
+    """
     rows: dict[Setting, dict[str, Row]] = {}
     for run in runs_of(table, runs):
         fresh: dict[Setting, list[Row]] = {}
         for setting, row in _rows_of(table, run):
             fresh.setdefault(setting, []).append(row)
         for setting, own in fresh.items():
-            there = rows.setdefault(setting, {})
-            if not there or next(iter(there.values())).code == own[0].code:
-                rows[setting] = {episode_key(row): row for row in own} | there
+            there = rows.get(setting, {})
+            shown = (
+                origin_of(next(iter(there.values()))) if there else Counter(map(origin_of, own)).most_common(1)[0][0]
+            )
+            rows[setting] = {episode_key(row): row for row in own if origin_of(row) == shown} | there
     ordered = sorted(rows, key=_order)
     return Results(table, {setting: list(rows[setting].values()) for setting in ordered})
 

@@ -16,22 +16,23 @@ from typing import Any
 import jinja2
 
 from mechsearch_jax.benchmarks.paper.findings import FINDINGS, HOLDS, MARGIN, Finding, Verdict, verdicts
-from mechsearch_jax.benchmarks.paper.paper_tables import TABLES, Figures
+from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, Figures
 from mechsearch_jax.benchmarks.paper.reproduce import (
     FACTORS,
     NOT_IN_THE_PAPER,
-    Mean,
     Results,
     Setting,
     actions_text,
-    mean_change,
     objects_text,
-    paired_rows,
+    origin_of,
 )
 from mechsearch_jax.benchmarks.paper.stored_tables import results_of_runs, runs_of
 from mechsearch_jax.benchmarks.report.results_page import table
-from mechsearch_jax.benchmarks.report.store_run import OUTCOMES, rates_of, takes_out
-from mechsearch_jax.benchmarks.statistics.rates import scene_of, step_of
+from mechsearch_jax.benchmarks.report.store_run import rates_of
+from mechsearch_jax.benchmarks.statistics.intervals import with_interval
+from mechsearch_jax.benchmarks.statistics.outcomes import COMPARED, OUTCOMES, WORDS, takes_out
+from mechsearch_jax.benchmarks.statistics.paired import change_of, same_episodes, steps_change
+from mechsearch_jax.benchmarks.statistics.rates import scene_of
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
 from mechsearch_jax.envs.scenes.scene_sets import CHOSEN_ON, is_chosen_on
@@ -39,23 +40,28 @@ from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 
 TEMPLATE = Path(__file__).with_name("reproduction_page.md.jinja")
-# Rates that stand beside each other, by their names in `OUTCOMES`.
-SHARES = {"found": "found", "graspable": "graspable", "retrieved": "retrieved", "drop_free": "drop-free"}
 # Scenes by the share of their episodes in which they were solved: the largest share of each column.
 DIFFICULTY = {"none": 0.0, "to 1/4": 0.25, "to 1/2": 0.5, "to 3/4": 0.75, "below all": 1.0 - 1e-9, "all": 1.0}
 
 
 def _share(rate: Mapping[str, Any] | None) -> str:
-    return "-" if rate is None else f"{rate['rate']:.3f} ({rate['interval'][0]:.3f} to {rate['interval'][1]:.3f})"
+    return "-" if rate is None else with_interval(rate["rate"], rate["interval"])
 
 
-def _change(mean: Mean, form: str = "{:+.3f}") -> str:
-    if mean.value is None:
-        return "-"
-    low, high = mean.interval
-    return form.format(mean.value) + (
-        "" if low is None or high is None else f" ({form.format(low)} to {form.format(high)})"
-    )
+def _table(header: Sequence[str], lines: Sequence[Sequence[object]], constant: Sequence[str] = ()) -> str:
+    """The table, without columns that say nothing, and without those of these names that say one thing throughout."""
+    columns = [[str(line[i]) for line in lines] for i in range(len(header))]
+    kept = [
+        i
+        for i, (name, cells) in enumerate(zip(header, columns, strict=True))
+        if set(cells) != {"-"} and not (name in constant and len(set(cells)) == 1)
+    ]
+    return table([header[i] for i in kept], [[line[i] for i in kept] for line in lines])
+
+
+def _values(setting: Setting) -> list[str]:
+    """What a setting is, under the names of `FACTORS`."""
+    return [actions_text(setting) if name == "actions" else getattr(setting, name) for name in FACTORS]
 
 
 def _paper(value: float | None) -> str:
@@ -109,58 +115,66 @@ def parts_of(results: Results) -> dict[str, Results]:
     return {part: Results(results.table, rows) for part, rows in parts.items()}
 
 
+def source(results: Results, runs: Sequence[StoredRun]) -> str:
+    """The files that have the rows of a part, and the simulators that they ran in."""
+    shown = {id(row) for rows in results.rows.values() for row in rows}
+    files = [f"[{run.name}](../{RUNS}/{run.name}.jsonl)" for run in runs if any(id(row) in shown for row in run.rows)]
+    simulators = sorted({str(origin_of(rows[0])[1]) for rows in results.rows.values()})
+    return f"Rows: {', '.join(files)}; {', '.join(simulators)}."
+
+
+_CELL = ("recognition", "method", "actions", "objects")
+
+
+def _cell(setting: Setting, objects: int | None) -> tuple[str, ...]:
+    """What a cell is, under `_CELL`."""
+    return setting.recognition, setting.method, actions_text(setting), objects_text(objects)
+
+
 def cells_table(results: Results) -> str:
-    """Our cells beside the paper's figures."""
-    header = ["recognition", "method", "actions", "objects", "episodes", "found", "paper", "graspable", "paper"]
-    header += ["with the paper's grasps", "retrieved", "drop-free", "actions to find", "paper", "to grasp", "paper"]
+    """Our shares beside the paper's."""
+    header = (*_CELL, "episodes", "found", "paper", "graspable", "paper")
+    more = ("paper_graspable", "retrieved", "drop_free")
     lines = []
     for setting, rows in results.rows.items():
         for count in results.counts():
             own = [row for row in rows if count in (None, row.objects)]
-            if own:
-                paper = results.paper(setting, count) or Figures(None, None, None, None)
-                lines.append(_cell_line(setting, objects_text(count), own, paper))
-    return table(header, lines)
+            if not own:
+                continue
+            paper = results.paper(setting, count) or Figures(None, None, None, None)
+            rates, errors = rates_of(own), sum(row.is_error for row in own)
+            beside = (_share(rates["found"]), _paper(paper.find), _share(rates["graspable"]), _paper(paper.grasp))
+            episodes = f"{len(own)}" + (f", {errors} errors" if errors else "")
+            lines.append([*_cell(setting, count), episodes, *beside, *(_share(rates[name]) for name in more)])
+    return _table([*header, *(WORDS[name] for name in more)], lines, ["actions"])
 
 
-def _cell_line(setting: Setting, objects: str, rows: Sequence[Row], paper: Figures) -> list[object]:
-    rates, errors = rates_of(rows), sum(row.is_error for row in rows)
-    return [
-        *(setting.recognition, setting.method, actions_text(setting), objects),
-        f"{len(rows)}" + (f", {errors} errors" if errors else ""),
-        *(_share(rates["found"]), _paper(paper.find), _share(rates["graspable"]), _paper(paper.grasp)),
-        *(_share(rates[name]) for name in ("paper_graspable", "retrieved", "drop_free")),
-        *(_mean_steps(rows, "found"), _paper(paper.find_steps)),
-        *(_mean_steps(rows, "graspable"), _paper(paper.grasp_steps)),
-    ]
-
-
-def _mean_steps(rows: Sequence[Row], goal: str) -> str:
-    steps = [step for row in rows if (step := step_of(row, goal)) is not None]
-    return f"{sum(steps) / len(steps):.2f}" if steps else "-"
+def actions_table(results: Results) -> str:
+    """Our mean numbers of actions beside the paper's."""
+    lines = []
+    for cell in results.cells():
+        paper = cell.paper or Figures(None, None, None, None)
+        find, grasp = (
+            with_interval(mean.value, mean.interval, "{:.2f}") for mean in (cell.find_steps, cell.grasp_steps)
+        )
+        place = _cell(cell.setting, cell.objects)
+        lines.append([*place, find, _paper(paper.find_steps), grasp, _paper(paper.grasp_steps)])
+    return _table([*_CELL, "actions to find", "paper", "to grasp", "paper"], lines, ["actions"])
 
 
 def differences_table(results: Results) -> str:
     """Paired differences of everything from the first value of its factor, over all numbers of objects."""
     lines = []
     for factor, setting, base in results.pairs():
-        pairs = paired_rows(results.rows[setting], results.rows[base])
+        pairs = same_episodes(results.rows[setting], results.rows[base])
         if not pairs:
             continue
-        against = actions_text(base) if factor == "actions" else getattr(base, factor)
-        values = [actions_text(setting) if name == "actions" else getattr(setting, name) for name in FACTORS]
-        changes = []
-        for name in SHARES:
-            reached = [(scene_of(a), OUTCOMES[name](a), OUTCOMES[name](b)) for a, b in pairs]
-            both = [(scene, a - b) for scene, a, b in reached if a is not None and b is not None]
-            changes.append(_change(mean_change(both)))
-        for goal in ("found", "graspable"):
-            steps = [(scene_of(a), step_of(a, goal), step_of(b, goal)) for a, b in pairs]
-            both = [(scene, a - b) for scene, a, b in steps if a is not None and b is not None]
-            changes.append(_change(mean_change(both), "{:+.2f}"))
-        lines.append([factor, against, *values, len(pairs), *changes])
-    header = ["of", "against", *FACTORS, "pairs", *SHARES.values(), "actions to find", "to grasp"]
-    return table(header, lines)
+        changes = [(change_of(pairs, OUTCOMES[name]), "{:+.3f}") for name in COMPARED]
+        changes += [(steps_change(pairs, goal), "{:+.2f}") for goal in ("found", "graspable")]
+        texts = [with_interval(change.mean, change.interval, form) for change, form in changes]
+        lines.append([factor, _values(base)[FACTORS.index(factor)], *_values(setting), len(pairs), *texts])
+    header = ["factor", "base", *FACTORS, "pairs", *(WORDS[name] for name in COMPARED), "actions to find", "to grasp"]
+    return _table(header, lines, FACTORS)
 
 
 def unchosen_table(results: Results) -> str:
@@ -170,9 +184,8 @@ def unchosen_table(results: Results) -> str:
         new = [row for row in rows if not is_chosen_on(row.scenario)]
         if new and len(new) < len(rows):
             rates = rates_of(new)
-            values = [actions_text(setting) if name == "actions" else getattr(setting, name) for name in FACTORS]
-            lines.append([*values, len(new), *(_share(rates[name]) for name in SHARES)])
-    return table([*FACTORS, "episodes", *SHARES.values()], lines) if lines else ""
+            lines.append([*_values(setting), len(new), *(_share(rates[name]) for name in COMPARED)])
+    return _table([*FACTORS, "episodes", *(WORDS[name] for name in COMPARED)], lines, FACTORS) if lines else ""
 
 
 def difficulty_table(tables: Mapping[str, Results]) -> str:
@@ -212,13 +225,15 @@ def findings(tables: Mapping[str, Results]) -> list[dict[str, Any]]:
 
 
 def _verdict_line(finding: Finding, verdict: Verdict) -> str:
-    form = "{:+.2f} actions" if finding.quantity.endswith("steps") else "{:+.3f}"
+    form = "{:+z.2f} actions" if finding.quantity.endswith("steps") else "{:+z.3f}"
     low, high = (form.split(" ")[0].format(bound) for bound in verdict.change.interval)
     paper = NOT_IN_THE_PAPER if verdict.paper is None else f"{form.split(' ')[0].format(verdict.paper)} in the paper"
     bold = f"**{verdict.verdict}**" if verdict.verdict == HOLDS else f"*{verdict.verdict}*"
     count = "pairs" if finding.factor != "table" else "episodes with boxes"
+    methods = verdict.change.methods
+    only = f", {methods[0]} alone" if finding.factor != "method" and len(methods) < len(METHODS) else ""
     return (
-        f"{verdict.part}, `{verdict.recognition}`: {bold}, {verdict.goal} {form.format(verdict.change.value)} "
+        f"{verdict.part}, `{verdict.recognition}`{only}: {bold}, {verdict.goal} {form.format(verdict.change.value)} "
         f"({low} to {high}), {verdict.change.count} {count}; {paper}"
     )
 
@@ -237,10 +252,14 @@ def page(folder: PathLike) -> str:
     )
     environment.globals |= {
         function.__name__: function
-        for function in (parts_of, cells_table, differences_table, unchosen_table, difficulty_table, scenes_table)
+        for function in (
+            *(parts_of, source, cells_table, actions_table),
+            *(differences_table, unchosen_table, difficulty_table, scenes_table),
+        )
     }
     template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
     return template.render(
+        stored=runs,
         runs=runs_table([run for run in runs if run.name in names], tables) if names else "",
         tables=tables,
         all_tables=TABLES,
@@ -256,6 +275,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument("--runs", default=str(RUNS), help="folder of the stored runs")
     parser.add_argument("--out", default="docs/reproduction.md", help="the page")
     parsed = parser.parse_args(None if arguments is None else list(arguments))
+    if not Path(parsed.runs).is_dir():
+        parser.error(f"{parsed.runs}: is no folder; start it at the root of a checkout, or give --runs")
     try:
         text = page(parsed.runs)
         with replacing(parsed.out) as file:

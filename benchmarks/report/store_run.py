@@ -9,31 +9,17 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
+from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.rates import scene_of
 from mechsearch_jax.benchmarks.statistics.settings import settings_of
 from mechsearch_jax.benchmarks.store.rows import Row, options_of
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, merged, started, variant_of, write_run
 from mechsearch_jax.envs.scenes.scene_sets import SETS, find_scene, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError
-
-
-def takes_out(row: Row) -> bool:
-    """Whether the episode's protocol takes a target out, and leaves on the floor what fell."""
-    return options_of(row)["protocol"] == "strict"
-
-
-# What an episode reaches, by what lines call it; None where a row does not say. An error reaches nothing.
-OUTCOMES: Mapping[str, Callable[[Row], bool | None]] = {
-    "found": lambda row: row.found_step is not None,
-    "graspable": lambda row: row.graspable_step is not None,
-    "paper_graspable": lambda row: row.paper_graspable,
-    "retrieved": lambda row: row.retrieved if takes_out(row) else None,
-    "drop_free": lambda row: row.objects_fallen == 0 if takes_out(row) else None,
-}
 
 
 def rates_of(rows: Sequence[Row]) -> dict[str, Any]:

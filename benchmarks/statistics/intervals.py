@@ -33,6 +33,14 @@ def wilson(successes: int, count: int) -> Interval:
     return float(interval.low), float(interval.high)
 
 
+def with_interval(value: int | float | None, interval: Sequence[float | None] | None, form: str = "{:.3f}") -> str:
+    """A value and its interval as a text, "0.500 (0.400 to 0.600)": without an interval the value, without both "-"."""
+    if value is None:
+        return "-"
+    bounds = [] if interval is None else [form.format(bound) for bound in interval if bound is not None]
+    return f"{form.format(value)} ({' to '.join(bounds)})" if bounds else form.format(value)
+
+
 def by_scene(
     values: Sequence[int | float], scenes: Sequence[Hashable]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:

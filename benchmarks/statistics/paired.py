@@ -6,13 +6,13 @@ The episodes of a scene are not independent. So a scene's differences are averag
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 
 import numpy as np
 import scipy.stats
 
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, by_scene, mean_interval
-from mechsearch_jax.benchmarks.statistics.rates import GOALS, step_of
+from mechsearch_jax.benchmarks.statistics.rates import GOALS, scene_of, step_of
 from mechsearch_jax.benchmarks.statistics.variants import canonical, column, label_variants, natural
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.runtime.errors import InputError
@@ -64,6 +64,36 @@ class PairedDifference:
         return mean_interval(self.scene_means, range(self.scenes))
 
 
+def same_episodes(rows: Sequence[Row], base: Sequence[Row], objects: int | None = None) -> list[tuple[Row, Row]]:
+    """The rows of which the base has one on the same scene with the same seed, each with that one.
+
+    Args:
+      rows, base: of two variants.
+      objects: only scenes with so many; all if None.
+    """
+    partners = {(scene_of(row), row.seed): row for row in base}
+    return [
+        (row, partner)
+        for row in rows
+        if objects in (None, row.objects) and (partner := partners.get((scene_of(row), row.seed)))
+    ]
+
+
+def change_of(pairs: Sequence[tuple[Row, Row]], measure: Callable[[Row], int | float | None]) -> PairedDifference:
+    """How much larger a measure is in the first row of each pair; a pair where one of them has none is left out."""
+    return _change([(measure(row), measure(other)) for row, other in pairs], [scene_of(row) for row, _ in pairs])
+
+
+def reached_change(pairs: Sequence[tuple[Row, Row]], goal: str) -> PairedDifference:
+    """How much larger the share of episodes is that reached a goal."""
+    return change_of(pairs, lambda row: step_of(row, goal) is not None)
+
+
+def steps_change(pairs: Sequence[tuple[Row, Row]], goal: str) -> PairedDifference:
+    """How many more actions it took to reach a goal, over the pairs of which both episodes did."""
+    return change_of(pairs, lambda row: step_of(row, goal))
+
+
 # By variant, and by goal or goal and "_steps": the actions until then, over the pairs in which both got there.
 VariantDifferences = Mapping[str, Mapping[str, PairedDifference]]
 
@@ -108,7 +138,9 @@ def paired(rows: Sequence[Row], baseline: str, columns: Sequence[str] = PAIRED) 
     return differences
 
 
-def _change(means: Sequence[tuple[float | None, float | None]], scenes: Sequence[Hashable]) -> PairedDifference:
+def _change(
+    means: Sequence[tuple[int | float | None, int | float | None]], scenes: Sequence[Hashable]
+) -> PairedDifference:
     """The difference over pairs of means, each on a scene; a pair of which one mean is None is left out."""
     differences = [
         (mean - base, scene)

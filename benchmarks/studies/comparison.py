@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from rich.table import Table
 
-from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_interval, share_interval
-from mechsearch_jax.benchmarks.statistics.paired import PairedDifference
+from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_interval, share_interval, with_interval
+from mechsearch_jax.benchmarks.statistics.outcomes import COMPARED, OUTCOMES, WORDS
+from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, change_of, same_episodes
 from mechsearch_jax.benchmarks.statistics.rates import scene_of
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant
 
-# What is compared, in the words of tables: a number for each episode.
-MEASURES: Mapping[str, Callable[[Row], float]] = {
-    "found": lambda row: row.found_step is not None,
-    "graspable": lambda row: row.graspable_step is not None,
-    "retrieved": lambda row: row.retrieved,
-    "nothing dropped": lambda row: not row.objects_fallen and not row.is_error,
+# What is compared, by the words of tables: a number for each episode, or None where its row does not say.
+SHARES = tuple(WORDS[name] for name in COMPARED)
+MEASURES: Mapping[str, Callable[[Row], float | None]] = {
+    **{WORDS[name]: OUTCOMES[name] for name in COMPARED},
     "actions": lambda row: row.steps,
 }
-SHARES = ("found", "graspable", "retrieved", "nothing dropped")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,8 +30,8 @@ class Comparison:
       variant: the method.
       episodes, scenes: how many.
       errors: how many of the episodes could not be run to their end; they count as failures.
-      means: of each of `MEASURES` over episodes.
-      intervals: their 95% intervals, which resample scenes; None from fewer than two scenes.
+      means: of each of `MEASURES` over episodes; None where no row says it.
+      intervals: their 95% intervals, by scene: see `intervals`; None where there is none.
       changes: how much more than the first variant, over the scenes and seeds that both have; empty for the first.
       decision_seconds: mean wall time of planning for an action, on the device that ran the rows [s].
     """
@@ -42,7 +40,7 @@ class Comparison:
     episodes: int
     scenes: int
     errors: int
-    means: Mapping[str, float]
+    means: Mapping[str, float | None]
     intervals: Mapping[str, Interval | None]
     changes: Mapping[str, PairedDifference]
     decision_seconds: float
@@ -67,27 +65,23 @@ def compare(study: Study, rows: Sequence[Row], objects: int | None = None) -> li
 
 
 def _comparison(variant: Variant, rows: Sequence[Row], base: Sequence[Row]) -> Comparison:
-    scenes = list(map(scene_of, rows))
-    means, intervals, changes = {}, {}, {}
-    partners = {(scene_of(row), row.seed): row for row in base}
-    pairs = [(row, partner) for row in rows if (partner := partners.get((scene_of(row), row.seed)))]
-    shared: list[Hashable] = [scene_of(row) for row, _ in pairs]
+    means, intervals = {}, {}
+    pairs = same_episodes(rows, base)
     for name, measure in MEASURES.items():
-        values = list(map(measure, rows))
-        means[name] = sum(values) / len(values)
+        ends = [(value, scene_of(row)) for row in rows if (value := measure(row)) is not None]
+        values, scenes = [value for value, _ in ends], [scene for _, scene in ends]
+        means[name] = sum(values) / len(values) if values else None
         interval = share_interval(list(map(bool, values)), scenes) if name in SHARES else mean_interval(values, scenes)
-        intervals[name] = interval
-        if pairs:
-            changes[name] = PairedDifference.of([measure(row) - measure(other) for row, other in pairs], shared)
+        intervals[name] = interval if values else None
     actions = max(sum(row.steps for row in rows), 1)
     return Comparison(
         variant,
         len(rows),
-        len(set(scenes)),
+        len(set(map(scene_of, rows))),
         sum(row.is_error for row in rows),
         means,
         intervals,
-        changes,
+        {name: change_of(pairs, measure) for name, measure in MEASURES.items()} if pairs else {},
         sum(row.planning_seconds for row in rows) / actions,
     )
 
@@ -102,16 +96,17 @@ def verdict(change: PairedDifference) -> int:
 
 def points(change: PairedDifference) -> str:
     """A change of a share in percentage points, with its interval."""
-    assert change.mean is not None
-    bounds = "" if change.interval is None else f" ({100 * change.interval[0]:+.1f} to {100 * change.interval[1]:+.1f})"
-    return f"{100 * change.mean:+.1f}{bounds}"
+    if change.mean is None:
+        return "-"
+    return with_interval(100 * change.mean, change.interval and [100 * bound for bound in change.interval], "{:+.1f}")
 
 
 def sentence(study: Study, comparisons: Sequence[Comparison]) -> str:
     """What the study says of `retrieved`, in words."""
     others = [each for each in comparisons if each.changes]
     if not others:
-        return "There are no rows of it yet."
+        there = bool(comparisons) and comparisons[0].variant is study.baseline
+        return f"There are no rows of {'another variant' if there else study.baseline.label} yet."
     by_verdict: dict[int, list[str]] = {1: [], -1: [], 0: []}
     for each in others:
         change = each.changes["retrieved"]
@@ -140,19 +135,13 @@ def cells(comparison: Comparison) -> list[str]:
     errors = f", {comparison.errors} errors" if comparison.errors else ""
     line = [comparison.variant.label, f"{comparison.episodes}{errors}"]
     for name in SHARES:
-        line.append(_with_interval(comparison.means[name], comparison.intervals[name], 2))
-    line.append(f"{comparison.means['actions']:.1f}")
+        line.append(with_interval(comparison.means[name], comparison.intervals[name], "{:.2f}"))
+    line.append(with_interval(comparison.means["actions"], None, "{:.1f}"))
     if not comparison.changes:
         return [*line, "", "", ""]
     actions = comparison.changes["actions"]
-    assert actions.mean is not None
     shares = [points(comparison.changes[name]) for name in ("retrieved", "graspable")]
-    return [*line, *shares, _with_interval(actions.mean, actions.interval, 1, "+")]
-
-
-def _with_interval(mean: float, interval: Interval | None, digits: int, sign: str = "") -> str:
-    bounds = "" if interval is None else f" ({interval[0]:{sign}.{digits}f} to {interval[1]:{sign}.{digits}f})"
-    return f"{mean:{sign}.{digits}f}{bounds}"
+    return [*line, *shares, with_interval(actions.mean, actions.interval, "{:+.1f}")]
 
 
 def screen(study: Study, rows: Sequence[Row]) -> Table:
@@ -165,7 +154,8 @@ def screen(study: Study, rows: Sequence[Row]) -> Table:
     for name in ("", "episodes", "found", "graspable", "retrieved", "actions", "change of retrieved"):
         table.add_column(name, justify="right" if name else "left")
     for each in comparisons:
-        shares = [f"{each.means[name]:.2f}" for name in ("found", "graspable", "retrieved")]
+        shares = [with_interval(each.means[name], None, "{:.2f}") for name in ("found", "graspable", "retrieved")]
+        actions = with_interval(each.means["actions"], None, "{:.1f}")
         change = points(each.changes["retrieved"]) if each.changes else ""
-        table.add_row(each.variant.label, str(each.episodes), *shares, f"{each.means['actions']:.1f}", change)
+        table.add_row(each.variant.label, str(each.episodes), *shares, actions, change)
     return table

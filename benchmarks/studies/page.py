@@ -16,6 +16,7 @@ from mechsearch_jax.benchmarks.studies.declared import GROUPS
 from mechsearch_jax.benchmarks.studies.pictures import picture
 from mechsearch_jax.benchmarks.studies.studies import Study
 from mechsearch_jax.envs.scenes.scene_sets import find_set, is_chosen_on
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import replacing
 
 INTRODUCTION = (
@@ -25,7 +26,8 @@ INTRODUCTION = (
     "`--dry-run` says what it would take, and `python -m mechsearch_jax.benchmarks.report.store_run` stores its rows.",
     "Unless a variant says otherwise: search-for-grasp, preset `standard`, true shapes, protocol `strict`, at most 10 "
     "actions. Words are in the [glossary](glossary.md), verdicts in [method.md](method.md#verdicts). In brackets stand "
-    "95% intervals that resample scenes. A change is a paired difference from the first variant, over the scenes and "
+    "95% intervals, which know that the seeds of a scene are alike; each is for itself: where there is no difference "
+    "at all, one in twenty shows one. A change is a paired difference from the first variant, over the scenes and "
     "seeds that both have: of shares in percentage points, of actions in actions. The simulator that tries actions out "
     "is the one that judges them, but for the studies under Robustness.",
 )
@@ -97,7 +99,12 @@ def main() -> None:
     parser.add_argument("--runs", default=RUNS, type=Path, help="folder of the stored runs")
     parser.add_argument("--out", default="docs/studies.md", type=Path, help="the page; its pictures come beside it")
     arguments = parser.parse_args()
-    runs = stored_runs(arguments.runs)
+    try:
+        if not arguments.runs.is_dir():
+            raise InputError(f"{arguments.runs}: is no folder; start it at the root of a checkout, or give --runs")
+        runs = stored_runs(arguments.runs)
+    except InputError as error:
+        parser.error(str(error))
     folder = arguments.out.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)
     for name, (study, comparisons) in pictures(runs).items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -39,11 +40,11 @@ def _plain(axes: Axes) -> None:
     axes.tick_params(colors=INK, labelsize=8)
 
 
-def _bars(means: Sequence[float], intervals: Sequence[Interval | None]) -> np.ndarray:
-    """Lengths of error bars, shape (2, n); 0 where there is no interval."""
+def _bars(means: Sequence[float | None], intervals: Sequence[Interval | None]) -> np.ndarray:
+    """Lengths of error bars, shape (2, n); 0 where there is no interval, NaN where there is no mean."""
     bounds = [(mean, mean) if interval is None else interval for mean, interval in zip(means, intervals, strict=True)]
-    low, high = np.array(bounds).T
-    return np.maximum(np.stack([np.array(means) - low, high - np.array(means)]), 0.0)
+    low, high = np.array(bounds, float).T
+    return np.maximum(np.stack([np.array(means, float) - low, high - np.array(means, float)]), 0.0)
 
 
 def _along_axis(study: Study, comparisons: Sequence[Comparison]) -> Figure:
@@ -55,7 +56,17 @@ def _along_axis(study: Study, comparisons: Sequence[Comparison]) -> Figure:
     for name, colour in COLOURS.items():
         means = [c.means[name] for c in placed]
         bars = _bars(means, [c.intervals[name] for c in placed])
-        axes.errorbar(x, means, bars, color=colour, marker="o", markersize=4, capsize=2, linewidth=1.2, label=name)
+        axes.errorbar(
+            x,
+            np.array(means, float),
+            bars,
+            color=colour,
+            marker="o",
+            markersize=4,
+            capsize=2,
+            linewidth=1.2,
+            label=name,
+        )
     if study.logarithmic:
         axes.set_xscale("log")
     axes.set_xticks(x, [f"{value:g}" for value in x], minor=False)
@@ -74,7 +85,7 @@ def _changes(comparisons: Sequence[Comparison]) -> Figure:
     axes.axvline(0.0, color=INK, linewidth=0.8)
     for offset, (name, colour) in zip((-0.13, 0.13), COLOURS.items(), strict=True):
         changes = [c.changes[name] for c in others]
-        means = [100 * (change.mean or 0.0) for change in changes]
+        means = [math.nan if change.mean is None else 100 * change.mean for change in changes]
         intervals = [change.interval and (100 * change.interval[0], 100 * change.interval[1]) for change in changes]
         y = np.arange(len(others)) + offset
         bars = _bars(means, intervals) if others else None
@@ -92,6 +103,8 @@ def _against_time(comparisons: Sequence[Comparison]) -> Figure:
     axes = figure.subplots()
     for i, c in enumerate(comparisons, start=1):
         x, y = 1000 * max(c.decision_seconds, 1e-6), c.means["retrieved"]
+        if y is None:
+            continue
         axes.errorbar(x, y, _bars([y], [c.intervals["retrieved"]]), color=MUTED, capsize=2, linewidth=0.8, zorder=1)
         marker = f"${i}$"
         axes.plot(x, y, linestyle="", marker=marker, markersize=8, color=RETRIEVED, label=c.variant.label)
