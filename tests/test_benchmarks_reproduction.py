@@ -217,13 +217,17 @@ def test_tables_have_no_columns_that_say_nothing(tmp_path):
     stored(tmp_path, "table1", rows)
     stored(tmp_path, "table4", rows_of("table4", 3, lambda *_: (1, 2)))
     page = reproduction_page.page(tmp_path)
-    before, after = page.split("## Table 4")
+    assert "Rows: [table4](../benchmarks/results/runs/table4.jsonl); NativeSimulator." in page
+    before, _, after = page.partition("## Table 4")
     assert (
         "| recognition | method | objects | episodes | found | paper | graspable | paper | with the paper's grasps |\n"
         in before
     )
     assert "| recognition | method | actions | objects | episodes |" in after
-    assert "Rows: [table4](../benchmarks/results/runs/table4.jsonl); NativeSimulator." in after
+    stored(tmp_path, "table3", rows_of("table3", 3, lambda *_: (1, 2), preset="standard"))
+    _, _, after = reproduction_page.page(tmp_path).partition("## Table 3")
+    assert "| episodes | found | paper | graspable | with the paper's grasps | retrieved | drop-free |\n" in after
+    assert "| actions to find | paper | to grasp |\n" in after
 
 
 def test_another_folder_is_no_page_without_runs(tmp_path, capsys):

@@ -15,7 +15,7 @@ from typing import Any
 
 import jinja2
 
-from mechsearch_jax.benchmarks.paper.findings import FINDINGS, HOLDS, MARGIN, Finding, Verdict, verdicts
+from mechsearch_jax.benchmarks.paper.findings import FINDINGS, HOLDS, MARGIN, Finding, Verdict, goal_of, verdicts
 from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, Figures
 from mechsearch_jax.benchmarks.paper.reproduce import (
     FACTORS,
@@ -131,6 +131,11 @@ def _cell(setting: Setting, objects: int | None) -> tuple[str, ...]:
     return setting.recognition, setting.method, actions_text(setting), objects_text(objects)
 
 
+def _grasp(setting: Setting, rows: Sequence[Row], value: float | None) -> str:
+    """A figure of the paper's grasps, "-" beside cells whose graspable is not the paper's."""
+    return _paper(value) if goal_of("grasp", setting, rows[0]) == "graspable" else "-"
+
+
 def cells_table(results: Results) -> str:
     """Our shares beside the paper's."""
     header = (*_CELL, "episodes", "found", "paper", "graspable", "paper")
@@ -143,9 +148,10 @@ def cells_table(results: Results) -> str:
                 continue
             paper = results.paper(setting, count) or Figures(None, None, None, None)
             rates, errors = rates_of(own), sum(row.is_error for row in own)
-            beside = (_share(rates["found"]), _paper(paper.find), _share(rates["graspable"]), _paper(paper.grasp))
+            beside = (_share(rates["found"]), _paper(paper.find), _share(rates["graspable"]))
             episodes = f"{len(own)}" + (f", {errors} errors" if errors else "")
-            lines.append([*_cell(setting, count), episodes, *beside, *(_share(rates[name]) for name in more)])
+            grasp = _grasp(setting, rows, paper.grasp)
+            lines.append([*_cell(setting, count), episodes, *beside, grasp, *(_share(rates[name]) for name in more)])
     return _table([*header, *(WORDS[name] for name in more)], lines, ["actions"])
 
 
@@ -158,7 +164,8 @@ def actions_table(results: Results) -> str:
             with_interval(mean.value, mean.interval, "{:.2f}") for mean in (cell.find_steps, cell.grasp_steps)
         )
         place = _cell(cell.setting, cell.objects)
-        lines.append([*place, find, _paper(paper.find_steps), grasp, _paper(paper.grasp_steps)])
+        grasp_steps = _grasp(cell.setting, results.rows[cell.setting], paper.grasp_steps)
+        lines.append([*place, find, _paper(paper.find_steps), grasp, grasp_steps])
     return _table([*_CELL, "actions to find", "paper", "to grasp", "paper"], lines, ["actions"])
 
 
