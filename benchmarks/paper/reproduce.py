@@ -207,13 +207,12 @@ def objects_text(count: int | None) -> str:
 
 
 CELL_COLUMNS = (
-    *("recognition", "method", "actions", "objects", "episodes", "find", "paper", "grasp", "paper"),
-    *("steps to find", "paper", "steps to grasp", "paper"),
+    *("recognition", "method", "actions", "objects", "episodes", "found", "paper", "graspable", "paper"),
+    *("actions to find", "paper", "to grasp", "paper"),
 )
 DIFFERENCE_COLUMNS = (
-    *("of", "against", "method", "recognition", "actions", "preset", "protocol", "grasps"),
-    *("objects", "pairs"),
-    *("find", "grasp", "steps to find", "steps to grasp"),
+    *("factor", "base", *FACTORS, "objects", "pairs"),
+    *("found", "graspable", "actions to find", "to grasp"),
 )
 
 
@@ -253,7 +252,7 @@ def screen(results: Results) -> Group:
             box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold", title=title, title_justify="left"
         )
         table.add_column("", no_wrap=True)
-        for name in ("objects", "runs", "find", "grasp", "to find", "to grasp"):
+        for name in ("objects", "episodes", "found", "graspable", "to find", "to grasp"):
             table.add_column(name, justify="right", no_wrap=True)
         for cell in cells:
             name = f"{cell.setting.recognition} {cell.setting.method}"
@@ -283,8 +282,8 @@ def markdown(results: Results, command: str) -> str:
         ),
         pages.Paragraph(
             "Shares of all episodes, with Wilson's 95% interval for as many independent episodes as those of the same "
-            "scenes are worth; steps are the mean number of actions in the episodes that got there, with a 95% "
-            "interval from resampling scenes (-: none got there). The paper's R stands beside `masks`, its setting, "
+            "scenes are worth; numbers of actions are means over the episodes that got there, with a 95% interval from "
+            "resampling scenes (-: none got there). The paper's R stands beside `masks`, its setting, "
             "and `full`."
         ),
     ]
@@ -299,7 +298,7 @@ def markdown(results: Results, command: str) -> str:
         pages.Heading("Paired differences"),
         pages.Paragraph(
             "Over the same scenes and seeds, a scene's seeds averaged first, with 95% intervals from resampling "
-            "scenes; steps where both got there."
+            "scenes; numbers of actions where both got there. Of the same code and simulator alone."
         ),
         pages.Table.of(DIFFERENCE_COLUMNS, lines, texts=8),
     ]

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from mechsearch_jax.benchmarks.paper.paper_tables import PaperTable
     from mechsearch_jax.benchmarks.paper.reproduce import Setting
     from mechsearch_jax.benchmarks.running.evaluate import Job
-    from mechsearch_jax.benchmarks.store.rows import Row
+    from mechsearch_jax.benchmarks.running.planned import PlannedJob
     from mechsearch_jax.envs.episode.method import Method
+    from mechsearch_jax.envs.scenes.scene_sets import Block
     from mechsearch_jax.envs.simulators.named import EngineName
 
 TableName = Literal["table1", "table3", "table4", "table5"]
@@ -97,6 +98,16 @@ def _jobs(
     return {setting: by_method[method] for setting, method in methods.items()}
 
 
+def _planned(
+    methods: Mapping[Setting, Method], scenes: Sequence[tuple[Block, int]], seeds: Sequence[int]
+) -> list[PlannedJob]:
+    """The episodes of all settings, of scenes that are not made."""
+    from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
+
+    outlines = [SceneOutline.of_block(*scene) for scene in scenes]
+    return planned_jobs(outlines, list(methods.values()), seeds)
+
+
 def reproduce(
     table: Annotated[TableName, tyro.conf.Positional, tyro.conf.arg(metavar="table1|table3|table4|table5")],
     /,
@@ -151,21 +162,19 @@ def reproduce(
     )
     methods = _methods(settings, simulator, engine)
     if run.dry_run:
-        from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
-
-        print(f"{chosen.name}: {chosen.about}; {len(scene_list)} scenes")
-        for setting in settings:
-            print(f"{len(scene_list) * len(seeds)} episodes: {', '.join(map(_named, setting))}")
-        outlines = [SceneOutline.of_block(*scene) for scene in scene_list]
-        print_estimate("reproduce", planned_jobs(outlines, list(methods.values()), seeds), out, run, simulator)
+        _print_settings(chosen, settings, len(scene_list), len(seeds))
+        print_estimate("reproduce", _planned(methods, scene_list, seeds), out, run, simulator)
         return
     jobs = _jobs(methods, files_of(scene_list), seeds)
     all_jobs = [job for jobs_of_setting in jobs.values() for job in jobs_of_setting]
+    run_jobs("reproduce", all_jobs, out, run, simulator, lambda console, _: _draw(console, chosen, jobs, out))
 
-    def draw(console: Console, rows: Sequence[Row]) -> None:
-        _draw(console, chosen, jobs, out)
 
-    run_jobs("reproduce", all_jobs, out, run, simulator, draw)
+def _print_settings(table: PaperTable, settings: Sequence[Setting], scenes: int, seeds: int) -> None:
+    """Print a line for each setting."""
+    print(f"{table.name}: {table.about}; {scenes} scenes")
+    for setting in settings:
+        print(f"{scenes * seeds} episodes: {', '.join(map(_named, setting))}")
 
 
 def _named(value: str | tuple[str, ...]) -> str:
