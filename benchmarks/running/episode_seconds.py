@@ -122,7 +122,7 @@ def seconds_of(run: StoredRun) -> list[StoredSeconds]:
     ]
 
 
-def _earlier(folder: PathLike) -> StoredSeconds:
+def earlier(folder: PathLike) -> StoredSeconds:
     """What the episodes of `EARLIER` took, by the clock: what it compiled first went on beside them."""
     (run,) = (each for each in json.loads((Path(folder) / EARLIER).read_bytes())["runs"] if each["name"] == "c2")
     clock = run["clock"]["nothing kept"]
@@ -145,7 +145,7 @@ def _with_compilation(entry: StoredSeconds, each: Sequence[StoredSeconds]) -> St
 def entries(results: PathLike, runs: Sequence[StoredRun]) -> list[dict[str, Any]]:
     """What `FILE` holds, of stored results and stored runs."""
     oldest_first = sorted(runs, key=lambda run: str(run.lines[0].get("started")) if run.lines else "")
-    each = [_earlier(results), *(entry for run in oldest_first for entry in seconds_of(run))]
+    each = [earlier(results), *(entry for run in oldest_first for entry in seconds_of(run))]
     newest = {(entry.device, entry.kind): _with_compilation(entry, each) for entry in each}
     return [
         {

@@ -18,6 +18,7 @@ from typing import Any
 from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, PaperTable
 from mechsearch_jax.benchmarks.parts.scaling import read_measured
 from mechsearch_jax.benchmarks.report.results_page import Stored, table
+from mechsearch_jax.benchmarks.running.episode_seconds import earlier
 from mechsearch_jax.benchmarks.studies.declared import GROUPS
 from mechsearch_jax.benchmarks.studies.studies import Study
 from mechsearch_jax.envs.camera.recognisers import RecognitionName
@@ -107,7 +108,7 @@ class Measures:
       episode: of a GPU, in a batch with true shapes [s].
       look: what recognising the objects of an image adds, by the name of the recognition [s].
       looks: mean number of images in an episode.
-      compiling: until all is compiled, where nothing is kept [s].
+      compiling: a planner and what else its episodes need, where nothing is kept [s].
       cpu: CPU time of an episode where there is no GPU [s].
       row: bytes of a row in a folder of results.
     """
@@ -123,7 +124,7 @@ class Measures:
     def of(cls, stored: Stored) -> Measures:
         """From the stored results."""
         run = stored.run("standard-h100", "c2")
-        clock = run["clock"]["nothing kept"]
+        clock = earlier(stored.folder).seconds
         look = {
             name: stored[f"perceive-{name}-h200"]["median_seconds"] / stored[f"perceive-{name}-h200"]["shapes"]["batch"]
             for name in ("masks", "full")
@@ -131,11 +132,11 @@ class Measures:
         scaled = read_measured(stored.folder / "scaling-cpu.jsonl")
         report = stored["report-cpu"]
         return cls(
-            episode=(clock["last episode [s]"] - clock["all compiled [s]"]) / len(run["episodes"]),
+            episode=clock.episode_seconds,
             look=look,
             # One before each action, and one after the last.
             looks=1 + statistics.fmean(each["steps"] for each in run["episodes"]),
-            compiling=clock["all compiled [s]"],
+            compiling=clock.compile_seconds,
             cpu=next(each.cpu_seconds for each in scaled if each.workers == 1 and each.cpu_seconds is not None),
             row=report["bytes"] / report["rows"],
         )
