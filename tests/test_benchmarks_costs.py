@@ -1,5 +1,6 @@
 """What all experiments cost: the page is what its generator gives, and counts the episodes that commands would run."""
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -52,3 +53,11 @@ def test_costs_are_those_of_what_was_measured(measures, experiments):
     images = table.count / 3 * measures.looks * (measures.look["masks"] + measures.look["full"]) / 3600
     assert measures.running(table) == pytest.approx(plain + images)
     assert images < 0.1 * plain
+
+
+def test_a_folder_without_the_stored_results_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["costs_page", "--results", str(tmp_path), "--out", str(tmp_path / "costs.md")])
+    with pytest.raises(SystemExit):
+        costs_page.main()
+    assert "standard-h100.json: is not there; give the folder" in capsys.readouterr().err
+    assert not (tmp_path / "costs.md").exists()

@@ -13,6 +13,7 @@ from mechsearch_jax.benchmarks.studies.comparison import compare, screen, senten
 from mechsearch_jax.benchmarks.studies.declared import GROUPS, STUDIES
 from mechsearch_jax.benchmarks.studies.pictures import picture
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant, find_studies
+from mechsearch_jax.commands import study as command
 from mechsearch_jax.commands.main import parse
 from mechsearch_jax.envs.scenes.scene_sets import SETS, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError
@@ -67,6 +68,11 @@ def test_names_are_found_and_others_refused():
             find_studies(names, STUDIES)
 
 
+def test_the_help_names_every_study():
+    text = " ".join(command.study.__doc__.partition("names: of studies: ")[2].split())
+    assert text.startswith(f"{', '.join(STUDIES)}; or all.")
+
+
 def test_a_row_goes_to_the_variant_that_it_ran_with():
     base, other = STUDY.variants
     strange = rows_of(Variant("", {"gamma": 0.5, "horizon": 2}), 1.0)
@@ -99,8 +105,6 @@ def test_changes_are_those_of_the_same_scenes_and_seeds():
     assert first.means["retrieved"] == 1.0
     assert second.means["retrieved"] == pytest.approx(0.4)
     assert "fewer are retrieved with 0.5 -20.0 (" in sentence(STUDY, [first, second])
-    (second_8,) = (each for each in compare(STUDY, rows, objects=8) if each.changes)
-    assert second_8.episodes == 50
     assert screen(STUDY, rows).row_count == 2
 
 
@@ -111,6 +115,14 @@ def test_an_error_is_neither_retrieved_nor_free_of_drops():
     ]
     (only,) = compare(STUDY, failed)
     assert (only.errors, only.means["drop-free"]) == (50, 0.0)
+
+
+def test_of_runs_with_as_many_variants_the_newest_is_shown():
+    rows = rows_of(STUDY.baseline, 1.0)
+    days = {"a": "2026-11-24", "b": "2026-11-26", "c": "2026-11-25"}
+    runs = [run_of(name, rows, command="x", started=day) for name, day in days.items()]
+    assert page.shown_run(STUDY, runs).name == "b"
+    assert page.shown_run(STUDY, []) is None
 
 
 def test_without_partners_the_sentence_says_whose_rows_lack():

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from mechsearch_jax.benchmarks.statistics.settings import settings_of
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 
 FILE = Path(__file__).with_name("episode_seconds.json")
@@ -163,9 +164,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Write how long episodes took, from the stored runs.")
     parser.add_argument("--results", default=str(RUNS.parent), help="folder of the stored results")
     folder = Path(parser.parse_args().results)
-    lines = ",\n".join(f" {json.dumps(entry)}" for entry in entries(folder, stored_runs(folder / RUNS.name)))
-    with replacing(FILE) as file:
-        file.write(f"[\n{lines}\n]\n".encode())
+    try:
+        lines = ",\n".join(f" {json.dumps(entry)}" for entry in entries(folder, stored_runs(folder / RUNS.name)))
+        with replacing(FILE) as file:
+            file.write(f"[\n{lines}\n]\n".encode())
+    except FileNotFoundError as error:
+        parser.error(f"{error.filename}: is not there; give the folder of the stored results as --results")
+    except InputError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

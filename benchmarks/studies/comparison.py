@@ -28,7 +28,7 @@ class Comparison:
 
     Attributes:
       variant: the method.
-      episodes, scenes: how many.
+      episodes: how many.
       errors: how many of the episodes could not be run to their end; they count as failures.
       means: of each of `MEASURES` over episodes; None where no row says it.
       intervals: their 95% intervals, by scene: see `intervals`; None where there is none.
@@ -38,7 +38,6 @@ class Comparison:
 
     variant: Variant
     episodes: int
-    scenes: int
     errors: int
     means: Mapping[str, float | None]
     intervals: Mapping[str, Interval | None]
@@ -46,16 +45,9 @@ class Comparison:
     decision_seconds: float
 
 
-def compare(study: Study, rows: Sequence[Row], objects: int | None = None) -> list[Comparison]:
-    """The variants of which there are rows, in the order of the study.
-
-    Args:
-      study: the question.
-      rows: of any studies.
-      objects: only episodes with so many objects; all if None.
-    """
-    chosen = [row for row in rows if objects in (None, row.objects)]
-    groups = study.rows_of(chosen)
+def compare(study: Study, rows: Sequence[Row]) -> list[Comparison]:
+    """The variants of which there are rows, of any studies, in the order of the study."""
+    groups = study.rows_of(rows)
     base = groups.get(study.baseline.label, [])
     return [
         _comparison(variant, groups[variant.label], base if variant is not study.baseline else [])
@@ -77,7 +69,6 @@ def _comparison(variant: Variant, rows: Sequence[Row], base: Sequence[Row]) -> C
     return Comparison(
         variant,
         len(rows),
-        len(set(map(scene_of, rows))),
         sum(row.is_error for row in rows),
         means,
         intervals,

@@ -26,6 +26,7 @@ from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.protocols import ProtocolName
 from mechsearch_jax.envs.scenes.scene_sets import SETS
 from mechsearch_jax.planner import PRESETS
+from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 
 TEMPLATE = Path(__file__).with_name("costs_page.md")
@@ -196,8 +197,14 @@ def main() -> None:
     arguments = parser.parse_args()
     if not Path(arguments.results).is_dir():
         parser.error(f"{arguments.results}: is no folder; start it at the root of a checkout, or give --results")
-    with replacing(arguments.out) as file:
-        file.write(page(arguments.results).encode())
+    try:
+        text = page(arguments.results)
+        with replacing(arguments.out) as file:
+            file.write(text.encode())
+    except FileNotFoundError as error:
+        parser.error(f"{error.filename}: is not there; give the folder of the stored results as --results")
+    except InputError as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

@@ -212,7 +212,7 @@ _ROBUSTNESS = (
     ),
     Study(
         "friction-without-trials",
-        "And without trials?",
+        "What if friction is not as usual, and nothing is tried out?",
         REPORT_SCENES,
         _factors("friction", lambda factor: Mismatch(friction=factor), rehearsal="none"),
         axis="true friction as a multiple of the usual",

@@ -34,11 +34,13 @@ INTRODUCTION = (
 
 
 def shown_run(study: Study, runs: Sequence[StoredRun]) -> StoredRun | None:
-    """The run that has most of a study's variants, its first one among them; the last of several; None without one."""
+    """The run that has most of a study's variants, the first among them; the newest of several; None without one."""
     counts = [
-        (len(groups), i) for i, run in enumerate(runs) if study.baseline.label in (groups := study.rows_of(run.rows))
+        (len(groups), str(run.lines[0].get("started") or ""), i)
+        for i, run in enumerate(runs)
+        if study.baseline.label in (groups := study.rows_of(run.rows))
     ]
-    return runs[max(counts)[1]] if counts else None
+    return runs[max(counts)[-1]] if counts else None
 
 
 def blocks(study: Study, run: StoredRun | None) -> list[Block]:

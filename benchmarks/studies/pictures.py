@@ -25,7 +25,7 @@ def picture(study: Study, comparisons: Sequence[Comparison]) -> Figure:
 
     Args:
       study: the question.
-      comparisons: of `comparison.compare`, over all numbers of objects; at least one.
+      comparisons: of `comparison.compare`; at least one.
     """
     if study.by_time:
         return _against_time(comparisons)

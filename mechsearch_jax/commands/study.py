@@ -39,7 +39,8 @@ def study(
     and what several studies have in common is run once. Each study is then printed, as far as its rows are there.
 
     Args:
-      names: of studies.
+      names: of studies: gamma, horizon, sequences, actions, extensions, push-model, steps, recognition, baselines,
+        friction, friction-without-trials, mass, calibration, sensor, cameras, physics; or all.
       out: folder for the results, one row for each episode.
       scenes: only the first so many of each number of objects, for a quick look.
       seed: one or more.
