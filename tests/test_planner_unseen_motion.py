@@ -12,6 +12,7 @@ from mechsearch_jax.actions import no_action
 from mechsearch_jax.actions.registry import ActionKind
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.belief.unseen_motion import reopened, same_objects
+from mechsearch_jax.envs.camera.snapshot import Snapshot
 from mechsearch_jax.envs.episode import slots
 from mechsearch_jax.envs.episode.episode_log import Choice
 from mechsearch_jax.envs.world.world import from_scenario
@@ -218,7 +219,7 @@ def test_an_episode_tells_the_belief_what_it_did(problem, monkeypatch):
         return belief
 
     monkeypatch.setattr(slots, "update_belief", update)
-    monkeypatch.setattr(slots.OneSlot, "_snapshot", lambda self, world: None)
+    monkeypatch.setattr(slots.OneSlot, "_snapshot", lambda self, world: Snapshot(problem.camera, problem.shelf, world))
     choice = Choice(push(), jnp.float32(3.0), jnp.float32(2.0), jnp.int32(1))
     monkeypatch.setattr(slots, "chosen", lambda decision: choice)
     monkeypatch.setattr(slots, "decide", lambda policy, trials, *arguments: policy(*arguments))

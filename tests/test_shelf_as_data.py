@@ -185,7 +185,7 @@ def test_a_look_is_traced_once_for_both(two, name):
     traced.clear()
     keys, rows = jax.random.split(KEY, 2), jnp.arange(2, dtype=jnp.int32)
     for pool, problem in zip(pools, two, strict=True):
-        many_slots._look.eval_shape(problem, pool._state, world, keys, rows, counted, pool._sight)
+        many_slots._look.eval_shape(problem, pool._state, world, keys, rows, counted, pool._sight, None)
     assert traced == [name]
 
 

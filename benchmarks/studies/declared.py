@@ -158,7 +158,7 @@ _ABLATIONS = (
 _BASELINES = (
     Study(
         "baselines",
-        "How does search-for-grasp compare with other ways to decide, on the same actions?",
+        "How does search-for-grasp compare with other ways to decide?",
         REPORT_SCENES,
         (
             Variant("search-for-grasp"),
