@@ -63,12 +63,12 @@ def test_the_papers_shares_are_of_so_many_scenes_and_its_steps_in_order(table):
     assert {cell.objects for cell in table.figures} == set(table.blocks)
     assert {cell.actions for cell in table.figures} == set(table.actions)
     assert {cell.method for cell in table.figures} == set(METHODS)
-    for cell, told in table.figures.items():
+    for cell, shown in table.figures.items():
         scenes = SETS[table.blocks[cell.objects]].scenes
-        for share in (told.find, told.grasp):
+        for share in (shown.find, shown.grasp):
             assert share is None or abs(share * scenes - round(share * scenes)) <= 0.0005 * scenes + 1e-9, cell
-        assert told.find is None or told.find >= told.grasp
-        assert 1 < told.find_steps < told.grasp_steps < 10
+        assert shown.find is None or shown.find >= shown.grasp
+        assert 1 < shown.find_steps < shown.grasp_steps < 10
 
 
 def test_the_papers_letters():
@@ -108,8 +108,8 @@ def test_cells_are_what_the_rows_say():
 def test_differences_are_over_the_same_episodes():
     base = [row("a", 1, 3), row("b", 2, None), row("c", None, None), row("d", 1, 2), row("a", 2, 3, seed=1)]
     now = [row("a", 2, 2), row("b", 2, 4), row("c", 3, None), row("x", 1, 1), row("a", 1, 1, seed=1)]
-    told = results({AND: base, FOR: now}).differences()
-    (one,) = told
+    shown = results({AND: base, FOR: now}).differences()
+    (one,) = shown
     assert (one.factor, one.setting, one.base, one.pairs) == ("method", FOR, METHODS[0], 4)
     # Scene a counts once with both of its seeds; b was graspable now alone, c found now alone.
     for goal in (one.find, one.grasp):
@@ -128,17 +128,17 @@ def test_settings_are_compared_in_one_thing_at_a_time():
     settings = [
         FOR._replace(method=m, recognition=r, preset=p) for m in METHODS for r in ("oracle", "masks") for p in "st"
     ]
-    told = results({setting: [row("a", 1, 2)] for setting in settings}).differences()
-    assert len(told) == 3 * 4
-    for one in told:
+    shown = results({setting: [row("a", 1, 2)] for setting in settings}).differences()
+    assert len(shown) == 3 * 4
+    for one in shown:
         other = one.setting._replace(**{one.factor: one.base})
         assert sum(a != b for a, b in zip(one.setting, other, strict=True)) == 1
 
 
 def test_the_page_has_a_table_for_each_preset_and_protocol():
     rows = [row("a", 1, 2), row("b", None, None)]
-    told = results({FOR: rows, AND: rows, FOR._replace(protocol="published-code"): rows})
-    page = re.sub(" +", " ", markdown(told, "mechsearch reproduce table1"))
+    shown = results({FOR: rows, AND: rows, FOR._replace(protocol="published-code"): rows})
+    page = re.sub(" +", " ", markdown(shown, "mechsearch reproduce table1"))
     assert re.findall(r"^## (.*)$", page, re.MULTILINE) == [
         "Preset paper, protocol strict",
         "Preset paper, protocol published-code",
@@ -149,7 +149,7 @@ def test_the_page_has_a_table_for_each_preset_and_protocol():
     for table in re.findall(r"(?:^\|.*\|$\n?)+", page, re.MULTILINE):
         assert len({line.count("|") for line in table.splitlines()}) == 1
     console = Console(record=True, width=80)
-    console.print(screen(told))
+    console.print(screen(shown))
     printed = console.export_text()
     assert re.search(
         "^masks search-for-grasp +2 +2 +0.50/0.97 +0.50/0.92 +1.00/1.33 +2.00/1.65 *$", printed, re.MULTILINE
@@ -187,8 +187,8 @@ def run(tmp_path, monkeypatch, capsys):
 
 def test_the_command_runs_every_cell_and_draws_what_came_of_it(run, tmp_path):
     jobs, printed = run("table4", "--scenes", "2", "--recognition", "masks", "--preset", "paper")
-    told = {(job.method.name, job.method.config.problem.actions.actions) for job in jobs}
-    assert told == {(name, actions) for name in METHODS for actions in TABLES["table4"].actions}
+    shown = {(job.method.name, job.method.config.problem.actions.actions) for job in jobs}
+    assert shown == {(name, actions) for name in METHODS for actions in TABLES["table4"].actions}
     assert len(jobs) == len({job.key for job in jobs}) == 2 * 2 * 6
     assert {job.method.recognition for job in jobs} == {"masks"}
     assert "table4, preset paper, protocol strict" in printed.out
@@ -261,8 +261,8 @@ def test_a_dry_run_knows_what_is_there_and_makes_no_scene(run, tmp_path, monkeyp
 
 def test_cells_without_a_figure_say_that_it_is_not_in_the_paper():
     rows = [row("a", 1, 2), row("b", None, None)]
-    told = results({FOR._replace(recognition=seen): rows for seen in ("oracle", "masks", "full")}, "table3")
-    page = markdown(told, "mechsearch reproduce table3")
+    shown = results({FOR._replace(recognition=seen): rows for seen in ("oracle", "masks", "full")}, "table3")
+    page = markdown(shown, "mechsearch reproduce table3")
     lines = {line.split("|")[1].strip(): line for line in page.splitlines() if "| both" in line}
     assert lines["oracle"].count("not in the paper") == 4
     # The paper does not say in how many of these scenes the target was found.
@@ -270,7 +270,7 @@ def test_cells_without_a_figure_say_that_it_is_not_in_the_paper():
         assert lines[recognition].count("not in the paper") == 1
         assert "0.995" in lines[recognition]
     console = Console(record=True, width=80)
-    console.print(screen(told))
+    console.print(screen(shown))
     assert re.search(r"^oracle search-for-grasp +2 +2 +0.50/none +0.50/none", console.export_text(), re.MULTILINE)
 
 
@@ -291,9 +291,9 @@ def test_collision_free_grasps_are_a_column_of_their_own(monkeypatch):
     settings = command._settings(*wanted, [True, False])
     assert [setting.grasps for setting in settings] == [ANY, ANY, COLLISION_FREE, COLLISION_FREE]
     rows = {setting: [row("a", 1, 2), row("b", None, None)] for setting in settings}
-    told = results(rows, "table3")
-    assert [one.factor for one in told.differences()] == ["method", "method", "grasps", "grasps"]
-    page = markdown(told, "mechsearch reproduce table3")
+    shown = results(rows, "table3")
+    assert [one.factor for one in shown.differences()] == ["method", "method", "grasps", "grasps"]
+    page = markdown(shown, "mechsearch reproduce table3")
     assert "## Preset standard, protocol strict, collision-free grasps" in page
 
 

@@ -138,11 +138,11 @@ def test_rows_are_timed_as_they_come(tmp_path):
         ([sys.executable, "-c", COPY.format(60), str(tmp_path / name), "--out", str(tmp_path / f"{name}-out")], {})
         for name in ("a", "b")
     ]
-    told, times = scaling._times_of_rows(commands, tmp_path, 8, lambda what: None)
-    assert sorted(map(repr, told)) == sorted(map(repr, rows))
+    read, times = scaling._times_of_rows(commands, tmp_path, 8, lambda what: None)
+    assert sorted(map(repr, read)) == sorted(map(repr, rows))
     assert len(times) == 8
     assert times == sorted(times)
-    assert isinstance(told[0], Row)
+    assert isinstance(read[0], Row)
 
 
 @pytest.mark.parametrize("script", ["raise SystemExit('mechsearch: no GPU')", "print('mechsearch: no GPU')"])

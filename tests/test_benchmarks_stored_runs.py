@@ -117,8 +117,8 @@ def test_every_preset_is_its_own_settings():
 
 
 def test_scenes_are_of_sets():
-    names = ("c2-4-017", "development-box-8-001", "d1-003", "published-2-00", "mine")
-    assert list(map(scene_set_of, names)) == ["c2", "development-box", "d1", "published", "mine"]
+    names = ("c2-4-017", "development-box-8-001", "d1-003", "published-2-00", "elsewhere")
+    assert list(map(scene_set_of, names)) == ["c2", "development-box", "d1", "published", "elsewhere"]
 
 
 def test_twenty_thousand_rows_are_small(tmp_path):

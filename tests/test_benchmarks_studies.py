@@ -63,8 +63,8 @@ def test_ablations_leave_the_scenes_to_report_with_unseen():
 def test_names_are_found_and_others_refused():
     assert [study.name for study in find_studies(["gamma", "mass", "gamma"], STUDIES)] == ["gamma", "mass"]
     assert find_studies(["all"], STUDIES) == list(STUDIES.values())
-    for names, told in (([], "name one or more of gamma"), (["gama"], "gama is unknown; did you mean gamma")):
-        with pytest.raises(InputError, match=told):
+    for names, reason in (([], "name one or more of gamma"), (["gama"], "gama is unknown; did you mean gamma")):
+        with pytest.raises(InputError, match=reason):
             find_studies(names, STUDIES)
 
 
@@ -172,8 +172,8 @@ def test_pictures_are_drawn(name, tmp_path):
 
 def test_the_command_says_what_it_would_do(capsys, tmp_path):
     parse(["study", "gamma", "--scenes", "1", "--out", str(tmp_path / "rows"), "--dry-run", "--simulator", "native"])()
-    told = capsys.readouterr().out
-    assert "gamma: Does the discount of later actions matter? 6 variants on development" in told
-    assert "6 variants, 24 episodes" in told
-    assert "1 compilation" in told
+    printed = capsys.readouterr().out
+    assert "gamma: Does the discount of later actions matter? 6 variants on development" in printed
+    assert "6 variants, 24 episodes" in printed
+    assert "1 compilation" in printed
     assert not (tmp_path / "rows").exists()

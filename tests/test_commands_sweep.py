@@ -247,18 +247,18 @@ def test_what_other_episodes_took_says_what_it_is_of(folder, monkeypatch):
     methods = [Method(), Method(config=PRESETS["paper"](), recognition="masks"), Method(recognition="full")]
     outlines = [SceneOutline.of_block(find_set("d1").blocks[0], 0)]
 
-    def told(device):
+    def estimated(device):
         monkeypatch.setattr(estimates, "versions", lambda: {"device": device})
         parts = estimate(planned_jobs(outlines, methods, (0, 1)), "none", None).parts
         return [(part.left, part.seconds.episode_seconds, part.grounds) for part in parts]
 
-    assert told("gpu: H100") == [
+    assert estimated("gpu: H100") == [
         (2, 0.1, "from one.json"),
         (2, 2.0, "from one.json"),
         (2, 0.1, "from one.json, of oracle"),
     ]
-    assert told("gpu: A100")[0] == (2, 0.1, "from one.json on H100")
-    assert told("cpu: cpu")[0] == (2, 8.0, "assumed: nothing was measured on such a device")
+    assert estimated("gpu: A100")[0] == (2, 0.1, "from one.json on H100")
+    assert estimated("cpu: cpu")[0] == (2, 8.0, "assumed: nothing was measured on such a device")
 
 
 def test_the_seconds_of_the_package_are_those_of_the_stored_runs():

@@ -7,14 +7,14 @@ The page is the template `reproduction_page.md.jinja` beside this file; every fi
 
 from __future__ import annotations
 
-import argparse
 import collections
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jinja2
 
+from mechsearch_jax.benchmarks.pages.rewriting import rewrite
 from mechsearch_jax.benchmarks.paper.findings import FINDINGS, HOLDS, MARGIN, Finding, Verdict, goal_of, verdicts
 from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, Figures
 from mechsearch_jax.benchmarks.paper.reproduce import (
@@ -36,8 +36,7 @@ from mechsearch_jax.benchmarks.statistics.rates import scene_of
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
 from mechsearch_jax.envs.scenes.scene_sets import CHOSEN_ON, is_chosen_on
-from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import PathLike, replacing
+from mechsearch_jax.runtime.files import PathLike
 
 TEMPLATE = Path(__file__).with_name("reproduction_page.md.jinja")
 # Scenes by the share of their episodes in which they were solved: the largest share of each column.
@@ -276,20 +275,9 @@ def page(folder: PathLike) -> str:
     )
 
 
-def main(arguments: Iterable[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Rewrite the page."""
-    parser = argparse.ArgumentParser(description="Write docs/reproduction.md from the stored runs.")
-    parser.add_argument("--runs", default=str(RUNS), help="folder of the stored runs")
-    parser.add_argument("--out", default="docs/reproduction.md", help="the page")
-    parsed = parser.parse_args(None if arguments is None else list(arguments))
-    if not Path(parsed.runs).is_dir():
-        parser.error(f"{parsed.runs}: is no folder; start it at the root of a checkout, or give --runs")
-    try:
-        text = page(parsed.runs)
-        with replacing(parsed.out) as file:
-            file.write(text.encode())
-    except InputError as error:
-        parser.error(str(error))
+    rewrite(page, "runs", str(RUNS), "docs/reproduction.md", arguments)
 
 
 if __name__ == "__main__":

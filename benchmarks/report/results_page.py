@@ -7,20 +7,20 @@ measured on the way to today's default is in docs/experiments.md, which is writt
 
 from __future__ import annotations
 
-import argparse
 import collections
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mechsearch_jax.benchmarks.pages.rewriting import rewrite
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.store.rows import options_of
 from mechsearch_jax.benchmarks.store.runs import StoredRun, load_run
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.scenes.scene_sets import is_chosen_on
-from mechsearch_jax.runtime.files import PathLike, replacing
+from mechsearch_jax.runtime.files import PathLike
 
 Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
@@ -221,16 +221,7 @@ def page(folder: PathLike) -> str:
 
 def main() -> None:
     """Rewrite the page."""
-    parser = argparse.ArgumentParser(description="Write docs/results.md from the stored results.")
-    parser.add_argument("--results", default="benchmarks/results", help="folder of the stored results")
-    parser.add_argument("--out", default="docs/results.md", help="the page")
-    arguments = parser.parse_args()
-    if not Path(arguments.results).is_dir():
-        parser.error(
-            f"{arguments.results}: is no folder; start it at the root of a checkout, or name one with --results"
-        )
-    with replacing(arguments.out) as file:
-        file.write(page(arguments.results).encode())
+    rewrite(page, "results", "benchmarks/results", "docs/results.md")
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ file. Episodes are those of the paper's tables and of the declared studies; what
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import itertools
 import statistics
@@ -15,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mechsearch_jax.benchmarks.pages.rewriting import rewrite
 from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, PaperTable
 from mechsearch_jax.benchmarks.parts.scaling import read_measured
 from mechsearch_jax.benchmarks.report.results_page import Stored, table
@@ -26,8 +26,7 @@ from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.protocols import ProtocolName
 from mechsearch_jax.envs.scenes.scene_sets import SETS
 from mechsearch_jax.planner import PRESETS
-from mechsearch_jax.runtime.errors import InputError
-from mechsearch_jax.runtime.files import PathLike, replacing
+from mechsearch_jax.runtime.files import PathLike
 
 TEMPLATE = Path(__file__).with_name("costs_page.md")
 RECOGNITIONS: tuple[RecognitionName, ...] = ("oracle", "masks", "full")
@@ -191,20 +190,7 @@ def page(folder: PathLike) -> str:
 
 def main() -> None:
     """Rewrite the page."""
-    parser = argparse.ArgumentParser(description="Write docs/costs.md from the stored results.")
-    parser.add_argument("--results", default="benchmarks/results", help="folder of the stored results")
-    parser.add_argument("--out", default="docs/costs.md", help="the page")
-    arguments = parser.parse_args()
-    if not Path(arguments.results).is_dir():
-        parser.error(f"{arguments.results}: is no folder; start it at the root of a checkout, or give --results")
-    try:
-        text = page(arguments.results)
-        with replacing(arguments.out) as file:
-            file.write(text.encode())
-    except FileNotFoundError as error:
-        parser.error(f"{error.filename}: is not there; give the folder of the stored results as --results")
-    except InputError as error:
-        parser.error(str(error))
+    rewrite(page, "results", "benchmarks/results", "docs/costs.md")
 
 
 if __name__ == "__main__":
