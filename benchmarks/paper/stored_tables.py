@@ -26,9 +26,13 @@ _RECOGNITIONS = ("oracle", "masks", "full")
 
 
 def runs_of(table: PaperTable, runs: Sequence[StoredRun]) -> list[StoredRun]:
-    """The runs of an experiment by their commands, the newest first."""
-    own = [run for run in runs if run.lines and f"reproduce {table.name}" in str(run.lines[0].get("command"))]
+    """The runs of an experiment, by their commands or as they were stored, the newest first."""
+    own = [run for run in runs if run.lines and _is_of(table, run.lines[0])]
     return sorted(own, key=lambda run: (str(run.lines[0].get("started") or ""), run.name), reverse=True)
+
+
+def _is_of(table: PaperTable, line: Mapping[str, Any]) -> bool:
+    return f"reproduce {table.name}" in str(line.get("command")) or line.get("table") == table.name
 
 
 def setting_of(line: Mapping[str, Any]) -> Setting | None:

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+from mechsearch_jax.benchmarks.paper.paper_tables import TABLES
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
 from mechsearch_jax.benchmarks.statistics.rates import scene_of
@@ -91,11 +92,17 @@ def main() -> None:
     parser.add_argument("--command", required=True, help="what was typed; several commands with ; between")
     parser.add_argument("--commit", help="of the code that ran it")
     parser.add_argument("--note", help="what else is to be said of it, such as what ran beside it")
+    parser.add_argument(
+        "--table",
+        choices=list(TABLES),
+        help="of the paper, whose episodes these are too, where the command does not name it",
+    )
     parser.add_argument("--out", default=RUNS, help=f"folder of the stored runs (default: {RUNS})")
     arguments = parser.parse_args()
     try:
         rows = merged(arguments.folders)
         origin = {"commit": arguments.commit, "command": arguments.command, "note": arguments.note}
+        origin |= {"table": arguments.table} if arguments.table else {}
         run = run_of(arguments.name, rows, **origin, started=started(arguments.folders))
         files = write_run(run, arguments.out)
     except InputError as error:
