@@ -12,6 +12,7 @@ import pytest
 import mechsearch_jax
 from mechsearch_jax.benchmarks.guard.guard import read_reference
 from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, paper_figures
+from mechsearch_jax.benchmarks.paper.reproduce import CONTACT
 from mechsearch_jax.benchmarks.report import results_page
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
 from mechsearch_jax.benchmarks.store.runs import load_run
@@ -299,20 +300,22 @@ def test_the_rates_of_the_readme_are_the_stored_ones():
         assert all(is_chosen_on(episode["scenario"]) for episode in groups[1])
 
 
-# Of its O-Search-for-Grasp.
-PAPER = {objects: paper_figures(TABLES["table1"], "oracle", METHODS[1], BOTH, int(objects)) for objects in "2468"}
-
-
-def test_preset_paper_stands_beside_the_papers_figures():
-    run = stored_runs("published-paper-h200.json")[0]
-    assert (run["preset"], run["policy"]) == ("paper", "search-for-grasp")
-    header = "| objects | preset `paper`: found | graspable | retrieved | the paper: found | graspable |"
-    stated = rows("README.md", header)
-    assert [objects for objects, *_ in stated] == ["2", "4", "6", "8"]
-    for objects, *figures in stated:
-        episodes = with_objects(run["episodes"], objects)
-        ours = [share(rate, episodes, 2) for rate in ("found", "graspable", "retrieved")]
-        assert figures == [*ours, f"{PAPER[objects].find:.2f}", f"{PAPER[objects].grasp:.2f}"]
+def test_what_comes_of_images_stands_beside_the_papers_figures():
+    run = load_run(RESULTS / "runs", "collision-free-h100")
+    header = "| objects | `masks`, 360 episodes: found | graspable | retrieved | the paper: found | graspable |"
+    stated = {row[0]: row[1:] for row in rows("README.md", header)}
+    assert list(stated) == ["2", "4", "6", "8"]
+    for line in run.lines:
+        assert (line["preset"], line["settings"]) == ("standard", {"recognition": "masks", CONTACT: False})
+        new = line["on_scenes_not_chosen_on"]
+        assert new["episodes"] == 360
+        assert line["seeds"] == [0, 1, 2, 3]
+        low, high = new["graspable"]["interval"]
+        graspable = f"{new['graspable']['rate']:.2f} ({low:.2f} to {high:.2f})"
+        figures = paper_figures(TABLES["table1"], "masks", METHODS[1], BOTH, line["objects"])
+        paper = [f"{figures.find:.2f}", f"{figures.grasp:.2f}"]
+        ours = [f"{new['found']['rate']:.2f}", graspable, f"{new['retrieved']['rate']:.2f}"]
+        assert stated[str(line["objects"])] == [*ours, *paper]
 
 
 def stored_median(name):
@@ -332,8 +335,8 @@ def test_the_times_of_a_decision_are_the_stored_ones():
 
 
 def test_what_is_retrieved_from_images_is_what_is_stored():
-    run = load_run(RESULTS / "runs", "table1-h100")
-    wanted = {"preset": "standard", "settings": {"recognition": "masks"}}
+    run = load_run(RESULTS / "runs", "table1-full-h100")
+    wanted = {"preset": "standard", "settings": {"recognition": "full"}}
     lines = [line for line in run.lines if {name: line[name] for name in wanted} == wanted]
     new = {line["objects"]: line["on_scenes_not_chosen_on"]["retrieved"]["rate"] for line in lines}
     assert list(new) == [2, 4, 6, 8]

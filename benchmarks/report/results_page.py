@@ -8,6 +8,7 @@ measured on the way to today's default is in docs/experiments.md, which is writt
 from __future__ import annotations
 
 import collections
+import dataclasses
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,8 @@ from mechsearch_jax.runtime.files import PathLike
 Episode = Mapping[str, Any]
 COUNTS = (2, 4, 6, 8)
 TEMPLATE = Path(__file__).with_name("results_page.md")
+# Without -h100.
+IMAGE_RUNS = ("table1", "table1-full", "seeds", "collision-free")
 RATES = ("objects", "episodes", "found", "graspable", "with the paper's grasps", "retrieved", "actions")
 
 
@@ -161,39 +164,42 @@ def perception(stored: Stored) -> str:
     return table([*header, "segments, 2 to 8 objects", "segments, 8 objects"], lines)
 
 
-def _from_masks(run: StoredRun) -> list[Episode]:
-    """The episodes of the default with recognition `masks` on scenes that nothing was chosen on."""
-    usual = Method(recognition="masks").options()
-    own = [row for row in run.rows if not is_chosen_on(row.scenario) and row.recognition == usual["recognition"]]
-    return [vars(row) for row in own if all(options_of(row).get(name) == value for name, value in usual.items())]
+def _on_new_scenes(runs: Iterable[StoredRun], method: Method) -> list[Episode]:
+    """The episodes with the method's settings on scenes that nothing was chosen on."""
+    settings = method.options()
+    rows = [row for run in runs for row in run.rows if not is_chosen_on(row.scenario)]
+    return [vars(row) for row in rows if all(options_of(row).get(name) == value for name, value in settings.items())]
+
+
+def from_images(table1: StoredRun, full: StoredRun, seeds: StoredRun, collision_free: StoredRun) -> dict[str, Any]:
+    """The episodes of the default from images, by what they ran with."""
+    usual = Method(recognition="masks")
+    grasps = dataclasses.replace(usual, config=usual.config.with_options(retrieval_contact=False))
+    return {
+        "`masks`, 4 seeds": _on_new_scenes([table1, seeds], usual),
+        "`masks`, collision-free grasps only, 4 seeds": _on_new_scenes([collision_free], grasps),
+        "`full`, 1 seed": _on_new_scenes([full], dataclasses.replace(usual, recognition="full")),
+    }
 
 
 def computed(stored: Stored) -> dict[str, Any]:
     """The fields of the template that are no values of a file."""
     new, published = (stored.run("standard-h100", name) for name in ("c2", "published"))
-    masks, full = (stored.run("standard-h200", f"published, {name}") for name in ("masks", "full"))
-    alone = stored.run("small-segments-cpu", "full, small segments left out")
     paper = stored.run("published-paper-h200", "search-for-grasp")
     default = {
         "new: `c2` 090 to 179": [each for each in new["episodes"] if not is_chosen_on(each["scenario"])],
         "development: published": published["episodes"],
     }
-    table1 = load_run(stored.folder / "runs", "table1-h100")
-    images = {
-        "`masks`, H100, new: `c2` 090 to 179": {"episodes": _from_masks(table1)},
-        "`masks`, H200, published": masks,
-        "`full`, H200, published": full,
-        "`full`, CPU, published": alone,
-    }
+    runs = [load_run(stored.folder / "runs", f"{name}-h100") for name in IMAGE_RUNS]
     clock = new["clock"]["nothing kept"]
     frictions = {"same": "X1", "half": "X5", "double": "X2"}
     starts = stored["scenes-start-cpu"]["summary"]
     return {
-        **{"new": new, "published": published, "masks": masks, "full": alone, "paper": paper},
+        **{"new": new, "published": published, "paper": paper},
         "default_rates": rates("scenes", default),
         "default_mishaps": mishaps(default),
-        "table1": table1.lines[0],
-        "image_rates": rates("recognition, device, scenes", {label: run["episodes"] for label, run in images.items()}),
+        **{name.replace("-", "_"): run.lines[0] for name, run in zip(IMAGE_RUNS, runs, strict=True)},
+        "image_rates": rates("recognition", from_images(*runs)),
         "paper_rates": paper_rates(paper["episodes"]),
         "pushes": pushes(stored),
         "perception": perception(stored),
