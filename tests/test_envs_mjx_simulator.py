@@ -17,11 +17,12 @@ from test_envs_simulator import BOARD, pick_and_place, pose, push, scene, standi
 
 from mechsearch_jax.actions import ActionKind, no_action, retrieve_action
 from mechsearch_jax.envs.simulators import mjx_step, simulator, warp_kernels
-from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields, cells_of
 from mechsearch_jax.envs.simulators.mjx_simulator import MjxConfig, MjxSimulator
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.simulators.simulator import Simulator, SimulatorConfig
 from mechsearch_jax.envs.world import model
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell, Mismatch
 from mechsearch_jax.envs.world.outcome import Failure, Overflow
 from mechsearch_jax.envs.world.world import TARGET, from_scenario, slots
 from mechsearch_jax.robot.motion import MotionConfig, Reference
@@ -65,12 +66,16 @@ def test_the_fields_of_every_world_are_those_that_mujoco_computes():
     blank = model.compile_model(Shelf(), Camera())
     scenes = [scene(BOX, BOTTLE), scene(), scene(*[BOTTLE] * 8, target=standing("box", (0.015, 0.02, 0.05), 0.6, 0.1))]
     worlds = stack(*[from_scenario(s) for s in scenes])
-    fields = body_fields(blank, worlds.kind, worlds.half_size, worlds.valid)
-    for i, start in enumerate(scenes):
-        compiled = model.with_bodies(blank, slots(start))
+    moved = Mismatch(friction=0.5, mass=2.0, shelf_shift=0.01, shelf_turn=2.0)
+    cells = [ASSUMED_CELL, moved.drawn(scenes[1], 0, Camera(), Shelf()), ActualCell(friction=2.0)]
+    fields = body_fields(blank, worlds.kind, worlds.half_size, worlds.valid, cells_of(blank, cells))
+    for i, (start, cell) in enumerate(zip(scenes, cells, strict=True)):
+        native = NativeWorld()
+        native.place(slots(start), cell)
+        compiled = native._model
         for name in BodyFields.__dataclass_fields__:
             value = np.asarray(getattr(fields, name)[i])
-            np.testing.assert_allclose(value, getattr(compiled, name).reshape(value.shape), 2e-6, err_msg=name)
+            np.testing.assert_allclose(value, getattr(compiled, name).reshape(value.shape), 2e-6, 1e-7, err_msg=name)
 
 
 def test_commands_are_those_of_the_native_simulator():
@@ -226,6 +231,29 @@ def test_a_push_ends_where_the_native_simulator_has_it_and_other_worlds_stay(sim
     for i in (1, 2):
         np.testing.assert_array_equal(sim.world.position[i], before.position[i])
         np.testing.assert_array_equal(sim.world.rotation[i], before.rotation[i])
+
+
+def test_every_world_has_its_own_cell(sim):
+    moved, heavy = Mismatch(shelf_shift=0.01, shelf_turn=1.0), Mismatch(friction=0.5, mass=2.0)
+    cells = {1: moved.drawn(scene(BOX), 0, Camera(), Shelf()), 2: heavy.drawn(scene(BOX), 0, Camera(), Shelf())}
+    sim.set_cells(cells)
+    sim.reset([scene(BOX)] * 4)
+    outcomes = sim.execute(stack(*[sideways()] * 4))
+    ends = np.asarray(sim.world.position)[:, 0]
+    for i in (0, 1, 2):
+        native = NativeWorld()
+        native.reset(scene(BOX), cells.get(i, ASSUMED_CELL))
+        assert native.execute(sideways()).reason() == outcomes.reason(i)
+        assert np.abs(ends[i] - native.world.position[0]).max() < 2e-3
+    np.testing.assert_array_equal(ends[3], ends[0])
+    assert np.linalg.norm(ends[1] - ends[0]) > 4e-3
+    # The next episodes have the usual cell, where none is set.
+    sim.replace({1: scene(BOX), 2: scene(BOX)})
+    for name in ("body_pos", "geom_friction", "body_mass"):
+        field = np.asarray(getattr(sim._fields, name))
+        np.testing.assert_array_equal(field[1:3], field[:1].repeat(2, axis=0))
+    with pytest.raises(InputError, match="usual physics"):
+        sim.set_cells({0: ActualCell(physics="fine-step")})
 
 
 @pytest.mark.slow

@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax import graspability
 from mechsearch_jax.envs.camera import simulated_camera
 from mechsearch_jax.envs.pushing import physics_push
-from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields, cells_of
 from mechsearch_jax.envs.simulators.native_world import NativeWorld
 from mechsearch_jax.envs.world import model, world
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL
 from mechsearch_jax.images.target_pose import target_pose
 from mechsearch_jax.perception import scores
 from mechsearch_jax.robot.gripper import Gripper
@@ -380,7 +381,7 @@ def test_a_new_shape_is_simulated(ball):
     mine = model.with_bodies(compiled, world.slots(scenario))
     assert mine.body("body0").mass[0] == pytest.approx(4 / 3 * math.pi * 0.05**3 * ball.density)
     there = jax.tree.map(lambda leaf: leaf[None], world.from_scenario(scenario))
-    fields = body_fields(compiled, there.kind, there.half_size, there.valid)
+    fields = body_fields(compiled, there.kind, there.half_size, there.valid, cells_of(compiled, [ASSUMED_CELL]))
     for name in BodyFields.__dataclass_fields__:
         value = np.asarray(getattr(fields, name)[0])
         np.testing.assert_allclose(value, getattr(mine, name).reshape(value.shape), 2e-6, err_msg=name)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant
+from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.envs.world.mismatch import Mismatch
 
 ABLATION_SCENES, REPORT_SCENES = "development", "report-a"
@@ -28,12 +29,9 @@ def _values(option: str, values: Sequence[int | float], **others: Any) -> tuple[
     return tuple(Variant(f"{option} {value:g}", {option: value, **others}, value=float(value)) for value in values)
 
 
-def _in_worlds(prefix: str, worlds: Mapping[str, Mismatch], **options: Any) -> tuple[Variant, ...]:
-    """A variant for each way in which the world is not as assumed; natively simulated."""
-    return tuple(
-        Variant(f"{prefix}{label}", {**options, "mismatch": world}, engine="NativeSimulator")
-        for label, world in worlds.items()
-    )
+def _in_worlds(worlds: Mapping[str, Mismatch], engine: EngineName | None = None, **options: Any) -> tuple[Variant, ...]:
+    """A variant for each way in which the world is not as assumed."""
+    return tuple(Variant(label, {**options, "mismatch": world}, engine=engine) for label, world in worlds.items())
 
 
 def _factors(label: str, world: Callable[[float], Mismatch], **options: Any) -> tuple[Variant, ...]:
@@ -43,7 +41,6 @@ def _factors(label: str, world: Callable[[float], Mismatch], **options: Any) -> 
             f"{label} x {factor:g}",
             {**options, "mismatch": world(factor)},
             value=factor,
-            engine="NativeSimulator",
         )
         for factor in (1.0, 0.5, 0.7, 1.4, 2.0)
     )
@@ -230,13 +227,13 @@ _ROBUSTNESS = (
         "calibration",
         "What if camera or shelf stand elsewhere than the planner takes them to be?",
         REPORT_SCENES,
-        _in_worlds("", _USUAL_WORLD | _CALIBRATION, recognition="masks"),
+        _in_worlds(_USUAL_WORLD | _CALIBRATION, recognition="masks"),
     ),
     Study(
         "sensor",
         "What if the depth image is noisier, or lacks pixels?",
         REPORT_SCENES,
-        _in_worlds("", _USUAL_WORLD | _SENSOR, recognition="masks"),
+        _in_worlds(_USUAL_WORLD | _SENSOR, recognition="masks"),
     ),
     Study(
         "cameras",
@@ -253,7 +250,6 @@ _ROBUSTNESS = (
         REPORT_SCENES,
         (
             *_in_worlds(
-                "",
                 _USUAL_WORLD
                 | {
                     "time step 2 ms": Mismatch(physics="fine-step"),
@@ -262,6 +258,7 @@ _ROBUSTNESS = (
                     "softer friction": Mismatch(physics="soft-friction"),
                     "pyramidal friction cone": Mismatch(physics="pyramidal-cone"),
                 },
+                engine="NativeSimulator",
             ),
             Variant("MJX with Warp", engine="MjxSimulator"),
         ),

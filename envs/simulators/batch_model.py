@@ -1,12 +1,15 @@
 """The model of many worlds at once: one compiled MJCF, and the few fields that differ between worlds.
 
-`body_fields` computes in closed form, for thousands of worlds, what `model.with_bodies` has MuJoCo compute for one.
+`body_fields` computes in closed form, for thousands of worlds, what `model.with_bodies` has MuJoCo compute for one, and
+`model.move_robot` sets.
 """
 
 # The bindings of MuJoCo come without type stubs.
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import flax.struct
 import jax
@@ -16,12 +19,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.envs.world import model as models
+from mechsearch_jax.envs.world.mismatch import ActualCell
 from mechsearch_jax.envs.world.world import BODIES
 from mechsearch_jax.shapes import in_order
 
 
 class BodyFields(flax.struct.PyTreeNode):
-    """Fields of the model that depend on the bodies' shapes, with a leading axis for the worlds.
+    """Fields of the model that depend on the bodies' shapes and on the cell, with a leading axis for the worlds.
 
     Names, units and further axes (bodies, geoms, degrees of freedom) are those of MJX's model.
     """
@@ -29,6 +33,9 @@ class BodyFields(flax.struct.PyTreeNode):
     geom_size: jax.Array
     geom_rbound: jax.Array
     geom_aabb: jax.Array
+    geom_friction: jax.Array
+    body_pos: jax.Array
+    body_quat: jax.Array
     body_mass: jax.Array
     body_inertia: jax.Array
     body_subtreemass: jax.Array
@@ -37,27 +44,58 @@ class BodyFields(flax.struct.PyTreeNode):
     body_gravcomp: jax.Array
 
 
+class Cells(flax.struct.PyTreeNode):
+    """How the worlds differ from what the planner assumes: what of an `ActualCell` this simulator's model holds.
+
+    Attributes:
+      friction, mass: factors on sliding frictions, and on the bodies' masses and inertias, shape (worlds,).
+      position, quaternion: of the robot's first link in the world, shapes (worlds, 3) [m] and (worlds, 4).
+    """
+
+    friction: jax.Array
+    mass: jax.Array
+    position: jax.Array
+    quaternion: jax.Array
+
+
+def cells_of(blank: mujoco.MjModel, cells: Sequence[ActualCell]) -> Cells:
+    """The cells of all worlds, float32; their physics are left out."""
+    poses = [models.base_pose(blank, cell.T_world_base) for cell in cells]
+    columns = (
+        [cell.friction for cell in cells],
+        [cell.mass for cell in cells],
+        [position for position, _ in poses],
+        [quaternion for _, quaternion in poses],
+    )
+    return Cells(*(jax.device_put(np.array(column, np.float32)) for column in columns))
+
+
 def body_fields(
     blank: mujoco.MjModel,
     kind: Int[Array, "worlds 9"],
     half_size: Float[Array, "worlds 9 3"],
     valid: Bool[Array, "worlds 9"],
+    cells: Cells,
 ) -> BodyFields:
     """The fields of a model whose slots hold the bodies of each world, float32; traceable.
 
     Args:
       blank: the compiled model with empty slots.
       kind, half_size, valid: of the bodies, as in a `World`.
+      cells: of the worlds.
     """
     worlds = len(kind)
     mass, inertia = models.masses_and_inertias(kind, half_size, jnp)
     mass = jnp.where(valid, mass, models.EMPTY_MASS)
     inertia = jnp.where(valid[..., None], inertia, models.EMPTY_INERTIA)
+    mass, inertia = cells.mass[:, None] * mass, cells.mass[:, None, None] * inertia
 
     fields = {}
     for name in BodyFields.__dataclass_fields__:
         value = jnp.asarray(getattr(blank, name), jnp.float32)
         fields[name] = jnp.broadcast_to(value, (worlds, *value.shape))
+
+    fields["geom_friction"] = fields["geom_friction"].at[:, :, 0].multiply(cells.friction[:, None])
 
     def put(name: str, where: np.ndarray | int, value: Array) -> None:
         fields[name] = fields[name].at[:, where].set(value.astype(jnp.float32))
@@ -70,6 +108,10 @@ def body_fields(
     put("body_subtreemass", body, mass)
     robot = blank.body_mass.sum() - blank.body_mass[body].sum()
     put("body_subtreemass", 0, robot + mass.sum(axis=1))
+
+    link = blank.body("link1").id
+    put("body_pos", link, cells.position)
+    put("body_quat", link, cells.quaternion)
 
     # The inverse of a free body's mass matrix is diagonal; its rotations share the mean, as in mj_setConst.
     inverse = jnp.stack([1 / mass, (1 / inertia).mean(axis=-1)], axis=-1)

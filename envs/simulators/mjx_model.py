@@ -19,7 +19,7 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 from jaxtyping import Array, Bool
 
-from mechsearch_jax.envs.simulators.batch_model import BodyFields, body_fields
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, Cells, body_fields
 from mechsearch_jax.envs.simulators.simulator import ARM, ROBOT, SimulatorConfig
 from mechsearch_jax.envs.simulators.warp_kernels import compile_kernels
 from mechsearch_jax.envs.world import model as models
@@ -120,10 +120,10 @@ class MjxModel:
         self._parked = jnp.asarray(np.stack(parked), jnp.float32)
         self.robot = jnp.asarray(np.concatenate([HOME, np.zeros(ROBOT - ARM)]), jnp.float32)
 
-    def start(self, world: World) -> tuple[BodyFields, Array, Array]:
+    def start(self, world: World, cells: Cells) -> tuple[BodyFields, Array, Array]:
         """The model's fields, configurations and commands of worlds at rest with the robot at home."""
         count = len(world.kind)
-        fields = body_fields(self.blank, world.kind, world.half_size, world.valid)
+        fields = body_fields(self.blank, world.kind, world.half_size, world.valid, cells)
         upright = jnp.where(world.valid[..., None, None], world.rotation, jnp.eye(3)[None, None])
         quaternion = Rotation.from_matrix(upright.reshape(-1, 3, 3)).as_quat()[:, np.array([3, 0, 1, 2])]
         poses = jnp.concatenate([world.position, quaternion.reshape(count, BODIES, 4)], axis=-1)

@@ -35,7 +35,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions import Action, ActionKind, no_action
-from mechsearch_jax.envs.simulators.batch_model import BodyFields
+from mechsearch_jax.envs.simulators.batch_model import BodyFields, cells_of
 from mechsearch_jax.envs.simulators.mjx_model import MjxConfig, MjxModel, where
 from mechsearch_jax.envs.simulators.mjx_step import (
     Progress,
@@ -49,6 +49,7 @@ from mechsearch_jax.envs.simulators.mjx_step import (
     waiting,
 )
 from mechsearch_jax.envs.simulators.simulator import ROBOT, check_actions
+from mechsearch_jax.envs.world.mismatch import ASSUMED_CELL, ActualCell
 from mechsearch_jax.envs.world.outcome import Failure, Outcome
 from mechsearch_jax.envs.world.world import World, from_scenario
 from mechsearch_jax.runtime.compiled import Kept
@@ -82,6 +83,9 @@ class MjxSimulator:
         self.world: World | None = None
         self._model = MjxModel(self.shelf, self.camera, self.config)
         self._fields: BodyFields | None = None
+        # Of all worlds now, and of those that begin next.
+        self._cells: list[ActualCell] = []
+        self._next_cells: dict[int, ActualCell] = {}
         self._data: Any = None
         # Task and progress of all worlds, and which outcomes were reported already; which worlds are moving.
         self._tasks: tuple[Task, Progress, Array] | None = None
@@ -105,6 +109,7 @@ class MjxSimulator:
         if not scenarios:
             raise InputError("MjxSimulator: no scenarios are given; reset it with one for each world")
         worlds = [from_scenario(scenario) for scenario in scenarios]
+        self._cells = [self._next_cells.pop(i, ASSUMED_CELL) for i in range(len(worlds))]
         return self.load(jax.tree.map(lambda *leaves: np.stack(leaves), *worlds))
 
     def replace(self, scenarios: Mapping[int, Scenario]) -> World:
@@ -116,9 +121,20 @@ class MjxSimulator:
         count = self._count()
         new = jax.tree.map(np.array, self.world)
         for i, scenario in scenarios.items():
+            self._cells[i] = self._next_cells.pop(i, ASSUMED_CELL)
             for old, value in zip(jax.tree.leaves(new), jax.tree.leaves(from_scenario(scenario)), strict=True):
                 old[i] = value
         return self.load(new, np.isin(np.arange(count), list(scenarios)))
+
+    def set_cells(self, cells: Mapping[int, ActualCell]) -> None:
+        """Set the cells of worlds for the next `reset` or `replace` alone; see `TakesCells`.
+
+        Raises:
+          InputError: one of them has other physics.
+        """
+        if any(cell.physics != ASSUMED_CELL.physics for cell in cells.values()):
+            raise InputError("MjxSimulator: all worlds have the usual physics; use the NativeSimulator")
+        self._next_cells.update(cells)
 
     def load(self, world: World, only: Bool[np.ndarray, " worlds"] | None = None) -> World:
         """Set the state of all worlds, or of those in `only`; see `Simulator.load`.
@@ -131,7 +147,9 @@ class MjxSimulator:
             now = 0 if self.world is None else len(self.world.kind)
             raise InputError(f"MjxSimulator: {count} worlds cannot be set in part: there are {now} now")
         world = jax.tree.map(lambda a: a if isinstance(a, jax.Array) else jax.device_put(a), world)
-        fields, qpos, ctrl = self._start(world)
+        if len(self._cells) != count:
+            self._cells = [ASSUMED_CELL] * count
+        fields, qpos, ctrl = self._start(world, cells_of(self._model.blank, self._cells))
         new = fields, world
         if only is None:
             if self._data is None or self._data.qpos.shape[0] != count:
@@ -209,11 +227,12 @@ class MjxSimulator:
         count = len(world.kind)
         mask = jax.ShapeDtypeStruct((count,), bool)
         actions = jax.tree.map(lambda a: jax.ShapeDtypeStruct((count, *a.shape), a.dtype), no_action())
+        usual = cells_of(self._model.blank, [ASSUMED_CELL] * count)
 
         # Traced only when the first program is lowered, since it takes long.
         @functools.cache
         def shapes() -> tuple[Any, Any, Any]:
-            start = jax.eval_shape(self._model.start, world)
+            start = jax.eval_shape(self._model.start, world, usual)
             data, *tasks = jax.eval_shape(self._begun, self._model.data_shapes(count), actions, mask)
             return start, data, tuple(tasks)
 
@@ -229,7 +248,7 @@ class MjxSimulator:
             "kernels": lambda: self._model.kernels(count),
             "simulate": going,
             "motions": lambda: self._begin.begin(shapes()[1], actions, mask),
-            "reset": lambda: self._start.begin(world),
+            "reset": lambda: self._start.begin(world, usual),
             "next episodes": placing,
             "next motions": lambda: self._merge.begin(mask, shapes()[2], shapes()[2]),
         }
@@ -239,7 +258,8 @@ class MjxSimulator:
     def simulate(self, world: World, actions: Action | None) -> tuple[World, Outcome]:
         """`load` and `execute` as a pure, traceable function.
 
-        This simulator's state is unchanged. An action of an unknown kind changes nothing and fails as such.
+        This simulator's state is unchanged, and the worlds are as the planner assumes. An action of an unknown kind
+        changes nothing and fails as such.
 
         Args:
           world, actions: fields with a leading axis for the worlds; without actions the worlds settle.
@@ -248,7 +268,7 @@ class MjxSimulator:
           The worlds afterwards, and the outcomes.
         """
         count = len(world.kind)
-        fields, qpos, ctrl = self._start(world)
+        fields, qpos, ctrl = self._start(world, cells_of(self._model.blank, [ASSUMED_CELL] * count))
         data = self._model.make_data(count).replace(qpos=qpos, ctrl=ctrl)
         _, world, outcome = self._simulate(fields, data, world, actions, jnp.ones(count, bool))
         return world, outcome

@@ -107,11 +107,8 @@ class Mismatch:
         """
         if recognition in ("oracle", "informed") and self.measures_otherwise:
             raise InputError("--depth-noise and --missing-depth need an image; add --recognition masks or full")
-        if engine != "NativeSimulator" and self.simulates_otherwise:
-            raise InputError(
-                "the batch simulator cannot differ in friction, mass, physics or where the shelf stands; add "
-                "--simulator native"
-            )
+        if engine != "NativeSimulator" and self.physics != "usual":
+            raise InputError("--world-physics: the batch simulator has the usual physics; add --simulator native")
 
     def drawn(self, scenario: Scenario, seed: int, camera: Camera, shelf: Shelf) -> ActualCell:
         """The cell of an episode, constant until its end.

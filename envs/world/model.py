@@ -346,15 +346,23 @@ def with_bodies(
     return model
 
 
+def base_pose(
+    model: mujoco.MjModel, T_world_base: Float[np.ndarray, "4 4"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]:
+    """Position and quaternion of the robot's first link in the world if its base stands elsewhere."""
+    link = model.body("link1").id
+    position, quaternion = model.body_pos[link].copy(), model.body_quat[link].copy()
+    if np.array_equal(T_world_base, np.eye(4)):
+        return position, quaternion
+    turn = Rotation.from_matrix(T_world_base[:3, :3])
+    at_base = Rotation.from_quat(quaternion, scalar_first=True)
+    return turn.apply(position) + T_world_base[:3, 3], (turn * at_base).as_quat(scalar_first=True)
+
+
 def move_robot(model: mujoco.MjModel, T_world_base: Float[np.ndarray, "4 4"]) -> None:
     """Put the robot's base elsewhere in a model, which is changed; nothing changes if it is where it was."""
-    if np.array_equal(T_world_base, np.eye(4)):
-        return
     link = model.body("link1").id
-    turn = Rotation.from_matrix(T_world_base[:3, :3])
-    model.body_pos[link] = turn.apply(model.body_pos[link]) + T_world_base[:3, 3]
-    at_base = Rotation.from_quat(model.body_quat[link], scalar_first=True)
-    model.body_quat[link] = (turn * at_base).as_quat(scalar_first=True)
+    model.body_pos[link], model.body_quat[link] = base_pose(model, T_world_base)
 
 
 def initial_state(model: mujoco.MjModel, bodies: Sequence[Body | None]) -> mujoco.MjData:
