@@ -15,7 +15,7 @@ from mechsearch_jax.benchmarks.studies.pictures import picture
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant, find_studies
 from mechsearch_jax.commands import study as command
 from mechsearch_jax.commands.main import parse
-from mechsearch_jax.envs.scenes.scene_sets import SETS, is_chosen_on
+from mechsearch_jax.envs.scenes.scene_sets import SETS, SHELVES, is_chosen_on
 from mechsearch_jax.runtime.errors import InputError
 
 STUDY = Study("gamma", "Does it matter?", "development", (Variant("0.9"), Variant("0.5", {"gamma": 0.5})), axis="gamma")
@@ -34,6 +34,13 @@ def rows_of(variant, share, seed=0, engine="MjxSimulator", scenes=25, first=0):
         dataclasses.replace(row, configuration=row.configuration.replace('"NativeSimulator"', f'"{engine}"'))
         for row in rows
     ]
+
+
+@pytest.mark.parametrize("study", STUDIES.values(), ids=lambda study: study.name)
+def test_the_scenes_of_a_study_stand_on_the_shelf_of_its_variants(study):
+    shelves = {block.shelf for block in SETS[study.scenes].blocks}
+    for variant in study.variants:
+        assert [SHELVES[shelf] for shelf in shelves] == [variant.method().workcell.shelf]
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=lambda study: study.name)

@@ -198,6 +198,23 @@ _SENSOR = {
 }
 _CAMERAS = ("camera-ahead", "camera-right", "camera-back")
 
+
+def _shelf(name: str, question: str) -> Study:
+    """What comes of another shelf, on scenes of its own."""
+    file = _VIEWS / f"shelf-{name}.toml"
+    return Study(
+        f"shelf-{name}",
+        question,
+        f"shelf-{name}",
+        (
+            Variant("true shapes", config=file),
+            Variant("masks", {"recognition": "masks"}, config=file),
+            Variant("full", {"recognition": "full"}, config=file),
+            Variant("preset paper", {"preset": "paper"}, config=file),
+        ),
+    )
+
+
 _ROBUSTNESS = (
     Study(
         "friction",
@@ -244,6 +261,9 @@ _ROBUSTNESS = (
             *(Variant(name, {"recognition": "masks"}, config=_VIEWS / f"{name}.toml") for name in _CAMERAS),
         ),
     ),
+    _shelf("low", "What if the shelf is lower and closer?"),
+    _shelf("narrow", "What if the shelf is higher and narrower?"),
+    _shelf("wide", "What if the shelf is deeper and wider?"),
     Study(
         "physics",
         "What if the world's physics are not those of the trials? MuJoCo in C judges, and tries out.",

@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 from mechsearch_jax.workspace.scenario import HASH_DIGITS, Scenario, load_scenario, save_scenario
+from mechsearch_jax.workspace.shelf import Shelf
 
 RECORD = Path(__file__).with_name("scene_sets.json")
 
@@ -35,6 +36,7 @@ class Block:
       target: shape of the target.
       first_seed: of scene 0; the others follow.
       layout: "clutter" as `ScenarioGenerator` makes it, or "line" as `LineGenerator` does.
+      shelf: one of `SHELVES`.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Block:
     target: str
     first_seed: int
     layout: Literal["clutter", "line"] = "clutter"
+    shelf: str = "usual"
 
     def scene_name(self, index: int) -> str:
         """The name of a scene."""
@@ -69,10 +72,19 @@ class SceneSet(NamedTuple):
 
 
 def _blocks(
-    name: str, scenes: int, counts: Sequence[int], first_seed: int, target: str = "cylinder"
+    name: str, scenes: int, counts: Sequence[int], first_seed: int, target: str = "cylinder", shelf: str = "usual"
 ) -> tuple[Block, ...]:
     """One block for each number of objects, all from the same seeds: the generator mixes that number into the seed."""
-    return tuple(Block(f"{name}-{count}", scenes, count, target, first_seed) for count in counts)
+    return tuple(Block(f"{name}-{count}", scenes, count, target, first_seed, shelf=shelf) for count in counts)
+
+
+# By name; those of benchmarks/parts/views.
+SHELVES: Mapping[str, Shelf] = {
+    "usual": Shelf(),
+    "low": Shelf(front=0.374, back=0.748, board=0.3045, ceiling=0.673, spawn_x=(0.41, 0.69)),
+    "narrow": Shelf(board=0.4545, ceiling=0.803, right=-0.2, left=0.4, spawn_y=(-0.1, 0.3)),
+    "wide": Shelf(back=0.864, right=-0.35, left=0.55, spawn_x=(0.45, 0.8), spawn_y=(-0.25, 0.45)),
+}
 
 
 # Seeds below 1000 are reserved for examples, tests and timings. No two experiments share a seed.
@@ -87,6 +99,14 @@ _EXPERIMENTS = (
     *(
         SceneSet(f"report-{letter}", "to report with, once", _blocks(f"report-{letter}", 100, (2, 4, 6, 8), first_seed))
         for letter, first_seed in (("a", 100_000), ("b", 110_000), ("c", 120_000), ("d", 130_000))
+    ),
+    *(
+        SceneSet(f"shelf-{shelf}", about, _blocks(f"shelf-{shelf}", 50, (2, 4, 6, 8), first_seed, shelf=shelf))
+        for shelf, about, first_seed in (
+            ("low", "on a lower and closer shelf", 140_000),
+            ("narrow", "on a higher and narrower shelf", 150_000),
+            ("wide", "on a deeper and wider shelf", 160_000),
+        )
     ),
 )
 
@@ -133,7 +153,7 @@ def find_scene(name: str) -> tuple[Block, int] | None:
 
 
 @functools.cache
-def _generate(layout: str, target: str) -> Callable[[int, int, str], Scenario]:
+def _generate(layout: str, target: str, shelf: str) -> Callable[[int, int, str], Scenario]:
     """A function that generates a scene from its seed, its number of objects and its name."""
     # Imported here because it takes long, and nothing is generated if all files exist.
     from mechsearch_jax.envs.scenes.generator import GeneratorConfig, ScenarioGenerator
@@ -144,7 +164,7 @@ def _generate(layout: str, target: str) -> Callable[[int, int, str], Scenario]:
     config = GeneratorConfig(visible=FOUND_PIXELS, anywhere=True)
     match layout:
         case "clutter":
-            return ScenarioGenerator(Target.of(target), config=config).generate
+            return ScenarioGenerator(Target.of(target), SHELVES[shelf], config=config).generate
         case "line":
             line = LineGenerator(checks=config)
             return lambda seed, objects, name: line.generate(seed, name)
@@ -163,7 +183,7 @@ def make_scene(block: Block, index: int) -> Scenario:
     """
     if not 0 <= index < block.scenes:
         raise InputError(f"{block.name}: there is no scene {index}; there are {block.scenes}, counted from 0")
-    generate = _generate(block.layout, block.target)
+    generate = _generate(block.layout, block.target, block.shelf)
     return generate(block.first_seed + index, block.objects, block.scene_name(index))
 
 
