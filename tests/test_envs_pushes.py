@@ -21,7 +21,8 @@ from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.envs.world.world import TARGET, World, bodies_of, from_scenario, superquadrics
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.networks.push import PushConfig
-from mechsearch_jax.networks.push_geometry import NORMALS, push_start, reach
+from mechsearch_jax.networks.push_contacts import reach
+from mechsearch_jax.networks.push_geometry import NORMALS, push_start
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.shapes.box import CODE as BOX

@@ -18,9 +18,10 @@ from mechsearch_jax.envs.scenes.generator import separation
 from mechsearch_jax.geometry import footprints, superquadric, transforms
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.networks import push
-from mechsearch_jax.networks import push_geometry as geometry
+from mechsearch_jax.networks import push_contacts as contacts
 from mechsearch_jax.networks.push import PushConfig, PushNetwork
-from mechsearch_jax.networks.push_geometry import REACH, push_geometry, push_start
+from mechsearch_jax.networks.push_contacts import REACH
+from mechsearch_jax.networks.push_geometry import POINTS, push_geometry, push_start
 from mechsearch_jax.networks.weights import read_card, save_weights
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper
@@ -92,13 +93,13 @@ def answer(weights, points, scene, T, displacement, shelf, config):
 
 def prediction(scene, T, displacement, shelf=OPEN, config=CONFIG, points=None):
     # All have the same shape, so that they share a program.
-    points = pusher()[: geometry.POINTS] if points is None else points
+    points = pusher()[:POINTS] if points is None else points
     return answer(parameters(config), points, scene, T, displacement, shelf, config)
 
 
 def symmetric_points():
     """Points of a gripper that is its own mirror image; the real one's are spread without regard to that."""
-    half = pusher()[: geometry.POINTS // 2]
+    half = pusher()[: POINTS // 2]
     return jnp.concatenate([half, half * jnp.float32([1.0, -1.0, 1.0])[None]])
 
 
@@ -246,7 +247,7 @@ def test_the_distance_to_contact_is_that_of_small_steps():
     prints = footprints.footprints(scene)
     heading = displacement[:2] / jnp.linalg.norm(displacement[:2])
     points = transforms.transform(T, pusher())
-    distance, level = jax.jit(geometry.pusher_distance)(prints, points, heading)
+    distance, level = jax.jit(contacts.pusher_distance)(prints, points, heading)
     half, yaw, centre = (np.asarray(a, float) for a in (prints.half, prints.yaw, prints.position))
     for i in range(5):
         axes = np.array([[np.cos(yaw[i]), np.sin(yaw[i])], [-np.sin(yaw[i]), np.cos(yaw[i])]])
@@ -258,8 +259,8 @@ def test_the_distance_to_contact_is_that_of_small_steps():
 
         expected = travelled(inside, REACH)
         across = np.abs((np.asarray(points)[:, :2] - centre[i]) @ [-float(heading[1]), float(heading[0])])
-        side = jnp.broadcast_to(geometry.perpendicular(heading)[None], (5, 2))
-        clear = np.abs(across - float(geometry.reach(prints, side)[i])) > 3e-3
+        side = jnp.broadcast_to(contacts.perpendicular(heading)[None], (5, 2))
+        clear = np.abs(across - float(contacts.reach(prints, side)[i])) > 3e-3
         ahead = expected > 0
         np.testing.assert_allclose(np.maximum(distance[i], 0.0)[clear & ahead], expected[clear & ahead], atol=5e-4)
     assert level.any()
@@ -278,7 +279,7 @@ def test_the_distance_between_objects_is_that_of_small_steps():
     scene, _, displacement = cluttered(9)
     prints = footprints.footprints(scene)
     heading = np.asarray(displacement[:2], float) / np.linalg.norm(displacement[:2])
-    met = jax.jit(geometry.meetings)(prints, jnp.float32(heading))
+    met = jax.jit(contacts.meetings)(prints, jnp.float32(heading))
     distance, gap = met.distance, met.gap
     count = 0
     for i in range(5):
@@ -310,7 +311,7 @@ def test_how_objects_meet_is_known_where_it_is_plain():
         ((0.02, 0.02, 0.05), BOX, 0.7, -0.05, np.radians(30)),
         ((0.02, 0.02, 0.05), ROUND, 0.7, 0.2, 0.0),
     )
-    met = jax.jit(geometry.meetings)(footprints.footprints(scene), jnp.float32([1.0, 0.0]))
+    met = jax.jit(contacts.meetings)(footprints.footprints(scene), jnp.float32([1.0, 0.0]))
     assert float(met.distance[0, 1]) == pytest.approx(0.06, abs=1e-6)
     np.testing.assert_allclose(met.normal[0, 1], [1.0, 0.0], atol=1e-5)
     # From 0 to 3 cm to the left of the first's centre, and from 2 cm to the right to 1 cm to the left of the second's.
@@ -337,7 +338,7 @@ def test_at_cylinders_objects_meet_along_the_line_to_their_axis(yaw):
     turn = jnp.float32([[c, -s], [s, c]])
     around = jnp.matmul(prints.position - centre, turn.T, precision="highest") + centre
     prints = prints.replace(position=around, yaw=prints.yaw + yaw)
-    met = jax.jit(geometry.meetings)(prints, turn[:, 0])
+    met = jax.jit(contacts.meetings)(prints, turn[:, 0])
     normal = jnp.matmul(met.normal, turn, precision="highest")
     along = np.sqrt(0.08**2 - 0.024**2)
     assert float(met.distance[0, 1]) == pytest.approx(0.2 - along, abs=2e-4)
@@ -350,7 +351,7 @@ def test_at_cylinders_objects_meet_along_the_line_to_their_axis(yaw):
     np.testing.assert_allclose(normal[0, 3], [1.0, 0.0], atol=1e-5)
     # A box on its way to a cylinder, to the right of it.
     heading = -turn[:, 0]
-    back = jax.jit(geometry.meetings)(prints, heading)
+    back = jax.jit(contacts.meetings)(prints, heading)
     assert float(back.distance[2, 0]) == pytest.approx(float(met.distance[0, 2]), abs=1e-5)
     np.testing.assert_allclose(back.normal[2, 0], -met.normal[0, 2], atol=1e-5)
 
@@ -361,7 +362,7 @@ def test_cylinders_that_touch_are_not_met_on_the_way_apart():
     scene = standing(
         ((0.03, 0.03, 0.05), ROUND, 0.6, 0.0, 0.0), ((0.05, 0.05, 0.05), ROUND, 0.6 + away[0], away[1], 0.0)
     )
-    met = jax.jit(geometry.meetings)(footprints.footprints(scene), jnp.float32([1.0, 0.0]))
+    met = jax.jit(contacts.meetings)(footprints.footprints(scene), jnp.float32([1.0, 0.0]))
     assert float(met.gap[0, 1]) == pytest.approx(5e-4, abs=1e-6)
     assert float(met.distance[0, 1]) == pytest.approx(REACH)
     assert float(met.distance[1, 0]) == pytest.approx(5e-4 / np.cos(0.5), abs=2e-4)
@@ -373,7 +374,7 @@ def test_an_object_reaches_as_far_as_its_outline():
     for i in range(5):
         outline = outline_of(prints, i, 4000) - np.asarray(prints.position[i])
         for direction in ([1.0, 0.0], [0.6, 0.8]):
-            extent = geometry.reach(prints, jnp.broadcast_to(jnp.float32(direction)[None], (5, 2)))[i]
+            extent = contacts.reach(prints, jnp.broadcast_to(jnp.float32(direction)[None], (5, 2)))[i]
             assert float(extent) == pytest.approx((outline @ direction).max(), abs=2e-4)
 
 

@@ -109,9 +109,8 @@ def test_a_folder_holds_no_more_than_a_newcomer_looks_through():
     assert {folder: count for folder, count in held.items() if count > 15} == {}
 
 
-# Each is one thing: a network's input, an optimiser, a table of primitives, a class.
+# Each is one thing: an optimiser, a table of primitives, a class.
 LONG = {
-    "mechsearch_jax/networks/push_geometry.py",
     "mechsearch_jax/perception/refinement.py",
     "mechsearch_jax/robot/gripper.py",
     "mechsearch_jax/session/searcher.py",

@@ -24,7 +24,8 @@ from mechsearch_jax.envs.pushing.pushes import Generation, Pushes, PushesConfig,
 from mechsearch_jax.envs.simulators.simulator import Simulator
 from mechsearch_jax.envs.world.world import superquadrics
 from mechsearch_jax.networks.push import PushConfig, PushMotion, PushNetwork, apply_network
-from mechsearch_jax.networks.push_geometry import CHAIN, NORMALS, REACH, PushStart, push_start, pusher_distance
+from mechsearch_jax.networks.push_contacts import REACH, pusher_distance
+from mechsearch_jax.networks.push_geometry import CHAIN, NORMALS, PushStart, push_start
 from mechsearch_jax.networks.weights import save_weights
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.train.push_scores import PushTruth, model_scores, no_motion, push_truth, turn_error

@@ -25,7 +25,7 @@ from mechsearch_jax.envs.world.world import TARGET, World, superquadrics
 from mechsearch_jax.geometry import superquadric
 from mechsearch_jax.geometry.footprints import bounding_half_extents, footprints
 from mechsearch_jax.geometry.transforms import back_off, inverse, make, transform, translate
-from mechsearch_jax.networks.push_geometry import pusher_distance
+from mechsearch_jax.networks.push_contacts import pusher_distance
 from mechsearch_jax.robot.grasp_frames import gripper_rotation
 from mechsearch_jax.robot.gripper import Gripper, arm_hits_shelf
 from mechsearch_jax.robot.kinematics import path_kinematics

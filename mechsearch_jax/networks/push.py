@@ -25,13 +25,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from mechsearch_jax.networks.layers import FeedForward
-from mechsearch_jax.networks.push_geometry import (
-    Parity,
-    PushGeometry,
-    PushStart,
-    perpendicular,
-    push_geometry,
-)
+from mechsearch_jax.networks.push_contacts import perpendicular
+from mechsearch_jax.networks.push_geometry import Parity, PushGeometry, PushStart, push_geometry
 from mechsearch_jax.runtime.errors import InputError
 
 # Units of the network's outputs: lengths [m], angles [rad].
