@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +13,17 @@ from mechsearch_jax import planner
 from mechsearch_jax.actions import ActionKind
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
 from mechsearch_jax.observation import Observation
-from mechsearch_jax.planner.occlusion import EACH, NEXT, most_occluding_first, weights_in_order
+from mechsearch_jax.planner.occlusion import (
+    EACH,
+    NEXT,
+    draw_by_occlusion,
+    most_occluding_first,
+    occlusion_weights,
+    weights_in_order,
+)
 from mechsearch_jax.planner.prediction import PredictByKind
+from mechsearch_jax.planner.proposal import WeightedDraw, guided_draw
+from mechsearch_jax.runtime.identity import identity
 from mechsearch_jax.workspace import scenario
 
 # Far from each other: one that hides much, one that hides some, one that hides little.
@@ -45,6 +55,13 @@ def decided(problem, names, seed=0, policy=POLICY, pose=None):
 def object_of(decision, names):
     assert int(decision.action.kind) in (ActionKind.PUSH, ActionKind.PICK_AND_PLACE)
     return names[int(decision.action.object)]
+
+
+def test_draws_by_other_weights_are_other_programs():
+    """Also on disk, where executables are kept; and equal ones in other processes are the same."""
+    draws = pickle.loads(pickle.dumps((guided_draw, draw_by_occlusion)))
+    assert draws == (guided_draw, draw_by_occlusion) == (guided_draw, WeightedDraw(occlusion_weights))
+    assert len({identity(draw) for draw in (guided_draw, draw_by_occlusion)}) == len(set(draws)) == 2
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,12 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from mechsearch_jax.actions.registry import ActionKind
-from mechsearch_jax.actions.sampler import sample_action
-from mechsearch_jax.actions.types import Sample
-from mechsearch_jax.belief.belief import Belief, possible_space
+from mechsearch_jax.belief.belief import Belief
 from mechsearch_jax.existence import occluders
 from mechsearch_jax.geometry.superquadric import Superquadrics
 from mechsearch_jax.planner.objective import Objective
+from mechsearch_jax.planner.proposal import WeightedDraw
 from mechsearch_jax.planner.rollout import Rollout, no_sequences
 from mechsearch_jax.planner.state import Decision, State
 from mechsearch_jax.problem.problem import Problem
@@ -59,24 +58,15 @@ def weights_in_order(by_object: Float[Array, " n"]) -> Float[Array, " n"]:
     return NEXT ** rank.astype(jnp.float32)
 
 
-def draw_by_occlusion(
-    key: Array,
-    problem: Problem,
-    belief: Belief,
-    objective: Objective,
-    guided_fraction: Array | float,
-    state: State,
-) -> Sample:
-    """The `Propose` of this baseline: most draws go to the object that occludes most and can be moved."""
-    return sample_action(
-        key,
-        problem.space,
-        state.scene,
-        possible_space(problem, belief, state.exists),
-        state.candidates,
-        state.able,
-        weights_in_order(occlusion(problem, belief, state).by_object),
-    )
+def occlusion_weights(
+    problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
+) -> Float[Array, " n"]:
+    """The `Weigh` of this baseline: most draws go to the object that occludes most and can be moved."""
+    return weights_in_order(occlusion(problem, belief, state).by_object)
+
+
+# The `Propose` of this baseline.
+draw_by_occlusion = WeightedDraw(occlusion_weights)
 
 
 def most_occluding_first(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Protocol
 
 import jax
@@ -49,6 +50,47 @@ class Propose(Protocol):
           state: the state in which to sample.
         """
         ...
+
+
+class Weigh(Protocol):
+    """Weighs the objects of a state for the draw of an action; static under jit."""
+
+    def __call__(
+        self, problem: Problem, belief: Belief, objective: Objective, guided_fraction: Array | float, state: State
+    ) -> Float[Array, " n"]:
+        """Sampling weight of each object, at least 0; see `Propose` for the arguments."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class WeightedDraw:
+    """A `Propose`: draws go to objects by sampling weights.
+
+    Attributes:
+      weigh: computes the weights.
+    """
+
+    weigh: Weigh
+
+    def __call__(
+        self,
+        key: Array,
+        problem: Problem,
+        belief: Belief,
+        objective: Objective,
+        guided_fraction: Array | float,
+        state: State,
+    ) -> Sample:
+        """See `Propose`."""
+        return sample_action(
+            key,
+            problem.space,
+            state.scene,
+            possible_space(problem, belief, state.exists),
+            state.candidates,
+            state.able,
+            self.weigh(problem, belief, objective, guided_fraction, state),
+        )
 
 
 class DrawnIn(Protocol):
@@ -119,21 +161,5 @@ def sampling_weights(
     return (1.0 - guided_fraction) / EVEN + guided_fraction * share
 
 
-def guided_draw(
-    key: Array,
-    problem: Problem,
-    belief: Belief,
-    objective: Objective,
-    guided_fraction: Array | float,
-    state: State,
-) -> Sample:
-    """The default `Propose`: draws go to objects by `sampling_weights`."""
-    return sample_action(
-        key,
-        problem.space,
-        state.scene,
-        possible_space(problem, belief, state.exists),
-        state.candidates,
-        state.able,
-        sampling_weights(problem, belief, objective, guided_fraction, state),
-    )
+# The default `Propose`: draws go to objects by `sampling_weights`.
+guided_draw = WeightedDraw(sampling_weights)
