@@ -73,6 +73,21 @@ def test_a_report_holds_what_the_rows_say(tmp_path):
     assert image.imread(tmp_path / "new" / "success.png").std() > 0.01
 
 
+def test_the_actions_of_errors_do_not_count(tmp_path):
+    """Of the two other episodes one took 3 actions, and the other 10."""
+    summary = {(rates.method, rates.objects): rates for rates in summarise(ROWS)}
+    assert summary["search-for-grasp", None].steps == 6.5
+    assert summary["search-for-grasp", 8].steps is None
+    write_report(ROWS, tmp_path)
+    text = page_of(tmp_path)
+    assert re.search(r"\| search-for-grasp \| all \| 3 \| 1 \|.*\| 6\.50 \|", text)
+    assert re.search(r"\| search-for-grasp \| 8 \| 1 \| 1 \|.*\| - \| 0\.00 \|", text)
+    assert json.loads((tmp_path / "rates.json").read_text())["rates"][3]["steps"] is None
+    screen = Console(file=io.StringIO(), width=100)
+    screen.print(rates_table(ROWS))
+    assert [line.split()[-3] for line in screen.file.getvalue().splitlines()[-2:]] == ["-", "6.5"]
+
+
 def test_a_report_tells_the_papers_grasps_of_the_episodes_that_say_so(tmp_path):
     said = [dataclasses.replace(WON, paper_graspable=True, paper_graspable_step=2), LOST]
     write_report([*said, dataclasses.replace(LOST, scenario="c", paper_graspable=False), OTHER], tmp_path)

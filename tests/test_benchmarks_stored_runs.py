@@ -55,12 +55,12 @@ def test_a_run_is_read_back_and_says_what_came_of_it(tmp_path, monkeypatch, caps
 
 
 def test_an_error_reaches_nothing():
-    failed = row_of(
-        "c2-4-100", failure="error: no", found_step=None, graspable_step=None, retrieved=False, objects_fallen=None
-    )
+    nothing = {"found_step": None, "graspable_step": None, "retrieved": False, "objects_fallen": None}
+    failed = row_of("c2-4-100", failure="error: no", steps=0, **nothing)
     (line,) = run_of("x", [failed, row_of("c2-4-101")]).lines
-    assert line["errors"] == 1
+    assert (line["errors"], line["actions"]) == (1, 3.0)
     assert {line[name]["rate"] for name in ("found", "graspable", "retrieved", "drop_free")} == {0.5}
+    assert run_of("x", [failed]).lines[0]["actions"] is None
 
 
 def test_what_a_row_does_not_say_is_no_share():

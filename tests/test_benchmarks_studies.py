@@ -115,13 +115,25 @@ def test_changes_are_those_of_the_same_scenes_and_seeds():
     assert screen(STUDY, rows).row_count == 2
 
 
+def failed(row):
+    return dataclasses.replace(row, failure="error: x", objects_fallen=None, retrieved=False, steps=0)
+
+
 def test_an_error_is_neither_retrieved_nor_free_of_drops():
-    base = STUDY.variants[0]
-    failed = [
-        dataclasses.replace(row, failure="error: x", objects_fallen=None, retrieved=False) for row in rows_of(base, 1)
-    ]
-    (only,) = compare(STUDY, failed)
+    rows = [failed(row) for row in rows_of(STUDY.variants[0], 1)]
+    (only,) = compare(STUDY, rows)
     assert (only.errors, only.means["drop-free"]) == (50, 0.0)
+    assert (only.means["actions"], only.intervals["actions"]) == (None, None)
+    assert screen(STUDY, rows).row_count == 1
+
+
+def test_the_actions_of_errors_do_not_count():
+    base, other = STUDY.variants
+    rows = [failed(row) if i < 10 else row for i, row in enumerate(rows_of(other, 1.0))]
+    first, second = compare(STUDY, [*rows_of(base, 1.0), *rows])
+    assert first.means["actions"] == second.means["actions"] == 3.0
+    assert (second.changes["actions"].pairs, second.changes["actions"].mean) == (40, 0.0)
+    assert (second.changes["retrieved"].pairs, second.changes["retrieved"].losses) == (50, 10)
 
 
 def test_of_runs_with_as_many_variants_the_newest_is_shown():

@@ -57,7 +57,7 @@ def summary_table(summary: Sequence[Rates], key: Key) -> Table:
             *_group(rates.group, key),
             str(rates.episodes),
             *("-" if share is None else f"{share:.2f}" for share in shares),
-            f"{rates.steps:.1f}",
+            "-" if rates.steps is None else f"{rates.steps:.1f}",
             f"{rates.planning_seconds:.2f}",
             f"{rates.simulation_seconds:.2f}",
             style="bold" if None in rates.group.values() else None,

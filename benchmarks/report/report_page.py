@@ -40,8 +40,9 @@ def blocks(report: Report) -> list[Block]:
             "scenes are worth. Actions until then are means over the episodes that got there, with a 95% interval from "
             "drawing scenes again; actions in all are the mean number per episode, attempts to take the target out "
             "among them; times are means per action. An episode that ended in an error of the program "
-            "counts as a failure. *Graspable*: found, and a grasp exists that touches nothing. *With the paper's "
-            "grasps*: graspable with those alone before the episode ended, of the episodes that say so."
+            "counts as a failure, and not in means of actions. *Graspable*: found, and a grasp exists that touches "
+            "nothing. *With the paper's grasps*: graspable with those alone before the episode ended, of the episodes "
+            "that say so."
         ),
         *(Paragraph(text) for text in remarks if text),
         *_key(report.key),
@@ -94,7 +95,8 @@ def _rates_table(rates: Sequence[Rates], key: Key, options: Sequence[str] = ()) 
             *(group.episodes, group.errors),
             *(_cell(getattr(group, goal), getattr(group, f"{goal}_interval"), 2) for goal in SHARES),
             *(_cell(getattr(group, f"{goal}_steps"), getattr(group, f"{goal}_steps_interval"), 1) for goal in GOALS),
-            *(f"{value:.2f}" for value in (group.steps, group.planning_seconds, group.simulation_seconds)),
+            "-" if group.steps is None else f"{group.steps:.2f}",
+            *(f"{value:.2f}" for value in (group.planning_seconds, group.simulation_seconds)),
         )
         for group in rates
     ]

@@ -15,7 +15,7 @@ from typing import Any
 from mechsearch_jax.benchmarks.paper.paper_tables import TABLES
 from mechsearch_jax.benchmarks.statistics.intervals import share_interval
 from mechsearch_jax.benchmarks.statistics.outcomes import OUTCOMES
-from mechsearch_jax.benchmarks.statistics.rates import scene_of
+from mechsearch_jax.benchmarks.statistics.rates import mean_actions, scene_of
 from mechsearch_jax.benchmarks.statistics.settings import settings_of
 from mechsearch_jax.benchmarks.store.rows import Row, options_of
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, merged, started, variant_of, write_run
@@ -24,7 +24,7 @@ from mechsearch_jax.runtime.errors import InputError
 
 
 def rates_of(rows: Sequence[Row]) -> dict[str, Any]:
-    """For each of `OUTCOMES` its share and 95% interval, by scene, or None; and the mean number of actions."""
+    """For each of `OUTCOMES` its share and 95% interval, by scene, or None; and `mean_actions`."""
     rates: dict[str, Any] = {}
     for name, outcome in OUTCOMES.items():
         ends = [(reached, scene_of(row)) for row in rows if (reached := outcome(row)) is not None]
@@ -35,7 +35,8 @@ def rates_of(rows: Sequence[Row]) -> dict[str, Any]:
             if ends
             else None
         )
-    return {**rates, "actions": round(sum(row.steps for row in rows) / len(rows), 3)}
+    actions = mean_actions(rows)
+    return {**rates, "actions": None if actions is None else round(actions, 3)}
 
 
 def scene_set_of(scenario: str) -> str:

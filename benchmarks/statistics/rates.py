@@ -43,7 +43,7 @@ class Rates:
         None where none did.
       found_steps_interval, graspable_steps_interval, retrieved_steps_interval: what the true means may be: see
         `mean_interval`.
-      steps: mean number of actions, attempts to take the target out among them.
+      steps: see `mean_actions`.
       planning_seconds, simulation_seconds: mean wall time per action [s].
     """
 
@@ -65,7 +65,7 @@ class Rates:
     found_steps_interval: Interval | None
     graspable_steps_interval: Interval | None
     retrieved_steps_interval: Interval | None
-    steps: float
+    steps: float | None
     planning_seconds: float
     simulation_seconds: float
 
@@ -117,6 +117,17 @@ def step_of(row: Row, goal: str) -> int | None:
     return row.found_step if goal == "found" else row.graspable_step
 
 
+def actions_of(row: Row) -> int | None:
+    """Number of actions of an episode, attempts to take the target out among them; None of one that did not end."""
+    return None if row.is_error else row.steps
+
+
+def mean_actions(rows: Sequence[Row]) -> float | None:
+    """Mean number of actions of the episodes that did not end in an error; None where all did."""
+    counts = [count for row in rows if (count := actions_of(row)) is not None]
+    return sum(counts) / len(counts) if counts else None
+
+
 def scene_of(row: Row) -> tuple[str, str | None]:
     """What an episode was run on: the scenario, by its name and content."""
     return row.scenario, row.content_hash
@@ -161,7 +172,7 @@ def _rates(group: Mapping[str, Hashable], rows: Sequence[Row], steps_intervals: 
         paper_episodes=len(by_paper),
         paper_graspable=sum(paper_graspable) / len(by_paper) if by_paper else None,
         paper_graspable_interval=share_interval(paper_graspable, list(map(scene_of, by_paper))),
-        steps=sum(row.steps for row in rows) / count,
+        steps=mean_actions(rows),
         planning_seconds=math.fsum(row.planning_seconds for row in rows) / actions,
         simulation_seconds=math.fsum(row.simulation_seconds for row in rows) / actions,
     )

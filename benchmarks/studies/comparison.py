@@ -10,7 +10,7 @@ from rich.table import Table
 from mechsearch_jax.benchmarks.statistics.intervals import Interval, mean_interval, share_interval, with_interval
 from mechsearch_jax.benchmarks.statistics.outcomes import COMPARED, OUTCOMES, WORDS
 from mechsearch_jax.benchmarks.statistics.paired import PairedDifference, change_of, same_episodes
-from mechsearch_jax.benchmarks.statistics.rates import scene_of
+from mechsearch_jax.benchmarks.statistics.rates import actions_of, scene_of
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.studies.studies import Study, Variant
 
@@ -18,7 +18,7 @@ from mechsearch_jax.benchmarks.studies.studies import Study, Variant
 SHARES = tuple(WORDS[name] for name in COMPARED)
 MEASURES: Mapping[str, Callable[[Row], float | None]] = {
     **{WORDS[name]: OUTCOMES[name] for name in COMPARED},
-    "actions": lambda row: row.steps,
+    "actions": actions_of,
 }
 
 
