@@ -6,8 +6,14 @@ from pathlib import Path
 import pytest
 
 from mechsearch_jax.benchmarks.report.results_page import Stored
+from mechsearch_jax.benchmarks.running import estimate
+from mechsearch_jax.benchmarks.running.episode_seconds import H100, Kind
+from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
 from mechsearch_jax.benchmarks.studies import costs_page
 from mechsearch_jax.benchmarks.studies.declared import STUDIES
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.scenes.scene_sets import find_set
+from mechsearch_jax.planner import PRESETS
 
 ROOT = Path(__file__).parents[1]
 
@@ -47,17 +53,31 @@ def test_what_studies_have_in_common_is_run_once(experiments):
 
 
 def test_costs_are_those_of_what_was_measured(measures, experiments):
-    assert measures.episode == pytest.approx((209.3 - 108.0) / 720)
-    table = experiments["Table 1"]
-    plain = table.count * measures.episode / 3600
-    images = table.count / 3 * measures.looks * (measures.look["masks"] + measures.look["full"]) / 3600
-    assert measures.running(table) == pytest.approx(plain + images)
-    assert images < 0.1 * plain
+    assert measures.episode(Method(engine=costs_page.ENGINE)) == pytest.approx((209.3 - 108.0) / 720, abs=1e-3)
+    (again,) = (part for name, part in experiments.items() if "more seeds" in name)
+    seconds = {each.kind: each.seconds.episode_seconds for each in measures.on_gpu}
+    with_masks = seconds[Kind("standard", "masks", True, "MjxSimulator")]
+    assert measures.running(again) == pytest.approx(again.count * with_masks / 3600)
+
+
+def test_dry_runs_count_as_the_page_does(measures, monkeypatch, tmp_path):
+    """Also of episodes that are natively simulated, which take a time of their own."""
+    monkeypatch.setattr(estimate, "versions", lambda: {"device": H100})
+    paper = PRESETS["paper"]()
+    methods = [
+        Method(engine="MjxSimulator"),
+        Method(config=paper, engine="MjxSimulator"),
+        Method(config=paper, engine="NativeSimulator", protocol="published-code"),
+    ]
+    outlines = [SceneOutline.of_block(find_set("d1").blocks[0], 0)]
+    parts = estimate.estimate(planned_jobs(outlines, methods, (0,)), tmp_path / "none", None).parts
+    assert [part.seconds.episode_seconds for part in parts] == [measures.episode(method) for method in methods]
+    assert len({part.seconds.episode_seconds for part in parts}) == len({part.grounds for part in parts}) + 1 == 3
 
 
 def test_a_folder_without_the_stored_results_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["costs_page", "--results", str(tmp_path), "--out", str(tmp_path / "costs.md")])
     with pytest.raises(SystemExit):
         costs_page.main()
-    assert "standard-h100.json: is not there; give the folder" in capsys.readouterr().err
+    assert "report-cpu.json: is not there; give the folder" in capsys.readouterr().err
     assert not (tmp_path / "costs.md").exists()

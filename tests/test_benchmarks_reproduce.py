@@ -225,7 +225,7 @@ def test_a_dry_run_says_what_it_would_be(run, tmp_path):
     assert not (tmp_path / "rows").exists()
     assert "4 episodes: search-for-grasp, masks, push+pick-and-place, standard, strict, any" in printed.out
     assert "6 variants, 24 episodes, 0 of them there already, 24 left" in printed.out
-    assert re.search(r"^  standard, full, with trials: 8 x [\d.]+ s, 2 x [\d.]+ s of compiling \(", printed.out, re.M)
+    assert re.search(r"^  standard, full, with trials, native simulator: 8 x [\d.]+ s, 2 x ", printed.out, re.M)
 
 
 def test_a_dry_run_knows_what_is_there_and_makes_no_scene(run, tmp_path, monkeypatch):

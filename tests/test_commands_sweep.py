@@ -8,15 +8,16 @@ import re
 from pathlib import Path
 
 import pytest
+from stored_rows import row_of
 
 from mechsearch_jax.benchmarks.running import estimate as estimates
 from mechsearch_jax.benchmarks.running import evaluate as evaluation
 from mechsearch_jax.benchmarks.running.episode_seconds import FILE as SECONDS_FILE
-from mechsearch_jax.benchmarks.running.episode_seconds import Kind, Measured, StoredSeconds, entries
+from mechsearch_jax.benchmarks.running.episode_seconds import H100, Kind, Measured, StoredSeconds, entries
 from mechsearch_jax.benchmarks.running.estimate import CONTINUOUS, estimate
 from mechsearch_jax.benchmarks.running.evaluate import make_jobs, present_code
 from mechsearch_jax.benchmarks.running.planned import SceneOutline, planned_jobs
-from mechsearch_jax.benchmarks.store.runs import stored_runs
+from mechsearch_jax.benchmarks.store.runs import StoredRun, stored_runs
 from mechsearch_jax.benchmarks.store.shards import ShardWriter
 from mechsearch_jax.commands import main as cli
 from mechsearch_jax.commands.runs import outlines_of
@@ -194,7 +195,7 @@ def test_what_a_run_would_take_is_told_and_nothing_is_run(folder, capsys):
         "96 variants, 192 episodes, 0 of them there already, 192 left\n1 compilation of the planner"
     )
     assert "hours in 2 processes" in output
-    assert re.search(r"^  standard, oracle, with trials: 192 x [\d.]+ s, 1 x [\d.]+ s of compiling \(", output, re.M)
+    assert re.search(r"^  standard, oracle, with trials, native simulator: 192 x [\d.]+ s, 1 x ", output, re.M)
     cli.parse(["sweep", *common, "--gamma", "0.5", "1", "--horizon", "2", "3", "--max-steps", "5", "10"])()
     assert "8 variants, 16 episodes, 0 of them there already, 16 left\n2 compilations" in capsys.readouterr().out
     shifts = ("--recognition", "masks", "--camera-shift", "0.01", "0.02", "--depth-noise", "0.001", "0.002")
@@ -230,7 +231,7 @@ def test_an_estimate_is_of_the_rows_that_are_there(folder):
     estimated = estimate(planned, "rows", 2)
     assert (estimated.variants, estimated.episodes, estimated.there, estimated.compilations) == (2, 4, 3, 1)
     (part,) = estimated.parts
-    assert (part.kind, part.seconds) == (Kind("standard", "oracle", True), Measured(3.5, 75.0, 2))
+    assert (part.kind, part.seconds) == (Kind.of(Method()), Measured(3.5, 75.0, 2))
     assert part.grounds == "from 2 rows of the folder"
     assert estimated.hours == pytest.approx((1 * 3.5 / 2 + 75.0) / 3600)
     assert estimate(planned, "rows", 2, retry_errors=True).there == 2
@@ -241,10 +242,17 @@ def test_an_estimate_is_of_the_rows_that_are_there(folder):
 
 
 def test_what_other_episodes_took_says_what_it_is_of(folder, monkeypatch):
-    clock = StoredSeconds("gpu: H100", Kind("standard", "oracle", True), Measured(0.1, 90.0, 720), "one.json")
-    slow = dataclasses.replace(clock, kind=Kind("paper", "masks", False), seconds=Measured(2.0, 60.0, 9))
-    monkeypatch.setattr(estimates, "stored_seconds", lambda: [clock, slow])
-    methods = [Method(), Method(config=PRESETS["paper"](), recognition="masks"), Method(recognition="full")]
+    batch, native = "MjxSimulator", "NativeSimulator"
+    clock = StoredSeconds("gpu: H100", Kind("standard", "oracle", True, batch), Measured(0.1, 90.0, 720), "one.json")
+    slow = dataclasses.replace(clock, kind=Kind("paper", "masks", False, batch), seconds=Measured(2.0, 60.0, 9))
+    published = dataclasses.replace(slow, kind=slow.kind._replace(simulator=native), seconds=Measured(3.0, 60.0, 9))
+    monkeypatch.setattr(estimates, "stored_seconds", lambda: [clock, slow, published])
+    methods = [
+        Method(engine=batch),
+        Method(config=PRESETS["paper"](), recognition="masks", engine=batch),
+        Method(config=PRESETS["paper"](), recognition="masks", engine=native, protocol="published-code"),
+        Method(recognition="full", engine=batch),
+    ]
     outlines = [SceneOutline.of_block(find_set("d1").blocks[0], 0)]
 
     def estimated(device):
@@ -255,6 +263,7 @@ def test_what_other_episodes_took_says_what_it_is_of(folder, monkeypatch):
     assert estimated("gpu: H100") == [
         (2, 0.1, "from one.json"),
         (2, 2.0, "from one.json"),
+        (2, 3.0, "from one.json"),
         (2, 0.1, "from one.json, of oracle"),
     ]
     assert estimated("gpu: A100")[0] == (2, 0.1, "from one.json on H100")
@@ -265,7 +274,20 @@ def test_the_seconds_of_the_package_are_those_of_the_stored_runs():
     results = Path(__file__).parents[1] / "benchmarks/results"
     written = json.loads(SECONDS_FILE.read_text(encoding="utf-8"))
     assert written == entries(results, stored_runs(results / "runs")), f"run `python -m {entries.__module__}`"
-    assert {"gpu: NVIDIA H100 80GB HBM3"} <= {entry["device"] for entry in written}
+    assert {H100} <= {entry["device"] for entry in written}
+    on_gpu = {entry["simulator"] for entry in written if entry["device"] == H100}
+    assert on_gpu == {"MjxSimulator", "NativeSimulator"}
+
+
+def test_of_several_runs_the_fastest_counts():
+    """What ran beside the others made them slower."""
+    results = Path(__file__).parents[1] / "benchmarks/results"
+    rows = [row_of(f"c2-4-{i:03d}", planning_seconds=3.0 + i, simulation_seconds=1.0) for i in range(2)]
+    runs = [StoredRun(f"run{i}", (row,), ({"started": f"2026-01-0{i + 1}"},)) for i, row in enumerate(rows)]
+    for each in (runs, runs[::-1]):
+        (entry,) = (entry for entry in entries(results, each) if entry["device"] == rows[0].device)
+        assert (entry["episode_seconds"], entry["source"]) == (4.0, "benchmarks/results/runs/run0.parquet")
+        assert Kind(*(entry[name] for name in Kind._fields)) == Kind.of(Method())
 
 
 def test_outlines_of_sets_are_those_of_their_files(folder):

@@ -1,7 +1,8 @@
 """How long episodes took in stored runs: `python -m mechsearch_jax.benchmarks.running.episode_seconds` in a checkout
 writes `episode_seconds.json` beside this file, which travels with the package.
 
-Every entry names the run that it is of. Of several runs of a device the newest counts.
+Every entry names the run that it is of. Of several runs of a device the one counts whose episodes took the least time:
+what ran beside the others made them slower.
 """
 
 from __future__ import annotations
@@ -17,12 +18,15 @@ from typing import Any, NamedTuple
 from mechsearch_jax.benchmarks.statistics.settings import settings_of
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
+from mechsearch_jax.envs.episode.method import Method
+from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike, replacing
 
 FILE = Path(__file__).with_name("episode_seconds.json")
 # The run before rows were stored: on one H100 with 16 cores, in batches.
 EARLIER = "standard-h100.json"
+H100 = "gpu: NVIDIA H100 80GB HBM3"
 
 
 class Kind(NamedTuple):
@@ -32,15 +36,36 @@ class Kind(NamedTuple):
       preset: that its settings are nearest to.
       recognition: what the planner sees the objects through.
       trials: whether actions are tried before one is executed.
+      simulator: that judges the episodes.
     """
 
     preset: str
     recognition: str
     trials: bool
+    simulator: EngineName
 
-    def distance(self, other: Kind) -> tuple[bool, bool, bool]:
-        """How far another kind is from telling how long this one takes: trials cost the most."""
-        return self.trials != other.trials, self.recognition != other.recognition, self.preset != other.preset
+    @classmethod
+    def of(cls, method: Method) -> Kind:
+        """The kind of the episodes of a method."""
+        return kind_of({**method.options(), "simulator": method.engine})
+
+    @property
+    def words(self) -> tuple[str, str, str, str]:
+        """The kind in words."""
+        trials = "with trials" if self.trials else "no trials"
+        simulator = "native simulator" if self.simulator == "NativeSimulator" else "batch simulator"
+        return self.preset, self.recognition, trials, simulator
+
+    def distance(self, other: Kind) -> tuple[bool, ...]:
+        """How far another kind is from telling how long this one takes: the simulator decides most, then trials."""
+        return (
+            self.simulator != other.simulator,
+            self.trials != other.trials,
+            # All others look at images.
+            (self.recognition == "oracle") != (other.recognition == "oracle"),
+            self.recognition != other.recognition,
+            self.preset != other.preset,
+        )
 
 
 class Measured(NamedTuple):
@@ -75,7 +100,7 @@ class StoredSeconds:
 
 
 def kind_of(options: Mapping[str, Any] | str) -> Kind:
-    """The kind of the episodes of a method's options, or of a `Row.configuration`."""
+    """The kind of the episodes of a method's options with its simulator, or of a `Row.configuration`."""
     return _kind_of(options if isinstance(options, str) else json.dumps(options, sort_keys=True))
 
 
@@ -83,7 +108,8 @@ def kind_of(options: Mapping[str, Any] | str) -> Kind:
 def _kind_of(configuration: str) -> Kind:
     options = json.loads(configuration)
     trials = options.get("rehearsal", "none") != "none"
-    return Kind(settings_of(options).preset, options.get("recognition", "oracle"), trials)
+    simulator = options.get("simulator", "NativeSimulator")
+    return Kind(settings_of(options).preset, options.get("recognition", "oracle"), trials, simulator)
 
 
 def measured(rows: Sequence[Row], compilations: int, at_once: int = 1) -> Measured:
@@ -98,12 +124,30 @@ def stored_seconds() -> Sequence[StoredSeconds]:
     return [
         StoredSeconds(
             entry["device"],
-            Kind(entry["preset"], entry["recognition"], entry["trials"]),
+            Kind(*(entry[name] for name in Kind._fields)),
             Measured(entry["episode_seconds"], entry["compile_seconds"], entry["episodes"]),
             entry["source"],
         )
         for entry in json.loads(FILE.read_text(encoding="utf-8"))
     ]
+
+
+def nearest(device: str, kind: Kind, stored: Sequence[StoredSeconds]) -> StoredSeconds | None:
+    """What tells most of how long episodes take: what both dry runs and docs/costs.md count with.
+
+    Args:
+      device: as `runtime.versions.versions` says it.
+      kind: of the episodes.
+      stored: what was measured.
+
+    Returns:
+      Of the device, or else of others of its platform, what was measured of the nearest kind; None where there is none.
+    """
+    platform = device.partition(":")[0]
+    alike = [each for each in stored if each.device == device] or [
+        each for each in stored if each.device.partition(":")[0] == platform
+    ]
+    return min(alike, key=lambda each: kind.distance(each.kind), default=None)
 
 
 def seconds_of(run: StoredRun) -> list[StoredSeconds]:
@@ -130,8 +174,8 @@ def earlier(folder: PathLike) -> StoredSeconds:
     episode = (clock["last episode [s]"] - clock["all compiled [s]"]) / len(run["episodes"])
     compiling = clock["all compiled [s]"] - clock["first line [s]"]
     return StoredSeconds(
-        "gpu: NVIDIA H100 80GB HBM3",
-        Kind("standard", "oracle", True),
+        H100,
+        Kind("standard", "oracle", True, "MjxSimulator"),
         Measured(episode, compiling, len(run["episodes"])),
         f"benchmarks/results/{EARLIER}",
     )
@@ -145,9 +189,9 @@ def _with_compilation(entry: StoredSeconds, each: Sequence[StoredSeconds]) -> St
 
 def entries(results: PathLike, runs: Sequence[StoredRun]) -> list[dict[str, Any]]:
     """What `FILE` holds, of stored results and stored runs."""
-    oldest_first = sorted(runs, key=lambda run: str(run.lines[0].get("started")) if run.lines else "")
-    each = [earlier(results), *(entry for run in oldest_first for entry in seconds_of(run))]
-    newest = {(entry.device, entry.kind): _with_compilation(entry, each) for entry in each}
+    each = [earlier(results), *(entry for run in runs for entry in seconds_of(run))]
+    slowest_first = sorted(each, key=lambda entry: -entry.seconds.episode_seconds)
+    fastest = {(entry.device, entry.kind): _with_compilation(entry, each) for entry in slowest_first}
     return [
         {
             "device": entry.device,
@@ -155,7 +199,7 @@ def entries(results: PathLike, runs: Sequence[StoredRun]) -> list[dict[str, Any]
             **{name: round(value, 3) for name, value in entry.seconds._asdict().items()},
             "source": entry.source,
         }
-        for _, entry in sorted(newest.items())
+        for _, entry in sorted(fastest.items())
     ]
 
 

@@ -10,7 +10,14 @@ from typing import NamedTuple
 
 import jax
 
-from mechsearch_jax.benchmarks.running.episode_seconds import Kind, Measured, kind_of, measured, stored_seconds
+from mechsearch_jax.benchmarks.running.episode_seconds import (
+    Kind,
+    Measured,
+    kind_of,
+    measured,
+    nearest,
+    stored_seconds,
+)
 from mechsearch_jax.benchmarks.running.evaluate import check_code
 from mechsearch_jax.benchmarks.running.planned import PlannedJob
 from mechsearch_jax.benchmarks.store.rows import Row
@@ -21,8 +28,8 @@ from mechsearch_jax.planner import PlannerConfig
 from mechsearch_jax.runtime.files import PathLike
 from mechsearch_jax.runtime.versions import versions
 
-# Of an episode and of a compilation where nothing was measured [s]: on one CPU core, and in batches on a GPU.
-ASSUMED = {"cpu": Measured(8.0, 60.0, 0), "gpu": Measured(0.14, 90.0, 0)}
+# Of an episode and of a compilation where nothing was measured on such a device: on one CPU core [s].
+ASSUMED = Measured(8.0, 60.0, 0)
 # The options that are data in what is compiled.
 CONTINUOUS = frozenset(path[0].name for path, _ in jax.tree_util.tree_flatten_with_path(PlannerConfig())[0])
 
@@ -89,9 +96,8 @@ class Estimate:
             f"about {self.hours:.2g} hours {where}, if nothing was compiled before",
         ]
         for part in self.parts:
-            trials = "with trials" if part.kind.trials else "no trials"
             lines.append(
-                f"  {part.kind.preset}, {part.kind.recognition}, {trials}: {part.left} x "
+                f"  {', '.join(part.kind.words)}: {part.left} x "
                 f"{part.seconds.episode_seconds:.3g} s, {part.compilations} x {part.seconds.compile_seconds:.3g} s of "
                 f"compiling ({part.grounds})"
             )
@@ -122,7 +128,7 @@ def estimate(jobs: Sequence[PlannedJob], out: PathLike, workers: int | None, ret
     device = versions()["device"]
     rows = [row for row in results.rows.values() if row.device == device and not row.is_error]
     by_kind: dict[Kind, list[PlannedJob]] = {}
-    kinds = functools.cache(lambda method: kind_of(method.options()))
+    kinds = functools.cache(Kind.of)
     for job in left:
         by_kind.setdefault(kinds(job.method), []).append(job)
     clocks = _Clocks(rows, device, workers or 1)
@@ -154,25 +160,20 @@ class _Clocks:
     def of(self, kind: Kind) -> tuple[Measured, str]:
         """What an episode of a kind and its compilation take, and how that is known."""
         if self._folder:
-            nearest = min(self._folder, key=kind.distance)
-            rows = self._folder[nearest]
+            of_rows = min(self._folder, key=kind.distance)
+            rows = self._folder[of_rows]
             seconds = measured(rows, _compilations(rows), self._at_once)
-            return seconds, f"from {_counted(len(rows), 'row')} of the folder{_of(nearest, kind)}"
-        platform = self._device.partition(":")[0]
-        alike = [each for each in self._stored if each.device == self._device] or [
-            each for each in self._stored if each.device.partition(":")[0] == platform
-        ]
-        if not alike:
-            return ASSUMED["cpu" if platform == "cpu" else "gpu"], "assumed: nothing was measured on such a device"
-        best = min(alike, key=lambda each: kind.distance(each.kind))
+            return seconds, f"from {_counted(len(rows), 'row')} of the folder{_of(of_rows, kind)}"
+        best = nearest(self._device, kind, self._stored)
+        if best is None:
+            return ASSUMED, "assumed: nothing was measured on such a device"
         where = f" on {best.device.partition(': ')[2]}" if best.device != self._device else ""
         return best.seconds, f"from {best.source}{where}{_of(best.kind, kind)}"
 
 
 def _of(measured_kind: Kind, kind: Kind) -> str:
     """What was measured instead of a kind; empty where it is the kind itself."""
-    differing = [str(value) for value, own in zip(measured_kind[:2], kind[:2], strict=True) if value != own]
-    differing += [] if measured_kind.trials == kind.trials else ["with trials" if measured_kind.trials else "no trials"]
+    differing = [text for text, wanted in zip(measured_kind.words, kind.words, strict=True) if text != wanted]
     return f", of {', '.join(differing)}" if differing else ""
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,13 +17,14 @@ from mechsearch_jax.benchmarks.pages.rewriting import rewrite
 from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, PaperTable
 from mechsearch_jax.benchmarks.parts.scaling import read_measured
 from mechsearch_jax.benchmarks.report.results_page import Stored, table
-from mechsearch_jax.benchmarks.running.episode_seconds import earlier
+from mechsearch_jax.benchmarks.running.episode_seconds import H100, Kind, StoredSeconds, nearest, stored_seconds
 from mechsearch_jax.benchmarks.studies.declared import GROUPS
 from mechsearch_jax.benchmarks.studies.studies import Study
 from mechsearch_jax.envs.camera.recognisers import RecognitionName
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.protocols import ProtocolName
 from mechsearch_jax.envs.scenes.scene_sets import SETS
+from mechsearch_jax.envs.simulators.named import EngineName
 from mechsearch_jax.planner import PRESETS
 from mechsearch_jax.runtime.files import PathLike
 
@@ -35,8 +35,9 @@ STRICT: tuple[ProtocolName, ...] = ("strict",)
 PROTOCOLS: Mapping[str, tuple[ProtocolName, ...]] = {"table1": ("strict", "published-code")}
 # The seeds of Table 1 beside the first, of one variant.
 MORE_SEEDS = 3
-# On a GPU.
-ENGINE = "MjxSimulator"
+# On a GPU; protocol published-code tries one action after the other, which takes no batches.
+ENGINES: Mapping[ProtocolName, EngineName] = {"strict": "MjxSimulator", "published-code": "NativeSimulator"}
+ENGINE = ENGINES["strict"]
 HOUR = 3600.0
 
 
@@ -69,7 +70,7 @@ def _of_table(paper: PaperTable) -> Experiment:
         METHODS, ("paper", "standard"), RECOGNITIONS, paper.actions, PROTOCOLS.get(paper.name, STRICT)
     )
     methods = [
-        Method(policy, PRESETS[preset](actions=actions), recognition, engine=ENGINE, protocol=protocol)
+        Method(policy, PRESETS[preset](actions=actions), recognition, engine=ENGINES[protocol], protocol=protocol)
         for policy, preset, recognition, actions, protocol in cells
     ]
     return Experiment(f"Table {paper.name.removeprefix('table')}", dict.fromkeys(methods, _scenes(paper)))
@@ -105,17 +106,13 @@ class Measures:
     """What was measured.
 
     Attributes:
-      episode: of a GPU, in a batch with true shapes [s].
-      look: what recognising the objects of an image adds, by the name of the recognition [s].
-      looks: mean number of images in an episode.
+      on_gpu: what episodes of the kinds that were measured take on a GPU.
       compiling: a planner and what else its episodes need, where nothing is kept [s].
       cpu: CPU time of an episode where there is no GPU [s].
       row: bytes of a row in a folder of results.
     """
 
-    episode: float
-    look: Mapping[str, float]
-    looks: float
+    on_gpu: Sequence[StoredSeconds]
     compiling: float
     cpu: float
     row: float
@@ -123,30 +120,35 @@ class Measures:
     @classmethod
     def of(cls, stored: Stored) -> Measures:
         """From the stored results."""
-        run = stored.run("standard-h100", "c2")
-        clock = earlier(stored.folder).seconds
-        look = {
-            name: stored[f"perceive-{name}-h200"]["median_seconds"] / stored[f"perceive-{name}-h200"]["shapes"]["batch"]
-            for name in ("masks", "full")
-        }
+        on_gpu = [each for each in stored_seconds() if each.device == H100]
         scaled = read_measured(stored.folder / "scaling-cpu.jsonl")
         report = stored["report-cpu"]
         return cls(
-            episode=clock.episode_seconds,
-            look=look,
-            # One before each action, and one after the last.
-            looks=1 + statistics.fmean(each["steps"] for each in run["episodes"]),
-            compiling=clock.compile_seconds,
+            on_gpu=on_gpu,
+            compiling=max(each.seconds.compile_seconds for each in on_gpu),
             cpu=next(each.cpu_seconds for each in scaled if each.workers == 1 and each.cpu_seconds is not None),
             row=report["bytes"] / report["rows"],
         )
 
     def running(self, experiment: Experiment) -> float:
         """Hours of one GPU that an experiment runs, once compiled."""
-        each = {
-            method: self.episode + self.looks * self.look.get(method.recognition, 0.0) for method in experiment.episodes
-        }
-        return sum(count * each[method] for method, count in experiment.episodes.items()) / HOUR
+        return sum(count * self.episode(method) for method, count in experiment.episodes.items()) / HOUR
+
+    def episode(self, method: Method) -> float:
+        """What an episode of a method takes on a GPU, once compiled, as dry runs count [s]."""
+        closest = nearest(H100, Kind.of(method), self.on_gpu)
+        assert closest is not None
+        return closest.seconds.episode_seconds
+
+    def seconds_table(self) -> str:
+        """What was measured on a GPU, with links to the runs."""
+        by_kind: dict[tuple[str, str, str], dict[str, str]] = {}
+        for each in self.on_gpu:
+            preset, recognition, trials, simulator = each.kind.words
+            linked = f"[{each.seconds.episode_seconds:.2f}]({_file(each.source)})"
+            by_kind.setdefault((preset, trials, simulator), {})[recognition] = linked
+        lines = [[*kind, *(cells.get(name, "-") for name in RECOGNITIONS)] for kind, cells in by_kind.items()]
+        return table(["preset", "trials", "simulator", *(f"s an episode, `{name}`" for name in RECOGNITIONS)], lines)
 
     def cells(self, name: str, parts: Sequence[Experiment]) -> list[str]:
         """A line of the table: what experiments cost together."""
@@ -163,6 +165,12 @@ class Measures:
         ]
 
 
+def _file(source: str) -> str:
+    """A file of a run as docs/ sees it; the lines of a table of rows."""
+    path = Path(source)
+    return f"../{path.with_suffix('.jsonl') if path.suffix == '.parquet' else path}"
+
+
 def computed(stored: Stored) -> dict[str, Any]:
     """The fields of the template."""
     measures, parts = Measures.of(stored), experiments()
@@ -174,6 +182,7 @@ def computed(stored: Stored) -> dict[str, Any]:
     return {
         "costs": table([*header, "CPU hours instead", "MB of rows"], [*lines, measures.cells("all", parts)]),
         "measures": measures,
+        "seconds": measures.seconds_table(),
         "hours": hours + compiling,
         "eight": (hours + compiling) / 8,
         "cold": hours / 8 + compiling,
