@@ -239,7 +239,7 @@ def test_a_dry_run_knows_what_is_there_and_makes_no_scene(run, tmp_path, monkeyp
     assert not jobs
     assert "4 episodes: search-for-grasp, oracle" in printed.out
     scenes = [SceneOutline.of_block(*scene) for scene in table_scenes(TABLES["table3"], (), 2)]
-    settings = command._settings(TABLES["table3"], METHODS, ["oracle"], ["paper"], ["strict"], [True])
+    settings = command.Cells(recognition=("oracle",), preset=("paper",)).settings(TABLES["table3"])
     planned = planned_jobs(scenes, list(command._methods(settings, "auto", "NativeSimulator").values()), (0,))
     rows = [
         dataclasses.replace(ROW, scenario=job.scene.name, content_hash=job.scene.content_hash, policy=job.method.name)
@@ -283,12 +283,12 @@ def test_rows_of_several_seeds_are_in_one_table(run, tmp_path):
 
 
 def test_collision_free_grasps_are_a_column_of_their_own(monkeypatch):
-    wanted = (TABLES["table3"], METHODS, ["masks"], ["standard"], ["strict"])
+    wanted = command.Cells(recognition=("masks",), preset=("standard",))
     monkeypatch.setattr(planner, "OPTIONS", [option for option in planner.OPTIONS if option.name != CONTACT])
     with pytest.raises(InputError, match="--retrieval-contact False: this version has no such option"):
-        command._settings(*wanted, [False])
+        dataclasses.replace(wanted, retrieval_contact=(False,)).settings(TABLES["table3"])
     monkeypatch.setattr(planner, "OPTIONS", [*planner.OPTIONS, Option(CONTACT, (), bool, "", None)])
-    settings = command._settings(*wanted, [True, False])
+    settings = dataclasses.replace(wanted, retrieval_contact=(True, False)).settings(TABLES["table3"])
     assert [setting.grasps for setting in settings] == [ANY, ANY, COLLISION_FREE, COLLISION_FREE]
     rows = {setting: [row("a", 1, 2), row("b", None, None)] for setting in settings}
     shown = results(rows, "table3")

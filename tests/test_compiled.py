@@ -312,6 +312,7 @@ def test_what_another_process_may_know_otherwise_has_no_identity(value):
 SEARCH = """
     import re
     import jax
+    from mechsearch_jax.envs.episode.closed_loop import Start
     from mechsearch_jax.envs.episode.episodes import run_episode, target_of
     from mechsearch_jax.envs.simulators.native import NativeSimulator
     from mechsearch_jax.session.preparing import first_decision, prepared
@@ -331,7 +332,7 @@ SEARCH = """
     scene = load_scenario(example_scenarios()["first-light"])
     problem, policy = cached_problem(target_of(scene)), search_for_grasp(sequences=2, horizon=1)
     with prepared(first_decision(problem, policy, MotionConfig()), print):
-        episode = run_episode(0, scene, problem, policy, NativeSimulator(), max_steps=1)
+        episode = run_episode(Start(scene, 0, max_steps=1), problem, policy, NativeSimulator())
     names = "update_belief", "_plan", "pixels_in_window", "_sizes_and_truths", "_keys_at"
     print(*(f"{name} {traced.count(name)}" for name in names))
     print([step.action for step in episode.steps], [step.cost for step in episode.steps])

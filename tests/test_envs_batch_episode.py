@@ -70,7 +70,7 @@ def test_episodes_are_the_same_alone_and_in_a_batch_whatever_their_slot(problem,
     episodes, together = run(problem, scenarios, simulator, 2, decides, seeds)
     assert sum(together) == 4
     alone = [
-        run_episode(seed, s, problem, decides, NativeSimulator(), max_steps=2)
+        run_episode(Start(s, seed, max_steps=2), problem, decides, NativeSimulator())
         for s, seed in zip(scenarios, seeds, strict=True)
     ]
     assert [without_times(e) for e in episodes] == [without_times(e) for e in alone]
@@ -86,7 +86,7 @@ def test_an_informed_planner_knows_a_hidden_target_in_a_batch_as_alone(problem):
         [Start(s, 0) for s in scenarios], problem, grab, Stage(reveal), 2, Listeners(episodes.update), settings
     )
     for i, scenario in enumerate(scenarios):
-        alone = run_episode(0, scenario, problem, grab, Stage(reveal), max_steps=2, recogniser=informed)
+        alone = run_episode(Start(scenario, 0), problem, grab, Stage(reveal), settings)
         assert without_times(episodes[i]) == without_times(alone)
         assert (alone.found_step, alone.retrieved) == (0, True)
 
@@ -118,7 +118,7 @@ def test_policies_that_differ_in_numbers_share_a_batch_and_what_is_compiled(prob
     assert [len(episodes[i].steps) for i in range(count)] == [2 + i % 2 for i in range(count)]
     assert [episodes[i].config["charge"] for i in range(count)] == list(range(count))
     for i in (0, 5):
-        alone = run_episode(0, HIDDEN, problem, policies[i], Stage(), max_steps=1 + i % 2, options={"charge": i})
+        alone = run_episode(starts[i], problem, policies[i], Stage())
         assert without_times(alone) == without_times(episodes[i])
 
 
@@ -350,5 +350,5 @@ def test_the_batch_simulator_runs_whole_episodes(problem):
     episodes, _ = run(problem, scenarios, simulator, 2, policy)
     assert [e.retrieved for e in episodes] == [True, True, True]
     assert [e.config["simulator"] for e in episodes] == ["MjxSimulator"] * 3
-    alone = run_episode(0, HIDDEN, problem, policy, NativeSimulator(), max_steps=2)
+    alone = run_episode(Start(HIDDEN, 0, max_steps=2), problem, policy, NativeSimulator())
     assert [s.action.kind for s in episodes[1].steps] == [s.action.kind for s in alone.steps]

@@ -59,16 +59,8 @@ def test_what_succeeds_in_physics_is_made_until_the_target_is_out(problem):
     # Compiled once, with what other tests plan.
     assert method.policy() == search_for_grasp(tries=True)
     trials = Recorded(method.trials())
-    episode = run_episode(
-        0,
-        SCENARIO,
-        problem,
-        method.policy(),
-        NativeSimulator(),
-        options=method.options(),
-        watcher=decisions,
-        trials=trials,
-    )
+    settings = RunSettings(options=method.options(), trials=trials)
+    episode = run_episode(Start(SCENARIO, 0), problem, method.policy(), NativeSimulator(), settings, decisions)
     check(episode, "NativeSimulator")
     assert len(trials.tried) == len(decisions.actions) == len(episode.steps)
     for (actions, results), made in zip(trials.tried, decisions.actions, strict=True):

@@ -14,6 +14,7 @@ from mechsearch_jax.actions import kind_of
 from mechsearch_jax.belief.moved_target import nearest_candidate
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.camera.snapshot import Snapshot, informed, oracle
+from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.episode.records import load_episode, save_episode
@@ -51,8 +52,8 @@ class Diary:
         self.moments.append(moment)
 
 
-def run(problem, scenario, stage, policy=grab, **options):
-    return run_episode(0, scenario, problem, policy, stage, max_steps=2, **options)
+def run(problem, scenario, stage, policy=grab, watcher=None, **settings):
+    return run_episode(Start(scenario, 0), problem, policy, stage, RunSettings(max_steps=2, **settings), watcher)
 
 
 def test_a_target_in_sight_is_taken_out_at_once(problem):
@@ -323,7 +324,7 @@ def test_the_same_seed_gives_the_same_decisions_whatever_the_recogniser_draws(pr
     chosen = []
     for recogniser in (oracle, drawing):
         stage = Stage()
-        run_episode(3, HIDDEN, problem, grab, stage, recogniser, max_steps=2)
+        run_episode(Start(HIDDEN, 3), problem, grab, stage, RunSettings(recogniser, max_steps=2))
         chosen.append([np.asarray(action.displacement) for action in stage.actions])
     np.testing.assert_array_equal(*chosen)
     planner_key, _ = jax.random.split(jax.random.key(3))

@@ -358,7 +358,7 @@ def test_episodes_with_a_mismatch_are_the_same_alone_and_in_a_batch(problem):
     simulator = NativeSimulator(threads=1)
     run_episodes(starts, problem, grab, simulator, 2, Listeners(episodes.extend), settings)
     for place, episode in episodes:
-        again = run_episode(0, OPEN, problem, grab, NativeSimulator(), max_steps=2, mismatch=mismatches[place])
+        again = run_episode(starts[place], problem, grab, NativeSimulator(), settings)
         assert episode.retrieved == again.retrieved
         assert [step.tracking_error for step in episode.steps] == [step.tracking_error for step in again.steps]
     errors = {place: episode.steps[-1].tracking_error for place, episode in episodes}

@@ -70,9 +70,9 @@ class Rewinding(Stage):
         return outcome
 
 
-def run(problem, scenario, stage, policy=None, **options):
-    given = {"max_steps": 2, "protocol": PUBLISHED, **options}
-    return run_episode(0, scenario, problem, policy or Several(), stage, **given)
+def run(problem, scenario, stage, policy=None, **settings):
+    settings = RunSettings(**{"max_steps": 2, "protocol": PUBLISHED, **settings})
+    return run_episode(Start(scenario, 0), problem, policy or Several(), stage, settings)
 
 
 def test_what_fails_is_taken_back_and_the_next_best_is_tried(problem):

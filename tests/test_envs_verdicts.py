@@ -36,7 +36,7 @@ REVEALING = {"hidden": reveal}
 def test_steeper_grasps_reach_over_what_the_papers_do_not(problem):
     """Alone and in a batch: what stands low and wide before the target leaves only grasps tilted by more than that."""
     scenarios = [OPEN, SILL, HIDDEN]
-    alone = [run_episode(0, s, problem, grab, Stage(REVEALING), max_steps=2) for s in scenarios]
+    alone = [run_episode(Start(s, 0, max_steps=2), problem, grab, Stage(REVEALING)) for s in scenarios]
     successes = {}
     starts = [Start(s, 0) for s in scenarios]
     settings = RunSettings(max_steps=2, at_once=2)

@@ -154,6 +154,7 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
       InputError: its options cannot be used today, the scenario holds something else, or the file cannot be written.
     """
     from mechsearch_jax.envs.camera.recognisers import recogniser
+    from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
     from mechsearch_jax.envs.episode.episodes import run_episode, target_of
     from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.recording.narration import verdict
@@ -170,18 +171,18 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
     problem = workcell.problem(target, method.problem_config)
     watcher = Frames(problem)
     episode = run_episode(
-        row.seed,
-        scenario,
+        Start(scenario, row.seed, mismatch=method.mismatch),
         problem,
         method.policy(),
         NativeSimulator(shelf=workcell.shelf, camera=workcell.camera),
-        recogniser(method.recognition, target),
-        method.config.max_steps,
-        method.options(),
+        RunSettings(
+            recogniser=recogniser(method.recognition, target),
+            max_steps=method.config.max_steps,
+            options=method.options(),
+            protocol=method.terms,
+            trials=method.trials(),
+        ),
         watcher,
-        method.terms,
-        method.trials(),
-        method.mismatch,
     )
     save_figure(filmstrip(watcher.frames, problem.camera, problem.shelf, problem.target, verdict(episode)), file)
     again = Row.of_episode(episode)

@@ -40,6 +40,25 @@ AT_ONCE, AT_ONCE_ON_CPU = 64, 4
 
 
 @dataclasses.dataclass(frozen=True)
+class _Means:
+    """What the episodes of a batch are run with.
+
+    Attributes:
+      target: of their scenes.
+      method: of one of them; the others differ from it in numbers alone.
+      simulator: executes their actions.
+      worlds: how many run at the same time.
+      trials: what tries actions out.
+    """
+
+    target: Target
+    method: Method
+    simulator: Simulator
+    worlds: int
+    trials: Trials | None
+
+
+@dataclasses.dataclass(frozen=True)
 class Batches:
     """Runs jobs in lockstep, in the simulator that they name.
 
@@ -95,7 +114,7 @@ class Batches:
                 batch = batches.pop()
                 try:
                     trials = trying(method.config.rehearsal)
-                    self._run(batch, failures.ended, target, method, simulator, worlds, trials)
+                    self._run(batch, failures.ended, _Means(target, method, simulator, worlds, trials))
                 except InputError:
                     raise
                 except Exception as error:
@@ -113,17 +132,8 @@ class Batches:
                     else:
                         batches += batch.halves()
 
-    def _run(
-        self,
-        batch: _Batch,
-        ended: Callable[[Sequence[Row]], None],
-        target: Target,
-        method: Method,
-        simulator: Simulator,
-        worlds: int,
-        trials: Trials | None,
-    ) -> None:
-        code = present_code()
+    def _run(self, batch: _Batch, ended: Callable[[Sequence[Row]], None], means: _Means) -> None:
+        code, method, target = present_code(), means.method, means.target
         policy_of, options_of = functools.cache(Method.policy), functools.cache(Method.options)
 
         def start(job: Job) -> Start:
@@ -135,16 +145,16 @@ class Batches:
                 ended([Row.of_episode(episode, code) for episode in counted])
 
         run_episodes(
-            map(start, batch.jobs(worlds)),
+            map(start, batch.jobs(means.worlds)),
             method.workcell.problem(target, method.problem_config),
             policy_of(method),
-            simulator,
-            worlds,
+            means.simulator,
+            means.worlds,
             Listeners(take, self.busy, self.compiling),
             RunSettings(
                 recogniser=recogniser(method.recognition, target),
                 protocol=method.terms,
-                trials=trials,
+                trials=means.trials,
                 at_once=AT_ONCE_ON_CPU if jax.default_backend() == "cpu" else AT_ONCE,
             ),
         )

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from mechsearch_jax.benchmarks.running.evaluate import Job, present_code
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.camera.recognisers import recogniser
+from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
 from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.simulators.native import NativeSimulator
@@ -47,17 +48,17 @@ class InTurn:
         workcell = method.workcell
         target = target_of(scenario, workcell.target)
         episode = run_episode(
-            job.seed,
-            scenario,
+            Start(scenario, job.seed, mismatch=method.mismatch),
             self._problem(workcell, target, method.problem_config),
             self._policy(method),
             self._simulator(workcell),
-            recogniser(method.recognition, target),
-            method.config.max_steps,
-            method.options(),
-            protocol=method.terms,
-            trials=method.trials(),
-            mismatch=method.mismatch,
+            RunSettings(
+                recogniser=recogniser(method.recognition, target),
+                max_steps=method.config.max_steps,
+                options=method.options(),
+                protocol=method.terms,
+                trials=method.trials(),
+            ),
         )
         return Row.of_episode(episode, present_code())
 

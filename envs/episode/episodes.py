@@ -17,24 +17,19 @@ not, and does not continue for the sake of `paper_graspable`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
 
 import jax
 import numpy as np
 
-from mechsearch_jax.envs.camera.snapshot import Recogniser, oracle
-from mechsearch_jax.envs.episode.closed_loop import STRICT, EpisodePool, Listeners, RunSettings, Start, keys_at
+from mechsearch_jax.envs.episode.closed_loop import EpisodePool, Listeners, RunSettings, Start, keys_at
 from mechsearch_jax.envs.episode.compile_clock import CompileClock
 from mechsearch_jax.envs.episode.many_slots import ManySlots
 from mechsearch_jax.envs.episode.moments import Watcher
-from mechsearch_jax.envs.episode.protocols import EpisodeProtocol
 from mechsearch_jax.envs.episode.records import Episode
 from mechsearch_jax.envs.episode.slots import OneSlot, Slots
 from mechsearch_jax.envs.simulators.simulator import Prepares, Simulator, TakesCells
-from mechsearch_jax.envs.world.mismatch import ASSUMED, Mismatch
 from mechsearch_jax.envs.world.world import World, from_scenario
 from mechsearch_jax.planner import Policy, Problem
-from mechsearch_jax.planner.trials import Trials
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.preparing import Program, prepared, program
 from mechsearch_jax.workspace.scenario import Scenario
@@ -52,33 +47,22 @@ def target_of(scenario: Scenario, usual: Target | None = None) -> Target:
 
 
 def run_episode(
-    seed: int,
-    scenario: Scenario,
+    start: Start,
     problem: Problem,
     policy: Policy,
     simulator: Simulator,
-    recogniser: Recogniser = oracle,
-    max_steps: int = 10,
-    options: Mapping[str, Any] | None = None,
+    settings: RunSettings | None = None,
     watcher: Watcher | None = None,
-    protocol: EpisodeProtocol = STRICT,
-    trials: Trials | None = None,
-    mismatch: Mismatch = ASSUMED,
 ) -> Episode:
     """Run one episode to its end.
 
     Args:
-      seed: see `Start`.
-      scenario: the scene at the start.
-      problem, policy, simulator: see `run_episodes`. Neither the policy nor the recogniser need be traceable.
-      recogniser, max_steps, options, protocol, trials: see `RunSettings`.
+      start: the episode.
+      problem, policy, simulator, settings: see `run_episodes`. Neither the policy nor the recogniser need be traceable.
       watcher: follows every step.
-      mismatch: see `Start`.
     """
     episodes: list[tuple[int, Episode]] = []
-    settings = RunSettings(recogniser, max_steps, options or {}, protocol, trials)
-    listeners = Listeners(episodes.extend, watcher=watcher)
-    run_episodes([Start(scenario, seed, mismatch=mismatch)], problem, policy, simulator, 1, listeners, settings)
+    run_episodes([start], problem, policy, simulator, 1, Listeners(episodes.extend, watcher=watcher), settings)
     return episodes[0][1]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import shlex
 import sys
@@ -31,30 +32,83 @@ Recognition = Literal["oracle", "masks", "full", "informed"]
 ProtocolName = Literal["strict", "published-code"]
 
 
-def _settings(
-    table: PaperTable,
-    method: Sequence[str],
-    recognition: Sequence[str],
-    preset: Sequence[str],
-    protocol: Sequence[str],
-    retrieval_contact: Sequence[bool],
-) -> list[Setting]:
-    """The settings of a table's cells.
+def _several(metavar: str) -> Any:
+    return tyro.conf.arg(metavar=f"{metavar} ...", help_behavior_hint="")
 
-    Raises:
-      InputError: a preset is unknown, or this version lacks an option.
+
+@dataclasses.dataclass(frozen=True)
+class Cells:
+    """The cells of a table that are run, on what and in what; what is empty stands for the default.
+
+    Attributes:
+      method: one of them; both by default.
+      recognition: what the planner sees: true shapes, a noisy depth image with true masks (the paper's R), or the image
+        alone, these three by default; or true shapes and the hidden target.
+      preset: where the planner's settings come from, one or more; paper and standard by default.
+      protocol: how episodes are run and judged, one or both; strict by default.
+      retrieval_contact: whether the target may be taken out with a grasp that brushes something, where it is tried out
+        first; only False is the paper's grasp. True by default; both for either.
+      objects: only the scenes with so many.
+      scenes: only the first so many of each number of objects, for a quick look.
+      seed: one or more.
+      simulator: as evaluate has it.
     """
-    from mechsearch_jax.benchmarks.paper.reproduce import ANY, COLLISION_FREE, CONTACT, Setting
-    from mechsearch_jax.planner import OPTIONS, PRESETS
 
-    unknown = [name for name in preset if name not in PRESETS]
-    if unknown:
-        raise InputError(f"reproduce: preset {unknown[0]} is unknown; use {', '.join(PRESETS)}")
-    if not all(retrieval_contact) and CONTACT not in {option.name for option in OPTIONS}:
-        raise InputError("reproduce: --retrieval-contact False: this version has no such option; leave it out")
-    grasps = [ANY if contact else COLLISION_FREE for contact in retrieval_contact]
-    product = itertools.product(preset, protocol, grasps, recognition, method, table.actions)
-    return [Setting(m, r, actions, p, terms, g) for p, terms, g, r, m, actions in dict.fromkeys(product)]
+    method: Annotated[tuple[PaperMethod, ...], _several("{search-and-grasp,search-for-grasp}")] = ()
+    recognition: Annotated[tuple[Recognition, ...], _several("{oracle,masks,full,informed}")] = ()
+    preset: Annotated[tuple[str, ...], _several("NAME")] = ()
+    protocol: Annotated[tuple[ProtocolName, ...], _several("{strict,published-code}")] = ()
+    retrieval_contact: Annotated[tuple[bool, ...], _several("{True,False}")] = ()
+    objects: Annotated[tuple[int, ...], _several("N")] = ()
+    scenes: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="")] = None
+    seed: tuple[int, ...] = (0,)
+    simulator: Literal["auto", "native", "mjx"] = "auto"
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds, each once."""
+        return list(dict.fromkeys(self.seed))
+
+    def scene_list(self, table: PaperTable) -> list[tuple[Block, int]]:
+        """The scenes of a table.
+
+        Raises:
+          InputError: it has none with so many objects, or none are to be run.
+        """
+        from mechsearch_jax.benchmarks.paper.paper_tables import table_scenes
+
+        at_least_one("reproduce", scenes=self.scenes)
+        return table_scenes(table, self.objects, self.scenes)
+
+    def settings(self, table: PaperTable) -> list[Setting]:
+        """The settings of a table's cells.
+
+        Raises:
+          InputError: a preset is unknown, or this version lacks an option.
+        """
+        from mechsearch_jax.benchmarks.paper.paper_tables import METHODS
+        from mechsearch_jax.benchmarks.paper.reproduce import ANY, COLLISION_FREE, CONTACT, Setting
+        from mechsearch_jax.planner import OPTIONS, PRESETS
+
+        unknown = [name for name in self.preset if name not in PRESETS]
+        if unknown:
+            raise InputError(f"reproduce: preset {unknown[0]} is unknown; use {', '.join(PRESETS)}")
+        if not all(self.retrieval_contact) and CONTACT not in {option.name for option in OPTIONS}:
+            raise InputError("reproduce: --retrieval-contact False: this version has no such option; leave it out")
+        grasps = [ANY if contact else COLLISION_FREE for contact in self.retrieval_contact or (True,)]
+        product = itertools.product(
+            self.preset or ("paper", "standard"),
+            self.protocol or ("strict",),
+            grasps,
+            self.recognition or ("oracle", "masks", "full"),
+            self.method or METHODS,
+            table.actions,
+        )
+        return [Setting(m, r, actions, p, terms, g) for p, terms, g, r, m, actions in dict.fromkeys(product)]
+
+
+# The default.
+ALL_CELLS = Cells()
 
 
 def _methods(settings: Sequence[Setting], simulator: str, engine: EngineName) -> dict[Setting, Method]:
@@ -113,15 +167,7 @@ def reproduce(
     /,
     *,
     out: Path,
-    method: Annotated[tuple[PaperMethod, ...], tyro.conf.arg(metavar="{search-and-grasp,search-for-grasp} ...")] = (),
-    recognition: Annotated[tuple[Recognition, ...], tyro.conf.arg(metavar="{oracle,masks,full,informed} ...")] = (),
-    preset: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = (),
-    protocol: Annotated[tuple[ProtocolName, ...], tyro.conf.arg(metavar="{strict,published-code} ...")] = (),
-    retrieval_contact: Annotated[tuple[bool, ...], tyro.conf.arg(metavar="{True,False} ...")] = (),
-    objects: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N ...")] = (),
-    scenes: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
-    seed: tuple[int, ...] = (0,),
-    simulator: Literal["auto", "native", "mjx"] = "auto",
+    cells: Annotated[Cells, tyro.conf.arg(name="")] = ALL_CELLS,
     run: Annotated[RunOptions, tyro.conf.arg(name="")] = USUAL_RUN,
 ) -> None:
     """Run an experiment of the paper in our simulator, and set what comes of it beside the paper's figures.
@@ -133,33 +179,15 @@ def reproduce(
       table: table1 is the main experiment, table3 two cylinders in a line, table4 one kind of action alone, table5 a
         box as the target.
       out: folder for the results, and for NAME.md and NAME.json.
-      method: one of them; both by default.
-      recognition: what the planner sees: true shapes, a noisy depth image with true masks (the paper's R), or the image
-        alone, these three by default; or true shapes and the hidden target.
-      preset: where the planner's settings come from, one or more; paper and standard by default.
-      protocol: how episodes are run and judged, one or both; strict by default.
-      retrieval_contact: whether the target may be taken out with a grasp that brushes something, where it is tried out
-        first; only False is the paper's grasp. True by default; both for either.
-      objects: only the scenes with so many.
-      scenes: only the first so many of each number of objects, for a quick look.
-      seed: one or more.
-      simulator: as evaluate has it.
+      cells: what of it is run.
       run: how the episodes are run.
     """
-    from mechsearch_jax.benchmarks.paper.paper_tables import METHODS, TABLES, table_scenes
+    from mechsearch_jax.benchmarks.paper.paper_tables import TABLES
 
-    at_least_one("reproduce", scenes=scenes)
     chosen = TABLES[table]
+    simulator, seeds = cells.simulator, cells.seeds
     engine = run.engine("reproduce", EpisodeOptions(simulator=simulator))
-    scene_list, seeds = table_scenes(chosen, objects, scenes), list(dict.fromkeys(seed))
-    settings = _settings(
-        chosen,
-        method or METHODS,
-        recognition or ("oracle", "masks", "full"),
-        preset or ("paper", "standard"),
-        protocol or ("strict",),
-        retrieval_contact or (True,),
-    )
+    scene_list, settings = cells.scene_list(chosen), cells.settings(chosen)
     methods = _methods(settings, simulator, engine)
     if run.dry_run:
         _print_settings(chosen, settings, len(scene_list), len(seeds))

@@ -91,6 +91,7 @@ def _run(
     console: Console, status: Status, chosen: Method, scene: Scenario, problem: Problem, seed: int
 ) -> tuple[Episode, Narrator, Recorder]:
     """Run the episode; return it with its narrator and its recorder."""
+    from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
     from mechsearch_jax.envs.episode.episodes import run_episode
     from mechsearch_jax.envs.simulators.simulator import SimulatorConfig
     from mechsearch_jax.session.preparing import first_decision, prepared
@@ -109,20 +110,15 @@ def _run(
         )
         recorder = Recorder(simulator)
         narrator = Narrator(console, status, problem, recorder.note)
-        episode = run_episode(
-            seed,
-            scene,
-            problem,
-            policy,
-            simulator,
-            recogniser(chosen.recognition, problem.target),
-            chosen.config.max_steps,
-            chosen.options(),
-            narrator,
-            chosen.terms,
-            chosen.trials(),
-            chosen.mismatch,
+        settings = RunSettings(
+            recogniser=recogniser(chosen.recognition, problem.target),
+            max_steps=chosen.config.max_steps,
+            options=chosen.options(),
+            protocol=chosen.terms,
+            trials=chosen.trials(),
         )
+        start = Start(scene, seed, mismatch=chosen.mismatch)
+        episode = run_episode(start, problem, policy, simulator, settings, narrator)
     return episode, narrator, recorder
 
 

@@ -93,6 +93,37 @@ class SweptOptions:
 SWEPT_DEFAULTS = SweptOptions()
 
 
+@dataclasses.dataclass(frozen=True)
+class SweptPolicies:
+    """Which policies decide in which episodes of a scenario.
+
+    Attributes:
+      file: a file with scenarios, policy, seed and options by their names with underscores, a value or a list of values
+        each; what is given here goes before it.
+      method: one or more; search-for-grasp if neither this nor a policy is given.
+      policy: instead of methods, names of policies, or import paths of others, one or more.
+      seed: one or more; 0 if not given.
+    """
+
+    file: Annotated[Path | None, tyro.conf.arg(metavar="SWEEP.toml", help_behavior_hint="")] = None
+    method: Annotated[tuple[PaperMethod, ...], tyro.conf.arg(help_behavior_hint="")] = ()
+    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE ...", help_behavior_hint="")] = ()
+    seed: Annotated[tuple[int, ...], tyro.conf.arg(help_behavior_hint="")] = ()
+
+    def read(self) -> dict[str, Any]:
+        """The values of the file by key, with policies of their own instead of the file's if any are given.
+
+        Raises:
+          InputError: as `read_sweep`.
+        """
+        values = {} if self.file is None else read_sweep(self.file)
+        given = {"method": self.method, "policy": self.policy} if self.method or self.policy else {}
+        return {**values, **given, **({"seed": self.seed} if self.seed else {})}
+
+
+SWEPT_POLICIES = SweptPolicies()
+
+
 def _options() -> dict[str, Option]:
     """The options of planner and mismatch by their names."""
     from mechsearch_jax.envs.world.mismatch import MISMATCH_OPTIONS
@@ -178,10 +209,7 @@ def sweep(
     /,
     *,
     out: Path,
-    file: Annotated[Path | None, tyro.conf.arg(metavar="SWEEP.toml")] = None,
-    method: tuple[PaperMethod, ...] = (),
-    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME|MODULE:ATTRIBUTE ...")] = (),
-    seed: tuple[int, ...] = (),
+    policies: Annotated[SweptPolicies, tyro.conf.arg(name="")] = SWEPT_POLICIES,
     run: Annotated[RunOptions, tyro.conf.arg(name="")] = USUAL_RUN,
     options: SweptOptions = SWEPT_DEFAULTS,
 ) -> None:
@@ -193,21 +221,15 @@ def sweep(
     Args:
       scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
       out: folder for the results, one row for each episode; those of which it holds a row are not run again.
-      file: a file with scenarios, policy, seed and options by their names with underscores, a value or a list of values
-        each; what is given here goes before it.
-      method: one or more; search-for-grasp if neither this nor a policy is given.
-      policy: instead of methods, names of policies, or import paths of others, one or more.
-      seed: one or more; 0 if not given.
+      policies: who decides, and in which episodes.
       run: how the episodes are run.
       options: how the planner decides.
     """
-    from_file = {} if file is None else read_sweep(file)
-    if method or policy:
-        from_file = {key: value for key, value in from_file.items() if key not in ("method", "policy")}
-    policies = chosen_policies("sweep", method or from_file.get("method"), policy or from_file.get("policy"))
-    fields = {name: from_file[key] for key, name in _FIELDS.items() if key in from_file}
-    fields |= {key: value for key, value in from_file.items() if key not in _KEYS}
+    values = policies.read()
+    names = chosen_policies("sweep", values.get("method"), values.get("policy"))
+    fields = {name: values[key] for key, name in _FIELDS.items() if key in values}
+    fields |= {key: value for key, value in values.items() if key not in _KEYS}
     not_on_command_line = {key: value for key, value in fields.items() if not getattr(options, key)}
     points = dataclasses.replace(options, **not_on_command_line).points()
-    chosen = scenarios or from_file.get("scenarios", ())
-    run_episodes_of("sweep", chosen, points, policies, seed or from_file.get("seed") or (0,), out, run)
+    chosen = scenarios or values.get("scenarios", ())
+    run_episodes_of("sweep", chosen, points, names, values.get("seed") or (0,), out, run)

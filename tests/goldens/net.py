@@ -63,6 +63,7 @@ def scenario_files():
 def run_episode(path, method, recognition, rehearsal="physics", seed=0):
     from mechsearch_jax.envs.camera.recognisers import recogniser
     from mechsearch_jax.envs.episode import episodes
+    from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
     from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.simulators.native import NativeSimulator
     from mechsearch_jax.planner import PRESETS
@@ -74,16 +75,8 @@ def run_episode(path, method, recognition, rehearsal="physics", seed=0):
     chosen = Method(method, PRESETS["standard"](rehearsal=rehearsal), recognition)
     see = recogniser(recognition, target)
     simulator = NativeSimulator(threads=1)
-    return episodes.run_episode(
-        seed,
-        scenario,
-        cached_problem(target),
-        chosen.policy(),
-        simulator,
-        see,
-        options=chosen.options(),
-        trials=chosen.trials(),
-    )
+    settings = RunSettings(see, options=chosen.options(), trials=chosen.trials())
+    return episodes.run_episode(Start(scenario, seed), cached_problem(target), chosen.policy(), simulator, settings)
 
 
 def episode_answer(path, method, recognition, rehearsal):
