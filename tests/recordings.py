@@ -35,7 +35,7 @@ FAR = PUSH.replace(displacement=2 * PUSH.displacement)
 
 
 def shifted(*shifts):
-    """The objects, moved along y by each of some lengths."""
+    """The objects, moved along y by each of these lengths."""
     moved = [np.asarray(OBJECTS.position) + np.array([0.0, shift, 0.0], np.float32) for shift in shifts]
     every = jax.tree.map(lambda a: np.stack([a] * len(shifts)), OBJECTS)
     return every.replace(position=np.stack(moved))

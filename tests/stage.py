@@ -68,12 +68,12 @@ class Stage:
     ):
         self.world = None
         self.actions, self.executed, self.names = [], [], []
-        self._told = {"acts": acts, "failures": failures, "retrievals": retrievals, "overflows": overflows}
-        self._told["restless"] = restless
+        self._script = {"acts": acts, "failures": failures, "retrievals": retrievals, "overflows": overflows}
+        self._script["restless"] = restless
 
     def _of(self, what, name, default):
-        told = self._told[what]
-        return told.get(name, default) if isinstance(told, dict) else default if told is None else told
+        scripted = self._script[what]
+        return scripted.get(name, default) if isinstance(scripted, dict) else default if scripted is None else scripted
 
     def reset(self, scenarios):
         self.names = [None] * len(scenarios)

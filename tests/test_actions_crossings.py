@@ -151,14 +151,14 @@ def test_the_gripper_hits_on_its_crossing_what_a_float64_reference_says(space, o
             shape=str(rng.choice(["box", "cylinder"])),
         )
         points = swept(T, GRIPPER.max_opening if opening == OPEN else 0.0, float(space.tables.q7[opening, WRIST]))
-        found = bool(judge(space, T, scene))
+        is_hit = bool(judge(space, T, scene))
         # Clouds have gaps: what is touched less than a centimetre deep may be missed.
         if least_gauge(scene, points) > 1.0 + 1e-3:
-            assert not found
+            assert not is_hit
         elif float(crossing_length(T, 0.374, GRIPPER)) > 0.03 and least_gauge(scene, points, -0.01) < 1.0:
             # A push may begin to touch something where its straight way in begins: that is proposals' to look at.
-            assert found or (opening == CLOSED and touched(space.tables, opening, T[None], scene).any())
-        seen.append(found)
+            assert is_hit or (opening == CLOSED and touched(space.tables, opening, T[None], scene).any())
+        seen.append(is_hit)
     assert 5 < sum(seen) < 50
 
 
@@ -228,7 +228,7 @@ SMALL = (0.02, 0.02, 0.06)
 
 @pytest.fixture(scope="module")
 def transfers(space):
-    """Whether a body of some half size at `DEEP` can be taken to two places, with or without a post: compiled once.
+    """Whether a body of a half size at `DEEP` can be taken to two places, with or without a post: compiled once.
 
     The arm gets anywhere and touches nothing, so that what the gripper and its load hit is all that can be in the way;
     unless a number says what is wrong with it.
@@ -319,8 +319,8 @@ def test_a_retrieval_past_a_post_that_only_its_crossing_touches_hits_it(grasps):
         assert bool(hits[turned, 0]) == hit
         assert not hits[~np.asarray(feasible)].any()
         assert not hits[:, 1].any()
-        found = retrieval.FoundGrasps(T_world_target, feasible, jnp.zeros((len(grasps.q7), 1, 7)))
-        z = jax.jit(retrieval.straight_hits)(grasps, found, scene)
+        found_grasps = retrieval.FoundGrasps(T_world_target, feasible, jnp.zeros((len(grasps.q7), 1, 7)))
+        z = jax.jit(retrieval.straight_hits)(grasps, found_grasps, scene)
         assert not z.any()
 
 

@@ -1,4 +1,4 @@
-"""Where pushes begin, in every direction, and how they are told."""
+"""Where pushes begin, in every direction, and how they are put into words."""
 
 import dataclasses
 import math
@@ -124,11 +124,11 @@ def test_further_directions_come_after_the_papers_and_change_nothing_about_them(
 @pytest.mark.parametrize("turn", [0.3, 0.9])
 def test_pushes_turn_with_the_object_and_the_hand(shape, turn):
     half = half_size(shape, 0.03, 0.05, 0.08)
-    found = []
+    starts = []
     for angle in (0.0, turn):
         space = space_of(push_directions=(0.1 + angle,), push_postures=((angle - 0.5, 1), (angle, 2)))
-        found.append([np.asarray(a[0]) for a in STARTS(space, standing(shape, half, 0.2 + angle))])
-    (T, stable), (turned, turned_stable) = found
+        starts.append([np.asarray(a[0]) for a in STARTS(space, standing(shape, half, 0.2 + angle))])
+    (T, stable), (turned, turned_stable) = starts
     centre = transforms.make(jnp.eye(3), jnp.float32([0.6, 0.1, 0.0]))
     about = transforms.make(transforms.yaw_rotation(jnp.float32(turn)), jnp.float32([0.6, 0.1, 0.0]))
     expected = transforms.compose(about, transforms.compose(transforms.inverse(centre), jnp.asarray(T)))

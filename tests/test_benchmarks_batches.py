@@ -124,9 +124,9 @@ class Together(Stand):
         errors = [error for start in batch if (error := self._fail(start.scenario.name, slots))]
         if errors:
             raise errors[0]
-        told = self.slots[:]
+        slots_before = self.slots[:]
         super().__call__(batch, problem, policy, simulator, slots, listeners, settings)
-        self.slots = told
+        self.slots = slots_before
 
 
 def test_a_batch_that_fails_is_run_again_in_halves(problem, tmp_path, files, monkeypatch):

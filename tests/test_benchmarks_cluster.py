@@ -161,17 +161,17 @@ def test_every_job_becomes_one_row_and_no_file_is_needed(ray, tmp_path):
     jobs = jobs_of(tmp_path, "one", "two", "three", seeds=range(4))
     for job in jobs:
         Path(job.path).unlink(missing_ok=True)
-    asked = Counter()
-    told = []
+    begun = Counter()
+    batches = []
 
     def begin(job):
-        asked[job.key] += 1
+        begun[job.key] += 1
         return job.seed != 2
 
-    scripted(tmp_path, 2)(jobs, told.append, begin)
-    rows = [row for rows in told for row in rows]
+    scripted(tmp_path, 2)(jobs, batches.append, begin)
+    rows = [row for rows in batches for row in rows]
     assert sorted(map(episode_key, rows)) == sorted(job.key for job in jobs if job.seed != 2)
-    assert asked == Counter(job.key for job in jobs)
+    assert begun == Counter(job.key for job in jobs)
     assert [row.failure for row in rows] == [None] * 9
 
 
@@ -179,17 +179,17 @@ def test_every_job_becomes_one_row_and_no_file_is_needed(ray, tmp_path):
 def test_jobs_of_dead_workers_are_rows_like_the_others(ray, tmp_path):
     names = ("one", "once", "three", "hang", "five")
     jobs = jobs_of(tmp_path, *names)
-    asked = Counter()
+    begun = Counter()
 
     def runner(jobs, ended, begin):
-        scripted(tmp_path, time_limit=2.0)(jobs, ended, lambda job: begin(job) and not asked.update([job.key]))
+        scripted(tmp_path, time_limit=2.0)(jobs, ended, lambda job: begin(job) and not begun.update([job.key]))
 
     rows = evaluate(jobs, tmp_path / "rows", runner)
     assert {row.scenario: row.failure for row in rows} == {
         **dict.fromkeys(names),
         "hang": "error: it took longer than 2 s, and its worker was killed",
     }
-    assert set(asked.values()) == {1}
+    assert set(begun.values()) == {1}
     # Of what was lost with the worker, each was run again, and nothing that had ended before.
     assert Counter(ran(tmp_path)) == Counter([*names, "once"])
 

@@ -175,7 +175,7 @@ def test_the_code_is_that_of_planner_perception_and_environment(tmp_path, monkey
         before = after
 
 
-def test_a_method_that_cannot_be_used_is_told_of_before_any_episode(tmp_path, files):
+def test_a_method_that_cannot_be_used_is_refused_before_any_episode(tmp_path, files):
     for method, message in (
         (Method("guess"), 'policy "guess" is unknown'),
         (Method("nobody.there:Mine"), "nobody"),
@@ -194,7 +194,7 @@ def test_a_file_is_no_place_for_results(tmp_path, files, name):
     assert not (tmp_path / "rows.parquet").exists()
 
 
-def test_errors_are_run_again_if_asked_for(tmp_path, files):
+def test_errors_are_run_again_where_the_option_says_so(tmp_path, files):
     out, jobs = tmp_path / "rows", make_jobs(files, [Method()], (0,))
     before = evaluate(jobs, out, one_by_one)
     (tmp_path / "log").write_text("")
@@ -231,11 +231,11 @@ def test_shards_share_all_episodes_evenly(tmp_path, files):
 
 def test_what_ends_elsewhere_meanwhile_is_not_run(tmp_path, files):
     out, jobs = tmp_path / "rows", make_jobs(files[:2], [Method()], (0, 1))
-    told = []
+    counts = []
 
     def runner(missing, ended, begin):
-        told.append(len(missing))
-        if len(told) == 1:
+        counts.append(len(missing))
+        if len(counts) == 1:
             # Another process takes two of them, and ends both.
             evaluate([jobs[0], jobs[2]], out, one_by_one)
         one_by_one(missing, ended, begin)
@@ -247,7 +247,7 @@ def test_what_ends_elsewhere_meanwhile_is_not_run(tmp_path, files):
     assert list((out / OPEN).glob("*.*")) == list((out / OPEN / "claims").iterdir()) == []
 
 
-def test_a_runner_that_loses_an_episode_is_told_of(tmp_path, files):
+def test_a_runner_that_loses_an_episode_raises(tmp_path, files):
     def runner(missing, ended, begin):
         assert all(begin(job) for job in missing)
         ended([dataclasses.replace(missing[0].failed("of something else"), seed=7)])

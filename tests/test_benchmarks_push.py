@@ -96,7 +96,7 @@ def test_impossible_comparisons_are_refused(wrong):
 
 
 @pytest.mark.slow
-def test_pushes_to_time_are_real_and_among_as_many_objects_as_asked_for(drawn):
+def test_pushes_to_time_are_real_and_among_the_given_number_of_objects(drawn):
     world, action = drawn
     np.testing.assert_array_equal(action.kind, ActionKind.PUSH)
     np.testing.assert_array_equal(world.valid[:, :TARGET].sum(axis=1), 3)
@@ -175,7 +175,7 @@ def test_simulating_is_better_than_guessing(comparison, pushes):
 
 
 @pytest.mark.slow
-def test_rows_that_are_asked_for_are_measured_in_their_order(pushes):
+def test_named_rows_are_measured_in_their_order(pushes):
     seen = []
     rows = ("quasi-static", "no motion", "quasi-static")
     few = Bench(GENERATION, rows, make_simulator=simulator).run(pushes, lambda *progress: seen.append(progress))

@@ -281,13 +281,13 @@ def test_every_configuration_is_a_place_of_its_own(monkeypatch, tmp_path, capsys
         (("x.toml",), ("first-light",), "leave the scenario files out"),
     ],
 )
-def test_places_that_cannot_be_told_apart_are_refused(config, scenarios, message):
+def test_places_without_names_of_their_own_are_refused(config, scenarios, message):
     with pytest.raises(InputError, match=message):
         quality.bench_recognition(scenarios, generated=quality.GeneratedScenes(tuple(map(Path, config))))
 
 
 @pytest.mark.slow
-def test_generated_scenes_stand_on_the_shelf_that_is_asked_for():
+def test_generated_scenes_stand_on_the_given_shelf():
     shelf = Shelf().moved((0.1, -0.05, 0.2))
     (scene,) = images.held_out_scenes(1, 0, shelf, "there")
     (usual,) = images.held_out_scenes(1)

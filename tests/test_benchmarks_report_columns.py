@@ -38,14 +38,14 @@ LOST = dataclasses.replace(WON, found_step=None, graspable_step=None, retrieved=
 def rows_of(variants, episodes=3, lost=lambda variant, episode: False):
     """Rows of variants that differ in gamma, guided fraction and criterion."""
     combinations = itertools.product(np.linspace(0.5, 1.0, 6).tolist(), (0.0, 0.4, 0.7, 0.9), "abcd")
-    found = []
+    rows = []
     for i, (gamma, guided, criterion) in enumerate(itertools.islice(combinations, variants)):
         options = {"gamma": gamma, "guided_fraction": guided, "criterion": criterion, "push_distances": [0.1, 0.2]}
         for j in range(episodes):
             row = LOST if lost(i, j) else WON
             more = {"gamma": gamma, "configuration": configuration(options)}
-            found.append(dataclasses.replace(row, scenario=f"s{j}", objects=2 * (j % 2 + 1), **more))
-    return found
+            rows.append(dataclasses.replace(row, scenario=f"s{j}", objects=2 * (j % 2 + 1), **more))
+    return rows
 
 
 def test_labels_are_short_and_say_what_differs():
@@ -82,7 +82,7 @@ def test_numbers_in_texts_sort_as_numbers():
     assert sorted([None, 3, "x", 2.5, True], key=natural) == [True, 2.5, 3, "x", None]
 
 
-def test_rates_are_told_by_any_columns():
+def test_rates_are_grouped_by_any_columns():
     rows = rows_of(8, lost=lambda variant, episode: variant < 4 and episode == 0)
     assert set(column(rows, "guided-fraction")) == {0.0, 0.4}
     assert set(column(rows, "push_distances")) == {"0.1/0.2"}
@@ -153,7 +153,7 @@ def test_the_seeds_of_a_scene_are_no_pairs_of_their_own():
     assert (retrieved.pairs, retrieved.scenes, retrieved.gains, retrieved.losses) == (5, 3, 3, 0)
     assert retrieved.mean == pytest.approx(np.mean(values))
     assert retrieved.standard_error == pytest.approx(np.std(values, ddof=1) / math.sqrt(3))
-    # Where pairs are not told apart by their scenes, each of them counts.
+    # Where scenes do not distinguish pairs, each of them counts.
     by_seed = goals(base, ["seed"])["retrieved"]
     assert (by_seed.pairs, by_seed.scenes, by_seed.mean) == (3, 3, pytest.approx((1 / 3 + 1 + 1) / 3))
 
@@ -187,7 +187,7 @@ def test_pictures_are_readable_with_few_and_with_many_variants(tmp_path, variant
     ticks = rates_figure(report.variants, report.key).axes[-1].get_xticklabels()
     assert {tick.get_text() for tick in ticks} == set(report.key.short.values())
     assert {path.name for path in tmp_path.iterdir()} == {*FILES, *OPTIONAL_FILES}
-    # What is not asked for any more does not stay.
+    # What the options no longer name does not stay.
     write_report(rows, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == set(FILES)
 
@@ -278,7 +278,7 @@ def test_a_curve_is_over_one_column_with_lines_for_another():
         Report.of(rows, ReportOptions(curve=["gamma", "method"]))
 
 
-def test_the_command_tells_what_is_asked_for(tmp_path, monkeypatch, capsys):
+def test_the_command_reports_what_its_options_name(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "80")
     write_rows(rows_of(8, lost=lambda variant, episode: variant == 0), tmp_path / "table.parquet")
@@ -305,12 +305,12 @@ def test_episodes_are_chosen_for_what_they_show(tmp_path):
     slow = dataclasses.replace(WON, scenario="slow", planning_seconds=99.0)
     broken = dataclasses.replace(LOST, scenario="broken", failure="error: no", planning_seconds=999.0)
     rows = [*lost, *won, slow, broken]
-    found = films.chosen(rows)
-    assert found == films.chosen(rows[::-1])
+    chosen = films.chosen(rows)
+    assert chosen == films.chosen(rows[::-1])
     by_why = {
-        why: [row for reason, row in found if reason == why] for why in (films.TYPICAL, films.LOST, films.SLOWEST)
+        why: [row for reason, row in chosen if reason == why] for why in (films.TYPICAL, films.LOST, films.SLOWEST)
     }
-    assert [len(chosen) for chosen in by_why.values()] == [3, 3, 3]
+    assert [len(episodes) for episodes in by_why.values()] == [3, 3, 3]
     assert {row.steps for row in by_why[films.TYPICAL]} == {3}
     assert [row.failure.partition(" at")[0] for row in by_why[films.LOST]] == ["dropped", "fell", "held up"]
     assert by_why[films.SLOWEST][0] is slow
@@ -328,8 +328,8 @@ def test_episodes_are_chosen_for_what_they_show(tmp_path):
 
     write_report(rows, tmp_path / "report")
     shown = films.films(rows, tmp_path / "report", draw)
-    assert len(drawn) == len({episode_key(row) for _, row in found})
-    assert [film.drawn for film in shown] == [row not in lost for _, row in found]
+    assert len(drawn) == len({episode_key(row) for _, row in chosen})
+    assert [film.drawn for film in shown] == [row not in lost for _, row in chosen]
     write_report(dataclasses.replace(Report.of(rows), films=shown), tmp_path / "report")
     page = (tmp_path / "report" / "report.html").read_text()
     # One variant has no picture of all of them.
@@ -364,7 +364,7 @@ def test_an_episode_is_replayed_from_its_row(tmp_path):
     assert Method.of_options(options_of(row)).options()["max_steps"] == 1
     assert films.replay(row, load_scenario(file), tmp_path / "film.png") == ""
     assert image.imread(tmp_path / "film.png").std() > 0.05
-    told = films.replay(dataclasses.replace(row, steps=7), load_scenario(file), tmp_path / "film.png")
-    assert told.startswith("run again on another machine, perhaps, it ended otherwise: ")
+    remark = films.replay(dataclasses.replace(row, steps=7), load_scenario(file), tmp_path / "film.png")
+    assert remark.startswith("run again on another machine, perhaps, it ended otherwise: ")
     with pytest.raises(InputError, match="holds something else today"):
         films.replay(dataclasses.replace(row, content_hash="0"), load_scenario(file), tmp_path / "film.png")

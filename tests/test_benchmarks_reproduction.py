@@ -42,8 +42,12 @@ def rows_of(table, scenes, reach, recognitions=("masks",), preset="paper", proto
                 method = Method(policy, PRESETS[preset](actions=actions), recognition, protocol=protocol)
                 for objects, block in paper_table.blocks.items():
                     for number in range(scenes) if isinstance(scenes, int) else scenes:
-                        found, grasped = reach(policy, recognition, actions, objects, number)
-                        usual = {"found_step": found, "graspable_step": grasped, "retrieved": grasped is not None}
+                        found_step, graspable_step = reach(policy, recognition, actions, objects, number)
+                        usual = {
+                            "found_step": found_step,
+                            "graspable_step": graspable_step,
+                            "retrieved": graspable_step is not None,
+                        }
                         name = f"{block}-{number:03d}"
                         yield row_of(name, method, objects=objects, content_hash=name.rjust(12, "0"), **usual | fields)
 
@@ -119,9 +123,9 @@ def test_findings_are_of_the_rows_that_they_name():
 
 def test_one_kind_of_action_is_compared_with_both():
     def reach(policy, recognition, actions, objects, number):
-        found = actions != PICK_AND_PLACE or number % 2
-        grasped = found and (actions != PUSH or number % 4)
-        return (1 if found else None), (2 if grasped else None)
+        is_found = actions != PICK_AND_PLACE or number % 2
+        is_graspable = is_found and (actions != PUSH or number % 4)
+        return (1 if is_found else None), (2 if is_graspable else None)
 
     run = run_of("x", list(rows_of("table4", 20, reach)), command="mechsearch reproduce table4")
     tables = {"table4": results_of_runs(TABLES["table4"], [run])}
@@ -266,8 +270,8 @@ def test_a_page_of_all_tables(tmp_path):
     draw = random.Random(0)
 
     def reach(*_):
-        found = draw.randrange(6) if draw.random() < 0.9 else None
-        return found, None if found is None or draw.random() < 0.2 else found + 1
+        found_step = draw.randrange(6) if draw.random() < 0.9 else None
+        return found_step, None if found_step is None or draw.random() < 0.2 else found_step + 1
 
     for table in TABLES:
         stored(tmp_path, table, rows_of(table, 5, reach, ("oracle", "masks")), commit="abc", note="beside others")

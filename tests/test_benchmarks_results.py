@@ -80,11 +80,11 @@ def test_an_episode_is_read_back(tmp_path):
 
 def test_what_happened_on_the_way_is_read_back_and_counted(tmp_path):
     before, after = STEPS
-    told = dataclasses.replace(before, truth_possible=True, restarts=0, fallen=(), held_up=False, at_rest=True)
+    calm = dataclasses.replace(before, truth_possible=True, restarts=0, fallen=(), held_up=False, at_rest=True)
     steps = (
-        told,
-        dataclasses.replace(told, truth_possible=False, restarts=1, fallen=(1, 0), held_up=True, at_rest=False),
-        dataclasses.replace(told, truth_possible=False, restarts=1, target_fallen=True, tracking_error=0.25),
+        calm,
+        dataclasses.replace(calm, truth_possible=False, restarts=1, fallen=(1, 0), held_up=True, at_rest=False),
+        dataclasses.replace(calm, truth_possible=False, restarts=1, target_fallen=True, tracking_error=0.25),
         dataclasses.replace(after, restarts=1),
     )
     save_episode(dataclasses.replace(EPISODE, steps=steps), tmp_path / "episode.json")

@@ -46,7 +46,7 @@ def test_the_true_masks_are_perfect(perfect):
     assert everything["counted"] <= everything["visible"] == len(perfect.rows)
 
 
-def test_an_object_that_is_not_told_apart_counts_as_nothing(wrong):
+def test_an_object_that_is_not_separated_counts_as_nothing(wrong):
     rows = {(row.noise, row.object): row for row in wrong.run().rows}
     for noise in ("clean", "gaussian"):
         assert rows[noise, 0].iou == 0.0

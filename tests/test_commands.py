@@ -378,7 +378,7 @@ def test_help_tells_a_default_once(command, capsys):
         assert not ("(default:" in option and re.search(r"by default|if not given|if left out", option)), option
 
 
-def test_the_version_is_told(capsys):
+def test_the_version_is_printed(capsys):
     with pytest.raises(SystemExit) as end:
         cli.parse(["--version"])
     assert not end.value.code
@@ -408,7 +408,7 @@ def test_planning_does_without_what_reports_are_made_with():
     assert answer.stdout == "set()\n", answer.stderr
 
 
-def test_many_episodes_are_run_as_asked(folder, monkeypatch, capsys):
+def test_many_episodes_are_run_as_the_options_say(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     broken = dataclasses.replace(ROW, failure="error: no", retrieved=False)
     seen = {}

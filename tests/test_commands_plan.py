@@ -59,10 +59,10 @@ def see(problem, monkeypatch):
     ],
 )
 def test_what_does_not_fit_together_is_refused(arguments, words, tmp_path, monkeypatch):
-    status, told = program(monkeypatch, "plan", *arguments, "--out", str(tmp_path / "out"))
+    status, message = program(monkeypatch, "plan", *arguments, "--out", str(tmp_path / "out"))
     assert status == 2
-    assert words in told
-    assert len(told.splitlines()) == 1
+    assert words in message
+    assert len(message.splitlines()) == 1
 
 
 def test_a_number_of_the_target_that_the_mask_file_does_not_have_is_said(tmp_path):
@@ -87,17 +87,17 @@ def test_a_camera_that_does_not_see_the_shelf_ends_it_with_one_line(tmp_path, mo
     R, p = np.array(IMAGES.camera.rotation), np.array(IMAGES.camera.position)
     turned = tuple(map(tuple, R.T.tolist()))
     inverted = dataclasses.replace(IMAGES.camera, rotation=turned, position=tuple((-R.T @ p).tolist()))
-    status, told = program(monkeypatch, "plan", *files_of_a_user(tmp_path, inverted))
-    assert (status, len(told.splitlines())) == (2, 1)
-    assert "T_world_camera looks inverted: its inverse sees the shelf" in told
+    status, message = program(monkeypatch, "plan", *files_of_a_user(tmp_path, inverted))
+    assert (status, len(message.splitlines())) == (2, 1)
+    assert "T_world_camera looks inverted: its inverse sees the shelf" in message
 
 
 def test_a_shelf_out_of_reach_ends_it_with_one_line(problem, tmp_path, monkeypatch):
     monkeypatch.setenv("MECHSEARCH_CACHE_DIR", "")
     nothing = problem.grasps.replace(pair_pose=jnp.zeros(0, jnp.int32), pair_grasp=jnp.zeros(0, jnp.int32))
     monkeypatch.setattr(problems, "candidate_grasps", lambda *args, **kwargs: nothing)
-    status, told = program(monkeypatch, "plan", *files_of_a_user(tmp_path))
-    assert (status, told.strip()) == (2, f"mechsearch: {NOWHERE}")
+    status, message = program(monkeypatch, "plan", *files_of_a_user(tmp_path))
+    assert (status, message.strip()) == (2, f"mechsearch: {NOWHERE}")
 
 
 @pytest.mark.slow
@@ -122,29 +122,29 @@ def test_the_example_is_planned_on_and_written_as_files_like_a_users(see, tmp_pa
 
     again = tmp_path / "again"
     files = ("--depth", str(out / "depth.png"), "--color", str(out / "color.png"), "--mask", str(out / "mask.png"))
-    asked = (*files, "--target-id", "200", "--camera", str(out / "camera.json"), "--out", str(again))
-    assert program(monkeypatch, "plan", *asked)[0] == 0
-    said = json.loads((again / "step.json").read_text())
+    arguments = (*files, "--target-id", "200", "--camera", str(out / "camera.json"), "--out", str(again))
+    assert program(monkeypatch, "plan", *arguments)[0] == 0
+    step_again = json.loads((again / "step.json").read_text())
     # A number that the mask does not have may be a slip.
-    assert "no pixel holds the target's number 200" in said["warnings"][0]
-    assert {**said, "warnings": []} == step
+    assert "no pixel holds the target's number 200" in step_again["warnings"][0]
+    assert {**step_again, "warnings": []} == step
 
 
 @pytest.mark.slow
 def test_a_search_goes_on_from_call_to_call(see, tmp_path, monkeypatch, capsys):
     see(OPEN)
     out, state = tmp_path / "out", tmp_path / "search.npz"
-    asked = ("plan", "--example", "--state", str(state), "--out", str(out))
-    assert program(monkeypatch, *asked)[0] == 0
-    assert program(monkeypatch, *asked, "--failed")[0] == 0
+    command = ("plan", "--example", "--state", str(state), "--out", str(out))
+    assert program(monkeypatch, *command)[0] == 0
+    assert program(monkeypatch, *command, "--failed")[0] == 0
     assert json.loads((out / "step.json").read_text())["index"] == 1
     # Nothing is to be followed that is of another step.
     see(HIDDEN)
-    assert program(monkeypatch, *asked, "--failed")[0] == 0
+    assert program(monkeypatch, *command, "--failed")[0] == 0
     assert json.loads((out / "step.json").read_text())["motion"] is None
     assert not (out / "trajectory.csv").exists()
     see(OPEN)
-    assert program(monkeypatch, *asked)[0] == 0
+    assert program(monkeypatch, *command)[0] == 0
     before = (out / "step.json").read_bytes()
-    assert program(monkeypatch, *asked)[0] == 0
+    assert program(monkeypatch, *command)[0] == 0
     assert (out / "step.json").read_bytes() == before

@@ -51,7 +51,7 @@ def test_a_scene_of_a_set_goes_by_its_name(folder):
             options.find_scenario(wrong)
 
 
-def test_a_file_or_folder_of_that_name_goes_before_and_is_told(folder, capsys):
+def test_a_file_or_folder_of_that_name_goes_before_and_is_reported(folder, capsys):
     scene = load_scenario(next(iter(example_scenarios().values())))
     save_scenario(scene, "d1-001")
     save_scenario(scene, "three/mine.json")
@@ -82,7 +82,7 @@ def test_a_folder_of_folders_stands_for_what_is_in_them(folder, capsys):
         options.find_scenarios(["none"])
 
 
-def test_scenes_that_are_not_what_is_on_record_are_told(folder, capsys, monkeypatch):
+def test_scenes_that_are_not_what_is_on_record_are_reported(folder, capsys, monkeypatch):
     monkeypatch.setattr(scene_sets, "recorded", lambda: {"d1": ["0123456789ab"] * 3})
     assert len(options.find_scenarios(["three"])) == 3
     assert capsys.readouterr().err.splitlines()[-1].startswith("d1-000 and 2 more: made here, not what is on record;")

@@ -184,7 +184,7 @@ def test_every_option_may_be_swept(option):
     assert [point.settings().config for point in points] == [standard()] * 2
 
 
-def test_what_a_run_would_take_is_told_and_nothing_is_run(folder, capsys):
+def test_what_a_run_would_take_is_printed_and_nothing_is_run(folder, capsys):
     common = ("one.json", "two.json", "--out", "rows", "--workers", "2", "--dry-run")
     gammas = [str(0.5 + 0.01 * i) for i in range(24)]
     cli.parse(

@@ -109,7 +109,7 @@ def test_other_code_versions_and_processors_are_other_entries(folder, monkeypatc
     assert TRACED == ["scaled"]
 
 
-def test_a_machine_is_told_by_versions_flags_and_what_its_processor_can(monkeypatch):
+def test_a_machine_is_identified_by_versions_flags_and_what_its_processor_can(monkeypatch):
     before = executables._machine.__wrapped__()
     assert jax.__version__ in before
     assert executables.processor() in before
@@ -233,7 +233,7 @@ def test_beside_a_gpu_the_host_computes_what_is_for_it(folder, monkeypatch):
     assert devices == [None, "cpu", None]
 
 
-def test_what_cannot_be_told_apart_is_not_kept(folder):
+def test_what_has_no_identity_is_not_kept(folder):
     function = another_process(static=("camera", "factor"))
 
     @dataclasses.dataclass(frozen=True)

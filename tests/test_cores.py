@@ -1,4 +1,4 @@
-"""Who shares a machine keeps its share of the cores busy, and leaves no files behind that nobody asked for."""
+"""Who shares a machine keeps its share of the cores busy, and leaves no files behind that nobody wants."""
 
 import os
 
@@ -51,7 +51,7 @@ def test_processes_share_them(monkeypatch, processes, each):
     assert share_of_cores(processes) == {VARIABLE: each}
 
 
-def test_workers_are_told_their_share(monkeypatch):
+def test_workers_are_given_their_share(monkeypatch):
     monkeypatch.setenv(VARIABLE, "6")
     jobs = make_jobs([example_scenarios()["first-light"]], [Method()], (0, 1))
     rows, before = [], dict(os.environ)

@@ -60,13 +60,13 @@ def test_links_lead_somewhere(page):
 
 
 def test_citations_in_the_source_name_a_heading():
-    found = 0
+    count = 0
     for folder in SOURCE:
         for file in (ROOT / folder).rglob("*.py"):
             for page, title in CITATION.findall(file.read_text(encoding="utf-8")):
                 assert title in headings(page), f"{file}: {page}, {title}"
-                found += 1
-    assert found > 0
+                count += 1
+    assert count > 0
 
 
 def test_no_table_row_is_broken():
@@ -103,7 +103,7 @@ def test_files_that_a_page_names_are_there(page):
 
 
 def test_what_the_python_guide_names_of_modules_is_there():
-    package, found = ROOT / "mechsearch_jax", 0
+    package, count = ROOT / "mechsearch_jax", 0
     rooms = {path.stem for path in package.iterdir()} | set(SOURCE)
     for path, name in re.findall(r"`(?:mechsearch_jax\.)?((?:\w+\.)+)(\w+)[`(]", read("docs/python.md")):
         folders = [folder for folder in path.strip(".").split(".") if folder != "mechsearch_jax"]
@@ -113,8 +113,8 @@ def test_what_the_python_guide_names_of_modules_is_there():
             text = "\n".join(file.read_text(encoding="utf-8") for file in modules if file.is_file())
             within = any((place / name).is_dir() or (place / f"{name}.py").is_file() for place in places)
             assert within or re.search(rf'^(def|class) {name}\b|^    "{name}",$', text, re.MULTILINE), (path, name)
-            found += 1
-    assert found > 15
+            count += 1
+    assert count > 15
 
 
 def test_the_python_guide_names_all_of_the_front_door():
@@ -197,7 +197,7 @@ def stored_runs(name):
     ]
 
 
-# What a table calls the shares that it tells, and how often it was so in some episodes.
+# What a table calls the shares that it holds, and how to compute them of episodes.
 RATES = {
     "found": lambda e: e["found_step"] is not None,
     "graspable": lambda e: e["graspable_step"] is not None,
@@ -384,7 +384,7 @@ def test_the_guard_is_paired_with_what_it_replaced_as_the_page_says():
     )
 
 
-def test_scenes_that_nothing_was_chosen_on_are_told_apart():
+def test_scenes_that_nothing_was_chosen_on_are_shown_apart():
     new = new_scenes(stored_runs("standard-h200.json")[1]["episodes"])
     page = " ".join(read("docs/experiments.md").split())
     groups = [with_objects(new, objects) for objects in "2468"]

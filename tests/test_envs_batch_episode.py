@@ -279,7 +279,7 @@ def test_a_retrieval_does_not_count_once_an_object_has_left_the_board():
     assert [(step.fallen, step.target_fallen) for step in episode.steps] == [((1,), True), ((2,), False)]
 
 
-def test_an_error_is_told_before_what_fell():
+def test_an_error_is_named_before_what_fell():
     log = EpisodeLog(2)
     log.decide(record(False, 9, Verdict(), None))
     assert log.act(dataclasses.replace(WON, off_board=frozenset({0})), "error: no", {})

@@ -40,11 +40,11 @@ def test_a_file_says_workcell_and_planner(file):
     searcher = cell.load_searcher(file, keep=False)
     assert searcher.workcell == settings.workcell
     assert searcher.config == settings.config
-    theirs = Method(config=settings.config, workcell=settings.workcell).policy()
-    mine = searcher._policy
-    assert mine.config == theirs.config
-    assert (mine.tries, searcher._trials) == (theirs.tries, rehearsal("physics")) == (True, rehearsal("physics"))
-    assert (mine.predict, mine.objective, mine.plan) == (theirs.predict, theirs.objective, theirs.plan)
+    expected = Method(config=settings.config, workcell=settings.workcell).policy()
+    policy = searcher._policy
+    assert policy.config == expected.config
+    assert (policy.tries, searcher._trials) == (expected.tries, rehearsal("physics")) == (True, rehearsal("physics"))
+    assert (policy.predict, policy.objective, policy.plan) == (expected.predict, expected.objective, expected.plan)
 
 
 def test_what_is_given_goes_before_the_file(file):

@@ -1,4 +1,4 @@
-"""Compilations are told apart from what they hold up."""
+"""Compilations are timed apart from what they hold up."""
 
 import time
 
@@ -45,7 +45,7 @@ def test_what_is_compiled_inside_of_something_else_counts_once(monkeypatch):
         assert clock.seconds == pytest.approx(7.0)
 
 
-def test_a_stage_is_told_without_what_was_compiled_in_it(monkeypatch):
+def test_a_stage_is_timed_without_what_was_compiled_in_it(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     with CompileClock() as compiling:

@@ -113,7 +113,7 @@ def test_a_search_goes_on_until_the_target_is_out(problem, tmp_path, policy):
     assert load_episode(tmp_path / "episode.json").steps == episode.steps
 
 
-def test_what_is_told_of_an_episode_is_what_its_record_says(problem):
+def test_what_is_narrated_of_an_episode_is_what_its_record_says(problem):
     console = Console(record=True, width=200, file=io.StringIO())
     narrator = Narrator(console, console.status("begins"), problem)
     episode = run(problem, HIDDEN, Stage(reveal, retrievals=Failure.MISSED), watcher=narrator)
@@ -213,7 +213,7 @@ def test_an_arm_that_is_held_up_has_failed(problem, failing):
     assert episode.failure == ("not found" if failing == "failures" else "retrieval: the arm was held up")
 
 
-def test_what_never_comes_to_rest_is_told_and_is_no_error(problem):
+def test_what_never_comes_to_rest_is_recorded_and_is_no_error(problem):
     episode = run(problem, HIDDEN, Stage(reveal, restless=True))
     assert episode.retrieved
     assert [step.at_rest for step in episode.steps] == [False, False]

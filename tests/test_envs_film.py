@@ -236,7 +236,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG, ids=list(WRONG))
-def test_what_cannot_be_filmed_is_told_at_once(case, tmp_path, monkeypatch):
+def test_what_cannot_be_filmed_is_refused_at_once(case, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     arguments, message = WRONG[case]
     arguments = arguments if "--out" in arguments else [*arguments, "--out", "film.mp4"]

@@ -42,12 +42,12 @@ def test_a_package_that_is_missing_breaks_the_main_job(monkeypatch):
     assert (broken.state, broken.remedy) == (State.BROKEN, "pip install no-such-package")
 
 
-def test_a_gpu_that_jax_does_not_see_is_told(monkeypatch):
+def test_a_gpu_that_jax_does_not_see_is_reported(monkeypatch):
     monkeypatch.setattr(health.shutil, "which", lambda name: f"/usr/bin/{name}")
     assert "mechsearch-jax[gpu]" in findings_of("devices")[-1].remedy
 
 
-def test_the_weights_are_told_with_their_digests(monkeypatch):
+def test_the_weights_are_listed_with_their_digests(monkeypatch):
     digests = [finding.says.split()[-1] for finding in findings_of("weights")]
     assert digests == [weights.shipped_weights(name).card["sha256"][:12] for name in weights.ARCHITECTURES]
 
@@ -147,7 +147,7 @@ def test_what_cannot_be_rendered_is_no_harm(monkeypatch):
     assert findings_of("rendering")[0].state is State.MISSING
 
 
-def test_a_check_that_fails_is_told():
+def test_a_check_that_fails_is_reported():
     def fails():
         raise RuntimeError("two\nlines")
         yield

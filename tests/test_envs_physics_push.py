@@ -187,7 +187,7 @@ def test_a_push_out_of_reach_fails_and_one_of_no_length_does_nothing(outcome):
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[2:], b[2:]), result, outcome)
 
 
-def test_what_falls_over_is_told(outcome):
+def test_what_falls_over_is_reported(outcome):
     high = push(pose(0.555, 0.058, 0.15, tilt=math.radians(30)), (0.0, 0.1, 0.0))
     result = predicted(copies(TALL), copies(high))
     assert (result.residual == 0).all()

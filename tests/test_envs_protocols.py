@@ -47,7 +47,7 @@ class Rewinding(Stage):
 
     def __init__(self, acts=reveal, fail=0, trouble=lambda world: world, failure=Failure.DROPPED):
         super().__init__(acts)
-        self.told, self.trouble, self.failure, self.tried, self.loads = fail, trouble, failure, {}, 0
+        self.failing, self.trouble, self.failure, self.tried, self.loads = fail, trouble, failure, {}, 0
 
     def load(self, world, only=None):
         self.loads += 1
@@ -56,17 +56,17 @@ class Rewinding(Stage):
         return self._gather()
 
     def execute(self, actions, active=None):
-        acts = self._told["acts"]
+        acts = self._script["acts"]
         bad = []
         for i in np.flatnonzero(np.asarray(active)):
             name = self.names[i]
             self.tried[name] = self.tried.get(name, 0) + 1
-            allowed = self.told.get(name, 0) if isinstance(self.told, dict) else self.told
+            allowed = self.failing.get(name, 0) if isinstance(self.failing, dict) else self.failing
             bad += [name] if self.tried[name] <= allowed else []
-        self._told["acts"] = {name: self.trouble if name in bad else acts for name in self.names}
-        self._told["failures"] = dict.fromkeys(bad, self.failure)
+        self._script["acts"] = {name: self.trouble if name in bad else acts for name in self.names}
+        self._script["failures"] = dict.fromkeys(bad, self.failure)
         outcome = super().execute(actions, active)
-        self._told["acts"] = acts
+        self._script["acts"] = acts
         return outcome
 
 
@@ -153,7 +153,7 @@ def test_a_target_that_hides_again_is_not_in_sight(problem):
     assert run(problem, OPEN, Rewinding(), Sure(), recogniser=shy).failure == HIDDEN_AGAIN
 
 
-def test_what_is_swept_at_some_grasp_must_meet_neither_objects_nor_shelf(problem):
+def test_what_is_swept_at_any_grasp_must_meet_neither_objects_nor_shelf(problem):
     world = from_scenario(OPEN)
     scene, pose = true_superquadrics(world), true_target_pose(world)
     free = jax.jit(lambda scene, pose, active: swept_free(problem.target_grasps, scene, pose, active))

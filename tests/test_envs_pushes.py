@@ -386,7 +386,7 @@ def test_poses_are_blurred_and_nothing_else(pushes):
 
 
 @pytest.mark.slow
-def test_what_is_sampled_to_learn_from_is_told_blurred(pushes):
+def test_what_is_sampled_to_learn_from_is_blurred(pushes):
     def sampled(blur):
         task = dataclasses.replace(task_of(pushes), blur=blur)
         return jax.jit(lambda key: task.sample(key, 32))(jax.random.key(0))
@@ -400,7 +400,7 @@ def test_what_is_sampled_to_learn_from_is_told_blurred(pushes):
 
 
 def row_of_boxes(*gaps):
-    """A push of the first of some boxes in a row along y, which moves by 5 cm; nothing becomes of the others.
+    """A push of the first of several boxes in a row along y, which moves by 5 cm; nothing becomes of the others.
 
     There are four slots, so that rows of any length are compiled once.
     """

@@ -146,7 +146,7 @@ def shown():
 
 
 @pytest.mark.parametrize(("y", "seen"), [(-0.0335, False), (-0.0403, True)])
-def test_full_is_told_the_targets_pixels_only_where_the_detector_sees_it(world, shown, y, seen):
+def test_full_is_given_the_targets_pixels_only_where_the_detector_sees_it(world, shown, y, seen):
     x, _, z = SCENE.target.position
     image, owner, labelled = shown(moved(world, TARGET, [x, y, z]))
     assert labelled == seen
@@ -184,7 +184,7 @@ def test_names_stand_for_one_object_each(masks):
 
 
 @pytest.mark.slow
-def test_without_masks_most_visible_objects_are_told_apart(world):
+def test_without_masks_most_visible_objects_are_separated(world):
     recognised = recogniser("full", target_of(SCENE))(jax.random.key(0), Snapshot(CAMERA, SHELF, world))
     truth = sharpened(true_superquadrics(world))
     overlap = np.asarray(intersection_over_union(truth, recognised.objects))[

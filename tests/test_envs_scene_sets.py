@@ -90,7 +90,7 @@ DIGESTS = {
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.name)
-def test_some_scenes_are_what_is_on_record(block):
+def test_a_scene_of_each_block_is_what_is_on_record(block):
     """Fails where the generator changed; `scene_sets.record` is for changes that are meant to change the sets."""
     index = block.scenes // 3
     scene = make_scene(block, index)
@@ -202,7 +202,7 @@ def test_files_are_made_once_and_hold_what_is_on_record(tmp_path, monkeypatch, q
     assert scene_files([(block, 1)], tmp_path / "mine").files == [tmp_path / "mine" / "quick-001.json"]
 
 
-def test_scenes_that_are_not_what_is_on_record_are_told(tmp_path, quick):
+def test_scenes_that_are_not_what_is_on_record_are_reported(tmp_path, quick):
     block, _, record = quick
     record[1] = "0123456789ab"
     files = scene_files([(block, i) for i in range(4)], tmp_path)

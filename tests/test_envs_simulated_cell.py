@@ -114,7 +114,7 @@ def test_a_searcher_takes_a_target_out_of_the_cell(problem):
     assert done.tracking_error < 0.02
 
 
-def test_what_is_gripped_is_pressed_with_the_force_that_is_asked_for():
+def test_what_is_gripped_is_pressed_with_the_given_force():
     cell = SimulatedCell(CELL, OPEN, noise=EXACT)
     still = moving(cell.joints, np.zeros(7), 100)
     ahead = cell._control(still.position[0], 0.0, 60.0)

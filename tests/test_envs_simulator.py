@@ -254,7 +254,7 @@ def test_settings_that_make_no_sense_are_refused(name, value):
         simulator.SimulatorConfig(**{name: value})
 
 
-def test_a_body_that_never_comes_to_rest_is_told():
+def test_a_body_that_never_comes_to_rest_is_reported():
     """In 0.2 s it has not fallen from 10 cm above the board; in 6 s it has."""
     high = dataclasses.replace(TARGET_BODY, position=(0.6, 0.1, BOARD + 0.15))
     for steps, rests in ((50, False), (1500, True)):

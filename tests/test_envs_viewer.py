@@ -161,7 +161,7 @@ def test_meshes_are_as_large_as_what_they_show():
     np.testing.assert_allclose(web.arrow_mesh(start, end).vertices[:, 0].max(), 0.6, atol=1e-6)
 
 
-def test_a_missing_library_is_told_in_one_line(monkeypatch, tmp_path):
+def test_a_missing_library_is_reported_in_one_line(monkeypatch, tmp_path):
     save_recording(RECORDING, tmp_path / NAME)
     monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(InputError, match=r"pip install 'mechsearch-jax\[viewer\]'") as refused:
@@ -177,7 +177,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG, ids=list(WRONG))
-def test_what_cannot_be_shown_is_told_at_once(case, tmp_path):
+def test_what_cannot_be_shown_is_refused_at_once(case, tmp_path):
     pytest.importorskip("viser")
     more, message = WRONG[case]
     with pytest.raises(InputError) as refused:

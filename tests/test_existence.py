@@ -151,8 +151,8 @@ def test_without_a_closer_look_every_place_may_show_the_same(problem):
     config = dataclasses.replace(problem.config.existence, closer_look=0)
     views = VIEWS(problem.existence, problem.camera, objects, None, config)
     closer = existence.closer_image(problem.camera, objects, views, config)
-    told = existence.allowances(problem.existence, problem.camera, problem.target, views, closer, config)
-    np.testing.assert_array_equal(told, np.full(told.shape, 2))
+    allowed = existence.allowances(problem.existence, problem.camera, problem.target, views, closer, config)
+    np.testing.assert_array_equal(allowed, np.full(allowed.shape, 2))
 
 
 def test_places_are_the_middle_and_the_corners():
@@ -277,7 +277,7 @@ def test_f_rules_out_what_the_detector_sees_and_nothing_else(problem, width):
     hidden = scenario.Body("cylinder", (0.02, 0.02, 0.05), (0.62, 0.07, 0.4545), (1.0, 0.0, 0.0, 0.0))
 
     @jax.jit
-    def told(world, objects):
+    def existence_and_pixels(world, objects):
         views = existence.object_views(tables, camera, objects, everywhere, config)
         closer = existence.closer_image(camera, objects, views, config)
         allowed = existence.allowances(tables, camera, target, views, closer, config)
@@ -293,7 +293,7 @@ def test_f_rules_out_what_the_detector_sees_and_nothing_else(problem, width):
     for y in (0.125, 0.128, 0.131, 0.134, 0.137):
         body = scenario.Body("box", (0.048, 0.028, 0.08), (0.55, y, 0.4845), (1.0, 0.0, 0.0, 0.0))
         world = from_scenario(scenario.Scenario("one", (body,), hidden))
-        f, counts = (np.asarray(a) for a in told(world, scenario.superquadrics([body])))
+        f, counts = (np.asarray(a) for a in existence_and_pixels(world, scenario.superquadrics([body])))
         unseen, seen = counts <= limit, counts > limit
         assert f[near[unseen]].all()
         # A pose stands for its cell, of which a part may be hidden yet.
@@ -322,7 +322,7 @@ def test_occluders_are_those_of_a_reference(problem):
     settings = problem.config.existence
     tables, coarse = problem.existence, problem.camera.scaled(settings.step(problem.camera))
     views = VIEWS(tables, problem.camera, objects, None, settings)
-    told = np.asarray(existence.occluders(tables, views))
+    hidden_by = np.asarray(existence.occluders(tables, views))
     middle = np.asarray(tables.corner[:, 0]) + np.array(tables.depth.shape[-2:]) // 2
     seen = (middle >= 0).all(axis=1) & (middle < (coarse.height, coarse.width)).all(axis=1)
     nearest = np.asarray(tables.depth[:, 0]).min(axis=(-1, -2))
@@ -330,9 +330,9 @@ def test_occluders_are_those_of_a_reference(problem):
     for k in np.flatnonzero(np.asarray(objects.valid)):
         alone = jax.tree.map(lambda field, k=k: field[k : k + 1], objects)
         hides = reference_superquadric_depth(coarse, alone)[tuple(middle[seen].T)] < nearest[seen]
-        assert np.mean(told[seen, k] == hides) > 0.98
-    assert not told[:, ~np.asarray(objects.valid)].any()
-    assert 0.1 < told.any(axis=1).mean() < 0.9
+        assert np.mean(hidden_by[seen, k] == hides) > 0.98
+    assert not hidden_by[:, ~np.asarray(objects.valid)].any()
+    assert 0.1 < hidden_by.any(axis=1).mean() < 0.9
 
 
 def test_collisions_need_not_count(problem):
@@ -347,9 +347,9 @@ def test_collisions_need_not_count(problem):
     hidden, same, free = (coarsely(problem, views, everywhere) for views in (without, empty, whole))
     np.testing.assert_array_equal(hidden, same)
     assert int(jnp.sum(free)) < int(jnp.sum(hidden))
-    # Of the poses that are asked about, the others do not change the answer.
-    some = jnp.arange(everywhere.size) % 3 == 0
-    np.testing.assert_array_equal(coarsely(problem, without, some), hidden & some)
+    # The other poses do not change the answer for the wanted ones.
+    wanted = jnp.arange(everywhere.size) % 3 == 0
+    np.testing.assert_array_equal(coarsely(problem, without, wanted), hidden & wanted)
 
 
 def test_the_papers_criterion_lets_visible_targets_pass(problem):

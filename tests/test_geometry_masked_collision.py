@@ -87,7 +87,7 @@ def test_batches_nest_and_shared_values_may_be_batched_too():
 
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("block", [4, 256])
-def test_rows_and_what_they_share_may_vary_along_some_axes_of_a_batch_only(block):
+def test_rows_and_what_they_share_may_vary_along_part_of_the_axes_of_a_batch(block):
     masks = jax.random.bernoulli(jax.random.key(2), 0.7, (2, 3, 10))
     outer, inner = jax.random.normal(jax.random.key(0), (2, 10)), jnp.arange(3)
     run = lambda m, a, b: evaluate(m, jnp.float32(1.0), a, b, block)  # noqa: E731
@@ -168,7 +168,7 @@ def rotations(rng, *shape):
 
 
 def random_clouds(rng, *batch, clouds=4, points=96):
-    """Points in boxes of several sizes, some away from their frame's origin."""
+    """Points in boxes of several sizes, part of them away from their frame's origin."""
     centre, reach = rng.uniform(-0.06, 0.06, (*batch, clouds, 3, 1)), rng.uniform(0.02, 0.1, (*batch, clouds, 1, 1))
     return np.float32(centre + reach * rng.uniform(-1, 1, (*batch, clouds, 3, points)))
 

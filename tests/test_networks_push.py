@@ -1,4 +1,4 @@
-"""The push network: its symmetries, what it is told, and the push model around it."""
+"""The push network: its symmetries, its input features, and the push model around it."""
 
 import dataclasses
 import functools
@@ -232,7 +232,7 @@ def test_neighbours_and_walls_matter_where_they_are_near():
     np.testing.assert_allclose(far, prediction(scene, T, displacement).shift, atol=2e-5)
 
 
-# --- what the network is told ----------------------------------------------------------------------------------------
+# --- the network's input features ------------------------------------------------------------------------------------
 
 
 def travelled(inside, longest):
@@ -378,7 +378,7 @@ def test_an_object_reaches_as_far_as_its_outline():
             assert float(extent) == pytest.approx((outline @ direction).max(), abs=2e-4)
 
 
-def test_how_two_objects_meet_is_told_from_both():
+def test_how_two_objects_meet_is_a_feature_of_both():
     # The gripper is 4 cm before the first, which is 6 cm before the second, whose middle is 2 cm to the left.
     scene = standing(((0.02, 0.03, 0.05), BOX, 0.6, 0.0, 0.0), ((0.02, 0.02, 0.08), BOX, 0.7, 0.02, 0.0))
     start = push_start(OPEN, scene, jnp.zeros((1, 3)), gripper_at(0.54, 0.0), jnp.float32([0.15, 0.0, 0.0]))
@@ -478,7 +478,7 @@ def everything_moves(limit):
     return jax.jit(functools.partial(predicted, PushNetwork(CONFIG), parameters(), 0.0, limit), static_argnums=0)
 
 
-def test_a_pushed_object_that_is_told_to_turn_turns_by_that():
+def test_a_pushed_object_turns_by_the_predicted_angle():
     scene, T, displacement = cluttered(3)
     expected = prediction(scene, T, displacement, shelf=SHELF)
     outcome = everything_moves(0.0)(SHELF, scene, pusher(), T, displacement, jnp.zeros(()))

@@ -115,7 +115,7 @@ def test_blue_green_red_is_said():
         assert colour_faults(CAMERA, SHELF, TARGET, detector, hidden[0], painted) == ()
 
 
-def test_what_keeps_the_target_from_being_told_is_said():
+def test_what_keeps_the_target_from_being_recognised_is_named():
     mask = np.full((4, 4), -1)
     mask[0] = 3
     (fault,) = identity_faults(None, None, None)
@@ -131,7 +131,7 @@ def nothing_seen():
     return Observation(empty(8), jnp.array(False), jnp.zeros(3))
 
 
-def test_an_empty_shelf_is_told_from_one_on_which_nothing_is_recognised():
+def test_an_empty_shelf_differs_from_one_on_which_nothing_is_recognised():
     bare = observe(CAMERA, from_scenario(SCENE).replace(valid=jnp.zeros(9, bool)))
     depth = np.asarray(bare.depth) + np.random.default_rng(0).normal(0, 0.001, bare.depth.shape).astype(np.float32)
     assert sight_faults(CAMERA, SHELF, depth, nothing_seen()) == (EMPTY_SHELF,)

@@ -168,10 +168,10 @@ def test_it_is_a_pytree_for_jit_and_vmap(see, images):
 def test_slots_are_callables(images):
     """A segmenter and a detector of one's own, as functions."""
 
-    def mine(key, shelf, points, of_target):
+    def all_free(key, shelf, points, of_target):
         return jnp.where(jnp.isfinite(points).all(axis=-1), FREE, MISSING).astype(jnp.int8)
 
-    see = Recogniser(setting(images.camera), segmenter=mine, detector=lambda colour: colour[..., 0] > 2.0)
+    see = Recogniser(setting(images.camera), segmenter=all_free, detector=lambda colour: colour[..., 0] > 2.0)
     seen = see(KEY, images.depth, images.colour)
     assert not seen.objects.valid.any()
     assert not seen.target_visible
@@ -213,7 +213,7 @@ def best_overlaps(objects):
 
 
 @pytest.mark.slow
-def test_without_a_mask_most_objects_are_told_apart(see, images, in_sight):
+def test_without_a_mask_most_objects_are_separated(see, images, in_sight):
     assert (best_overlaps(see(KEY, images.depth, images.colour).objects) > 0.7).sum() >= 4
     blind = see(KEY, images.depth)
     assert (best_overlaps(blind.objects) > 0.7).sum() >= 4

@@ -52,7 +52,7 @@ def share(target, rgb, noise, light):
 
 @pytest.mark.parametrize("name", list(HUES))
 @pytest.mark.parametrize("noise", [4, pytest.param(8, marks=pytest.mark.slow)])
-def test_a_target_of_any_hue_is_told_from_others_in_light_and_shade(name, noise):
+def test_a_target_of_any_hue_is_separated_from_others_in_light_and_shade(name, noise):
     hue, others = HUES[name], [*(rgb for other, rgb in HUES.items() if other != name), *PALETTE[:8], PALETTE[9]]
     for light in (0.45, 0.7, 1.0):
         assert share(hue, hue, noise, light) > 0.99

@@ -88,7 +88,7 @@ def test_a_place_that_was_measured_to_be_recognised_worse_is_warned_of():
         assert (loss > 0.03) <= bool(faults(place)), name
 
 
-def test_only_a_camera_farther_away_is_told_as_nearer_and_only_a_denser_image_is_thinned_more():
+def test_only_a_camera_farther_away_is_shown_as_nearer_and_only_a_denser_image_is_thinned_more():
     assert nearness(Camera(), Shelf()) == 1.0
     for name, ratio, stride in (
         ("camera-back", 0.775 / 1.23, 3),
@@ -134,7 +134,7 @@ def test_numbers_by_hand():
     assert TrainedView(camera.moved(shift), shelf.moved(shift)).numbers() == pytest.approx(expected)
 
 
-def test_each_size_of_a_shelf_is_told_once_it_is_out_of_its_range_and_not_before():
+def test_each_size_of_a_shelf_is_reported_once_it_is_out_of_its_range_and_not_before():
     ends = {"depth": "back", "width": "left", "height": "ceiling"}
     usual = Shelf()
     for number, end in ends.items():

@@ -171,8 +171,10 @@ def test_what_is_in_the_way_of_a_grasp_weighs_as_much_as_is_said(problem):
     assert none == exists.sum()
     assert light - none == pytest.approx(0.1 * (plain - none), rel=1e-5)
     assert cost(SearchAndGrasp(), belief) == exists.sum()
-    found = belief.replace(found=jnp.array(True))
-    assert cost(SearchAndGrasp(hindrance=0.5), found) == pytest.approx(0.5 * cost(SearchAndGrasp(), found))
+    found_belief = belief.replace(found=jnp.array(True))
+    assert cost(SearchAndGrasp(hindrance=0.5), found_belief) == pytest.approx(
+        0.5 * cost(SearchAndGrasp(), found_belief)
+    )
 
 
 def test_what_is_picked_later_stays_where_it_is_in_the_published_code(problem):
@@ -188,10 +190,10 @@ def test_what_is_picked_later_stays_where_it_is_in_the_published_code(problem):
     def shift(kind, first):
         action = no_action().replace(kind=jnp.int32(kind))
         sample = Sample(action, jnp.int32(0))
-        told = LaterPlacementsStay(shifts)(problem, state, sample, jnp.array(first))
-        assert bool(told.possible)
-        assert np.any(told.moved) == np.any(told.scene.position != state.scene.position)
-        return float(told.scene.position[0, 0] - state.scene.position[0, 0])
+        prediction = LaterPlacementsStay(shifts)(problem, state, sample, jnp.array(first))
+        assert bool(prediction.possible)
+        assert np.any(prediction.moved) == np.any(prediction.scene.position != state.scene.position)
+        return float(prediction.scene.position[0, 0] - state.scene.position[0, 0])
 
     assert shift(ActionKind.PICK_AND_PLACE, False) == 0
     for kind, first in ((ActionKind.PICK_AND_PLACE, True), (ActionKind.PUSH, True), (ActionKind.PUSH, False)):
@@ -228,9 +230,9 @@ def test_later_actions_are_drawn_in_the_present_scene_in_the_published_code(prob
     def starts(drawn_in):
         config = dataclasses.replace(CONFIG, horizon=3, sequences=2)
         rollout = Drawn(problem, belief, config, draws_where_it_stands, moves, POLICY.objective, drawn_in)
-        told = jax.jit(lambda key, objects: plan(rollout, key, objects))(jax.random.key(0), objects)
-        np.testing.assert_allclose(np.diff(told.sequences.cost[0]), 0.05, atol=1e-6)
-        return np.asarray(told.sequences.actions.T_world_gripper)[0, :, 1, 3] - float(objects.position[0, 1])
+        planned = jax.jit(lambda key, objects: plan(rollout, key, objects))(jax.random.key(0), objects)
+        np.testing.assert_allclose(np.diff(planned.sequences.cost[0]), 0.05, atol=1e-6)
+        return np.asarray(planned.sequences.actions.T_world_gripper)[0, :, 1, 3] - float(objects.position[0, 1])
 
     np.testing.assert_allclose(starts(as_predicted), [0.0, 0.05, 0.1], atol=1e-6)
     np.testing.assert_allclose(starts(in_the_present_scene), 0.0, atol=1e-6)
@@ -249,8 +251,8 @@ def test_an_action_is_drawn_again_until_it_is_possible_and_the_first_more_often(
         config = dataclasses.replace(CONFIG, **changes)
         rollout = Rollout(problem, belief, config, counts, seldom, POLICY.objective)
         keys = jax.random.split(jax.random.key(0), 4000)
-        told = jax.vmap(lambda key: rollout.act(jnp.array(first), root, key)[0]["alive"])(keys)
-        return float(jnp.mean(told))
+        alive = jax.vmap(lambda key: rollout.act(jnp.array(first), root, key)[0]["alive"])(keys)
+        return float(jnp.mean(alive))
 
     for draws, first_draws, first, later in ((1, 1, 1, 1), (1, 4, 4, 1), (3, 1, 3, 3), (2, 4, 4, 2)):
         changes = {"draws": draws, "first_draws": first_draws}
@@ -287,17 +289,17 @@ def test_an_attempt_has_something_to_do_only_where_no_other_was_possible(problem
     alive = np.asarray(states.alive)
     if on_cpu:
         # One after the other: only those go on that have no action yet.
-        found = np.cumsum(works, axis=0) > 0
+        has_action = np.cumsum(works, axis=0) > 0
         assert busy.shape == (draws, rows)
         np.testing.assert_array_equal(busy[0], alive)
-        np.testing.assert_array_equal(busy[1:], alive & ~found[:-1])
+        np.testing.assert_array_equal(busy[1:], alive & ~has_action[:-1])
         assert 0 < busy[-1].sum() < busy[0].sum() / 2
     else:
         # All at once, in a single call.
         works, busy = works[0], busy[0]
         np.testing.assert_array_equal(busy, np.repeat(alive[:, None], draws, axis=1))
-        found = np.cumsum(works, axis=1).T > 0
-    np.testing.assert_array_equal(acted, found[-1] & alive)
+        has_action = np.cumsum(works, axis=1).T > 0
+    np.testing.assert_array_equal(acted, has_action[-1] & alive)
 
 
 def test_options_are_changed_by_name_and_survive_json():
@@ -406,9 +408,9 @@ def test_nothing_is_compiled_anew_when_objects_come_go_or_move(decision, problem
     _, other = load("crowded-shelf")
     for scene in (fewer, moved, other):
         POLICY(jax.random.key(1), problem, look(problem, scene), seen(scene))
-    found = look(problem, objects, True, (0.7, 0.2, 0.0))
-    told = POLICY(jax.random.key(1), problem, found, seen(objects, True, (0.7, 0.2, 0.0)))
-    assert float(told.cost) < superquadric.empty(8).capacity + 3
+    found_belief = look(problem, objects, True, (0.7, 0.2, 0.0))
+    planned = POLICY(jax.random.key(1), problem, found_belief, seen(objects, True, (0.7, 0.2, 0.0)))
+    assert float(planned.cost) < superquadric.empty(8).capacity + 3
     best_grasp(problem.target_grasps, fewer, jnp.float32([0.6, 0.0, 0.0]))
     after = [f._cache_size() for f in functions]
     assert after[:2] == counts[:2]
@@ -420,10 +422,10 @@ def test_continuous_settings_are_data_and_compile_nothing(decision, problem):
     count = policies._plan._cache_size()
     changes = {"gamma": 0.5, "unseen_contact_penalty": 0.0, "guided_fraction": 0.1}
     other = planner.search_for_grasp(**changes, crowding_weight=0.0)
-    told = other(jax.random.key(0), problem, belief, seen(objects))
+    changed = other(jax.random.key(0), problem, belief, seen(objects))
     assert policies._plan._cache_size() == count
-    assert float(told.cost) != float(usual.cost)
-    assert not np.array_equal(np.asarray(told.sequences.value), np.asarray(usual.sequences.value))
+    assert float(changed.cost) != float(usual.cost)
+    assert not np.array_equal(np.asarray(changed.sequences.value), np.asarray(usual.sequences.value))
 
 
 def test_a_found_target_is_one_pose_and_stays_found_where_it_may_be_hidden(problem):
@@ -462,9 +464,9 @@ class Shaky:
     residual: float | jax.Array
 
     def __call__(self, shelf, scene, pusher, T_world_gripper, displacement, q7):
-        told = QuasiStatic()(shelf, scene, pusher, T_world_gripper, displacement, q7)
-        feared = jnp.where(told.moved, self.chance, 0.0)
-        return told.replace(topples=jnp.maximum(told.topples, feared), residual=told.residual + self.residual)
+        motion = QuasiStatic()(shelf, scene, pusher, T_world_gripper, displacement, q7)
+        feared = jnp.where(motion.moved, self.chance, 0.0)
+        return motion.replace(topples=jnp.maximum(motion.topples, feared), residual=motion.residual + self.residual)
 
 
 # The first is executed as ever, and the second nevertheless.
@@ -486,8 +488,8 @@ def drawn(decision, root, problem):
         def one(key):
             sample = POLICY.propose(key, problem, belief, POLICY.objective, CONFIG.guided_fraction, root)
             predict = lambda *shaky: foreseen(Shaky(*shaky))(problem, root, sample, jnp.array(True))  # noqa: E731
-            told = jax.vmap(predict)(CHANCES, RESIDUALS)
-            return sample, told.possible
+            prediction = jax.vmap(predict)(CHANCES, RESIDUALS)
+            return sample, prediction.possible
 
         return jax.vmap(one)(keys)
 
@@ -656,11 +658,11 @@ def test_a_greedy_policy_looks_one_action_ahead_and_minds_nothing_but_the_area()
 @pytest.mark.slow
 def test_a_greedy_policy_leaves_the_least_of_f(decision, problem):
     objects, belief, _ = decision
-    told = planner.greedy()(jax.random.key(0), problem, belief, seen(objects))
-    left = np.asarray(told.sequences.cost)[:, 0]
-    acted = np.asarray(told.sequences.actions.kind)[:, 0] != ActionKind.NONE
-    assert float(told.cost) == float(belief.exists.sum())
-    assert float(told.predicted_cost) == left[acted].min() < float(told.cost)
+    greedy = planner.greedy()(jax.random.key(0), problem, belief, seen(objects))
+    left = np.asarray(greedy.sequences.cost)[:, 0]
+    acted = np.asarray(greedy.sequences.actions.kind)[:, 0] != ActionKind.NONE
+    assert float(greedy.cost) == float(belief.exists.sum())
+    assert float(greedy.predicted_cost) == left[acted].min() < float(greedy.cost)
     assert len(set(left[acted])) > 1
 
 
@@ -670,13 +672,13 @@ def test_a_decision_with_the_settings_of_the_published_code_is_one_too(decision)
     config = planner.published_code(sequences=10)
     problem = planner.build_problem(config=config.problem)
     belief = planner.update_belief(problem, planner.initial_belief(problem), seen(objects))
-    told = planner.search_for_grasp(config.planner)(jax.random.key(0), problem, belief, seen(objects))
-    kinds, cost = np.asarray(told.sequences.actions.kind), np.asarray(told.sequences.cost)
+    published = planner.search_for_grasp(config.planner)(jax.random.key(0), problem, belief, seen(objects))
+    kinds, cost = np.asarray(published.sequences.actions.kind), np.asarray(published.sequences.cost)
     later = kinds[:, 1:] == ActionKind.PICK_AND_PLACE
     assert later.any()
     np.testing.assert_array_equal(np.diff(cost, axis=1)[later], 0.0)
     pushes = kinds == ActionKind.PUSH
-    distance = np.linalg.norm(np.asarray(told.sequences.actions.displacement), axis=-1)
+    distance = np.linalg.norm(np.asarray(published.sequences.actions.displacement), axis=-1)
     np.testing.assert_allclose(distance[pushes], 0.1, rtol=1e-5)
 
 
@@ -686,13 +688,13 @@ def test_the_papers_preset_draws_until_an_action_is_possible_and_moves_objects_a
     config = planner.paper()
     paper = planner.build_problem(config=config.problem)
     belief = planner.update_belief(paper, planner.initial_belief(paper), seen(objects))
-    told = planner.search_for_grasp(config.planner)(jax.random.key(0), paper, belief, seen(objects))
-    kinds = np.asarray(told.sequences.actions.kind)
+    decided = planner.search_for_grasp(config.planner)(jax.random.key(0), paper, belief, seen(objects))
+    kinds = np.asarray(decided.sequences.actions.kind)
     lengths = (kinds != ActionKind.NONE).sum(axis=1)
     assert lengths.mean() > (np.asarray(standard.sequences.actions.kind) != ActionKind.NONE).sum(axis=1).mean() + 0.5
-    moved = np.asarray(told.sequences.actions.object)
+    moved = np.asarray(decided.sequences.actions.object)
     assert any(len(set(o[:n])) < n for o, n in zip(moved, lengths, strict=True))
-    assert float(told.value) < 0
+    assert float(decided.value) < 0
 
 
 @pytest.mark.slow

@@ -31,7 +31,7 @@ def same(a, b):
 def test_g_and_j_are_the_same(problem):
     rng = np.random.default_rng(0)
     belief = planner.initial_belief(problem)
-    found = belief.replace(found=jnp.array(True))
+    found_belief = belief.replace(found=jnp.array(True))
     rows = pairs(problem.grasps, belief.grasps.feasible)
     count = problem.poses.shape[0]
     exists, somewhere = jnp.asarray(rng.random(count) < 0.3), jnp.arange(count) == 400
@@ -46,7 +46,11 @@ def test_g_and_j_are_the_same(problem):
     assert g[~nothing].min() > 1 - INFEASIBLE
     for objective in (planner.search_for_grasp().objective, planner.search_and_grasp().objective):
         # Where a found target is hidden, no grasp counts.
-        for known, at in ((belief, jnp.zeros_like(somewhere)), (found, jnp.zeros_like(somewhere)), (found, somewhere)):
+        for known, at in (
+            (belief, jnp.zeros_like(somewhere)),
+            (found_belief, jnp.zeros_like(somewhere)),
+            (found_belief, somewhere),
+        ):
             state = present_state(problem, known, empty(8), PlannerConfig())
             state = state.replace(exists=exists | somewhere, target_at=at)
             costs = [float(objective.cost(problem, known, state.replace(hits=h), Weights())) for h in (hits, wider)]

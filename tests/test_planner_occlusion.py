@@ -26,7 +26,7 @@ from mechsearch_jax.planner.proposal import WeightedDraw, guided_draw
 from mechsearch_jax.runtime.identity import identity
 from mechsearch_jax.workspace import scenario
 
-# Far from each other: one that hides much, one that hides some, one that hides little.
+# Far from each other: one that hides much, one that hides less, one that hides little.
 SIZES = {"wide": ((0.03, 0.06, 0.08), 0.1), "narrow": ((0.025, 0.03, 0.06), 0.3), "low": ((0.02, 0.02, 0.05), -0.15)}
 ORDERS = (("wide", "narrow", "low"), ("low", "wide", "narrow"), ("narrow", "low", "wide"))
 POLICY = planner.most_occluding(push_model=QuasiStatic(), sequences=12)

@@ -68,10 +68,10 @@ def never(problem, state, sample, first):
 
 
 def only_left(problem, state, sample, first):
-    told = moves(problem, state, sample, first)
+    prediction = moves(problem, state, sample, first)
     possible = sample.action.displacement[1] < 0
-    scene = jax.tree.map(lambda a, b: jnp.where(possible, a, b), told.scene, state.scene)
-    return Prediction(scene, told.moved & possible, possible)
+    scene = jax.tree.map(lambda a, b: jnp.where(possible, a, b), prediction.scene, state.scene)
+    return Prediction(scene, prediction.moved & possible, possible)
 
 
 @pytest.fixture(scope="module")
@@ -110,9 +110,9 @@ def test_a_later_gain_is_discounted(decide):
 
 
 def test_what_is_impossible_is_never_chosen(decide):
-    told = decide(only_left)
-    assert told.action.displacement[1] < 0
-    kinds, value = np.asarray(told.sequences.actions.kind)[:, 0], np.asarray(told.sequences.value)
+    decision = decide(only_left)
+    assert decision.action.displacement[1] < 0
+    kinds, value = np.asarray(decision.sequences.actions.kind)[:, 0], np.asarray(decision.sequences.value)
     assert (np.isfinite(value) == (kinds == ActionKind.PUSH)).all()
     assert (kinds == ActionKind.NONE).any()
     none = decide(never)
@@ -122,18 +122,18 @@ def test_what_is_impossible_is_never_chosen(decide):
 
 
 def test_a_decision_has_the_form_of_any_other(decide, objects):
-    told = decide()
+    decision = decide()
     expected = no_sequences(CONFIG, objects)
-    assert jax.tree.map(lambda a: (a.shape, a.dtype), told.sequences) == jax.tree.map(
+    assert jax.tree.map(lambda a: (a.shape, a.dtype), decision.sequences) == jax.tree.map(
         lambda a: (a.shape, a.dtype), expected
     )
-    assert told.predicted.capacity == objects.capacity
-    assert float(told.predicted.position[0, 1] - objects.position[0, 1]) == pytest.approx(STEP, abs=1e-6)
-    cost = np.asarray(told.sequences.cost)
-    assert np.isfinite(cost[np.isfinite(told.sequences.value), 0]).all()
+    assert decision.predicted.capacity == objects.capacity
+    assert float(decision.predicted.position[0, 1] - objects.position[0, 1]) == pytest.approx(STEP, abs=1e-6)
+    cost = np.asarray(decision.sequences.cost)
+    assert np.isfinite(cost[np.isfinite(decision.sequences.value), 0]).all()
     assert np.isnan(cost[:, 1:]).all()
     again = decide()
-    jax.tree.map(np.testing.assert_array_equal, told, again)
+    jax.tree.map(np.testing.assert_array_equal, decision, again)
 
 
 @pytest.mark.parametrize(
@@ -160,8 +160,8 @@ def test_a_decision_on_a_shelf(problem, objects):
     seen = Observation(objects, jnp.array(False), jnp.zeros(3))
     belief = planner.update_belief(problem, planner.initial_belief(problem), seen)
     policy = planner.policy_factory("mctx")(sequences=8, horizon=2)
-    told = policy(jax.random.key(0), problem, belief, seen)
-    assert int(told.action.kind) in (ActionKind.PUSH, ActionKind.PICK_AND_PLACE)
-    assert float(told.value) < 0
-    assert float(told.predicted_cost) < float(told.cost)
-    assert float(told.cost) == float(planner.search_for_grasp()(jax.random.key(0), problem, belief, seen).cost)
+    decision = policy(jax.random.key(0), problem, belief, seen)
+    assert int(decision.action.kind) in (ActionKind.PUSH, ActionKind.PICK_AND_PLACE)
+    assert float(decision.value) < 0
+    assert float(decision.predicted_cost) < float(decision.cost)
+    assert float(decision.cost) == float(planner.search_for_grasp()(jax.random.key(0), problem, belief, seen).cost)

@@ -95,7 +95,7 @@ def test_no_joint_exceeds_its_limits_in_the_samples_of_random_motions(kind):
     ]
     for ratio in ratios:
         assert ratio.max() < 1.02
-    # And no motion takes longer than it must: some limit is what slows it down, but for the rounding of durations.
+    # And no motion takes longer than it must: a limit is what slows it down, but for the rounding of durations.
     assert np.max(ratios, axis=(0, 2)).min() > 0.93
     np.testing.assert_allclose(reference.velocity, next(sampled(reference))[:, 2:], atol=1e-2)
 

@@ -35,28 +35,28 @@ def imports(file):
 
 def arrows(*packages):
     """From each room of these packages: which places it imports from."""
-    found = {}
+    imported = {}
     for package in packages:
         for file in (ROOT / package).rglob("*.py"):
             inside = file.relative_to(ROOT / package).parts
             room = package, inside[0] if len(inside) > 1 else inside[0].removesuffix(".py")
-            found.setdefault(room, set()).update(other for other in imports(file) if other and other != room)
-    return found
+            imported.setdefault(room, set()).update(other for other in imports(file) if other and other != room)
+    return imported
 
 
-def circles(found):
+def circles(imported):
     """The rooms that need one which needs them."""
 
     def reached(room):
         seen, left = set(), [room]
         while left:
-            for other in found.get(left.pop(), ()):
+            for other in imported.get(left.pop(), ()):
                 if other not in seen:
                     seen.add(other)
                     left.append(other)
         return seen
 
-    return {room for room in found if room in reached(room)}
+    return {room for room in imported if room in reached(room)}
 
 
 def test_a_circle_of_rooms_is_seen():
@@ -66,11 +66,11 @@ def test_a_circle_of_rooms_is_seen():
 
 
 def test_packages_import_what_is_below_them_alone():
-    found = arrows(*PACKAGES)
-    assert {package for package, _ in found} == set(PACKAGES)
+    imported = arrows(*PACKAGES)
+    assert {package for package, _ in imported} == set(PACKAGES)
     wrong = {
         (room, other)
-        for room, others in found.items()
+        for room, others in imported.items()
         for other in others
         if other[0] not in BELOW[room[0]] | {room[0]}
     }
@@ -78,17 +78,17 @@ def test_packages_import_what_is_below_them_alone():
 
 
 def test_no_room_needs_one_that_needs_it():
-    found = arrows(*PACKAGES)
-    assert ("envs", "simulators") in found["envs", "trials"]
-    assert circles(found) == set()
+    imported = arrows(*PACKAGES)
+    assert ("envs", "simulators") in imported["envs", "trials"]
+    assert circles(imported) == set()
 
 
 def test_nor_does_one_of_the_planner():
-    found = {
+    imported = {
         room: others for room, others in arrows("mechsearch_jax").items() if room[1] not in ("__init__", "commands")
     }
-    assert ("mechsearch_jax", "belief") in found["mechsearch_jax", "planner"]
-    assert circles(found) == set()
+    assert ("mechsearch_jax", "belief") in imported["mechsearch_jax", "planner"]
+    assert circles(imported) == set()
 
 
 def test_the_planner_knows_neither_simulators_nor_benchmarks():

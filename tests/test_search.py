@@ -156,7 +156,7 @@ def test_an_image_without_any_depth_is_refused_and_nothing_is_forgotten(problem)
     assert searcher.belief is before
 
 
-def test_where_all_that_was_tried_out_does_harm_it_says_so_and_draws_others_when_asked_again(problem):
+def test_where_all_that_was_tried_out_does_harm_it_says_so_and_the_next_call_draws_others(problem):
     drawn = []
 
     def harmed(key, problem, belief, observation):
@@ -244,7 +244,7 @@ def test_after_all_actions_only_the_target_is_taken_out(problem):
     assert searcher._within_limit(take) == take
 
 
-def test_a_step_is_told_as_json(problem):
+def test_a_step_is_written_as_json(problem):
     step = searcher_of(problem, OPEN).next(IMAGES.depth, IMAGES.colour)
     values = json.loads(json.dumps(step.to_json(), allow_nan=False))
     assert (values["kind"], values["found"], values["warnings"]) == ("retrieve", True, [])
@@ -349,7 +349,7 @@ def test_after_warming_up_nothing_is_compiled(problem, rehearsal, monkeypatch):
 
 
 @pytest.mark.slow
-def test_an_impasse_is_told_from_another(problem):
+def test_impasses_have_reasons_of_their_own(problem):
     belief = initial_belief(problem)
     objects = seen(HIDDEN).objects
     far = objects.replace(position=objects.position.at[:, 0].add(1.0))
@@ -429,7 +429,7 @@ def test_the_example_images_fit_their_camera():
         (dataclasses.replace(CAMERA, fx=6000.0, fy=6000.0), "% of the board only"),
     ],
 )
-def test_a_wrong_camera_is_told(camera, words):
+def test_a_wrong_camera_is_reported(camera, words):
     (fault,) = camera_faults(camera, SHELF)
     assert words in fault
 
@@ -442,7 +442,7 @@ def test_a_wrong_camera_is_told(camera, words):
         (moved(CAMERA, (0.0, 0.0, 0.12)), "shows no board"),
     ],
 )
-def test_a_board_elsewhere_is_told(camera, words):
+def test_a_board_elsewhere_is_reported(camera, words):
     (fault,) = image_faults(camera, SHELF, IMAGES.depth)
     assert words in fault
 
@@ -451,7 +451,7 @@ def test_a_board_5_mm_off_is_not():
     assert image_faults(moved(CAMERA, (0.0, 0.0, 0.005)), SHELF, IMAGES.depth) == ()
 
 
-def test_images_that_show_nothing_are_told():
+def test_images_that_show_nothing_are_reported():
     (fault,) = image_faults(CAMERA, SHELF, np.zeros_like(IMAGES.depth))
     assert "nothing was measured" in fault
     (fault,) = image_faults(CAMERA, SHELF, IMAGES.depth, np.full_like(IMAGES.mask, -1))

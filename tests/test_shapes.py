@@ -149,7 +149,7 @@ def test_codes_number_the_shapes_from_0_and_names_find_them():
 
 
 @pytest.mark.parametrize("library", [np, jnp])
-def test_each_body_is_told_of_its_own_shape(library):
+def test_each_body_has_its_own_shape(library):
     kind = library.asarray([[1, 0], [0, 1]])
     values = by_shape(kind[..., None], lambda shape: library.asarray([shape.code, shape.density]), library)
     expected = [[[shape.code, shape.density] for shape in row] for row in ([*reversed(in_order())], in_order())]
@@ -378,13 +378,13 @@ def test_a_new_shape_is_read_seen_and_recognised_for_what_it_is(ball):
 def test_a_new_shape_is_simulated(ball):
     scenario = balls()
     compiled = model.compile_model(Shelf(), Camera())
-    mine = model.with_bodies(compiled, world.slots(scenario))
-    assert mine.body("body0").mass[0] == pytest.approx(4 / 3 * math.pi * 0.05**3 * ball.density)
+    expected = model.with_bodies(compiled, world.slots(scenario))
+    assert expected.body("body0").mass[0] == pytest.approx(4 / 3 * math.pi * 0.05**3 * ball.density)
     there = jax.tree.map(lambda leaf: leaf[None], world.from_scenario(scenario))
     fields = body_fields(compiled, there.kind, there.half_size, there.valid, cells_of(compiled, [ASSUMED_CELL]))
     for name in BodyFields.__dataclass_fields__:
         value = np.asarray(getattr(fields, name)[0])
-        np.testing.assert_allclose(value, getattr(mine, name).reshape(value.shape), 2e-6, err_msg=name)
+        np.testing.assert_allclose(value, getattr(expected, name).reshape(value.shape), 2e-6, err_msg=name)
     simulator = NativeWorld()
     before = simulator.reset(scenario)
     outcome = simulator.settle()

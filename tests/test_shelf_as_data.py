@@ -242,10 +242,10 @@ def test_images_are_recognised_by_one_program_for_both(two):
 
 
 def test_bodies_of_trials_are_compiled_once_for_both_shelves():
-    pose, found = jnp.zeros(3), jnp.array(True)
-    worlds = [native._world(TARGET, shelf, OBJECTS, pose, found) for shelf in (SHELF, SHELF)]
+    pose, is_found = jnp.zeros(3), jnp.array(True)
+    worlds = [native._world(TARGET, shelf, OBJECTS, pose, is_found) for shelf in (SHELF, SHELF)]
     size = cache_size(native._world)
-    worlds.append(native._world(TARGET, MOVED, OBJECTS, pose, found))
+    worlds.append(native._world(TARGET, MOVED, OBJECTS, pose, is_found))
     assert cache_size(native._world) == size
     heights = [float(world.position[-1, 2]) for world in worlds]
     assert heights[0] == heights[1]

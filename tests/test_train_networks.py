@@ -90,7 +90,7 @@ def test_the_strongest_neighbour_and_its_gradient_are_those_of_plain_differentia
     features = jax.random.normal(keys[0], (30, 8))
     offsets = jax.random.normal(keys[1], (30, count, 3))
     place = jax.random.normal(keys[2], (3, 8))
-    # Some points are the neighbour of many, others of none; one is a neighbour twice.
+    # A point may be the neighbour of many, or of none; one is a neighbour twice.
     neighbours = jax.random.randint(keys[3], (30, count), 0, 11)
     weight = jax.random.normal(keys[4], (30, 8))
 
@@ -262,7 +262,7 @@ def test_edges_tell_what_ends_from_what_is_hidden():
 
 
 @functools.cache
-def some_segments():
+def drawn_segments():
     task = recognition.RecognitionTask(network=RECOGNITION, precision=jnp.float32)
     keys = jax.random.split(jax.random.key(5), 3)
     return task, jax.jit(jax.vmap(task.scene))(keys)
@@ -270,7 +270,7 @@ def some_segments():
 
 @pytest.mark.slow
 def test_segments_hold_their_own_points_in_their_frame():
-    task, (_, seen, examples) = some_segments()
+    task, (_, seen, examples) = drawn_segments()
     one = jax.tree.map(lambda a: np.asarray(a[0]), examples.segments)
     labels, points = np.asarray(seen.labels[0]), np.asarray(seen.points[0], float)
     clouds_of = jax.jit(segment_clouds, static_argnums=1)
@@ -281,11 +281,11 @@ def test_segments_hold_their_own_points_in_their_frame():
         own = points[labels == slot]
         local = (own - np.asarray(origin)) @ turn
         mark = np.asarray(segments.mark[slot])
-        mine = np.isin(mark, (INNER, OUTLINE, HIDDEN_EDGE))
+        of_segment = np.isin(mark, (INNER, OUTLINE, HIDDEN_EDGE))
         assert segments.pixels[slot] == len(own)
-        distance = np.abs(np.asarray(segments.points[slot])[mine][:, None] - local[None]).max(axis=-1).min(axis=1)
+        distance = np.abs(np.asarray(segments.points[slot])[of_segment][:, None] - local[None]).max(axis=-1).min(axis=1)
         assert distance.max() < 1e-5
-        assert mine.sum() >= task.segments.inner + task.segments.edge
+        assert of_segment.sum() >= task.segments.inner + task.segments.edge
         assert origin[2] == pytest.approx(Shelf().board)
         eye = (np.asarray(task.view.camera.position) - np.asarray(origin)) @ turn
         assert np.allclose(segments.camera[slot], eye, atol=1e-5)
@@ -300,7 +300,7 @@ def test_segments_hold_their_own_points_in_their_frame():
 
 @pytest.mark.slow
 def test_recognition_does_not_mind_the_order_of_the_points():
-    task, (_, _, examples) = some_segments()
+    task, (_, _, examples) = drawn_segments()
     segments = jax.tree.map(lambda a: a[0], examples.segments)
     order = jax.random.permutation(jax.random.key(0), task.segments.points)
     network = jax.jit(functools.partial(model.apply_network, model.RecognitionNetwork(RECOGNITION)))
@@ -424,7 +424,7 @@ def test_the_loss_is_equation_7_and_vanishes_at_the_truth(kind):
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(slope))
 
 
-def test_height_is_told_relative_to_a_body_at_rest():
+def test_height_is_relative_to_a_body_at_rest():
     zero = jnp.zeros((1, HYPOTHESES, model.OUTPUTS + model.UNCERTAIN))
     decoded = jax.jit(model.decode)(zero, zero[..., 0])
     down = np.abs(np.asarray(decoded.rotation[0])[:, 2])

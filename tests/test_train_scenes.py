@@ -67,7 +67,7 @@ def test_other_pixels_show_no_object():
     for scene in range(COUNT):
         points = seen.points[scene][seen.labels[scene] == FREE]
         for slot in np.flatnonzero(world.valid[scene, :TARGET]):
-            # All but the lowest 4 mm of an object are told apart from the shelf.
+            # All but the lowest 4 mm of an object are distinguished from the shelf.
             above = points[points[:, 2] > SHELF.board + 5e-3]
             assert (signed_gap(world, scene, slot, above) > -2e-5).all()
         assert np.isnan(seen.points[scene][seen.labels[scene] == MISSING]).all()

@@ -182,11 +182,11 @@ def test_a_target_that_is_taken_out_is_drawn_in_front_of_the_shelf(target):
 
 
 def test_a_hidden_target_is_outlined_in_the_view_and_a_found_one_is_seen():
-    hidden, found = (filmed(frame(Target.cylinder(), found=f)).axes[0] for f in (False, True))
+    hidden, in_sight = (filmed(frame(Target.cylinder(), found=f)).axes[0] for f in (False, True))
     (outline,) = ghosts(hidden, drawing.TARGET)
     middle = np.asarray(project(CAMERA, jnp.array([0.7, 0.1, SHELF.board + 0.05]))[0])[::-1]
     np.testing.assert_allclose((outline.min(axis=0) + outline.max(axis=0)) / 2, middle, atol=3)
-    assert ghosts(found, drawing.TARGET) == []
+    assert ghosts(in_sight, drawing.TARGET) == []
 
 
 def test_the_view_is_cut_to_what_stands_there():
@@ -274,12 +274,12 @@ def test_a_push_points_where_the_gripper_goes():
 
 
 def test_objects_and_target_are_outlined():
-    hidden, found = (filmed(frame(Target.cylinder(), found=f, **shown(no_action()))).axes[1] for f in (False, True))
+    hidden, in_sight = (filmed(frame(Target.cylinder(), found=f, **shown(no_action()))).axes[1] for f in (False, True))
     assert sum(isinstance(p, Polygon) for p in hidden.patches) == 3
     circle = next(p for p in hidden.patches if isinstance(p, Circle))
     assert circle.center == (pytest.approx(0.1), pytest.approx(0.7))
     assert circle.get_facecolor()[3] == 0
-    assert next(p for p in found.patches if isinstance(p, Circle)).get_facecolor()[3] == 1
+    assert next(p for p in in_sight.patches if isinstance(p, Circle)).get_facecolor()[3] == 1
 
 
 def test_a_long_episode_is_broken_into_lines(tmp_path):

@@ -63,12 +63,12 @@ def _figures(
     lines: Mapping[tuple[str, str, tuple[str, ...]], tuple[tuple[float | None, ...], tuple[float | None, ...]]],
 ) -> dict[PaperCell, Figures]:
     """Figures from lines as the paper prints them: shares, then steps, find and grasp in turn by number of objects."""
-    found = {}
+    figures = {}
     for (letter, method, actions), (shares, steps) in lines.items():
         for i, count in enumerate(objects):
             pair = slice(2 * i, 2 * i + 2)
-            found[PaperCell(letter, method, actions, count)] = Figures(*shares[pair], *steps[pair])
-    return found
+            figures[PaperCell(letter, method, actions, count)] = Figures(*shares[pair], *steps[pair])
+    return figures
 
 
 _AND, _FOR = METHODS

@@ -114,8 +114,8 @@ def shard_of(jobs: Sequence[AnyJob], shard: int, shards: int) -> list[AnyJob]:
     """
     if not 1 <= shard <= shards:
         raise InputError(f"shard {shard}/{shards}: give K/N with K from 1 to N")
-    mine = set(sorted({job.key for job in jobs})[shard - 1 :: shards])
-    return [job for job in jobs if job.key in mine]
+    of_shard = set(sorted({job.key for job in jobs})[shard - 1 :: shards])
+    return [job for job in jobs if job.key in of_shard]
 
 
 @functools.cache

@@ -88,16 +88,16 @@ def episode_answer(path, method, recognition, rehearsal):
     return {name: value[name] for name in names} | {"rehearsal": episode.config["rehearsal"]}
 
 
-def some_episodes(share):
+def answers_of(share):
     from mechsearch_jax.problem.cache import keep_compilations
 
     keep_compilations()
-    found = {}
+    answers = {}
     for path, method, recognition, rehearsal in share:
         name = f"{Path(path).stem} {method} {recognition}, rehearsal {rehearsal}"
-        found[name] = episode_answer(path, method, recognition, rehearsal)
+        answers[name] = episode_answer(path, method, recognition, rehearsal)
         print(".", end="", flush=True)
-    return found
+    return answers
 
 
 def episode_jobs():
@@ -108,13 +108,13 @@ def episode_jobs():
 
 def episodes():
     """By scenario, method, recognition and rehearsal; in two processes."""
-    jobs, found = episode_jobs(), {}
+    jobs, answers = episode_jobs(), {}
     with concurrent.futures.ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
         # Half of the recognitions' jobs each: the one's episodes with masks take as long as the other's.
-        for part in pool.map(some_episodes, (jobs[0::2], jobs[1::2])):
-            found |= part
+        for part in pool.map(answers_of, (jobs[0::2], jobs[1::2])):
+            answers |= part
     print()
-    return dict(sorted(found.items()))
+    return dict(sorted(answers.items()))
 
 
 def chosen_actions():
@@ -133,15 +133,15 @@ def chosen_actions():
     decision = planner.search_for_grasp()(jax.random.key(0), problem, belief, observation)
     firsts = jax.tree.map(lambda a: a[:, 0], decision.sequences.actions)
     kinds = np.asarray(firsts.kind)
-    found = [no_action()]
+    actions = [no_action()]
     for kind in (ActionKind.PUSH, ActionKind.PICK_AND_PLACE):
         first = int(np.flatnonzero(kinds == kind)[0])
-        found.append(jax.tree.map(lambda a, i=first: a[i], firsts))
+        actions.append(jax.tree.map(lambda a, i=first: a[i], firsts))
     clear = objects.replace(valid=jnp.zeros_like(objects.valid))
     x, y, _ = scenario.target.position
-    found.append(best_grasp(problem.target_grasps, clear, jnp.float32([x, y, 0.0])).action)
+    actions.append(best_grasp(problem.target_grasps, clear, jnp.float32([x, y, 0.0])).action)
     return {
-        name: np.stack([np.asarray(getattr(action, name)) for action in found])
+        name: np.stack([np.asarray(getattr(action, name)) for action in actions])
         for name in ("T_world_gripper", "displacement", "T_world_place", "q7", "opening", "object")
     }
 
@@ -166,9 +166,9 @@ def simulator(kept):
         )
     )
     names = ("failure", "steps", "settled", "fallen", "held", "outside", "retrieved", "overflow")
-    told = {name: np.asarray(getattr(outcome, name)) for name in names}
+    results = {name: np.asarray(getattr(outcome, name)) for name in names}
     world = simulator.world
-    return {**actions, **told, "position": np.asarray(world.position), "rotation": np.asarray(world.rotation)}
+    return {**actions, **results, "position": np.asarray(world.position), "rotation": np.asarray(world.rotation)}
 
 
 def maps(kept):
@@ -177,13 +177,13 @@ def maps(kept):
     from mechsearch_jax.problem.cache import cached_problem
     from mechsearch_jax.workspace.scenario import load_scenario
 
-    found = {}
+    answers = {}
     for file in scenario_files():
         scenario = load_scenario(file)
-        told, _ = inspect_scenario(scenario, cached_problem(target_of(scenario)))
-        found[f"{file.stem} existence"] = np.asarray(told.existence)
-        found[f"{file.stem} graspability"] = np.asarray(told.graspability)
-    return found
+        maps, _ = inspect_scenario(scenario, cached_problem(target_of(scenario)))
+        answers[f"{file.stem} existence"] = np.asarray(maps.existence)
+        answers[f"{file.stem} graspability"] = np.asarray(maps.graspability)
+    return answers
 
 
 def shapes(kept):
@@ -194,7 +194,7 @@ def shapes(kept):
     from mechsearch_jax.problem.cache import cached_problem
     from mechsearch_jax.workspace.scenario import load_scenario
 
-    found = {}
+    answers = {}
     for file in scenario_files():
         scenario = load_scenario(file)
         problem = cached_problem(target_of(scenario))
@@ -202,10 +202,10 @@ def shapes(kept):
             see = recogniser(recognition, target_of(scenario))
             seen = see(jax.random.key(0), Snapshot(problem.camera, problem.shelf, from_scenario(scenario)))
             for name in ("size", "exponents", "position", "rotation", "valid"):
-                found[f"{file.stem} {recognition} {name}"] = np.asarray(getattr(seen.objects, name))
-            found[f"{file.stem} {recognition} found"] = np.asarray(seen.target_visible)
-            found[f"{file.stem} {recognition} target_pose"] = np.asarray(seen.target_pose)
-    return found
+                answers[f"{file.stem} {recognition} {name}"] = np.asarray(getattr(seen.objects, name))
+            answers[f"{file.stem} {recognition} found"] = np.asarray(seen.target_visible)
+            answers[f"{file.stem} {recognition} target_pose"] = np.asarray(seen.target_pose)
+    return answers
 
 
 def made_up_pushes():
@@ -249,14 +249,14 @@ def losses(kept):
         "recognition": RecognitionTask(network=RecognitionConfig(width=32, layers=1, heads=2)),
         "push": PushTask(pushes, pushes, network=PushConfig(width=16, layers=2)),
     }
-    found = {}
+    answers = {}
     for name, task in tasks.items():
         parameters = jax.jit(task.init)(jax.random.key(1))
         examples = jax.jit(task.sample, static_argnums=1)(jax.random.key(2), 2)
         loss, terms = jax.jit(task.loss)(parameters, examples)
-        found[f"{name} loss"] = np.asarray(loss)
-        found |= {f"{name} {term}": np.asarray(value) for term, value in terms.items()}
-    return found
+        answers[f"{name} loss"] = np.asarray(loss)
+        answers |= {f"{name} {term}": np.asarray(value) for term, value in terms.items()}
+    return answers
 
 
 def weights(kept):
@@ -347,7 +347,7 @@ def main():
     from mechsearch_jax.problem.cache import keep_compilations
 
     keep_compilations()
-    found = 0
+    differing = 0
     for part in options.only:
         kept = load(part) if place(part).exists() else {}
         # What is not there is not compared: the published scenes, in a checkout alone.
@@ -359,10 +359,10 @@ def main():
         if not PUBLISHED.is_dir():
             kept = {name: value for name, value in kept.items() if not name.startswith("objects_")}
         lines = sorted(differences(kept, now, part))
-        found += len(lines)
+        differing += len(lines)
         print(f"{part}: {len(kept)} answers, {len(lines)} differences")
         print("".join(f"  {line}\n" for line in lines[:20]), end="")
-    sys.exit(1 if found else 0)
+    sys.exit(1 if differing else 0)
 
 
 if __name__ == "__main__":
