@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from mechsearch_jax.benchmarks.parts import push, scenes, segmentation
+from mechsearch_jax.benchmarks.parts import push, reach, scenes, segmentation
 from mechsearch_jax.benchmarks.parts.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.parts.bench import Timing
 from mechsearch_jax.benchmarks.parts.recognition import SHARES, Measured
@@ -226,6 +226,23 @@ def scenes_table(rows: Sequence[scenes.Row]) -> Group:
         if "exact_scenes" in line
     ]
     return Group(table, Text(explanation, style="dim"), *map(Text, beside_exact))
+
+
+def reach_table(rows: Sequence[reach.Row]) -> Group:
+    """Where a target alone on the shelf can be grasped: a row for each band across it."""
+    table = plain_table("grasps of a target alone on the shelf, from its right wall to its left one")
+    for name in ("y [m]", "poses", "graspable", "hand", "reached", "feasible", "approaches"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for line in reach.bands(rows):
+        low, high = line["y"]
+        counts = (f"{line[name]:.1f}" for name in ("hand", "reached", "feasible", "approaches"))
+        table.add_row(f"{low:.3f} to {high:.3f}", str(line["poses"]), f"{line['graspable']:.2f}", *counts)
+    explanation = (
+        "graspable: share of the poses with a feasible grasp. The rest are means over poses. hand: grasps at which "
+        "gripper and target clear the shelf. reached: of these, those that the arm can follow. feasible: of these, "
+        "those at which its links clear the shelf. approaches: different directions among the feasible ones."
+    )
+    return Group(table, Text(explanation, style="dim"))
 
 
 def scene_sets_table() -> Table:

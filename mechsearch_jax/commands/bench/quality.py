@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import tyro
 
 from mechsearch_jax.commands.options import (
+    DEFAULTS,
+    EpisodeOptions,
     JsonFile,
     Scenarios,
     SomeScenarios,
@@ -346,8 +348,41 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     console.print(scenes_table(rows))
 
 
+def bench_reach(
+    *,
+    grasps: Literal["candidates", "found"] = "candidates",
+    out: JsonFile = None,
+    options: EpisodeOptions = DEFAULTS,
+) -> None:
+    """Tell where a target that stands alone on the shelf can be grasped, and what rules its grasps out elsewhere.
+
+    Args:
+      grasps: those of g at candidate poses, or the denser ones of a found target.
+      out: JSON file for the means across the shelf and for every candidate pose's row.
+      options: of shelf, gripper, target and grasps; the others do not matter here.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.parts.reach import reach, save_reach
+    from mechsearch_jax.benchmarks.report.console_tables import reach_table
+    from mechsearch_jax.problem.cache import keep_compilations
+
+    settings = options.settings()
+    check_files(out)
+    keep_compilations()
+    problem = settings.config.problem
+    chosen = problem.grasps if grasps == "candidates" else problem.retrieval
+    console = Console(highlight=False)
+    with console.status("reaching"):
+        rows = reach(settings.workcell, chosen)
+    if out is not None:
+        save_reach(rows, chosen, out)
+    console.print(reach_table(rows))
+
+
 COMMANDS = {
     "scenes": bench_scenes,
+    "reach": bench_reach,
     "agreement": bench_agreement,
     "recognition": bench_recognition,
     "segmentation": bench_segmentation,
