@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from mechsearch_jax.benchmarks.parts.reach import bands, reach, save_reach
+from mechsearch_jax.benchmarks.reach.reach import bands, reach, save_reach
 from mechsearch_jax.benchmarks.report.console_tables import reach_table
 from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.graspability import GraspConfig, feasible_grasps, grasp_tables
@@ -34,7 +34,7 @@ def test_the_feasible_grasps_are_those_of_g(rows):
     assert [row.feasible for row in rows] == np.asarray(feasible).sum(axis=1).tolist()
     np.testing.assert_allclose([[row.x, row.y, row.yaw] for row in rows], poses, atol=1e-4)
     assert all(row.hand >= row.reached >= row.feasible >= row.approaches for row in rows)
-    assert sum(row.feasible for row in rows) > len(rows)
+    assert 0 < sum(row.feasible > 0 for row in rows) < len(rows)
 
 
 def test_a_wall_takes_approaches_that_a_wider_shelf_leaves(rows):

@@ -363,7 +363,7 @@ def bench_reach(
     """
     from rich.console import Console
 
-    from mechsearch_jax.benchmarks.parts.reach import reach, save_reach
+    from mechsearch_jax.benchmarks.reach.reach import reach, save_reach
     from mechsearch_jax.benchmarks.report.console_tables import reach_table
     from mechsearch_jax.problem.cache import keep_compilations
 
