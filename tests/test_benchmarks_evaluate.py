@@ -320,8 +320,10 @@ def test_workers_that_cannot_be_started_end_the_run(tmp_path, files, monkeypatch
 @pytest.mark.parametrize("how", ["an interrupt", "a kill"])
 def test_workers_end_with_the_run_whatever_they_are_doing(tmp_path, files, how):
     save_scenario(Scenario("hang", (), TARGET), tmp_path / "hang.json")
+    # Whoever starts the tests in the background has interrupts ignored, also by what they start.
     program = (
-        "import sys; from scripted import run; from mechsearch_jax.benchmarks.running.evaluate import *; "
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from scripted import run; from mechsearch_jax.benchmarks.running.evaluate import *; "
         "from mechsearch_jax.benchmarks.running.processes import Processes; "
         "evaluate(make_jobs([sys.argv[1]], [Method()], (0,)), sys.argv[2], Processes(1, run=run))"
     )

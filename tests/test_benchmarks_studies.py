@@ -23,13 +23,13 @@ STUDY = Study("gamma", "Does it matter?", "development", (Variant("0.9"), Varian
 
 def rows_of(variant, share, seed=0, engine="MjxSimulator", scenes=25, first=0):
     """Rows of a variant on scenes of `development`, of which a share is retrieved."""
-    draw = random.Random(first)
+    draw, method = random.Random(first), variant.method()
     rows = []
     for i in range(scenes):
         for count in (2, 8):
             reached = draw.random() < share
             fields = {"retrieved": reached, "steps": 3 if reached else 10}
-            rows.append(row_of(f"development-{count}-{i:03d}", variant.method(), seed, **fields))
+            rows.append(row_of(f"development-{count}-{i:03d}", method, seed, **fields))
     return [
         dataclasses.replace(row, configuration=row.configuration.replace('"NativeSimulator"', f'"{engine}"'))
         for row in rows
