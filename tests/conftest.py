@@ -47,6 +47,7 @@ GROUPS = {
         "test_planner",
         "test_envs_default_episode",
         "test_planner_moved_target",
+        "test_dynamics_actions",
         "test_envs_episode",
         "test_envs_batch_episode",
         "test_envs_protocols",
@@ -63,7 +64,6 @@ LONG_FIRST = (
     *GROUPS["pushing"],
     "test_networks_push",
     *GROUPS["recognising"],
-    "test_dynamics_actions",
     "test_train_networks",
     "test_envs_mjx_simulator",
     "test_perception_refinement",
@@ -73,6 +73,17 @@ LONG_FIRST = (
 
 # What was traced is gone afterwards.
 LAST = ("test_program_budget",)
+
+# Where programs run for longer than it takes to make them fast. All others are compiled with no optimisation at all: in
+# half the time, to run for three times as long.
+OFTEN_RUN = {
+    *("test_planner", "test_planner_cache", "test_planner_lost_target", "test_planner_unseen_motion"),
+    *("test_envs_default_episode", "test_envs_episode", "test_envs_protocols", "test_envs_verdicts"),
+    *("test_envs_generator", "test_envs_scene_sets", "test_envs_mjx_simulator", "test_envs_simulator"),
+    *("test_envs_trials", "test_envs_trials_processes", "test_existence", "test_shelf_as_data"),
+    *("test_perception_real_camera", "test_perception_recogniser", "test_perception_target_pixels"),
+    *("test_search", "test_search_whole_trajectory"),
+}
 
 # What is traced stays, and there is much of it: Python looks through all of it for cycles, again and again.
 gc.set_threshold(50_000, 20, 100)
@@ -153,9 +164,19 @@ def pytest_collection_modifyitems(config, items):
 @pytest.fixture(scope="session")
 def problem():
     """The default problem: the paper's shelf, camera and gripper, and the cylinder as the target."""
-    from mechsearch_jax.planner import build_problem
+    from mechsearch_jax.problem.cache import VARIABLE, cached_problem
 
-    return build_problem()
+    # It is built once for all processes.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(VARIABLE, CACHE)
+        return cached_problem()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compile_as_it_pays(request):
+    """Compile without optimisation where programs hardly run."""
+    if os.environ["XLA_FLAGS"] == QUICK:
+        jax.config.update("jax_disable_most_optimizations", request.path.stem not in OFTEN_RUN)
 
 
 @pytest.fixture(scope="module", autouse=True)
