@@ -1,6 +1,7 @@
 """The planner: equation 2, decisions that repeat, no retracing, and the rules of the two methods."""
 
 import dataclasses
+import functools
 import json
 
 import jax
@@ -66,7 +67,8 @@ def root(decision, problem):
     """The first state of the decision, brought up to date, with what can be done in it."""
     objects, belief, _ = decision
 
-    @jax.jit
+    # It runs once.
+    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
     def begin(problem, belief, objects):
         rollout = rollout_of(problem, belief)
         state = rollout.root(objects)

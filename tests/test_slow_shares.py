@@ -104,8 +104,8 @@ def test_a_part_that_there_is_none_of_is_refused(wrong):
         conftest.share_of(wrong)
 
 
-def test_what_takes_longest_comes_first_and_what_drops_what_was_traced_last():
-    names = ("test_program_budget", "test_viz", "test_readme", "test_planner")
+def test_what_drops_what_was_traced_comes_first_and_then_what_takes_longest():
+    names = ("test_viz", "test_readme", "test_planner", "test_program_budget")
     items = [Item(f"tests/{name}.py::test", False) for name in names]
     conftest.pytest_collection_modifyitems(Config(None), items)
     assert [item.path for item in items] == [f"tests/{name}.py" for name in reversed(names)]
