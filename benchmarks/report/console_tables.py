@@ -10,10 +10,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from mechsearch_jax.benchmarks.parts import push, reach, scenes, segmentation
+from mechsearch_jax.benchmarks.parts import push, scenes, segmentation
 from mechsearch_jax.benchmarks.parts.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.parts.bench import Timing
 from mechsearch_jax.benchmarks.parts.recognition import SHARES, Measured
+from mechsearch_jax.benchmarks.reach import reach
 from mechsearch_jax.benchmarks.running.evaluate import Tally
 from mechsearch_jax.benchmarks.store.rows import Row
 from mechsearch_jax.envs.scenes import scene_sets
