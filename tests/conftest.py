@@ -74,14 +74,6 @@ LONG_FIRST = (
 # What was traced is gone afterwards, and to forget it takes the longer the more it is.
 FIRST = ("test_program_budget",)
 
-# Where programs run so little that no optimisation at all is best: they are compiled in half the time, and run for
-# three times as long. Measured file by file. What other files run, too, must not be compiled in these: it would be slow
-# there, and no more the same to the bit as what is compiled elsewhere.
-SELDOM_RUN = {
-    *("test_actions_crossings", "test_dynamics_actions", "test_geometry_masked_collision", "test_networks_push"),
-    *("test_planner_moved_target", "test_robot_time_scaling", "test_train_networks"),
-}
-
 # What is traced stays, and there is much of it: Python looks through all of it for cycles, again and again.
 gc.set_threshold(50_000, 20, 100)
 
@@ -171,13 +163,6 @@ def problem():
         built = cached_problem()
     jax.config.update("jax_disable_most_optimizations", before)
     return built
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compile_as_it_pays(request):
-    """Compile without optimisation where programs run little."""
-    if os.environ["XLA_FLAGS"] == QUICK:
-        jax.config.update("jax_disable_most_optimizations", request.path.stem in SELDOM_RUN)
 
 
 @pytest.fixture(scope="module", autouse=True)
