@@ -103,9 +103,9 @@ _EXPERIMENTS = (
     *(
         SceneSet(f"shelf-{shelf}", about, _blocks(f"shelf-{shelf}", 50, (2, 4, 6, 8), first_seed, shelf=shelf))
         for shelf, about, first_seed in (
-            ("low", "on a lower and closer shelf", 140_000),
-            ("narrow", "on a higher and narrower shelf", 150_000),
-            ("wide", "on a deeper and wider shelf", 160_000),
+            ("low", "a lower, closer shelf", 140_000),
+            ("narrow", "a narrower shelf", 150_000),
+            ("wide", "a wider, deeper shelf", 160_000),
         )
     ),
 )
