@@ -109,7 +109,7 @@ def run_search(
         while len(actions) < max_motions and in_a_row < PATIENCE:
             look, pixels = cell.look(), cell.target_pixels()
             begin = time.perf_counter()
-            step = searcher.next(*look, joints=cell.joints)
+            step = searcher.next(*look, joints=cell.joints, width=cell.width)
             seconds.append(round(time.perf_counter() - begin, 3))
             on_step(step)
             warnings.update(step.warnings)

@@ -1,15 +1,16 @@
 """A simulated robot cell with the interface of a real one: a camera takes images, an arm follows trajectories.
 
     cell = SimulatedCell(workcell, scenario)
-    step = searcher.next(*cell.look(), joints=cell.joints)
+    step = searcher.next(*cell.look(), joints=cell.joints, width=cell.width)
     searcher.acted(ok=cell.follow(step.trajectory).ok)
 
 It replaces the real cell for a `Searcher`. Images come from MuJoCo's ray-casting of the simulated scene with the robot,
 through a pinhole model of this module: the package's own camera is not involved. The whole trajectory is simulated,
 including the motions through free space.
 
-Approximations: an arm that is held up follows its trajectory to the end and reports it afterwards. The grip force
-exceeds the trajectory's by the fingers' stiffness times half the object's width, up to 20 N.
+Approximations: an arm that is held up follows its trajectory to the end and reports it afterwards. The fingers follow
+the trajectory's width and force at once, whatever becomes of a grasp. The grip force exceeds the trajectory's by the
+fingers' stiffness times half of what the object is wider than it was recognised, or falls short of it.
 """
 
 # The bindings of MuJoCo come without type stubs.
@@ -157,6 +158,11 @@ class SimulatedCell:
         return self._world.positions[:ARM].copy()
 
     @property
+    def width(self) -> float:
+        """How far the fingers are apart [m]."""
+        return max(float(self._world.positions[ARM:ROBOT].sum()), 0.0)
+
+    @property
     def fallen(self) -> Bool[np.ndarray, " 9"]:
         """Whether each body has left the board, the target last."""
         return self._world.fallen
@@ -195,12 +201,16 @@ class SimulatedCell:
         timestep = float(trajectory.time[1] - trajectory.time[0])
         ahead = LAG * np.diff(trajectory.position, axis=0) / timestep
         rows = zip(trajectory.position[:-1] + ahead, trajectory.width[1:], trajectory.force[1:], strict=True)
-        controls = [self._control(position, width, force) for position, width, force in rows]
-        states = self._world.drive(np.array(controls))
-        error = float(np.abs(states[:, :ARM] - trajectory.position[1:]).max())
+        controls = np.array([self._control(position, width, force) for position, width, force in rows])
+        # A target that is put down is judged in the hand.
+        carried = len(controls) if trajectory.put_down is None else trajectory.put_down
+        states = self._world.drive(controls[:carried])
         takes = trajectory.action == "retrieve"
-        holds = bool(self._world.positions[ARM:ROBOT].sum() > HOLDING)
+        holds = self.width > HOLDING
         held, outside = self._world.holds_target if takes else (False, False)
+        if carried < len(controls):
+            states = np.concatenate([states, self._world.drive(controls[carried:])])
+        error = float(np.abs(states[:, :ARM] - trajectory.position[1:]).max())
         fallen = self.fallen & ~(held & (np.arange(BODIES) == TARGET))
         return Followed(
             ok=error <= trajectory.bounds.tracking and (holds or not takes),

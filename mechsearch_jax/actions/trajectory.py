@@ -2,37 +2,120 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple, Protocol
+
 import flax.struct
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
+from mechsearch_jax.geometry.transforms import upright_pose
+from mechsearch_jax.observation import Observation
+from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.robot.hand import (
+    Grip,
+    HandConfig,
+    HandEvent,
+    check_width,
+    grip_of,
+    grip_of_any_yaw,
+    grip_of_anything,
+)
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference
+from mechsearch_jax.robot.robot_trajectory import derivatives
 from mechsearch_jax.runtime.compiled import kept
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.target import Target
+
+
+class Setting(Protocol):
+    """What the motion of an action needs of a problem; `Problem` fulfils it."""
+
+    @property
+    def shelf(self) -> Shelf: ...
+    @property
+    def gripper(self) -> Gripper: ...
+    @property
+    def target(self) -> Target: ...
 
 
 class JointTrajectory(flax.struct.PyTreeNode):
     """The motion of the arm and the fingers, one row for each time step.
 
     It begins and ends outside the shelf. The caller plans the motion between there and the home configuration, in front
-    of the shelf. A width of 0 with an object between the fingers means grip.
+    of the shelf.
 
     Attributes:
       time: time since the motion began [s], shape (T,).
       position: joint angles [rad], shape (T, 7).
       velocity: joint velocities [rad/s], shape (T, 7).
-      gripper: distance between the fingers [m], shape (T,).
+      gripper: distance between the fingers [m], shape (T,), as a hand that executes the events has it.
+      events: what the hand does, in order; the arm stands still meanwhile. Static.
     """
 
     time: jax.Array
     position: jax.Array
     velocity: jax.Array
     gripper: jax.Array
+    events: tuple[HandEvent, ...] = flax.struct.field(pytree_node=False, default=())
+
+
+class Grasped(NamedTuple):
+    """What an action grasps.
+
+    Attributes:
+      T_world_object: its pose before the action.
+      size: half-extents [m].
+      exponents: (e1, e2).
+      seen: False for a target that is not visible, which is assumed between the fingers, with arbitrary yaw.
+    """
+
+    T_world_object: Float[np.ndarray, "4 4"]
+    size: tuple[float, float, float]
+    exponents: tuple[float, float]
+    seen: bool
+
+
+def grasped(problem: Setting, observation: Observation, action: Action) -> Grasped:
+    """The object, or the target, that an action grasps; an object's index beyond the slots stands for the target."""
+    kind, scene, i = kind_of(int(action.kind)), observation.objects, int(action.object)
+    if kind.holds_object and i < scene.capacity:
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = np.asarray(scene.rotation[i]), np.asarray(scene.position[i])
+        x, y, z = np.asarray(scene.size[i], float).tolist()
+        e1, e2 = np.asarray(scene.exponents[i], float).tolist()
+        return Grasped(T, (x, y, z), (e1, e2), True)
+    T, seen = target_pose(problem, observation), bool(observation.target_visible)
+    if not seen:
+        T[:3, 3] = np.asarray(action.T_world_gripper, float)[:3, 3]
+    return Grasped(T, problem.target.half_size, problem.target.exponents, seen)
+
+
+def target_pose(problem: Setting, observation: Observation) -> Float[np.ndarray, "4 4"]:
+    """`T_world_target` as observed; arbitrary if the target is not visible."""
+    pose = jnp.asarray(observation.target_pose, jnp.float32)
+    return np.array(upright_pose(pose, problem.target.height(problem.shelf)), float)
+
+
+def grip_for(problem: Setting, observation: Observation | None, action: Action) -> Grip:
+    """How wide what an action grasps is between the fingers; of anything without an observation."""
+    opening = float(action.opening)
+    kind = kind_of(int(action.kind))
+    if observation is None or not (kind.holds_object or kind.takes_target):
+        return grip_of_anything(opening)
+    what = grasped(problem, observation, action)
+    closing = np.asarray(action.T_world_gripper, float)[:3, 1]
+    if what.seen:
+        return grip_of(closing, what.T_world_object[:3, :3], np.array(what.size), np.array(what.exponents), opening)
+    x, y, _ = what.size
+    return grip_of_any_yaw((x, y, 0.0), opening)
 
 
 @kept(static_argnames=("kind", "config"), on_host=True)
@@ -49,8 +132,18 @@ def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[
     return kind.reference(action, config)
 
 
-def joint_trajectory(problem, action: Action, config: MotionConfig | None = None) -> JointTrajectory:
+def joint_trajectory(
+    problem: Setting,
+    action: Action,
+    observation: Observation | None = None,
+    config: MotionConfig | None = None,
+    *,
+    width: float | None = None,
+    hand: HandConfig | None = None,
+) -> JointTrajectory:
     """The joint trajectory of a decision's action: a push, a pick-and-place or a retrieval.
+
+    The arm waits while the hand moves, at first for its opening from `width` to what the action begins with.
 
     Not for use inside `jit`: its length depends on the action. For the action that does nothing it is a single row, the
     home configuration.
@@ -58,24 +151,37 @@ def joint_trajectory(problem, action: Action, config: MotionConfig | None = None
     Args:
       problem: the problem, with the gripper.
       action: a single action.
+      observation: that the action was decided on, which says how wide what it grasps is; without it, the grasp takes
+        whatever is between the fingers.
       config: lengths and durations; default: the problem's gripper and default durations.
+      width: present distance between the fingers [m]; open if left out.
+      hand: how the real hand is used; the default if None.
 
     Raises:
-      InputError: the kind of action is unknown, or the arm does not reach all of the motion, or not in time.
+      InputError: the kind of action is unknown, the width is impossible, or the arm does not reach all of the motion,
+        or not in time.
     """
-    config = config or MotionConfig(gripper=problem.gripper)
+    config, hand = config or MotionConfig(gripper=problem.gripper), hand or HandConfig()
+    width = problem.gripper.max_opening if width is None else float(width)
+    check_width(width, problem.gripper.max_opening)
     kind = kind_of(int(action.kind))
     motion = reference_motion(kind, action, config)
     if motion is None:
         still = jnp.float32(HOME)[None]
-        return JointTrajectory(jnp.zeros(1), still, jnp.zeros_like(still), jnp.zeros(1))
+        return JointTrajectory(jnp.zeros(1), still, jnp.zeros_like(still), jnp.full(1, width))
     reference, reachable = motion
     if not reachable:
         raise InputError(f"{kind.name}: the arm does not reach all of this motion; decide anew")
-    steps = int(reference.length)
+    reference = jax.device_get(reference)
+    start = np.asarray(reference.start, float)
+    first = opening_to(start[:7], width, 2.0 * max(float(start[7]), 0.0), hand, config.timestep)
+    parts: list[Rows] = [first, acting(reference, grip_for(problem, observation, action), config, hand)]
+    rows = joined(parts, config.timestep)
+    velocity, _ = derivatives(np.concatenate([start[None, :7], rows.position]), config.timestep)
     return JointTrajectory(
-        time=(jnp.arange(steps) + 1.0) * config.timestep,
-        position=reference.q[:steps],
-        velocity=reference.velocity[:steps],
-        gripper=2.0 * jnp.maximum(reference.fingers[:steps], 0.0),
+        time=(jnp.arange(len(rows.width)) + 1.0) * config.timestep,
+        position=jnp.asarray(rows.position, jnp.float32),
+        velocity=jnp.asarray(velocity[1:], jnp.float32),
+        gripper=jnp.asarray(rows.width, jnp.float32),
+        events=rows.events,
     )

@@ -100,6 +100,7 @@ def plan(
     images: Annotated[ImageFiles, tyro.conf.arg(name="")] = ImageFiles(),
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE.toml")] = None,
     joints: Annotated[tuple[float, ...], tyro.conf.arg(metavar="RAD ...")] = (),
+    width: Annotated[float | None, tyro.conf.arg(metavar="M", help_behavior_hint="")] = None,
     state: Annotated[Path | None, tyro.conf.arg(metavar="FILE.npz")] = None,
     failed: bool = False,
     seed: int = 0,
@@ -111,6 +112,7 @@ def plan(
       images: what is decided from.
       config: file of settings of camera, shelf, gripper, target and planner; `mechsearch config` prints an example.
       joints: where the arm is, seven angles; at home if not given.
+      width: how far the fingers are apart at present; taken to be open if not given.
       state: where the search is kept from call to call. If it is there, the last motion is taken to be over.
       failed: whether that motion failed.
       seed: of all random numbers.
@@ -141,7 +143,7 @@ def plan(
             console.print(f"{state}: the target was taken out; the search is finished", soft_wrap=True)
             return
         status.update("looking and planning; the first time in a workcell this takes minutes")
-        step = searcher.next(**arguments, joints=joints or None)
+        step = searcher.next(**arguments, joints=joints or None, width=width)
         step = dataclasses.replace(step, warnings=(*warnings, *step.warnings))
         status.update("writing")
         files = _write(step, check, out)

@@ -11,6 +11,7 @@ from mechsearch_jax.problem.cache import cached_problem, is_cached
 from mechsearch_jax.problem.problem import Problem
 from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.robot.hand import HandConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.shelf import Shelf
@@ -19,11 +20,12 @@ from mechsearch_jax.workspace.target import Target
 
 @dataclasses.dataclass(frozen=True)
 class Workcell:
-    """Camera, shelf, gripper, target and arm; hashable. Frame: the robot's base.
+    """Camera, shelf, gripper, target, arm and hand; hashable. Frame: the robot's base.
 
     Attributes:
       target: what is searched; for a scenario, which has its own target, how finely it is searched.
-      arm: home and speed.
+      arm: home and speed, and where it puts the target.
+      hand: how the real hand is used.
       colour: of the target in colour images: red, green and blue in 0 to 1. Compiled programs do not depend on it.
     """
 
@@ -32,6 +34,7 @@ class Workcell:
     gripper: Gripper = dataclasses.field(default_factory=Gripper)
     target: Target = dataclasses.field(default_factory=Target)
     arm: ArmConfig = dataclasses.field(default_factory=ArmConfig)
+    hand: HandConfig = dataclasses.field(default_factory=HandConfig)
     colour: tuple[float, float, float] = RED
 
     def __post_init__(self):

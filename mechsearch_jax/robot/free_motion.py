@@ -168,11 +168,11 @@ def free_motion(
         waits = np.repeat(start[None], math.ceil(least / timestep - 1e-9), axis=0)
         return FreeMotion(waits, float(clearance(body, obstacles, start[None]).free[0]), True)
     space = _space(path, body, obstacles, config)
-    rows = _timed(_respaced(path, WAYPOINTS), timestep, pace, least)
+    rows = timed_rows(_respaced(path, WAYPOINTS), timestep, pace, least)
     if not straight and not space.allowed(_thinned(rows, config.step)).all():
         # The smooth curve cuts a corner and touches something: stop at each corner.
         pieces = [
-            _timed(_respaced(np.array(pair), WAYPOINTS), timestep, pace, 0.0) for pair in itertools.pairwise(path)
+            timed_rows(_respaced(np.array(pair), WAYPOINTS), timestep, pace, 0.0) for pair in itertools.pairwise(path)
         ]
         rows = np.concatenate(pieces)
     nearest = clearance(body, obstacles, np.concatenate([start[None], _thinned(rows, config.step)])).free.min()
@@ -316,8 +316,15 @@ def _respaced(path: np.ndarray, count: int) -> np.ndarray:
     return np.array([_at(path, lengths, place) for place in np.linspace(0.0, lengths[-1], count)])
 
 
-def _timed(points: np.ndarray, timestep: float, pace: float, least: float) -> np.ndarray:
-    """Joint angles after each time step of the fastest motion along a smooth curve through the points."""
+def timed_rows(
+    points: Float[np.ndarray, "n 7"], timestep: float, pace: float, least: float = 0.0
+) -> Float[np.ndarray, "steps 7"]:
+    """Joint angles after each time step of the fastest motion along a smooth curve, from rest to rest.
+
+    Args:
+      points: of the curve [rad]; it is compiled once for each number of them.
+      timestep, pace, least: as of `free_motion`.
+    """
     curve = _smooth_curve(points.astype(np.float32))
     seconds, ramp = _timing(curve, np.float32(least), np.float32(pace * (1.0 - SPARE)))
     steps = max(1, math.ceil(float(seconds) / timestep - 1e-6))

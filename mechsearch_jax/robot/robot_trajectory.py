@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import CubicSpline
 
+from mechsearch_jax.robot.hand import HandEvent
 from mechsearch_jax.robot.kinematics import (
     ACCELERATION_LIMIT,
     JERK_LIMIT,
@@ -21,32 +22,31 @@ from mechsearch_jax.runtime.errors import InputError
 
 
 class Part(enum.IntEnum):
-    """Which part of a motion a row belongs to."""
+    """Which part of a motion a row belongs to; `PLACE`, where the target is put down, comes before the way home."""
 
     WAY_THERE = 0
     ACTION = 1
     WAY_HOME = 2
+    PLACE = 3
 
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """Where a controller should stop, and how it grips.
+    """Where a controller should stop.
 
     Attributes:
       tracking: largest error of a joint's angle [rad]. In the simulator ordinary actions stay below 0.01, a few reach
         0.027; a hand that pushes a box against a wall reaches 0.065 and more.
       effort: largest torque of each joint beyond what gravity and the motion require [N m].
       force: largest force on the hand, without its grip and the weight of the held object [N].
-      grip_force: of the fingers [N].
     """
 
     tracking: float = 0.05
     effort: tuple[float, ...] = (40.0, 40.0, 40.0, 40.0, 10.0, 10.0, 10.0)
     force: float = 40.0
-    grip_force: float = 60.0
 
     def __post_init__(self):
-        for name in ("tracking", "force", "grip_force"):
+        for name in ("tracking", "force"):
             if not (getattr(self, name) > 0 and math.isfinite(getattr(self, name))):
                 raise InputError(f"Bounds: {name} {getattr(self, name)} must be a positive number")
         if len(self.effort) != len(JOINT_LOWER) or not all(0 < e < math.inf for e in self.effort):
@@ -64,6 +64,7 @@ class Report:
       clearance: least distance from everything in free space [m], at most 0.2.
       straight: whether the ways through free space are straight lines in joint space.
       ends_at_home: False if home is not free and the arm stops outside the shelf.
+      place_fault: why the target stays in the hand though there is a place for it; empty if it does not.
     """
 
     duration: float
@@ -74,6 +75,7 @@ class Report:
     clearance: float
     straight: bool
     ends_at_home: bool
+    place_fault: str = ""
 
     def within(self, tolerance: float = 1e-3) -> bool:
         """Whether all joints stay within their limits, up to a tolerance for rounding."""
@@ -86,6 +88,7 @@ class Report:
             f"{1000 * self.clearance:.0f} mm from everything in free space"
             f"{'' if self.straight else ', around what is in the way'}"
             f"{'' if self.ends_at_home else '; stops outside the shelf: the way home is not free'}"
+            f"{self.place_fault and '; the target stays in the hand: '}{self.place_fault}"
         )
 
 
@@ -100,7 +103,8 @@ class RobotTrajectory:
       position: joint angles [rad], shape (T, 7).
       velocity: [rad/s], shape (T, 7).
       acceleration: [rad/s2], shape (T, 7).
-      width: commanded distance between the fingers [m], shape (T,); 0 where they grip.
+      width: distance between the fingers [m], shape (T,): as a hand that executes the events has it; where it grips,
+        what is held is taken to be as wide.
       force: grip force [N], shape (T,); 0 where they hold nothing.
       part: a `Part` for each row, shape (T,).
       action: name of the kind of action.
@@ -108,6 +112,8 @@ class RobotTrajectory:
       clearance: least distance from everything in free space [m], at most 0.2.
       straight: whether the ways through free space are straight lines in joint space.
       ends_at_home: False if home is not free and the arm stops outside the shelf.
+      events: what the hand does, in order; where an event `waits`, and where any ends, the arm stands still.
+      place_fault: why the target stays in the hand though there is a place for it; empty if it does not.
     """
 
     time: Float[np.ndarray, " t"]
@@ -122,13 +128,29 @@ class RobotTrajectory:
     clearance: float
     straight: bool
     ends_at_home: bool
+    events: tuple[HandEvent, ...] = ()
+    place_fault: str = ""
+
+    @property
+    def put_down(self) -> int | None:
+        """The row from which the hand opens to put the target down at its place; None if it does not."""
+        rows = np.flatnonzero((self.part[1:] == Part.PLACE) & (self.force[1:] == 0.0) & (self.force[:-1] > 0.0))
+        return int(rows[0]) if len(rows) else None
 
     def report(self) -> Report:
         """Duration, shares of the limits and clearance."""
         timestep = self.time[1] - self.time[0] if len(self.time) > 1 else 1.0
         shares = limit_shares(self.position, float(timestep))
         margin = np.minimum(self.position - JOINT_LOWER, JOINT_UPPER - self.position).min()
-        return Report(float(self.time[-1]), float(margin), *shares, self.clearance, self.straight, self.ends_at_home)
+        return Report(
+            float(self.time[-1]),
+            float(margin),
+            *shares,
+            clearance=self.clearance,
+            straight=self.straight,
+            ends_at_home=self.ends_at_home,
+            place_fault=self.place_fault,
+        )
 
 
 def limit_shares(position: Float[np.ndarray, "t 7"], timestep: float) -> tuple[float, float, float]:
@@ -159,9 +181,5 @@ def slowed(position: Float[np.ndarray, "t 7"], factor: float) -> Float[np.ndarra
     if len(position) < 2:
         return position
     spline = CubicSpline(np.arange(len(position)), position, bc_type="clamped")
-    return spline(places_when_slowed(len(position), factor))
-
-
-def places_when_slowed(rows: int, factor: float) -> Float[np.ndarray, " s"]:
-    """Positions, in rows of a motion, of the rows of the same motion that takes about `factor` times as long."""
-    return np.linspace(0.0, rows - 1, math.ceil((rows - 1) * factor - 1e-9) + 1)
+    rows = math.ceil((len(position) - 1) * factor - 1e-9) + 1
+    return spline(np.linspace(0.0, len(position) - 1, rows))

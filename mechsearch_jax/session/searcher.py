@@ -49,6 +49,7 @@ from mechsearch_jax.planner.trials import Trials, decide
 from mechsearch_jax.problem.problem import NOWHERE, Problem
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.free_motion import check_joints
+from mechsearch_jax.robot.hand import check_width
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
@@ -57,7 +58,7 @@ from mechsearch_jax.session.images import Images, converted
 from mechsearch_jax.session.preparing import first_decision, prepared
 from mechsearch_jax.session.slots import UNTRIED, filled, tries_nothing
 from mechsearch_jax.session.state import State, beginning, load_state, save_state
-from mechsearch_jax.session.step import Motion, SearchStep, display_image, motion_of
+from mechsearch_jax.session.step import Motion, Present, SearchStep, display_image, motion_of
 from mechsearch_jax.session.whole_trajectory import TrajectoryConfig
 from mechsearch_jax.workspace.sight import camera_faults, check_camera
 
@@ -253,6 +254,7 @@ class Searcher:
         mask: Any = None,
         target_id: int | None = None,
         joints: Any = None,
+        width: float | None = None,
     ) -> SearchStep:
         """Recognise the objects, update the belief and decide what to do next.
 
@@ -265,6 +267,7 @@ class Searcher:
           mask: integers (H, W), the number of the object that a pixel shows; see `Recogniser`.
           target_id: the target's number in the mask; negative where the mask does not show it.
           joints: where the arm is, seven angles [rad]; at home if left out.
+          width: present distance between the fingers [m]; if left out, they are taken to be open.
 
         Returns:
           The step. Follow its trajectory as it is, then call `acted`.
@@ -282,6 +285,8 @@ class Searcher:
         if joints is not None:
             joints = np.asarray(joints, float)
             check_joints("joints", joints)
+        if width is not None:
+            check_width(float(width), problem.gripper.max_opening)
         observation = self.recogniser(recognition_key, depth, colour, mask, target_id)
         check_measured(problem.camera, problem.shelf, depth)
         warnings = [*self._camera_faults, *self._faults(depth, colour, mask, target_id)]
@@ -296,7 +301,9 @@ class Searcher:
             )
         if bool(now.belief.found) and not bool(belief.found):
             warnings.append("the target is not where it was found any more: it is searched for anew")
-        decision, motion = self._decide(decision_key, belief, observation, depth, joints)
+        decision, motion = self._decide(decision_key, belief, observation, depth, Present(joints, width))
+        if motion.trajectory is not None and motion.trajectory.place_fault:
+            warnings.append(f"the target is to stay in the hand: {motion.trajectory.place_fault}")
         step = SearchStep(
             index=now.index,
             kind=motion.kind,
@@ -324,7 +331,7 @@ class Searcher:
         return step
 
     def _decide(
-        self, key: Array, belief: Belief, observation: Observation, depth: np.ndarray, joints: np.ndarray | None
+        self, key: Array, belief: Belief, observation: Observation, depth: np.ndarray, present: Present
     ) -> tuple[Decision, Motion]:
         """A decision and its motion, drawn up to `DRAWS` times until the arm can execute it.
 
@@ -334,10 +341,16 @@ class Searcher:
         for draw in range(DRAWS):
             draw_key = jax.random.fold_in(key, draw) if draw else key
             decision = decide(self._policy, self._trials, draw_key, problem, belief, observation)
-            motion = motion_of(problem, belief, observation, decision, depth, joints, arm, self._trajectories)
+            motion = motion_of(problem, belief, observation, decision, depth, present, arm, self._motions)
             if not motion.blocked or kind_of(int(decision.action.kind)).takes_target:
                 break
         return decision, self._within_limit(motion)
+
+    @property
+    def _motions(self) -> TrajectoryConfig:
+        """How motions are made: as given, with the workcell's hand and place where these are not."""
+        config, cell = self._trajectories or TrajectoryConfig(), self.workcell
+        return dataclasses.replace(config, hand=config.hand or cell.hand, place=config.place or cell.arm.place)
 
     def _within_limit(self, motion: Motion) -> Motion:
         """The motion if the limit of actions allows it; beyond it only the target is taken out, as in an episode."""

@@ -103,22 +103,34 @@ class Motion(NamedTuple):
     blocked: bool = False
 
 
+class Present(NamedTuple):
+    """How arm and hand are at present.
+
+    Attributes:
+      joints: joint angles [rad], shape (7,); at home if None.
+      width: distance between the fingers [m]; not known if None.
+    """
+
+    joints: Float[np.ndarray, " 7"] | None
+    width: float | None
+
+
 def motion_of(
     problem: Problem,
     belief: Belief,
     observation: Observation,
     decision: Decision,
     depth: Float[np.ndarray, "h w"],
-    joints: Float[np.ndarray, " 7"] | None,
+    present: Present,
     arm: ArmConfig,
-    config: TrajectoryConfig | None,
+    config: TrajectoryConfig,
 ) -> Motion:
     """The motion of a decision, or why there is none.
 
     Args:
       problem, belief, observation, decision: the decision and what it is based on.
       depth: the image that `observation` comes from.
-      joints: present joint angles [rad]; home if None.
+      present: arm and hand.
       arm: home and speed.
       config: how trajectories are made.
     """
@@ -131,7 +143,6 @@ def motion_of(
         why = f"each of the {refused} best actions does harm as it is tried out; ask again, and others are drawn"
         return Motion(nothing, f"{target}; {why if refused else impasse(problem, belief, observation.objects)}", None)
     verb = kind.describe(decision.action, observation.objects.capacity)
-    config = config or TrajectoryConfig()
     try:
         check_recognition(problem, observation, depth, config.doubt)
     except InputError as error:
@@ -141,7 +152,8 @@ def motion_of(
             problem,
             observation,
             decision,
-            joints=joints,
+            joints=present.joints,
+            width=present.width,
             home=np.array(arm.home),
             speed=arm.speed,
             config=config,

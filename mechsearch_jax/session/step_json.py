@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from mechsearch_jax.actions.registry import kind_of
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.geometry.superquadric import Superquadrics
+from mechsearch_jax.robot.hand import HandEvent
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ def step_json(step: SearchStep) -> dict[str, Any]:
         "target": _target(step),
         "action": _action(step.decision.action) if acts else None,
         "hand": _hand(step.decision.action) if acts else None,
+        "gripper": [_event(event) for event in step.trajectory.events] if step.trajectory is not None else None,
     }
 
 
@@ -101,6 +103,11 @@ def _action(action: Action) -> dict[str, Any]:
         "q7": float(action.q7),
         "opening": float(action.opening),
     }
+
+
+def _event(event: HandEvent) -> dict[str, Any]:
+    """What the hand does, when [s], and how [m, m/s, N]."""
+    return {"kind": event.kind, **dataclasses.asdict(event)}
 
 
 def _hand(action: Action) -> dict[str, Any]:

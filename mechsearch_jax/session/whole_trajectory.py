@@ -6,36 +6,28 @@ import dataclasses
 from typing import Any, Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mechsearch_jax.actions.kind import Kind
 from mechsearch_jax.actions.registry import kind_of
-from mechsearch_jax.actions.trajectory import reference_motion
+from mechsearch_jax.actions.trajectory import grasped, grip_for, reference_motion, target_pose
 from mechsearch_jax.actions.types import Action
 from mechsearch_jax.geometry.superquadric import Superquadrics
-from mechsearch_jax.geometry.transforms import upright_pose
 from mechsearch_jax.observation import Observation
 from mechsearch_jax.perception import recogniser
 from mechsearch_jax.perception.doubt import DoubtConfig, check_recognition
+from mechsearch_jax.robot.acting import Rows, acting, joined, opening_to
 from mechsearch_jax.robot.arm_clearance import ArmBody, Held, Obstacles, clearance, tip_positions
-from mechsearch_jax.robot.free_motion import SPARE, FreeMotion, FreeMotionConfig, check_joints, free_motion
+from mechsearch_jax.robot.arm_config import check_place
+from mechsearch_jax.robot.free_motion import FreeMotion, FreeMotionConfig, check_joints, free_motion, timed_rows
 from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.robot.hand import HandConfig, HandMove, check_width, stroke
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference
-from mechsearch_jax.robot.robot_trajectory import (
-    Bounds,
-    Part,
-    RobotTrajectory,
-    derivatives,
-    limit_shares,
-    places_when_slowed,
-    slowed,
-)
+from mechsearch_jax.robot.robot_trajectory import Bounds, Part, RobotTrajectory, derivatives
 from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.session.placing import PlaceWay, place_ways
 
-# How fast the distance between the fingers changes on the ways through free space [m/s].
-FINGER_SPEED = 0.1
 # Tolerance within which a gripper counts as at `Gripper.nearest_outside` [m].
 OUTSIDE = 2e-3
 
@@ -54,27 +46,30 @@ class TrajectoryConfig:
     Attributes:
       motion: lengths and durations of the action; with the problem's gripper if None.
       free: how ways through free space are planned.
-      bounds: where a controller should stop, and how it grips.
+      bounds: where a controller should stop.
       doubt: when recognition is too doubtful to move.
+      hand: how the real hand is used; a `Searcher`'s workcell's, else the default, if None.
+      place: where a target that was taken out is put down, see `ArmConfig.place`; a `Searcher`'s workcell's if empty.
     """
 
     motion: MotionConfig | None = None
     free: FreeMotionConfig = dataclasses.field(default_factory=FreeMotionConfig)
     bounds: Bounds = dataclasses.field(default_factory=Bounds)
     doubt: DoubtConfig = dataclasses.field(default_factory=DoubtConfig)
+    hand: HandConfig | None = None
+    place: tuple[float, ...] = ()
+
+    def __post_init__(self):
+        check_place("TrajectoryConfig: place", self.place)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Stage:
-    """Rows of one part: joint angles [rad], distance between the fingers [m] and grip force [N].
-
-    The first row comes one timestep after the last row of the part before.
-    """
+    """Rows of one part, the first one timestep after the last row of the part before, and the free ways among them."""
 
     part: Part
-    position: np.ndarray
-    width: np.ndarray
-    force: np.ndarray
+    rows: Rows
+    way: FreeMotion | None = None
 
 
 def whole_trajectory(
@@ -84,7 +79,7 @@ def whole_trajectory(
     *,
     joints: Any = None,
     home: Any = None,
-    width: float = 0.0,
+    width: float | None = None,
     speed: float = 1.0,
     depth: Any = None,
     config: TrajectoryConfig | None = None,
@@ -93,8 +88,12 @@ def whole_trajectory(
 
     The ways through free space are straight in joint space, or planned if something is in the way: the whole arm with
     what it holds keeps clear of the shelf, of the observed objects, of itself and, on the way home, of the predicted
-    objects. After a retrieval the hand brings the target home, or stops outside the shelf if the target would hit
-    something at home. The trajectory of no action is the way home.
+    objects. After a retrieval the hand puts the target down at `config.place`; if there is none, or it cannot, it
+    brings the target home, or stops outside the shelf if the target would hit something at home. The trajectory of no
+    action is the way home.
+
+    The fingers move as a real hand does: what it does is in `events`, and the arm stands still where one has to have
+    ended. The first, which opens or closes them for the action, is there whatever `width` is.
 
     Args:
       problem: the constants.
@@ -102,7 +101,8 @@ def whole_trajectory(
       decision: a `Decision`, or an `Action` without a prediction.
       joints: present joint angles, shape (7,) [rad]; `home` if left out.
       home: final joint angles, shape (7,) [rad]; `kinematics.HOME` if left out.
-      width: present distance between the fingers [m].
+      width: present distance between the fingers [m]; if left out, they are taken to be open, and there is time for
+        the longest way that they may have.
       speed: share of the joints' velocity limits, above 0 and at most 1; accelerations reach the share's square of
         their limits, and jerks its cube.
       depth: the depth image that `observation` comes from; with it, recognition that does not explain the image is
@@ -120,8 +120,8 @@ def whole_trajectory(
     check_joints("joints", joints)
     if not 0.0 < speed <= 1.0:
         raise InputError(f"speed: {speed} must be above 0 and at most 1, a share of the joints' limits")
-    if not 0.0 <= width <= problem.gripper.max_opening + 1e-6:
-        raise InputError(f"width: {width} m must be between 0 and the gripper's {problem.gripper.max_opening}")
+    if width is not None:
+        check_width(width, problem.gripper.max_opening)
     if depth is not None:
         check_recognition(problem, observation, depth, config.doubt)
     action = getattr(decision, "action", decision)
@@ -142,38 +142,106 @@ class _Assembly:
         speed: float,
     ):
         self.problem, self.observation, self.action, self.after = problem, observation, action, after
-        self.config, self.speed = config, speed
+        self.config, self.speed, self.hand = config, speed, config.hand or HandConfig()
         self.motion = config.motion or MotionConfig(gripper=problem.gripper)
         self.kind: Kind = kind_of(int(action.kind))
 
-    def run(self, joints: np.ndarray, home: np.ndarray, width: float) -> RobotTrajectory:
+    def run(self, joints: np.ndarray, home: np.ndarray, width: float | None) -> RobotTrajectory:
+        widest = self.problem.gripper.max_opening
+        present = widest if width is None else min(max(float(width), 0.0), widest)
         reference = self._reference()
         if reference is None:
-            back = self._free("the way home", joints, home, ArmBody.of(width), self._obstacles(), abs(width))
-            return self._joined(joints, width, [self._travel(Part.WAY_HOME, back, width, 0.0)], [back], True)
+            back = self._free("the way home", joints, home, ArmBody.of(present), self._obstacles())
+            return self._joined(joints, present, [self._travel(Part.WAY_HOME, back, present)], True)
 
         begin = np.asarray(reference.start, float)
         opened = 2.0 * max(begin[7], 0.0)
-        body = ArmBody.of(max(width, opened))
-        approach = self._free(
-            f"the way to the {self.kind.name}", joints, begin[:7], body, self._obstacles(), opened - width
-        )
-        stages, ways = [self._travel(Part.WAY_THERE, approach, width, opened)], [approach]
+        farthest = max(opened, widest - opened) if width is None else opened - present
+        stages = [self._way_there(joints, begin[:7], present, opened, self.hand.time(farthest))]
+        grip = grip_for(self.problem, self.observation, self.action)
+        stages.append(_Stage(Part.ACTION, acting(reference, grip, self.motion, self.hand, self.speed)))
+        between = self._between(stages[-1].rows)
 
-        acting = self._acting(reference)
-        stages.append(acting)
-        between = self._between(acting)
+        fault, at_home = "", True
+        if self.kind.takes_target and self.config.place:
+            try:
+                placing = self._placing(stages[-1].rows, home)
+                return self._joined(joints, present, stages + placing, True, between)
+            except InputError as error:
+                fault = str(error)
+        way_home = self._way_home(stages[-1].rows, home)
+        at_home = way_home is not None
+        stages += [way_home] if way_home is not None else []
+        return self._joined(joints, present, stages, at_home, between, fault)
 
-        end, left = acting.position[-1], float(acting.width[-1])
+    def _way_there(self, joints: np.ndarray, end: np.ndarray, before: float, after: float, least: float) -> _Stage:
+        """The way to where the action begins, while the fingers move from one distance to another."""
+        body = ArmBody.of(max(before, after))
+        way = self._free(f"the way to the {self.kind.name}", joints, end, body, self._obstacles(), least=least)
+        width, _ = stroke(before, after, len(way.position), self.motion.timestep, self.hand)
+        event = HandMove(0.0, least, False, after, self.hand.speed)
+        return _Stage(Part.WAY_THERE, Rows(way.position, width, np.zeros(len(width)), (event,)), way)
+
+    def _way_home(self, acted: Rows, home: np.ndarray) -> _Stage | None:
+        """The way home after the action; None if home is not free with what the hand holds."""
         held = self._held() if self.kind.takes_target else None
-        body, obstacles = ArmBody.of(0.0 if held else left, held), self._obstacles(afterwards=True)
-        at_home = held is None or _is_free(body, obstacles, home)
-        if at_home:
-            pace = self.motion.carry_pace if held else 1.0
-            back = self._free("the way home", end, home, body, obstacles, 0.0 if held else left, pace)
-            stages.append(self._travel(Part.WAY_HOME, back, left, left if held else 0.0, acting.force[-1]))
-            ways.append(back)
-        return self._joined(joints, width, stages, ways, at_home, between)
+        left = float(acted.width[-1])
+        body, obstacles = ArmBody.of(left, held), self._obstacles(afterwards=True)
+        if held is not None and not _is_free(body, obstacles, home):
+            return None
+        pace = self.motion.carry_pace if held else 1.0
+        back = self._free("the way home", acted.position[-1], home, body, obstacles, pace=pace)
+        return self._travel(Part.WAY_HOME, back, left, float(acted.force[-1]))
+
+    def _placing(self, acted: Rows, home: np.ndarray) -> list[_Stage]:
+        """The ways to the place of the target, down to it, back from it, and home.
+
+        Raises:
+          InputError: the arm does not reach the place, or a way is not free.
+        """
+        what = grasped(self.problem, self.observation, self.action)
+        T_world_gripper = np.asarray(self.action.T_world_gripper, float)
+        ways = place_ways(self.config.place, T_world_gripper, what.T_world_object if what.seen else None, what.size[2])
+        fault: InputError | None = None
+        for way in ways:
+            try:
+                return self._placing_along(way, acted, home)
+            except InputError as error:
+                fault = fault or error
+        assert fault is not None
+        raise fault
+
+    def _placing_along(self, way: PlaceWay, acted: Rows, home: np.ndarray) -> list[_Stage]:
+        """`_placing` along one way."""
+        held, opened = float(acted.width[-1]), self.problem.gripper.max_opening
+        force, pace, timestep = float(acted.force[-1]), self.speed * self.motion.carry_pace, self.motion.timestep
+        around, body = self._obstacles(afterwards=True), ArmBody.of(opened)
+        free = clearance(body, around, np.concatenate([way.down, way.back]))
+        if free.free.min() <= 0.0 or free.inside.max() > 0.0:
+            raise InputError("place: the arm touches something there")
+        there = self._free(
+            "the way to the place",
+            acted.position[-1],
+            way.down[0],
+            ArmBody.of(held, self._held()),
+            around,
+            pace=self.motion.carry_pace,
+        )
+        parts = [Rows(there.position, np.full(len(there.position), held), np.full(len(there.position), force))]
+        if len(way.down) > 1:
+            q = timed_rows(way.down, timestep, pace)
+            parts.append(Rows(q, np.full(len(q), held), np.full(len(q), force)))
+        parts.append(opening_to(way.down[-1], held, opened, self.hand, timestep))
+        if len(way.back) > 1:
+            q = timed_rows(way.back, timestep, pace)
+            parts.append(Rows(q, np.full(len(q), opened), np.zeros(len(q))))
+        if way.T_world_placed is not None:
+            around = self._obstacles(afterwards=True, placed=way.T_world_placed)
+        back = self._free("the way home from the place", way.back[-1], home, body, around)
+        return [
+            _Stage(Part.PLACE, joined(parts, timestep), there),
+            self._travel(Part.WAY_HOME, back, opened),
+        ]
 
     def _reference(self) -> Reference | None:
         motion = reference_motion(self.kind, self.action, self.motion)
@@ -184,8 +252,16 @@ class _Assembly:
             raise InputError(f"{self.kind.name}: the arm does not reach all of this motion; decide anew")
         return jax.device_get(reference)
 
-    def _obstacles(self, afterwards: bool = False, without: int | None = None) -> Obstacles:
-        """The shelf and the objects: as observed, and if `afterwards`, also as predicted after the action."""
+    def _obstacles(
+        self, afterwards: bool = False, without: int | None = None, placed: np.ndarray | None = None
+    ) -> Obstacles:
+        """The shelf and the objects: as observed, and if `afterwards`, also as predicted after the action.
+
+        Args:
+          afterwards: whether the action is over.
+          without: slot of an object that is left out.
+          placed: pose of the target at its place.
+        """
         seen = self.observation.objects
         if without is not None and without < seen.capacity:
             seen = seen.replace(valid=np.asarray(seen.valid) & (np.arange(seen.capacity) != without))
@@ -195,16 +271,14 @@ class _Assembly:
         # A target that the action takes out, pushes or carries leaves its place.
         moved = self.kind.takes_target or (self.kind.moves_object and int(self.action.object) >= seen.capacity)
         if bool(self.observation.target_visible) and not ((afterwards or without is not None) and moved):
-            scenes.append(self._target_scene())
+            scenes.append(self._target_scene(target_pose(self.problem, self.observation)))
+        if placed is not None:
+            scenes.append(self._target_scene(placed))
         return Obstacles.of(self.problem.shelf, tuple(scenes), self.config.free.floor)
 
-    def _target_pose(self) -> np.ndarray:
-        pose = jnp.asarray(self.observation.target_pose, jnp.float32)
-        return np.asarray(upright_pose(pose, self.problem.target.height(self.problem.shelf)), float)
-
-    def _target_scene(self) -> Superquadrics:
-        """The target as observed, as a scene of one object."""
-        T, target = self._target_pose()[None], self.problem.target
+    def _target_scene(self, pose: np.ndarray) -> Superquadrics:
+        """The target at a pose, as a scene of one object."""
+        T, target = pose[None], self.problem.target
         return Superquadrics(
             size=np.array([target.half_size]),  # pyright: ignore[reportArgumentType]
             exponents=np.array([target.exponents]),  # pyright: ignore[reportArgumentType]
@@ -215,17 +289,8 @@ class _Assembly:
 
     def _held(self) -> Held:
         """What the closed hand holds; a target that is not visible is assumed between the fingers."""
-        T_world_gripper = np.asarray(self.action.T_world_gripper, float)
-        scene, i = self.observation.objects, int(self.action.object)
-        if self.kind.holds_object and i < scene.capacity:
-            T_world_held = np.eye(4)
-            T_world_held[:3, :3], T_world_held[:3, 3] = np.asarray(scene.rotation[i]), np.asarray(scene.position[i])
-            x, y, z = np.asarray(scene.size[i], float).tolist()
-            return Held(np.linalg.inv(T_world_gripper) @ T_world_held, (x, y, z))
-        T_world_held = self._target_pose()
-        if not bool(self.observation.target_visible):
-            T_world_held[:3, 3] = T_world_gripper[:3, 3]
-        return Held(np.linalg.inv(T_world_gripper) @ T_world_held, self.problem.target.half_size)
+        what = grasped(self.problem, self.observation, self.action)
+        return Held(np.linalg.inv(np.asarray(self.action.T_world_gripper, float)) @ what.T_world_object, what.size)
 
     def _free(
         self,
@@ -234,11 +299,10 @@ class _Assembly:
         end: np.ndarray,
         body: ArmBody,
         obstacles: Obstacles,
-        opens: float,
+        *,
+        least: float = 0.0,
         pace: float = 1.0,
     ) -> FreeMotion:
-        # The fingers start and stop smoothly, which takes 1.5 times as long.
-        least = 1.5 * abs(opens) / (FINGER_SPEED * self.speed)
         try:
             return free_motion(
                 start,
@@ -253,34 +317,12 @@ class _Assembly:
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
 
-    def _travel(self, part: Part, way: FreeMotion, before: float, after: float, force: float = 0.0) -> _Stage:
-        share = np.arange(1, len(way.position) + 1) / max(len(way.position), 1)
-        width = before + (after - before) * share * share * (3.0 - 2.0 * share)
-        return _Stage(part, way.position, width, np.full(len(width), force))
+    def _travel(self, part: Part, way: FreeMotion, width: float, force: float = 0.0) -> _Stage:
+        """A way through free space with resting fingers."""
+        rows = len(way.position)
+        return _Stage(part, Rows(way.position, np.full(rows, width), np.full(rows, force)), way)
 
-    def _acting(self, reference: Reference) -> _Stage:
-        """The rows of the action, slowed down until they respect the joints' limits."""
-        steps, timestep = int(reference.length), self.motion.timestep
-        start = np.asarray(reference.start, float)
-        position = np.concatenate([start[None, :7], np.asarray(reference.q[:steps], float)])
-        fingers = np.concatenate([start[7:], np.asarray(reference.fingers[:steps], float)])
-        force = np.zeros(steps + 1)
-        closed, opens = int(reference.closed), int(reference.opens)
-        if closed:
-            force[closed - self.motion.close_steps + 1 : opens + 1] = self.config.bounds.grip_force
-        velocity, acceleration, jerk = limit_shares(position, timestep)
-        reached = max(velocity, acceleration ** (1 / 2), jerk ** (1 / 3))
-        factor = max(1.0, reached / (self.speed * (1.0 - SPARE)))
-        places = places_when_slowed(len(position), factor)
-        rows = np.arange(len(position))
-        return _Stage(
-            Part.ACTION,
-            slowed(position, factor)[1:],
-            2.0 * np.maximum(np.interp(places, rows, fingers), 0.0)[1:],
-            force[np.round(places).astype(int)][1:],
-        )
-
-    def _between(self, acting: _Stage) -> float:
+    def _between(self, acted: Rows) -> float:
         """Clearance while a pick-and-place carries its object from one pose outside the shelf to another [m].
 
         Raises:
@@ -288,13 +330,13 @@ class _Assembly:
         """
         if not self.kind.holds_object:
             return np.inf
-        x = tip_positions(acting.position)[:, 0]
-        carries = (x <= self.problem.gripper.nearest_outside + OUTSIDE) & (acting.force > 0.0)
+        x = tip_positions(acted.position)[:, 0]
+        carries = (x <= self.problem.gripper.nearest_outside + OUTSIDE) & (acted.force > 0.0)
         if not carries.any():
             return np.inf
         body = ArmBody.of(self.problem.gripper.max_opening, self._held())
         obstacles = self._obstacles(without=int(self.action.object))
-        free = float(clearance(body, obstacles, acting.position[carries]).free.min())
+        free = float(clearance(body, obstacles, acted.position[carries]).free.min())
         if free <= 0.0:
             raise InputError(f"{self.kind.name}: the arm touches something in front of the shelf; decide anew")
         return free
@@ -304,26 +346,30 @@ class _Assembly:
         joints: np.ndarray,
         width: float,
         stages: list[_Stage],
-        ways: list[FreeMotion],
         at_home: bool,
         between: float = np.inf,
+        fault: str = "",
     ) -> RobotTrajectory:
-        position = np.concatenate([joints[None], *(s.position for s in stages)])
         timestep = self.motion.timestep
+        rows = joined([stage.rows for stage in stages], timestep)
+        position = np.concatenate([joints[None], rows.position])
         velocity, acceleration = derivatives(position, timestep)
+        ways = [stage.way for stage in stages if stage.way is not None]
         return RobotTrajectory(
             time=np.arange(len(position)) * timestep,
             position=position,
             velocity=velocity,
             acceleration=acceleration,
-            width=np.concatenate([[width], *(s.width for s in stages)]),
-            force=np.concatenate([[0.0], *(s.force for s in stages)]),
-            part=np.concatenate([[stages[0].part], *(np.full(len(s.width), s.part) for s in stages)]),
+            width=np.concatenate([[width], rows.width]),
+            force=np.concatenate([[0.0], rows.force]),
+            part=np.concatenate([[stages[0].part], *(np.full(len(s.rows.width), s.part) for s in stages)]),
             action=self.kind.name,
             bounds=self.config.bounds,
             clearance=min(between, *(way.clearance for way in ways)),
             straight=all(way.straight for way in ways),
             ends_at_home=at_home,
+            events=rows.events,
+            place_fault=fault,
         )
 
 

@@ -1,0 +1,157 @@
+"""Trajectories as ROS 2 messages: dictionaries with the fields of the message types, for JSON and for a node.
+
+| what | type |
+|---|---|
+| the arm | `trajectory_msgs/msg/JointTrajectory`, also as the goal of `control_msgs/action/FollowJointTrajectory` |
+| the hand | goals of `franka_msgs/action/Move` and `Grasp`, or of `control_msgs/action/GripperCommand` |
+
+ROS itself is not needed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+from mechsearch_jax.robot.hand import HandEvent, HandGrasp
+from mechsearch_jax.robot.robot_trajectory import RobotTrajectory, derivatives
+from mechsearch_jax.runtime.errors import InputError
+
+# The first Panda's names; an FR3's are fr3_joint1 to fr3_joint7.
+JOINT_NAMES = tuple(f"panda_joint{i}" for i in range(1, 8))
+# Type of the action of each kind of event.
+ACTION_TYPES = {"move": "franka_msgs/action/Move", "grasp": "franka_msgs/action/Grasp"}
+# Position of a `GripperCommand` for each metre between the fingers: Franka's server takes that of one finger.
+FINGER_SHARE = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Leg:
+    """What arm and hand do at the same time; the next leg begins when both have ended.
+
+    Attributes:
+      first, last: rows of the trajectory that the arm moves along, both included; equal if it stands still.
+      event: what the hand does; None if nothing.
+    """
+
+    first: int
+    last: int
+    event: HandEvent | None
+
+
+def legs(trajectory: RobotTrajectory) -> list[Leg]:
+    """A trajectory in pieces from rest to rest.
+
+    Who executes them in turn waits for the real hand, however long it takes, and learns at once if a grasp failed.
+    """
+    timestep = float(trajectory.time[1]) if len(trajectory.time) > 1 else 1.0
+    pieces: list[Leg] = []
+    row, along = 0, None
+    for event in trajectory.events:
+        begins = round(event.start / timestep)
+        if not event.waits:
+            along = event
+            continue
+        if begins > row or along is not None:
+            pieces.append(Leg(row, begins, along))
+        pieces.append(Leg(begins, begins, event))
+        row, along = round((event.start + event.duration) / timestep), None
+    last = len(trajectory.time) - 1
+    if last > row or along is not None:
+        pieces.append(Leg(row, last, along))
+    return pieces
+
+
+def joint_trajectory_message(
+    trajectory: RobotTrajectory,
+    joint_names: Sequence[str] = JOINT_NAMES,
+    first: int = 0,
+    last: int | None = None,
+) -> dict[str, Any]:
+    """Rows of a trajectory as a `trajectory_msgs/msg/JointTrajectory`, with times from the first of them.
+
+    Args:
+      trajectory: of the arm.
+      joint_names: of the seven joints, from the base.
+      first, last: rows, both included, where the arm stands still; all of them by default.
+
+    Raises:
+      InputError: `joint_names` are not seven different names.
+    """
+    names = [str(name) for name in joint_names]
+    if len(set(names)) != len(JOINT_NAMES) or len(names) != len(JOINT_NAMES):
+        raise InputError(f"joint_names: {names} must be {len(JOINT_NAMES)} different names")
+    rows = slice(first, None if last is None else last + 1)
+    time, position = trajectory.time[rows] - trajectory.time[first], trajectory.position[rows]
+    whole = first == 0 and last is None
+    timestep = float(trajectory.time[1]) if len(trajectory.time) > 1 else 1.0
+    velocity, acceleration = (
+        (trajectory.velocity, trajectory.acceleration) if whole else derivatives(position, timestep)
+    )
+    points = [
+        {"positions": q, "velocities": v, "accelerations": a, "effort": [], "time_from_start": duration(t)}
+        for q, v, a, t in zip(position.tolist(), velocity.tolist(), acceleration.tolist(), time.tolist(), strict=True)
+    ]
+    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+    return {"header": header, "joint_names": names, "points": points}
+
+
+def hand_goal(event: HandEvent) -> dict[str, Any]:
+    """An event as the goal of `franka_msgs/action/Move` or `Grasp` [m, m/s, N]."""
+    goal: dict[str, Any] = {"width": event.width, "speed": event.speed}
+    if isinstance(event, HandGrasp):
+        goal |= {"epsilon": {"inner": event.inner, "outer": event.outer}, "force": event.force}
+    return goal
+
+
+def gripper_command_goal(event: HandEvent, share: float = FINGER_SHARE) -> dict[str, Any]:
+    """An event as the goal of `control_msgs/action/GripperCommand`; speed and tolerances are the server's.
+
+    Args:
+      event: of the hand.
+      share: position of the command for each metre between the fingers: 0.5 where it is that of one finger, as for
+        Franka's `gripper_action`, 1 where it is the distance between them.
+    """
+    force = event.force if isinstance(event, HandGrasp) else 0.0
+    return {"command": {"position": share * event.width, "max_effort": force}}
+
+
+def ros_messages(trajectory: RobotTrajectory, joint_names: Sequence[str] = JOINT_NAMES) -> dict[str, Any]:
+    """A trajectory and what the hand does as JSON values.
+
+    `arm` is a `trajectory_msgs/msg/JointTrajectory` of all rows. `gripper` lists the hand's events: `type` of the
+    action and its `goal`, the `start` and `duration` in the arm's time [s], whether the arm `waits`, and the same as
+    the goal of a `gripper_command`. `legs` says which of the arm's points (`first`, `last`) and which event (`gripper`,
+    or null) go together. `stop` has the bounds at which a controller should stop.
+
+    Raises:
+      InputError: `joint_names` are not seven different names.
+    """
+    bounds = trajectory.bounds
+    number = {id(event): i for i, event in enumerate(trajectory.events)}
+    return {
+        "arm": joint_trajectory_message(trajectory, joint_names),
+        "gripper": [
+            {
+                "type": ACTION_TYPES[event.kind],
+                "start": event.start,
+                "duration": event.duration,
+                "waits": event.waits,
+                "goal": hand_goal(event),
+                "gripper_command": gripper_command_goal(event),
+            }
+            for event in trajectory.events
+        ],
+        "legs": [
+            {"first": leg.first, "last": leg.last, "gripper": None if leg.event is None else number[id(leg.event)]}
+            for leg in legs(trajectory)
+        ],
+        "stop": {"tracking": bounds.tracking, "effort": list(bounds.effort), "force": bounds.force},
+    }
+
+
+def duration(seconds: float) -> dict[str, int]:
+    """A `builtin_interfaces/msg/Duration`."""
+    nanoseconds = round(float(seconds) * 1e9)
+    return {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
