@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from mechsearch_jax.problem.workcell import Workcell
     from mechsearch_jax.robot.arm_config import ArmConfig
     from mechsearch_jax.robot.gripper import Gripper
+    from mechsearch_jax.robot.hand import HandConfig
     from mechsearch_jax.robot.robot_trajectory import RobotTrajectory
     from mechsearch_jax.runtime.errors import InputError
     from mechsearch_jax.session.searcher import Searcher
@@ -56,6 +57,7 @@ _ROOMS = {
     "Config": "config.config",
     "Decision": "planner.state",
     "Gripper": "robot.gripper",
+    "HandConfig": "robot.hand",
     "InputError": "runtime.errors",
     "JointTrajectory": "actions.trajectory",
     "Observation": "observation",
@@ -98,6 +100,7 @@ __all__ = [
     "Config",
     "Decision",
     "Gripper",
+    "HandConfig",
     "InputError",
     "JointTrajectory",
     "Observation",

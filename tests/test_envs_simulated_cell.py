@@ -10,6 +10,7 @@ from mechsearch_jax.envs.camera.simulated_camera import observe
 from mechsearch_jax.envs.cell.simulated_cell import SHELF, SensorNoise, SimulatedCell, _owner
 from mechsearch_jax.envs.world.world import TARGET, from_scenario
 from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.robot.arm_config import ArmConfig
 from mechsearch_jax.robot.robot_trajectory import Bounds, RobotTrajectory
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
@@ -107,11 +108,35 @@ def test_a_searcher_takes_a_target_out_of_the_cell(problem):
 
     cell = SimulatedCell(Workcell(), OPEN)
     searcher = searcher_of(problem, OPEN)
-    step = searcher.next(*cell.look(), joints=cell.joints)
+    step = searcher.next(*cell.look(), joints=cell.joints, width=cell.width)
     assert step.kind == "retrieve"
     done = cell.follow(step.trajectory)
     assert (done.ok, done.retrieved, done.fallen) == (True, True, ())
     assert done.tracking_error < 0.02
+
+
+@pytest.mark.slow
+def test_a_target_is_put_down_at_its_place(problem):
+    from test_search import searcher_of
+
+    place = (0.35, -0.45, 0.1)
+    workcell = Workcell(arm=ArmConfig(place=place))
+    cell = SimulatedCell(workcell, OPEN)
+    step = searcher_of(problem, OPEN, workcell=workcell).next(*cell.look(), joints=cell.joints, width=cell.width)
+    trajectory = step.trajectory
+    done = cell.follow(trajectory)
+    # Nothing is under it there, but the hand has let it go where it is to stand.
+    assert (done.ok, done.retrieved) == (True, True)
+    assert cell.width == pytest.approx(0.08, abs=2e-3)
+    np.testing.assert_allclose(cell.joints, workcell.arm.home, atol=5e-3)
+
+
+def test_the_present_opening_is_measured():
+    cell = SimulatedCell(CELL, OPEN, noise=EXACT)
+    assert cell.width == pytest.approx(0.0, abs=1e-3)
+    still = moving(cell.joints, np.zeros(7), 300)
+    cell.follow(dataclasses.replace(still, width=np.full(301, 0.05)))
+    assert cell.width == pytest.approx(0.05, abs=2e-3)
 
 
 def test_what_is_gripped_is_pressed_with_the_given_force():

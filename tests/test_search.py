@@ -29,6 +29,9 @@ from mechsearch_jax.perception.doubt import DoubtConfig
 from mechsearch_jax.perception.plausibility import image_faults
 from mechsearch_jax.planner import Decision, initial_belief, search_for_grasp, update_belief
 from mechsearch_jax.planner.rollout import no_sequences
+from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.robot.arm_config import ArmConfig
+from mechsearch_jax.robot.hand import HandConfig
 from mechsearch_jax.robot.kinematics import FINGER_TIPS
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.session.images import converted
@@ -263,11 +266,38 @@ def test_a_step_is_written_as_json(problem):
     T = np.array(action["T_world_gripper"])
     assert np.linalg.norm(T[:3, 3] - OPEN.target.position) < 0.05
     assert np.array(hand["T_world_hand"])[:3, 3] == pytest.approx(T[:3, 3] - FINGER_TIPS * T[:3, 2])
+    opens, closes = values["gripper"]
+    assert (opens["kind"], opens["start"], opens["waits"]) == ("move", 0.0, False)
+    assert opens["width"] == pytest.approx(action["opening"], abs=1e-6)
+    assert (closes["kind"], closes["waits"], closes["force"]) == ("grasp", True, 60.0)
+    assert closes["width"] == pytest.approx(2 * OPEN.target.half_size[0], abs=1e-6)
+    assert set(closes) == {"kind", "start", "duration", "waits", "width", "speed", "force", "inner", "outer"}
+    assert opens["start"] + opens["duration"] <= closes["start"] <= values["motion"]["duration"]
+    assert values["reason"] == step.reason
+
+
+def test_the_hand_and_the_place_are_the_workcells(problem):
+    hand, place = HandConfig(speed=0.05, force=20.0), (0.35, -0.45, 0.1)
+    cell = Workcell(hand=hand, arm=ArmConfig(place=place))
+    searcher = searcher_of(problem, OPEN, workcell=cell)
+    step = searcher.next(IMAGES.depth, IMAGES.colour, width=0.02)
+    opens, closes, *_ = step.trajectory.events
+    assert (opens.speed, closes.force) == (0.05, 20.0)
+    assert opens.duration == pytest.approx(hand.time(0.06), abs=1e-3)
+    assert step.trajectory.width[0] == 0.02
+    assert step.trajectory.put_down is not None
+    assert step.warnings == ()
+    with pytest.raises(InputError, match=r"width: 20\.0 m must be between 0"):
+        searcher.next(IMAGES.depth, width=20.0)
+    far = Workcell(arm=ArmConfig(place=(1.9, 0.0, 0.0)))
+    (warning,) = searcher_of(problem, OPEN, workcell=far).next(IMAGES.depth, IMAGES.colour).warnings
+    assert warning.startswith("the target is to stay in the hand: place: the arm does not reach [1.9, 0.0, 0.0]")
 
 
 def test_a_step_without_a_motion_has_neither_action_nor_hand(problem):
     values = searcher_of(problem, HIDDEN).next(IMAGES.depth).to_json()
     assert (values["kind"], values["motion"], values["action"], values["hand"]) == ("none", None, None, None)
+    assert values["gripper"] is None
     assert (values["target"]["visible"], values["target"]["pose"], values["target"]["found_pose"]) == (
         False,
         None,
