@@ -95,13 +95,11 @@ def acting(reference: Reference, grip: Grip, motion: MotionConfig, hand: HandCon
     if not closed:
         return moving(0, steps, opening, 0.0)
     closes, held = closed - motion.close_steps, grip.width
-    parts = [
-        moving(0, closes, opening, 0.0),
-        closing(position[closes], opening, grip, hand, timestep),
-        moving(closes + motion.close_steps, opens, held, hand.force),
-    ]
+    parts = [moving(0, closes, opening, 0.0)]
+    parts.append(closing(parts[-1].position[-1], opening, grip, hand, timestep))
+    parts.append(moving(closed, opens, held, hand.force))
     if opens < steps:
-        parts.append(opening_to(position[opens], held, opening, hand, timestep))
+        parts.append(opening_to(parts[-1].position[-1], held, opening, hand, timestep))
         parts.append(moving(opens + motion.open_steps, steps, opening, 0.0))
     return joined(parts, timestep)
 
