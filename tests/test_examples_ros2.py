@@ -246,14 +246,15 @@ def test_arm_and_hand_take_turns(start):
     assert node.follow(trajectory)
     names = [name for name, _ in stand_in.goals]
     arm = "/fr3_arm_controller/follow_joint_trajectory"
-    assert names == ["/fr3_gripper/move", arm, "/fr3_gripper/grasp", arm]
-    (_, opens), (_, there), (_, closes), (_, out) = stand_in.goals
+    assert names == ["/fr3_gripper/move", arm, arm, "/fr3_gripper/grasp", arm]
+    (_, opens), (_, there), (_, enters), (_, closes), (_, out) = stand_in.goals
     assert (opens.width, opens.speed) == (pytest.approx(0.08), 0.1)
     assert (closes.width, closes.force) == (pytest.approx(0.04), 60.0)
     assert (closes.epsilon.inner, closes.epsilon.outer, closes.speed) == (0.01, 0.01, 0.1)
     assert there.trajectory.joint_names == JOINTS
     np.testing.assert_allclose(there.trajectory.points[0].positions, trajectory.position[0])
-    np.testing.assert_allclose(out.trajectory.points[0].positions, there.trajectory.points[-1].positions)
+    np.testing.assert_allclose(enters.trajectory.points[0].positions, there.trajectory.points[-1].positions)
+    np.testing.assert_allclose(out.trajectory.points[0].positions, enters.trajectory.points[-1].positions)
     np.testing.assert_allclose(out.trajectory.points[-1].positions, trajectory.position[-1])
     first, second = out.trajectory.points[:2]
     assert (first.time_from_start.sec, first.time_from_start.nanosec) == (0, 0)
@@ -283,7 +284,7 @@ def test_after_a_grasp_that_failed_the_arm_goes_its_way_out(start):
     _, node, stand_in = start()
     stand_in.answers["grasp"] = types.SimpleNamespace(success=False)
     assert not node.follow(taken())
-    assert len(stand_in.goals) == 4
+    assert len(stand_in.goals) == 5
     assert any("could not grasp to 40 mm" in line for line in node.log)
 
 

