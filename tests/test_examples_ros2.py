@@ -18,14 +18,14 @@ JOINTS = [f"fr3_joint{i}" for i in range(1, 8)]
 HERE = [0.1 * i for i in range(7)]
 
 
-def message(name, **fields):
+def message(type_name, /, **fields):
     """A type with these fields, given by what makes their first values; others cannot be set."""
 
     def start(self, **given):
         for field, make in fields.items():
             setattr(self, field, given.get(field, make()))
 
-    return type(name, (), {"__slots__": tuple(fields), "__init__": start})
+    return type(type_name, (), {"__slots__": tuple(fields), "__init__": start})
 
 
 TIME = message("Time", sec=int, nanosec=int)

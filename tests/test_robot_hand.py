@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_search_whole_trajectory import CONFIG, HERE, PLACE, Q7, SETTING, grasp, seen
+from test_search_whole_trajectory import CONFIG, HERE, PLACE, Q7, SETTING, grasp, pushed, seen
 
 from mechsearch_jax.actions import Action, joint_trajectory
 from mechsearch_jax.actions.kinds.retrieve import retrieve_action
@@ -151,6 +151,7 @@ def test_what_is_gripped_has_its_own_width():
     trajectory = whole_trajectory(SETTING, seen(standing((0.012, 0.025, 0.08), 90.0), False), action, config=CONFIG)
     # The hand is turned by 0.1 rad.
     assert trajectory.events[1].width == pytest.approx(0.024, abs=3e-3)
+    check(trajectory, HandConfig())
     gripped = trajectory.force > 0.0
     np.testing.assert_allclose(trajectory.width[gripped], trajectory.events[1].width)
 
@@ -181,6 +182,14 @@ def test_nothing_is_ever_grasped_at_width_0():
         assert event.width + event.outer <= 0.08 + 1e-9
         assert event.width - event.inner < max(grip.low, 2 * EMPTY)
     assert grip_of(ACROSS, np.eye(3), np.full(3, 1e-4), np.array(BOX), 0.08).width == pytest.approx(2 * EMPTY)
+
+
+def test_a_push_begins_with_closed_fingers():
+    trajectory = pushed(width=0.03)
+    check(trajectory, HandConfig())
+    (closes,) = trajectory.events
+    assert (closes.kind, closes.width, closes.waits) == ("move", 0.0, False)
+    assert (trajectory.width[trajectory.part == Part.ACTION] == 0.0).all()
 
 
 def test_fingers_move_at_their_speed_and_then_rest():
@@ -237,7 +246,7 @@ def test_the_plain_trajectory_of_an_action_waits_for_the_hand_too():
         assert np.ptp(position[max(first - 1, 0) : last], axis=0).max() == 0.0
     assert width[-1] == pytest.approx(0.04)
     usual = joint_trajectory(SETTING, action, config=CONFIG.motion)
-    assert usual.events[0].duration == pytest.approx(hand.settle, abs=0.004)
+    assert usual.events[0].duration == pytest.approx(hand.settle, abs=0.005)
     anything = usual.events[1]
     assert anything.width - anything.inner < 0.01 < 0.07 < anything.width + anything.outer
     assert len(jax.tree.leaves(usual)) == 4

@@ -76,7 +76,7 @@ def test_it_leads_from_home_through_the_action_and_home():
         np.testing.assert_allclose(trajectory.velocity[row], 0.0, atol=1e-12)
     np.testing.assert_allclose(np.diff(trajectory.time), 0.004)
     assert (np.diff(trajectory.part) >= 0).all()
-    assert set(trajectory.part) == set(Part)
+    assert set(trajectory.part) == set(Part) - {Part.PLACE}
     tips = tip_positions(trajectory.position)
     assert np.linalg.norm(tips - (*PLACE, Shelf().board + 0.05), axis=1).min() < 2e-3
     assert tips[trajectory.part != Part.ACTION, 0].max() < Gripper().nearest_outside + 2e-3
@@ -115,7 +115,8 @@ def test_what_is_held_goes_home_gently():
     home = np.abs(trajectory.velocity[trajectory.part == Part.WAY_HOME]).max()
     there = np.abs(trajectory.velocity[trajectory.part == Part.WAY_THERE]).max()
     assert home < 2.175 * MotionConfig().carry_pace
-    assert there > 0.5
+    # The arm waits for the hand there.
+    assert there > 0.4
 
 
 def test_speed_is_a_share_of_the_limits():

@@ -211,7 +211,8 @@ def stroke(
     time = np.arange(1, rows + 1) * timestep
     moving = hand.moving_time(after - before)
     share = np.clip(time / moving, 0.0, 1.0) if moving > 0.0 else np.ones(rows)
-    return before + (after - before) * share * share * (3.0 - 2.0 * share), time - moving
+    eased = before + (after - before) * share * share * (3.0 - 2.0 * share)
+    return np.where(share < 1.0, eased, after), time - moving
 
 
 def check_width(width: float, max_opening: float) -> None:
