@@ -119,14 +119,16 @@ def test_a_searcher_takes_a_target_out_of_the_cell(problem):
 def test_a_target_is_put_down_at_its_place(problem):
     from test_search import searcher_of
 
-    place = (0.35, -0.45, 0.1)
+    # In simulation the board goes on in front of the shelf.
+    place = (0.3, -0.12, CELL.shelf.board)
     workcell = Workcell(arm=ArmConfig(place=place))
     cell = SimulatedCell(workcell, OPEN)
     step = searcher_of(problem, OPEN, workcell=workcell).next(*cell.look(), joints=cell.joints, width=cell.width)
     trajectory = step.trajectory
     done = cell.follow(trajectory)
-    # Nothing is under it there, but the hand has let it go where it is to stand.
-    assert (done.ok, done.retrieved) == (True, True)
+    assert (done.ok, done.retrieved, done.fallen) == (True, True, ())
+    centre = np.add(place, (0.0, 0.0, OPEN.target.half_size[2]))
+    np.testing.assert_allclose(cell.scenario("after").target.position, centre, atol=5e-3)
     assert cell.width == pytest.approx(0.08, abs=2e-3)
     np.testing.assert_allclose(cell.joints, workcell.arm.home, atol=5e-3)
 

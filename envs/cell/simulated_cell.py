@@ -10,7 +10,9 @@ including the motions through free space.
 
 Approximations: an arm that is held up follows its trajectory to the end and reports it afterwards. The fingers follow
 the trajectory's width and force at once, whatever becomes of a grasp. The grip force exceeds the trajectory's by the
-fingers' stiffness times half of what the object is wider than it was recognised, or falls short of it.
+fingers' stiffness times half of what the object is wider than it was recognised, or falls short of it. For objects the
+shelf's faces are planes that go on in front of it, so that a target can only be put down between the side walls, at the
+board's height or above.
 """
 
 # The bindings of MuJoCo come without type stubs.
