@@ -99,6 +99,15 @@ def test_a_robot_that_stands_elsewhere_sees_camera_and_shelf_from_there(tmp_path
     assert load(tmp_path, "[base]\nposition = [0, 0, 0]").workcell == Workcell()
 
 
+def test_the_targets_place_is_in_the_frame_of_the_shelf_but_joint_angles_are_not(tmp_path):
+    base = "[base]\nposition = [5, -0.25, 0.125]\n[arm]\nplace = "
+    assert load(tmp_path, base + "[5.4, -0.5, 0.2]").workcell.arm.place == (0.4, -0.25, 0.075)
+    angles = Workcell().arm.home
+    assert load(tmp_path, base + str(list(angles))).workcell.arm.place == angles
+    assert load(tmp_path, base + "[]").workcell.arm.place == ()
+    assert load(tmp_path, "[arm]\nplace = [0.4, -0.5, 0]").workcell.arm.place == (0.4, -0.5, 0.0)
+
+
 def test_the_colour_of_the_target_is_the_recognisers_and_not_the_problems(tmp_path):
     workcell = load(tmp_path, '[target]\nshape = "box"\ncolor = [0, 0.2, 1]').workcell
     assert workcell == Workcell(target=Target.box(), colour=(0.0, 0.2, 1.0))
@@ -117,6 +126,8 @@ WRONG = {
     "[target]\ncolour = [1, 0, 0]": ":2: [target] colour is unknown; did you mean color?",
     "[base]\nposition = [0, 11, 0]": ":2: [base] position y (11.0) must be from -10 to 10 m",
     "[base]\nposition = [9.9, 0, 0]\n[camera]\nposition = [-5, 0, 0]": ":1: [base]: position x (-14.9) must be from",
+    "[base]\nposition = [5, 0, 0]\n[arm]\nplace = [0.4, 0, 0]": ":4: [arm] place [-4.6, 0.0, 0.0] must be x, y and z",
+    "[arm]\nplace = [0.4, 'a', 0]": ":2: [arm] place[1] must be a number",
     "[camera]\nwidth = 0": ":2: [camera] width (0) must be from 1 to",
     "[camera]\n\nwidth = 1.5": ":3: [camera] width must be a whole number, not 1.5",
     "[camera]\nwidth = true": ":2: [camera] width must be a whole number, not true",

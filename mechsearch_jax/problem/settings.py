@@ -27,7 +27,7 @@ EXAMPLE = "example-config.toml"
 
 @dataclasses.dataclass(frozen=True)
 class Base:
-    """Where the robot's base stands in the frame in which a file gives camera and shelf.
+    """Where the robot's base stands in the frame in which a file gives camera, shelf and the target's place.
 
     Attributes:
       position: of the base, whose axes are parallel to the frame's [m].
@@ -113,9 +113,13 @@ def load_settings(path: PathLike) -> Settings:
     colour = _colour(document)
     without_colour = {key: value for key, value in document.tables.get("target", {}).items() if key != COLOR}
     document = dataclasses.replace(document, tables={**document.tables, "target": without_colour})
-    parts = {name: with_table(document, name, usual) for name, usual in _PARTS.items() if name != "target"}
-    objects, base = parts.pop("objects"), parts.pop("base")
+    base = with_table(document, "base", Base())
     x, y, z = base.position
+    document = _with_moved_place(document, (-x, -y, -z))
+    parts = {
+        name: with_table(document, name, usual) for name, usual in _PARTS.items() if name not in ("target", "base")
+    }
+    objects = parts.pop("objects")
     in_base_frame = lambda _: {name: parts[name].moved((-x, -y, -z)) for name in ("camera", "shelf")}  # noqa: E731
     parts |= apply(document, "base", {}, in_base_frame)
     target = _target(document)
@@ -126,6 +130,22 @@ def load_settings(path: PathLike) -> Settings:
         lambda given: Workcell(target=target if given else Target(), colour=colour, **parts),
     )
     return _with_planner(document, Settings(workcell, objects))
+
+
+def _with_moved_place(document: Document, offset: tuple[float, float, float]) -> Document:
+    """The document with the target's place moved, if the place is a point; joint angles stay as they are.
+
+    The place is moved before it is checked, since its bounds are around the robot.
+    """
+    arm = document.tables.get("arm", {})
+    if "place" not in arm:
+        return document
+    place = checked(arm["place"], tuple[float, ...], document.where("arm", "place"))
+    if len(place) != len(offset):
+        return document
+    # Without the digits that binary fractions add: messages show the place.
+    moved = [round(value + by, 9) for value, by in zip(place, offset, strict=True)]
+    return dataclasses.replace(document, tables={**document.tables, "arm": {**arm, "place": moved}})
 
 
 def _colour(document: Document) -> tuple[float, float, float]:

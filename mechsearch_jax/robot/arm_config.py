@@ -22,8 +22,8 @@ class ArmConfig:
       home: joint angles where it waits between motions, out of the camera's sight [rad].
       speed: share of the joints' limits that velocities may reach, above 0 and at most 1; accelerations reach its
         square, and jerks its cube.
-      place: where a target that was taken out is put down: three coordinates of where its foot is to stand [m], or
-        seven joint angles at which the hand opens [rad]; it stays in the hand if empty.
+      place: where a target that was taken out is put down: x, y and z of where its foot is to stand, in the frame
+        of the robot's base [m], or seven joint angles at which the hand opens [rad]; it stays in the hand if empty.
     """
 
     home: tuple[float, ...] = tuple(round(float(q), 4) for q in HOME)
@@ -47,6 +47,6 @@ def check_place(name: str, place: tuple[float, ...]) -> None:
         check_joints(name, np.array(place, float))
     elif len(place) not in (0, 3) or not all(abs(value) <= FARTHEST for value in place):
         raise InputError(
-            f"{name} {list(place)} must be x, y and z in metres, at most {FARTHEST:g} away, or {len(HOME)} joint "
-            "angles in radians"
+            f"{name} {list(place)} must be x, y and z in metres, each within {FARTHEST:g} of the robot's base, or "
+            f"{len(HOME)} joint angles in radians"
         )
