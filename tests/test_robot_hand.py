@@ -17,7 +17,17 @@ from mechsearch_jax.geometry.superquadric import empty
 from mechsearch_jax.geometry.transforms import yaw_rotation
 from mechsearch_jax.robot.arm_clearance import tip_positions
 from mechsearch_jax.robot.arm_config import ArmConfig
-from mechsearch_jax.robot.hand import EMPTY, Grip, HandConfig, grip_of, grip_of_any_yaw, grip_of_anything, stroke
+from mechsearch_jax.robot.gripper import Gripper
+from mechsearch_jax.robot.hand import (
+    EMPTY,
+    Grip,
+    HandConfig,
+    checked_width,
+    grip_of,
+    grip_of_any_yaw,
+    grip_of_anything,
+    stroke,
+)
 from mechsearch_jax.robot.kinematics import gripper_pose
 from mechsearch_jax.robot.robot_trajectory import Part
 from mechsearch_jax.runtime.errors import InputError
@@ -163,7 +173,7 @@ def test_what_is_gripped_has_its_own_width():
         ((0.02, 0.03, 0.1), 90.0, BOX, 0.04, 0.04),
         ((0.02, 0.03, 0.1), 10.0, BOX, 0.06, 0.066),
         ((0.02, 0.02, 0.1), 33.0, ROUND, 0.04, 0.04),
-        ((0.02, 0.09, 0.1), 0.0, BOX, 0.08, 0.08),
+        ((0.02, 0.09, 0.1), 0.0, BOX, 0.077, 0.077),
     ],
 )
 def test_the_width_is_that_along_the_closing_direction(size, degrees, exponents, low, high):
@@ -174,12 +184,16 @@ def test_the_width_is_that_along_the_closing_direction(size, degrees, exponents,
 
 def test_nothing_is_ever_grasped_at_width_0():
     hand = HandConfig()
-    for grip in (grip_of_anything(0.08), grip_of_any_yaw((0.01, 0.03, 0.05), 0.08), Grip(0.0061, 0.0061)):
+    widest = grip_of(ACROSS, np.eye(3), np.array((0.04, 0.04, 0.1)), np.array(BOX), 0.08)
+    usable = grip_of(ACROSS, np.eye(3), np.full(3, Gripper().usable_opening / 2), np.array(BOX), 0.08)
+    assert usable.width == pytest.approx(Gripper().usable_opening)
+    any_yaw = grip_of_any_yaw((0.01, 0.03, 0.05), 0.08)
+    for grip in (grip_of_anything(0.08), any_yaw, Grip(0.0061, 0.0061), usable, widest):
         event = grip.grasp(0.08, 1.0, 0.5, hand)
         assert event.width > 0.0
         # Fingers that closed on nothing are no grasp; those that did not close are none, either.
         assert event.width - event.inner > EMPTY / 2
-        assert event.width + event.outer <= 0.08 + 1e-9
+        assert event.width + event.outer <= 0.08 - EMPTY + 1e-9
         assert event.width - event.inner < max(grip.low, 2 * EMPTY)
     assert grip_of(ACROSS, np.eye(3), np.full(3, 1e-4), np.array(BOX), 0.08).width == pytest.approx(2 * EMPTY)
 
@@ -216,7 +230,7 @@ def test_the_present_opening_decides_how_long_the_way_there_takes_at_least():
     hand = HandConfig()
     assert first(0.08).duration == pytest.approx(hand.settle)
     assert first(0.0).duration == pytest.approx(hand.time(0.08))
-    # Not known: the arm waits for the longest way, and the hand is told where to be.
+    # Not known: the arm waits for the longest way.
     assert first(None).duration == pytest.approx(hand.time(0.08))
     assert first(None).width == pytest.approx(0.08)
     slow = whole_trajectory(
@@ -232,9 +246,25 @@ def test_the_present_opening_decides_how_long_the_way_there_takes_at_least():
         first(8.0)
 
 
+@pytest.mark.parametrize("width", ["0.04", "x", True, [0.04], np.zeros(2), float("nan"), object()])
+def test_a_width_that_is_no_number_is_refused_in_a_line(width):
+    action = retrieve_action(grasp(), Q7, jnp.float32(0.08))
+    for make in (
+        lambda: whole_trajectory(SETTING, seen(), action, width=width, config=CONFIG),
+        lambda: joint_trajectory(SETTING, action, CONFIG.motion, width=width),
+    ):
+        with pytest.raises(InputError, match=r"^width: [^\n]*$"):
+            make()
+
+
+def test_a_width_may_be_of_any_kind_of_number():
+    for width in (0, 0.04, np.float32(0.04), np.array(0.04), jnp.float32(0.04), 0.0805, -5e-4):
+        assert checked_width(width, 0.08) == pytest.approx(min(max(float(width), 0.0), 0.08))
+
+
 def test_the_plain_trajectory_of_an_action_waits_for_the_hand_too():
     action, hand = retrieve_action(grasp(), Q7, jnp.float32(0.08)), HandConfig()
-    trajectory = joint_trajectory(SETTING, action, seen(), CONFIG.motion, width=0.01)
+    trajectory = joint_trajectory(SETTING, action, CONFIG.motion, observation=seen(), width=0.01)
     opens, closes = trajectory.events
     assert (opens.kind, opens.start, opens.width) == ("move", 0.0, pytest.approx(0.08))
     assert closes.width == pytest.approx(0.04)
@@ -245,8 +275,11 @@ def test_the_plain_trajectory_of_an_action_waits_for_the_hand_too():
         first, last = round(event.start / 0.004), round((event.start + event.duration) / 0.004)
         assert np.ptp(position[max(first - 1, 0) : last], axis=0).max() == 0.0
     assert width[-1] == pytest.approx(0.04)
-    usual = joint_trajectory(SETTING, action, config=CONFIG.motion)
-    assert usual.events[0].duration == pytest.approx(hand.settle, abs=0.005)
+    is_open = joint_trajectory(SETTING, action, CONFIG.motion, width=0.08)
+    assert is_open.events[0].duration == pytest.approx(hand.settle, abs=0.005)
+    # Not known: after a push they are closed.
+    usual = joint_trajectory(SETTING, action, CONFIG.motion)
+    assert usual.events[0].duration == pytest.approx(hand.time(0.08), abs=0.005)
     anything = usual.events[1]
     assert anything.width - anything.inner < 0.01 < 0.07 < anything.width + anything.outer
     assert len(jax.tree.leaves(usual)) == 4

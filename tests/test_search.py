@@ -289,6 +289,8 @@ def test_the_hand_and_the_place_are_the_workcells(problem):
     assert step.warnings == ()
     with pytest.raises(InputError, match=r"width: 20\.0 m must be between 0"):
         searcher.next(IMAGES.depth, width=20.0)
+    with pytest.raises(InputError, match=r'width: "x" must be a number'):
+        searcher.next(IMAGES.depth, width="x")
     far = Workcell(arm=ArmConfig(place=(1.9, 0.0, 0.0)))
     (warning,) = searcher_of(problem, OPEN, workcell=far).next(IMAGES.depth, IMAGES.colour).warnings
     assert warning.startswith("the target is to stay in the hand: place: the arm does not reach [1.9, 0.0, 0.0]")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import flax.struct
 import jax
@@ -21,10 +21,11 @@ from mechsearch_jax.robot.hand import (
     Grip,
     HandConfig,
     HandEvent,
-    check_width,
+    checked_width,
     grip_of,
     grip_of_any_yaw,
     grip_of_anything,
+    longest_way,
 )
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference
@@ -135,10 +136,10 @@ def reference_motion(kind: Kind, action: Action, config: MotionConfig) -> tuple[
 def joint_trajectory(
     problem: Setting,
     action: Action,
-    observation: Observation | None = None,
     config: MotionConfig | None = None,
     *,
-    width: float | None = None,
+    observation: Observation | None = None,
+    width: Any = None,
     hand: HandConfig | None = None,
 ) -> JointTrajectory:
     """The joint trajectory of a decision's action: a push, a pick-and-place or a retrieval.
@@ -151,10 +152,11 @@ def joint_trajectory(
     Args:
       problem: the problem, with the gripper.
       action: a single action.
+      config: lengths and durations; default: the problem's gripper and default durations.
       observation: that the action was decided on, which says how wide what it grasps is; without it, the grasp takes
         whatever is between the fingers.
-      config: lengths and durations; default: the problem's gripper and default durations.
-      width: present distance between the fingers [m]; open if left out.
+      width: present distance between the fingers [m]; if left out, they are taken to be open, and there is time for
+        the longest way that they may have.
       hand: how the real hand is used; the default if None.
 
     Raises:
@@ -162,19 +164,21 @@ def joint_trajectory(
         or not in time.
     """
     config, hand = config or MotionConfig(gripper=problem.gripper), hand or HandConfig()
-    width = problem.gripper.max_opening if width is None else float(width)
-    check_width(width, problem.gripper.max_opening)
+    widest = problem.gripper.max_opening
+    present = widest if width is None else checked_width(width, widest)
     kind = kind_of(int(action.kind))
     motion = reference_motion(kind, action, config)
     if motion is None:
         still = jnp.float32(HOME)[None]
-        return JointTrajectory(jnp.zeros(1), still, jnp.zeros_like(still), jnp.full(1, width))
+        return JointTrajectory(jnp.zeros(1), still, jnp.zeros_like(still), jnp.full(1, present))
     reference, reachable = motion
     if not reachable:
         raise InputError(f"{kind.name}: the arm does not reach all of this motion; decide anew")
     reference = jax.device_get(reference)
     start = np.asarray(reference.start, float)
-    first = opening_to(start[:7], width, 2.0 * max(float(start[7]), 0.0), hand, config.timestep)
+    opened = 2.0 * max(float(start[7]), 0.0)
+    farthest = longest_way(opened, widest) if width is None else 0.0
+    first = opening_to(start[:7], present, opened, hand, config.timestep, farthest)
     parts: list[Rows] = [first, acting(reference, grip_for(problem, observation, action), config, hand)]
     rows = joined(parts, config.timestep)
     velocity, _ = derivatives(np.concatenate([start[None, :7], rows.position]), config.timestep)

@@ -60,9 +60,14 @@ def closing(q: Float[np.ndarray, " 7"], opening: float, grip: Grip, hand: HandCo
     return Rows(np.repeat(q[None], rows, axis=0), width, force, (event,))
 
 
-def opening_to(q: Float[np.ndarray, " 7"], before: float, after: float, hand: HandConfig, timestep: float) -> Rows:
-    """The arm waits at `q` while the fingers move from one distance to another [m]."""
-    rows = _count(hand.time(after - before), timestep)
+def opening_to(
+    q: Float[np.ndarray, " 7"], before: float, after: float, hand: HandConfig, timestep: float, farthest: float = 0.0
+) -> Rows:
+    """The arm waits at `q` while the fingers move from one distance to another [m].
+
+    There is time for a way of `farthest` m, if that is more.
+    """
+    rows = _count(hand.time(max(abs(after - before), farthest)), timestep)
     width, _ = stroke(before, after, rows, timestep, hand)
     event = HandMove(0.0, rows * timestep, True, after, hand.speed)
     return Rows(np.repeat(q[None], rows, axis=0), width, np.zeros(rows), (event,))

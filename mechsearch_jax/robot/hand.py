@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
 
 from mechsearch_jax.geometry.footprints import ROUND_EXPONENT
-from mechsearch_jax.runtime.errors import InputError, check_range
+from mechsearch_jax.runtime.errors import InputError, check_range, shown
 
 # Peak of the fingers' speed over its mean: they start and stop smoothly.
 PEAK = 1.5
-# Fingers that are closer together than this hold nothing [m].
+# Fingers that are closer together than this, or to their opening, hold nothing [m].
 EMPTY = 0.003
 # Upper bounds of the hand's speed [m/s], force [N], tolerances [m] and reserve of time [s].
 FASTEST, STRONGEST, WIDEST, LONGEST = 1.0, 200.0, 0.1, 10.0
@@ -143,7 +143,7 @@ class Grip:
             speed=hand.speed,
             force=hand.force,
             inner=min(spread + hand.inner, self.width - EMPTY),
-            outer=max(min(spread + hand.outer, opening - self.width), 1e-3),
+            outer=max(min(spread + hand.outer, opening - EMPTY - self.width), 0.0),
         )
 
 
@@ -190,7 +190,7 @@ def grip_of_anything(opening: float) -> Grip:
 def _bounded(low: float, high: float, opening: float) -> Grip:
     """Bounds that open fingers can close on, and that are more than nothing."""
     least = 2.0 * EMPTY
-    high = min(max(high, least), max(opening, least))
+    high = min(max(high, least), max(opening - EMPTY, least))
     return Grip(min(max(low, least), high), high)
 
 
@@ -215,12 +215,22 @@ def stroke(
     return np.where(share < 1.0, eased, after), time - moving
 
 
-def check_width(width: float, max_opening: float) -> None:
-    """Check a distance between the fingers.
+def longest_way(after: float, max_opening: float) -> float:
+    """The longest way to a distance between the fingers [m], if the present one is not known."""
+    return max(after, max_opening - after)
+
+
+def checked_width(width: Any, max_opening: float) -> float:
+    """A distance between the fingers that a user or a hand reports, as one that the gripper has [m].
 
     Raises:
-      InputError: it is no distance that the gripper can have.
+      InputError: it is no number, or no distance that the gripper can have.
     """
+    number = np.asarray(width) if isinstance(width, (int, float)) or hasattr(width, "dtype") else np.asarray("")
+    if number.ndim or number.dtype.kind not in "fiu":
+        raise InputError(f"width: {shown(width)} must be a number, the distance between the fingers in metres")
+    value = float(number)
     # A hand reports a little more than its largest opening, or less than none.
-    if not -1e-3 <= width <= max_opening + 1e-3:
-        raise InputError(f"width: {width} m must be between 0 and the gripper's {max_opening}, in metres")
+    if not -1e-3 <= value <= max_opening + 1e-3:
+        raise InputError(f"width: {value} m must be between 0 and the gripper's {max_opening}, in metres")
+    return min(max(value, 0.0), max_opening)

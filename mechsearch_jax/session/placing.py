@@ -73,10 +73,10 @@ def place_ways(
     paths = np.stack([_path(T) for T in grippers])
     q, reached = path_kinematics(np.repeat(paths, WRISTS, axis=0), np.tile(wrists, len(TURNS)))
     q, reached = np.asarray(q, float), np.asarray(reached)
-    found = np.flatnonzero(reached)
-    if not len(found):
+    reachable = np.flatnonzero(reached)
+    if not len(reachable):
         raise InputError(f"place: the arm does not reach {list(place)} with the target as it is grasped")
-    return [PlaceWay(q[i, :WAYPOINTS], q[i, WAYPOINTS - 1 :], placed[i // WRISTS]) for i in found[:MOST].tolist()]
+    return [PlaceWay(q[i, :WAYPOINTS], q[i, WAYPOINTS - 1 :], placed[i // WRISTS]) for i in reachable[:MOST].tolist()]
 
 
 def _path(T: np.ndarray) -> np.ndarray:

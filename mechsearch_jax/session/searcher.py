@@ -49,7 +49,7 @@ from mechsearch_jax.planner.trials import Trials, decide
 from mechsearch_jax.problem.problem import NOWHERE, Problem
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.free_motion import check_joints
-from mechsearch_jax.robot.hand import check_width
+from mechsearch_jax.robot.hand import checked_width
 from mechsearch_jax.robot.motion import MotionConfig
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.runtime.files import PathLike
@@ -254,7 +254,7 @@ class Searcher:
         mask: Any = None,
         target_id: int | None = None,
         joints: Any = None,
-        width: float | None = None,
+        width: Any = None,
     ) -> SearchStep:
         """Recognise the objects, update the belief and decide what to do next.
 
@@ -285,8 +285,7 @@ class Searcher:
         if joints is not None:
             joints = np.asarray(joints, float)
             check_joints("joints", joints)
-        if width is not None:
-            check_width(float(width), problem.gripper.max_opening)
+        width = None if width is None else checked_width(width, problem.gripper.max_opening)
         observation = self.recogniser(recognition_key, depth, colour, mask, target_id)
         check_measured(problem.camera, problem.shelf, depth)
         warnings = [*self._camera_faults, *self._faults(depth, colour, mask, target_id)]

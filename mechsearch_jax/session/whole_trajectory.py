@@ -21,7 +21,7 @@ from mechsearch_jax.robot.arm_clearance import ArmBody, Held, Obstacles, clearan
 from mechsearch_jax.robot.arm_config import check_place
 from mechsearch_jax.robot.free_motion import FreeMotion, FreeMotionConfig, check_joints, free_motion, timed_rows
 from mechsearch_jax.robot.gripper import Gripper
-from mechsearch_jax.robot.hand import HandConfig, HandMove, check_width, stroke
+from mechsearch_jax.robot.hand import HandConfig, HandMove, checked_width, longest_way, stroke
 from mechsearch_jax.robot.kinematics import HOME
 from mechsearch_jax.robot.motion import MotionConfig, Reference
 from mechsearch_jax.robot.robot_trajectory import Bounds, Part, RobotTrajectory, derivatives
@@ -79,7 +79,7 @@ def whole_trajectory(
     *,
     joints: Any = None,
     home: Any = None,
-    width: float | None = None,
+    width: Any = None,
     speed: float = 1.0,
     depth: Any = None,
     config: TrajectoryConfig | None = None,
@@ -120,8 +120,7 @@ def whole_trajectory(
     check_joints("joints", joints)
     if not 0.0 < speed <= 1.0:
         raise InputError(f"speed: {speed} must be above 0 and at most 1, a share of the joints' limits")
-    if width is not None:
-        check_width(width, problem.gripper.max_opening)
+    width = None if width is None else checked_width(width, problem.gripper.max_opening)
     if depth is not None:
         check_recognition(problem, observation, depth, config.doubt)
     action = getattr(decision, "action", decision)
@@ -148,7 +147,7 @@ class _Assembly:
 
     def run(self, joints: np.ndarray, home: np.ndarray, width: float | None) -> RobotTrajectory:
         widest = self.problem.gripper.max_opening
-        present = widest if width is None else min(max(float(width), 0.0), widest)
+        present = widest if width is None else width
         reference = self._reference()
         if reference is None:
             back = self._free("the way home", joints, home, ArmBody.of(present), self._obstacles())
@@ -156,7 +155,7 @@ class _Assembly:
 
         begin = np.asarray(reference.start, float)
         opened = 2.0 * max(begin[7], 0.0)
-        farthest = max(opened, widest - opened) if width is None else opened - present
+        farthest = longest_way(opened, widest) if width is None else opened - present
         stages = [self._way_there(joints, begin[:7], present, opened, self.hand.time(farthest))]
         grip = grip_for(self.problem, self.observation, self.action)
         stages.append(_Stage(Part.ACTION, acting(reference, grip, self.motion, self.hand, self.speed)))
