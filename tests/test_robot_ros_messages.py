@@ -63,8 +63,18 @@ def test_the_hands_goals_have_the_fields_of_franka_and_of_a_gripper_command():
         "force": 60.0,
         "epsilon": {"inner": 0.01, "outer": 0.02},
     }
-    assert gripper_command_goal(move) == {"command": {"position": 0.04, "max_effort": 0.0}}
+    assert gripper_command_goal(move) == {"command": {"position": 0.04, "max_effort": 20.0}}
+    assert gripper_command_goal(move, effort=5.0, widest=0.079) == {"command": {"position": 0.0395, "max_effort": 5.0}}
+    assert gripper_command_goal(grasp, widest=0.079) == gripper_command_goal(grasp)
     assert gripper_command_goal(grasp, 1.0) == {"command": {"position": 0.04, "max_effort": 60.0}}
+
+
+def test_goals_hold_floats_alone():
+    width, whole = np.float32(0.04), 1
+    for event in (HandMove(0.0, 1.0, False, width, whole), HandGrasp(0.0, 1.0, True, width, whole, 60, width, whole)):
+        goal = hand_goal(event)
+        numbers = [*goal.pop("epsilon", {}).values(), *goal.values(), *gripper_command_goal(event)["command"].values()]
+        assert {type(number) for number in numbers} == {float}
 
 
 def test_events_are_listed_beside_the_arm():

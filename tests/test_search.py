@@ -408,6 +408,16 @@ def test_a_saved_search_goes_on_where_it_was(problem, tmp_path):
     assert third.finished
 
 
+def test_a_saved_search_goes_on_with_another_hand_and_place(problem, tmp_path):
+    path = tmp_path / "search.npz"
+    searcher_of(problem, OPEN).save(path)
+    other = Workcell(hand=HandConfig(force=20.0), arm=ArmConfig(place=(0.35, -0.45, 0.1)))
+    searcher_of(problem, OPEN, workcell=other).load(path)
+    # As before there was a hand, so that older files can be read.
+    assert "hand" not in repr(other)
+    assert repr(other) == repr(Workcell())
+
+
 def test_a_file_of_another_search_is_refused(problem, tmp_path):
     path = tmp_path / "search.npz"
     searcher_of(problem, OPEN).save(path)

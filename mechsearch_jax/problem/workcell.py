@@ -25,8 +25,8 @@ class Workcell:
     Attributes:
       target: what is searched; for a scenario, which has its own target, how finely it is searched.
       arm: home and speed, and where it puts the target.
-      hand: how the real hand is used.
       colour: of the target in colour images: red, green and blue in 0 to 1. Compiled programs do not depend on it.
+      hand: how the real hand is used.
     """
 
     camera: Camera = dataclasses.field(default_factory=Camera)
@@ -34,8 +34,9 @@ class Workcell:
     gripper: Gripper = dataclasses.field(default_factory=Gripper)
     target: Target = dataclasses.field(default_factory=Target)
     arm: ArmConfig = dataclasses.field(default_factory=ArmConfig)
-    hand: HandConfig = dataclasses.field(default_factory=HandConfig)
     colour: tuple[float, float, float] = RED
+    # Searches are saved with a digest of this text, and may go on with another hand.
+    hand: HandConfig = dataclasses.field(default_factory=HandConfig, repr=False)
 
     def __post_init__(self):
         TargetColour.lit(self.colour)

@@ -28,7 +28,8 @@ class ArmConfig:
 
     home: tuple[float, ...] = tuple(round(float(q), 4) for q in HOME)
     speed: float = 1.0
-    place: tuple[float, ...] = ()
+    # Searches are saved with a digest of this text, and may go on after the place has changed.
+    place: tuple[float, ...] = dataclasses.field(default=(), repr=False)
 
     def __post_init__(self):
         check_joints("ArmConfig: home", np.array(self.home, float))

@@ -26,6 +26,8 @@ JOINT_NAMES = tuple(f"panda_joint{i}" for i in range(1, 8))
 ACTION_TYPES = {"move": "franka_msgs/action/Move", "grasp": "franka_msgs/action/Grasp"}
 # Position of a `GripperCommand` for each metre between the fingers: Franka's server takes that of one finger.
 FINGER_SHARE = 0.5
+# Effort of a `GripperCommand` that grasps nothing [N]: Franka's server closes the fingers by a grasp with it.
+MOVE_EFFORT = 20.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +76,8 @@ def joint_trajectory_message(
     joint_names: Sequence[str] = JOINT_NAMES,
     first: int = 0,
     last: int | None = None,
+    *,
+    backward: bool = False,
 ) -> dict[str, Any]:
     """Rows of a trajectory as a `trajectory_msgs/msg/JointTrajectory`, with times from the first of them.
 
@@ -81,6 +85,7 @@ def joint_trajectory_message(
       trajectory: of the arm.
       joint_names: of the seven joints, from the base.
       first, last: rows, both included, where the arm stands still; all of them by default.
+      backward: whether it goes from `last` to `first`, along the same way.
 
     Raises:
       InputError: `joint_names` are not seven different names.
@@ -90,7 +95,8 @@ def joint_trajectory_message(
         raise InputError(f"joint_names: {names} must be {len(JOINT_NAMES)} different names")
     rows = slice(first, None if last is None else last + 1)
     time, position = trajectory.time[rows] - trajectory.time[first], trajectory.position[rows]
-    whole = first == 0 and last is None
+    position = position[::-1] if backward else position
+    whole = first == 0 and last is None and not backward
     timestep = float(trajectory.time[1]) if len(trajectory.time) > 1 else 1.0
     velocity, acceleration = (
         (trajectory.velocity, trajectory.acceleration) if whole else derivatives(position, timestep)
@@ -105,22 +111,29 @@ def joint_trajectory_message(
 
 def hand_goal(event: HandEvent) -> dict[str, Any]:
     """An event as the goal of `franka_msgs/action/Move` or `Grasp` [m, m/s, N]."""
-    goal: dict[str, Any] = {"width": event.width, "speed": event.speed}
+    # Fields of messages refuse whole numbers and numbers of 32 bits.
+    goal: dict[str, Any] = {"width": float(event.width), "speed": float(event.speed)}
     if isinstance(event, HandGrasp):
-        goal |= {"epsilon": {"inner": event.inner, "outer": event.outer}, "force": event.force}
+        goal |= {"epsilon": {"inner": float(event.inner), "outer": float(event.outer)}, "force": float(event.force)}
     return goal
 
 
-def gripper_command_goal(event: HandEvent, share: float = FINGER_SHARE) -> dict[str, Any]:
+def gripper_command_goal(
+    event: HandEvent, share: float = FINGER_SHARE, *, effort: float = MOVE_EFFORT, widest: float | None = None
+) -> dict[str, Any]:
     """An event as the goal of `control_msgs/action/GripperCommand`; speed and tolerances are the server's.
 
     Args:
       event: of the hand.
       share: position of the command for each metre between the fingers: 0.5 where it is that of one finger, as for
         Franka's `gripper_action`, 1 where it is the distance between them.
+      effort: with which the fingers move where nothing is grasped [N]; Franka's server closes with it.
+      widest: largest distance between the fingers that is commanded [m]; a server refuses more than what it measured
+        when the hand was homed, which may be a little less than the gripper's opening.
     """
-    force = event.force if isinstance(event, HandGrasp) else 0.0
-    return {"command": {"position": share * event.width, "max_effort": force}}
+    force = event.force if isinstance(event, HandGrasp) else effort
+    width = event.width if widest is None else min(event.width, widest)
+    return {"command": {"position": float(share * width), "max_effort": float(force)}}
 
 
 def ros_messages(trajectory: RobotTrajectory, joint_names: Sequence[str] = JOINT_NAMES) -> dict[str, Any]:

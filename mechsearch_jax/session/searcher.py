@@ -393,6 +393,8 @@ class Searcher:
     def load(self, path: PathLike) -> None:
         """Continue a search that was saved by a searcher with the same workcell, configuration and seed.
 
+        The hand and the target's place may have changed.
+
         Raises:
           InputError: the file cannot be read, was not made by `save`, or belongs to another searcher.
         """
@@ -423,7 +425,7 @@ class Searcher:
 
     @functools.cached_property
     def _digest(self) -> str:
-        """SHA-256 of everything that a saved state depends on."""
+        """SHA-256 of everything that a saved state depends on; not of the hand, nor of the target's place."""
         return hashlib.sha256(repr((self.workcell, self.config, self._seed)).encode()).hexdigest()
 
 
