@@ -3,7 +3,9 @@
 import dataclasses
 import importlib.util
 import sys
+import time
 import types
+import unittest.mock
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +15,24 @@ from test_search_whole_trajectory import pushed, taken
 from mechsearch_jax.workspace.camera import Camera
 
 NODE = Path(__file__).parents[1] / "examples" / "ros2" / "search_node.py"
-ROS = ("rclpy", "control_msgs", "franka_msgs", "sensor_msgs", "trajectory_msgs")
+ROS = ("rclpy", "action_msgs", "control_msgs", "franka_msgs", "sensor_msgs", "trajectory_msgs")
 JOINTS = [f"fr3_joint{i}" for i in range(1, 8)]
 HERE = [0.1 * i for i in range(7)]
 
 
 def message(type_name, /, **fields):
-    """A type with these fields, given by what makes their first values; others cannot be set."""
+    """A type with these fields, given by what makes their first values; others cannot be set, nor other types."""
 
     def start(self, **given):
         for field, make in fields.items():
             setattr(self, field, given.get(field, make()))
 
-    return type(type_name, (), {"__slots__": tuple(fields), "__init__": start})
+    def put(self, field, value):
+        expected = type(fields[field]()) if field in fields else object
+        assert isinstance(value, expected), f"{type_name}.{field} is of type {expected}, not {type(value)}"
+        object.__setattr__(self, field, value)
+
+    return type(type_name, (), {"__slots__": tuple(fields), "__init__": start, "__setattr__": put})
 
 
 TIME = message("Time", sec=int, nanosec=int)
@@ -69,12 +76,28 @@ MOVE = action("Move", {"width": float, "speed": float}, {"success": True})
 GRASP = action("Grasp", {"width": float, "epsilon": EPSILON, "speed": float, "force": float}, {"success": True})
 
 
+# Results of goals: none ever, or somebody presses Ctrl-C meanwhile.
+NEVER, INTERRUPTED = object(), object()
+
+
 class Future:
+    """What arrives at once, or when `arrive` is called."""
+
     def __init__(self, value):
-        self.value = value
+        self.value, self.calls = value, []
 
     def add_done_callback(self, call):
-        call(self)
+        if self.value is INTERRUPTED:
+            raise KeyboardInterrupt
+        if self.value is NEVER:
+            self.calls.append(call)
+        else:
+            call(self)
+
+    def arrive(self, value):
+        self.value = value
+        for call in self.calls:
+            call(self)
 
     def result(self):
         return self.value
@@ -85,11 +108,15 @@ class StandIn:
 
     Attributes:
       goals: in the order in which they were sent, with the name of their action.
-      answers: results of actions by the last part of their names; a success if there is none.
+      answers: results of actions by the last part of their names; a success if there is none, a refusal if None.
+      statuses: of the goals, in the same way; 4, succeeded, if there is none.
+      late: futures of the goals' handles by action, which arrive when the test says so.
+      cancelled: names of the actions whose goals were cancelled, and what else is done at the end.
     """
 
     def __init__(self, **parameters):
         self.parameters, self.goals, self.answers, self.callbacks = parameters, [], {}, {}
+        self.statuses, self.late, self.cancelled = {}, {}, []
 
     def modules(self):
         stand_in = self
@@ -105,7 +132,7 @@ class StandIn:
                 stand_in.callbacks[topic] = kind, call
 
             def get_logger(self):
-                return types.SimpleNamespace(info=self.log.append, warning=self.log.append)
+                return types.SimpleNamespace(**dict.fromkeys(("info", "warning", "error"), self.log.append))
 
             def get_clock(self):
                 return types.SimpleNamespace(now=lambda: types.SimpleNamespace(nanoseconds=5 * 10**9))
@@ -120,19 +147,33 @@ class StandIn:
             def send_goal_async(self, goal):
                 assert type(goal) is self.kind.Goal
                 stand_in.goals.append((self.name, goal))
-                result = stand_in.answers.get(self.name.rpartition("/")[2], self.kind.Result)
+                name = self.name.rpartition("/")[2]
+                result = stand_in.answers.get(name, self.kind.Result)
+                answer = types.SimpleNamespace(result=result, status=stand_in.statuses.get(name, 4))
+
+                def cancel():
+                    stand_in.cancelled.append(name)
+                    return Future("cancelling")
+
                 handle = types.SimpleNamespace(
                     accepted=result is not None,
-                    get_result_async=lambda: Future(types.SimpleNamespace(result=result)),
+                    get_result_async=lambda: Future(result if result in (NEVER, INTERRUPTED) else answer),
+                    cancel_goal_async=cancel,
                 )
+                if name in stand_in.late:
+                    stand_in.late[name] = Future(NEVER), handle
+                    return stand_in.late[name][0]
                 return Future(handle)
 
         held = {
-            "rclpy": {"init": None, "shutdown": None},
+            "action_msgs": {},
+            "action_msgs.msg": {"GoalStatus": types.SimpleNamespace(STATUS_SUCCEEDED=4)},
+            "rclpy": {"init": self.init, "shutdown": lambda: self.cancelled.append("shutdown")},
             "rclpy.action": {"ActionClient": Client},
-            "rclpy.executors": {"MultiThreadedExecutor": None},
+            "rclpy.executors": {"MultiThreadedExecutor": unittest.mock.Mock},
             "rclpy.node": {"Node": Node},
             "rclpy.qos": {"qos_profile_sensor_data": None},
+            "rclpy.signals": {"SignalHandlerOptions": types.SimpleNamespace(NO="no")},
             "control_msgs": {},
             "control_msgs.action": {"FollowJointTrajectory": FOLLOW, "GripperCommand": COMMAND},
             "control_msgs.msg": {"JointTolerance": TOLERANCE},
@@ -147,6 +188,10 @@ class StandIn:
             module = types.ModuleType(name)
             vars(module).update(values)
             yield name, module
+
+    def init(self, signal_handler_options):
+        # Else Ctrl-C ends the connection, and nothing can be cancelled.
+        assert signal_handler_options == "no"
 
     def publish(self, topic, message):
         kind, call = self.callbacks[topic]
@@ -165,7 +210,8 @@ def start(monkeypatch):
         spec = importlib.util.spec_from_file_location("search_node", NODE)
         example = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(example)
-        monkeypatch.setattr(example, "PATIENCE", 0.05)
+        for name, seconds in (("PATIENCE", 0.05), ("CANCELLING", 0.05), ("SPARE", -10.0), ("STALE", 60.0)):
+            monkeypatch.setattr(example, name, seconds)
         return example, example.SearchNode(), stand_in
 
     return started
@@ -223,6 +269,11 @@ def test_the_camera_has_its_own_intrinsics_and_the_configured_pose(start):
     info.d = [0.1]
     with pytest.raises(ValueError, match="distorts"):
         example.camera_of(info, usual)
+    with pytest.raises(ValueError, match="p holds no focal lengths"):
+        example.camera_of(INFO(p=[0.0] * 12), usual, rectified=True)
+    info.p = [400.0, 0.0, 400.5, 0.0, 0.0, 401.0, 220.5, 0.0, 0.0, 0.0, 1.0, 0.0]
+    camera = example.camera_of(info, usual, rectified=True)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (400.0, 401.0, 401.0, 221.0)
 
 
 def test_old_images_and_missing_ones_are_not_taken(start):
@@ -238,6 +289,21 @@ def test_old_images_and_missing_ones_are_not_taken(start):
     assert depth[0, 0] == pytest.approx(1.5)
     assert node.joints == HERE
     assert node.width == pytest.approx(0.03)
+
+
+def test_joint_states_without_positions_and_stale_ones_are_not_taken(start, monkeypatch):
+    example, node, stand_in = start()
+    stand_in.publish("/joint_states", STATE(name=JOINTS, velocity=HERE))
+    with pytest.raises(TimeoutError, match="joint states of the arm"):
+        _ = node.joints
+    published(stand_in)
+    stand_in.publish("/joint_states", STATE(name=JOINTS, velocity=HERE))
+    assert node.joints == HERE
+    monkeypatch.setattr(example, "STALE", 0.0)
+    time.sleep(0.001)
+    with pytest.raises(TimeoutError, match="joint states of the arm"):
+        _ = node.joints
+    assert node.width is None
 
 
 def test_arm_and_hand_take_turns(start):
@@ -266,18 +332,96 @@ def test_arm_and_hand_take_turns(start):
 def test_a_gripper_of_another_make_is_commanded_by_position(start):
     _, node, stand_in = start(gripper="command", gripper_namespace="/hand")
     stand_in.answers["gripper_action"] = types.SimpleNamespace(reached_goal=False, stalled=True)
-    # It did not open, so that the arm stays outside.
+    # It did not open, so that the arm stays outside, and goes back.
     assert not node.follow(taken())
-    assert stand_in.goals[0][0] == "/hand/gripper_action"
-    assert len(stand_in.goals) == 2
+    arm = "/fr3_arm_controller/follow_joint_trajectory"
+    assert [name for name, _ in stand_in.goals] == ["/hand/gripper_action", arm, arm]
     stand_in.goals.clear()
     stand_in.answers["gripper_action"] = types.SimpleNamespace(reached_goal=True, stalled=False)
     assert node.follow(taken())
     commands = [goal.command for name, goal in stand_in.goals if name == "/hand/gripper_action"]
     assert [(c.position, c.max_effort) for c in commands] == [
-        (pytest.approx(0.04), 0.0),
+        (pytest.approx(0.0395), 20.0),
         (pytest.approx(0.02), 60.0),
     ]
+    stand_in.goals.clear()
+    assert node.follow(pushed())
+    closes = stand_in.goals[0][1].command
+    # Franka's server closes by a grasp.
+    assert (closes.position, closes.max_effort) == (0.0, 20.0)
+
+
+@pytest.mark.parametrize("answer", [None, NEVER, types.SimpleNamespace(success=False), "canceled"])
+def test_an_arm_whose_hand_does_not_open_goes_back_out_of_sight(start, answer):
+    _, node, stand_in = start()
+    if answer == "canceled":
+        stand_in.statuses["move"] = 5
+    else:
+        stand_in.answers["move"] = answer
+    trajectory = taken()
+    assert not node.follow(trajectory)
+    assert [name.rpartition("/")[2] for name, _ in stand_in.goals] == ["move", *["follow_joint_trajectory"] * 2]
+    there, back = (goal.trajectory.points for _, goal in stand_in.goals[1:])
+    np.testing.assert_array_equal([p.positions for p in back], [p.positions for p in there][::-1])
+    np.testing.assert_allclose([p.velocities for p in back], -np.array([p.velocities for p in there])[::-1], atol=1e-9)
+    assert [p.time_from_start.nanosec for p in back] == [p.time_from_start.nanosec for p in there]
+    assert stand_in.cancelled == (["move"] if answer is NEVER else [])
+
+
+def test_goals_that_were_cancelled_are_not_done(start):
+    example, node, stand_in = start()
+    # The result of a goal that was cancelled is an empty one, whose error code is that of a success.
+    stand_in.statuses["follow_joint_trajectory"] = 5
+    with pytest.raises(example.ArmStoppedError, match="error 0, status of the goal 5; take it out by hand"):
+        node.follow(taken())
+    stand_in.statuses = {"grasp": 5}
+    assert not node.follow(taken())
+
+
+@pytest.mark.parametrize(("answer", "error"), [(NEVER, RuntimeError), (INTERRUPTED, KeyboardInterrupt)])
+def test_goals_are_cancelled_when_time_is_up_and_when_somebody_stops_the_node(start, answer, error):
+    _, node, stand_in = start()
+    stand_in.answers["follow_joint_trajectory"] = answer
+    with pytest.raises(error):
+        node.follow(taken())
+    # The hand's goal is on its way, too.
+    assert sorted(stand_in.cancelled) == ["follow_joint_trajectory", "move"]
+    node.cancel()
+    assert len(stand_in.cancelled) == 2
+
+
+def test_a_goal_that_is_accepted_too_late_is_cancelled_then(start):
+    example, node, stand_in = start()
+    stand_in.late["follow_joint_trajectory"] = None
+    with pytest.raises(example.ArmStoppedError, match="no answer"):
+        node.follow(taken())
+    assert stand_in.cancelled == ["move"]
+    assert any("stop the robot by hand" in line for line in node.log)
+    future, handle = stand_in.late["follow_joint_trajectory"]
+    future.arrive(handle)
+    assert stand_in.cancelled == ["move", "follow_joint_trajectory"]
+
+
+def test_the_node_cancels_before_it_shuts_down(start, monkeypatch):
+    example, node, stand_in = start(confirm=False)
+    stand_in.answers["grasp"] = INTERRUPTED
+    trajectory, interrupted = taken(), []
+
+    def search(node, searcher, confirm):
+        node._begin_event(trajectory.events[-1])
+        interrupted.append(confirm(None))
+        raise KeyboardInterrupt
+
+    info = INFO(k=[400.0, 0.0, 400.5, 0.0, 401.0, 220.5, 0.0, 0.0, 1.0], width=640, height=480)
+    monkeypatch.setattr(example, "SearchNode", lambda: node)
+    monkeypatch.setattr(example, "load_searcher", unittest.mock.MagicMock())
+    monkeypatch.setattr(example, "search", search)
+    monkeypatch.setattr(example.signal, "signal", lambda number, handler: None)
+    stand_in.publish("/camera/camera/color/camera_info", info)
+    with pytest.raises(KeyboardInterrupt):
+        example.main()
+    assert interrupted == [True]
+    assert stand_in.cancelled == ["grasp", "shutdown"]
 
 
 def test_after_a_grasp_that_failed_the_arm_goes_its_way_out(start):
@@ -304,7 +448,7 @@ class Searching:
     """A searcher that hands out motions and is told what became of them."""
 
     def __init__(self, *trajectories):
-        self.left, self.told, self.given = list(trajectories), [], []
+        self.left, self.outcomes, self.given = list(trajectories), [], []
 
     @property
     def finished(self):
@@ -316,7 +460,7 @@ class Searching:
         return types.SimpleNamespace(kind=kind, reason="why", warnings=("odd",), trajectory=self.left[0])
 
     def acted(self, ok):
-        self.told.append(ok)
+        self.outcomes.append(ok)
         self.left.pop(0)
 
 
@@ -325,7 +469,7 @@ def test_a_search_goes_on_until_the_target_is_out(start):
     published(stand_in)
     searcher = Searching(pushed(), taken())
     assert example.search(node, searcher)
-    assert searcher.told == [True, True]
+    assert searcher.outcomes == [True, True]
     assert searcher.given[0] == ((3, 4), (3, 4, 3), HERE, pytest.approx(0.03))
     assert node.log[:2] == ["push: why", "odd"]
 
@@ -347,7 +491,7 @@ def test_what_failed_is_told_to_the_searcher_though_the_arm_stopped(start):
     searcher = Searching(pushed())
     with pytest.raises(example.ArmStoppedError, match="error -5"):
         example.search(node, searcher)
-    assert searcher.told == [False]
+    assert searcher.outcomes == [False]
 
 
 def test_the_package_needs_no_ros():

@@ -11,17 +11,20 @@ parameters.
 from __future__ import annotations
 
 import dataclasses
+import signal
 import threading
 import time
 
 import numpy as np
 import rclpy
+from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory, GripperCommand
 from control_msgs.msg import JointTolerance
 from rclpy.action import ActionClient
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -31,8 +34,10 @@ from mechsearch_jax.robot.ros_messages import gripper_command_goal, hand_goal, j
 
 # How far the stamps of images that belong together may be apart [s], and how long the node waits for what it needs [s].
 SLOP, PATIENCE = 0.1, 30.0
-# Longer than a goal's own time [s]: then the controller is taken to be dead.
-SPARE = 30.0
+# Longer than a goal's own time [s]: then the controller is taken to be dead. How long a cancellation is waited for [s].
+SPARE, CANCELLING = 30.0, 2.0
+# Age at which a joint state counts no more [s].
+STALE = 1.0
 # Steps without a motion, one after the other, after which the search ends.
 IDLE = 3
 
@@ -42,10 +47,12 @@ PARAMETERS = {
     "depth": "/camera/camera/aligned_depth_to_color/image_raw",
     "colour": "/camera/camera/color/image_raw",
     "camera_info": "/camera/camera/color/camera_info",
+    "rectified": False,
     "joint_states": "/joint_states",
     "arm_action": "",
     "gripper": "franka",
     "gripper_namespace": "",
+    "widest": 0.079,
     "confirm": True,
 }
 
@@ -74,15 +81,24 @@ def colour_of(image):
     return array[..., ::-1].copy() if image.encoding.startswith("bgr") else array
 
 
-def camera_of(info, camera):
-    """The configuration's camera, which has the pose, with the intrinsics of a `CameraInfo`."""
-    if any(abs(value) > 1e-6 for value in info.d):
-        raise ValueError("camera_info: the lens distorts; subscribe to rectified images, whose d is zeros")
-    k = [float(value) for value in info.k]
-    # In k the centre of the first pixel is at 0.
-    return dataclasses.replace(
-        camera, width=info.width, height=info.height, fx=k[0], fy=k[4], cx=k[2] + 0.5, cy=k[5] + 0.5
-    )
+def camera_of(info, camera, rectified=False):
+    """The configuration's camera, which has the pose, with the intrinsics of a `CameraInfo`.
+
+    Those of `rectified` images, as image_proc publishes them, are in p; k and d are of the raw images.
+    """
+    if rectified:
+        fx, _, cx, _, _, fy, cy = (float(value) for value in info.p[:7])
+    elif any(abs(value) > 1e-6 for value in info.d):
+        raise ValueError(
+            "camera_info: the lens distorts; subscribe to rectified images, and set rectified:=true if they have the "
+            "camera_info of the raw ones, as image_proc's"
+        )
+    else:
+        fx, _, cx, _, fy, cy = (float(value) for value in info.k[:6])
+    if fx <= 0.0 or fy <= 0.0:
+        raise ValueError(f"camera_info: {'p' if rectified else 'k'} holds no focal lengths; calibrate the camera")
+    # In ROS the centre of the first pixel is at 0.
+    return dataclasses.replace(camera, width=info.width, height=info.height, fx=fx, fy=fy, cx=cx + 0.5, cy=cy + 0.5)
 
 
 def filled(message, values):
@@ -99,6 +115,11 @@ def seconds_of(stamp):
     return stamp.sec + 1e-9 * stamp.nanosec
 
 
+def succeeded(answer):
+    """Whether a goal came to its end; a goal that was cancelled or aborted has a result, too, often an empty one."""
+    return answer is not None and answer.status == GoalStatus.STATUS_SUCCEEDED
+
+
 class ArmStoppedError(RuntimeError):
     """The arm did not reach the end of a leg, and may stand inside the shelf."""
 
@@ -113,6 +134,8 @@ class SearchNode(Node):
         self.joint_names = [f"{robot}_joint{i}" for i in range(1, 8)]
         self.finger_names = [f"{robot}_finger_joint{i}" for i in (1, 2)]
         self._latest, self._positions = {}, {}
+        # Futures of the handles of goals whose result has not come.
+        self._running = []
         for name, kind in (("depth", Image), ("colour", Image), ("camera_info", CameraInfo)):
             self.create_subscription(kind, self.given[name], self._keeper(name), qos_profile_sensor_data)
         self.create_subscription(JointState, self.given["joint_states"], self._keep_joints, qos_profile_sensor_data)
@@ -140,18 +163,32 @@ class SearchNode(Node):
         return keep
 
     def _keep_joints(self, message):
-        self._positions.update(zip(message.name, message.position, strict=True))
+        # Some drivers publish velocities or efforts alone.
+        if len(message.position) == len(message.name):
+            now = time.monotonic()
+            self._positions.update({q: (x, now) for q, x in zip(message.name, message.position, strict=True)})
+
+    def _position(self, name):
+        """The present position of a joint; None if nobody has published it lately."""
+        position, arrived = self._positions.get(name, (None, 0.0))
+        return None if time.monotonic() - arrived > STALE else position
 
     @property
     def joints(self):
         """Where the arm is: seven angles [rad]."""
-        self._wait_for(lambda: all(name in self._positions for name in self.joint_names), "joint states of the arm")
-        return [self._positions[name] for name in self.joint_names]
+        positions = []
+
+        def arrived():
+            positions[:] = [self._position(name) for name in self.joint_names]
+            return None not in positions
+
+        self._wait_for(arrived, "joint states of the arm")
+        return positions
 
     @property
     def width(self):
         """How far the fingers are apart [m]; None if nobody publishes it."""
-        fingers = [self._positions.get(name) for name in self.finger_names]
+        fingers = [self._position(name) for name in self.finger_names]
         return None if None in fingers else sum(fingers)
 
     def camera_info(self):
@@ -174,55 +211,81 @@ class SearchNode(Node):
     def follow(self, trajectory):
         """Execute a trajectory leg by leg; whether the hand did all that it was to do.
 
-        The hand that does not open ends it outside the shelf. After a grasp that failed the arm goes on, for that is
-        its way out.
+        If the hand does not open on the way to the shelf, the arm goes the same way back, out of the camera's sight.
+        After a grasp that failed it goes on, for that is its way out. Whatever ends it early, no goal stays behind.
 
         Raises:
           ArmStoppedError: the arm did not follow.
         """
         ok = True
-        for leg in legs(trajectory):
-            events = [] if leg.event is None else [self._begin_event(leg.event)]
-            if leg.last > leg.first:
-                self._end_arm(self._begin_arm(trajectory, leg), leg)
-            done = all(self._end_event(*begun) for begun in events)
-            if not done and not leg.event.waits:
-                return False
-            ok &= done
+        try:
+            for leg in legs(trajectory):
+                events = [] if leg.event is None else [self._begin_event(leg.event)]
+                self._move_arm(trajectory, leg)
+                done = all(self._end_event(*begun) for begun in events)
+                if not done and not leg.event.waits:
+                    self._move_arm(trajectory, leg, backward=True)
+                    return False
+                ok &= done
+        finally:
+            self.cancel()
         return ok
 
-    def _begin_arm(self, trajectory, leg):
-        message = joint_trajectory_message(trajectory, self.joint_names, leg.first, leg.last)
+    def cancel(self):
+        """Cancel all goals that have no result."""
+        for sent in list(self._running):
+            self._cancel(sent)
+
+    def _cancel(self, sent):
+        self._running.remove(sent)
+        handle = self._done(sent, CANCELLING)
+        if handle is None:
+            # It may be accepted yet.
+            sent.add_done_callback(lambda late: late.result().accepted and late.result().cancel_goal_async())
+        if handle is None or (handle.accepted and self._done(handle.cancel_goal_async(), CANCELLING) is None):
+            self.get_logger().error("a goal may go on, for its server does not answer; stop the robot by hand")
+
+    def _move_arm(self, trajectory, leg, backward=False):
+        if leg.last == leg.first:
+            return
+        answer = self._answer(*self._begin_arm(trajectory, leg, backward))
+        if succeeded(answer) and answer.result.error_code == FollowJointTrajectory.Result.SUCCESSFUL:
+            return
+        if answer is None:
+            why = "no answer"
+        else:
+            why = answer.result.error_string or f"error {answer.result.error_code}, status of the goal {answer.status}"
+        raise ArmStoppedError(f"the arm stopped in rows {leg.first} to {leg.last}: {why}; take it out by hand")
+
+    def _begin_arm(self, trajectory, leg, backward):
+        message = joint_trajectory_message(trajectory, self.joint_names, leg.first, leg.last, backward=backward)
         points = [filled(JointTrajectoryPoint(), point) for point in message.pop("points")]
         goal = FollowJointTrajectory.Goal()
         goal.trajectory = filled(JointTrajectory(), message)
         goal.trajectory.points = points
-        tracking = trajectory.bounds.tracking
+        tracking = float(trajectory.bounds.tracking)
         goal.path_tolerance = [
             filled(JointTolerance(), {"name": name, "position": tracking}) for name in self.joint_names
         ]
         seconds = float(trajectory.time[leg.last] - trajectory.time[leg.first])
         return self._send(self._arm, goal), seconds
 
-    def _end_arm(self, begun, leg):
-        result = self._result(*begun)
-        if result is None or result.error_code != FollowJointTrajectory.Result.SUCCESSFUL:
-            why = "no answer" if result is None else result.error_string or f"error {result.error_code}"
-            raise ArmStoppedError(f"the arm stopped in rows {leg.first} to {leg.last}: {why}; take it out by hand")
-
     def _begin_event(self, event):
         kind, client = self._hand[event.kind]
-        values = gripper_command_goal(event) if kind is GripperCommand else hand_goal(event)
+        if kind is GripperCommand:
+            values = gripper_command_goal(event, widest=self.given["widest"])
+        else:
+            values = hand_goal(event)
         return event, self._send(client, filled(kind.Goal(), values))
 
     def _end_event(self, event, sent):
-        result = self._result(sent, event.duration)
-        if result is None:
+        answer = self._answer(sent, event.duration)
+        if not succeeded(answer):
             done = False
         elif self._hand[event.kind][0] is GripperCommand:
-            done = result.reached_goal or (event.kind == "grasp" and result.stalled)
+            done = answer.result.reached_goal or (event.kind == "grasp" and answer.result.stalled)
         else:
-            done = result.success
+            done = answer.result.success
         if not done:
             self.get_logger().warning(f"the hand could not {event.kind} to {1000 * event.width:.0f} mm")
         return bool(done)
@@ -230,15 +293,22 @@ class SearchNode(Node):
     def _send(self, client, goal):
         if not client.wait_for_server(timeout_sec=PATIENCE):
             raise TimeoutError("an action server of the arm or the gripper does not answer; is its driver running?")
-        return client.send_goal_async(goal)
+        sent = client.send_goal_async(goal)
+        self._running.append(sent)
+        return sent
 
-    def _result(self, sent, seconds):
-        """The result of a goal; None if it is refused or does not come."""
+    def _answer(self, sent, seconds):
+        """Status and result of a goal; None if it is refused, or cancelled because no result came in time."""
         handle = self._done(sent, PATIENCE)
-        if handle is None or not handle.accepted:
+        if handle is not None and not handle.accepted:
+            self._running.remove(sent)
             return None
-        answer = self._done(handle.get_result_async(), seconds + SPARE)
-        return None if answer is None else answer.result
+        answer = None if handle is None else self._done(handle.get_result_async(), seconds + SPARE)
+        if answer is None:
+            self._cancel(sent)
+        else:
+            self._running.remove(sent)
+        return answer
 
     def _done(self, future, seconds):
         """The result of a future, for which another thread spins; None if it does not come in time."""
@@ -279,14 +349,16 @@ def search(node, searcher, confirm=lambda step: True):
     return True
 
 
-def asked(step):
+def confirmed(step):
     """Whether the operator agrees to a motion."""
     print(f"{step.kind}: {step.reason}\n{step.trajectory.report()}")
     return input("Move? [y/N] ").strip().lower() == "y"
 
 
 def main():
-    rclpy.init()
+    # ROS's own handlers would end the connection before goals are cancelled.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     node = SearchNode()
     executor = MultiThreadedExecutor()
     executor.add_node(node)
@@ -294,13 +366,15 @@ def main():
     try:
         path = node.given["config"] or None
         settings = Settings() if path is None else load_settings(path)
-        searcher = load_searcher(path, camera=camera_of(node.camera_info(), settings.workcell.camera))
+        camera = camera_of(node.camera_info(), settings.workcell.camera, node.given["rectified"])
+        searcher = load_searcher(path, camera=camera)
         for warning in searcher.check().warnings:
             node.get_logger().warning(warning)
         searcher.warm_up(lambda what, left: node.get_logger().info(f"preparing {what}"), colour=True)
-        found = search(node, searcher, asked if node.given["confirm"] else lambda step: True)
-        node.get_logger().info("the target is out" if found else "the search ended without the target")
+        retrieved = search(node, searcher, confirmed if node.given["confirm"] else lambda step: True)
+        node.get_logger().info("the target is out" if retrieved else "the search ended without the target")
     finally:
+        node.cancel()
         executor.shutdown()
         rclpy.shutdown()
 
