@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import json
 import math
 import re
 import tomllib
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from mechsearch_jax.runtime.errors import InputError, nearest, shown
@@ -81,6 +83,48 @@ def _lines(text: str, tables: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str
         elif key and key[1] in tables[table]:
             lines.setdefault((table, key[1]), number)
     return lines
+
+
+def with_values(text: str, table: str, values: Mapping[str, Any], name: str) -> str:
+    """A TOML file's text with other values in a table; all else, comments too, stays as it is.
+
+    Args:
+      text: of the file; may be empty.
+      table: that the values are of; it is appended if it is missing.
+      values: numbers, and lists of them, by their keys.
+      name: of the file, in messages.
+
+    Raises:
+      InputError: the text is not TOML, or the table is not written on lines of its own.
+    """
+    try:
+        before = tomllib.loads(text)
+        lines = text.splitlines()
+        places = _lines(text, {key: part for key, part in before.items() if isinstance(part, dict)} | {"": before})
+        for place in sorted((at for (of, key), at in places.items() if of == table and key in values), reverse=True):
+            del lines[place - 1 : place - 1 + _span(lines[place - 1 :])]
+        written = [f"{key} = {json.dumps(value)}" for key, value in values.items()]
+        at = places.get((table, ""))
+        if at is None:
+            lines += [*([""] if lines else []), f"[{table}]"]
+            at = len(lines)
+        lines[at:at] = written
+        after = "\n".join(lines) + "\n"
+        wanted = before | {table: {**before.get(table, {}), **json.loads(json.dumps(values))}}
+        if tomllib.loads(after) == wanted:
+            return after
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        pass
+    raise InputError(f"{name}: cannot be changed; write [{table}] on a line of its own, and its keys below it")
+
+
+def _span(lines: Sequence[str]) -> int:
+    """How many lines the value takes that begins on the first."""
+    for count in range(1, len(lines) + 1):
+        with contextlib.suppress(ValueError, RecursionError):
+            tomllib.loads("\n".join(lines[:count]))
+            return count
+    return 1
 
 
 def check_names(document: Document, table: str, valid: Mapping[str, Any]) -> None:
