@@ -21,7 +21,8 @@ from typing import Annotated, Any, get_type_hints
 import tyro
 
 from mechsearch_jax.commands import bench, scenarios, train
-from mechsearch_jax.commands.doctor import doctor, print_config
+from mechsearch_jax.commands.cell.calibrate import calibrate
+from mechsearch_jax.commands.cell.doctor import doctor, print_config
 from mechsearch_jax.commands.evaluate import evaluate
 from mechsearch_jax.commands.inspect import inspect as inspect_scenarios
 from mechsearch_jax.commands.options import EpisodeOptions, with_planner_options
@@ -49,6 +50,7 @@ def _only_described(description: str | None) -> Callable[[], None]:
 COMMANDS: Commands = {
     "search": search,
     "plan": plan,
+    "calibrate": calibrate,
     "inspect": inspect_scenarios,
     "video": video,
     "view": view,

@@ -276,7 +276,10 @@ def _check(camera: Camera, depth: Any, colour: Any, mask: Any, target_id: Any) -
         if image is None or not (hasattr(image, "shape") and hasattr(image, "dtype")):
             raise InputError(f"{name} image: is a {type(image).__name__}; give an array of the shape {shape}")
         if tuple(image.shape) != shape:
-            raise InputError(f"{name} image: its shape is {tuple(image.shape)}, the camera's images are {shape}")
+            turned = "; it looks transposed" if tuple(image.shape[:2]) == size[::-1] else ""
+            raise InputError(
+                f"{name} image: its shape is {tuple(image.shape)}, the camera's images are {shape}{turned}"
+            )
     _check_depth(depth)
     if colour is not None:
         _check_colour(colour)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.config.config import ProblemConfig
 from mechsearch_jax.images.colour import RED, TargetColour
 from mechsearch_jax.problem.cache import cached_problem, is_cached
@@ -25,6 +26,7 @@ class Workcell:
     Attributes:
       target: what is searched; for a scenario, which has its own target, how finely it is searched.
       arm: home and speed, and where it puts the target.
+      calibration: how far the shelf in an image may be from its place; decisions do not depend on it.
       colour: of the target in colour images: red, green and blue in 0 to 1. Compiled programs do not depend on it.
       hand: how the real hand is used.
     """
@@ -34,6 +36,8 @@ class Workcell:
     gripper: Gripper = dataclasses.field(default_factory=Gripper)
     target: Target = dataclasses.field(default_factory=Target)
     arm: ArmConfig = dataclasses.field(default_factory=ArmConfig)
+    # Not in the representation, which identifies saved searches: they go on with other limits.
+    calibration: CalibrationLimits = dataclasses.field(default_factory=CalibrationLimits, repr=False)
     colour: tuple[float, float, float] = RED
     # Searches are saved with a digest of this text, and may go on with another hand.
     hand: HandConfig = dataclasses.field(default_factory=HandConfig, repr=False)

@@ -28,6 +28,7 @@ from mechsearch_jax.actions.kinds.nothing import no_action
 from mechsearch_jax.actions.registry import KINDS, ActionKind, kind_of
 from mechsearch_jax.belief.belief import Belief, initial_belief, update_belief
 from mechsearch_jax.belief.impasse import impasse
+from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.config.config import Config
 from mechsearch_jax.config.presets import standard
 from mechsearch_jax.dynamics.push_model import PushModel
@@ -273,7 +274,8 @@ class Searcher:
           The step. Follow its trajectory as it is, then call `acted`.
 
         Raises:
-          InputError: an image has the wrong shape, type or unit, nothing was measured, or the search is finished.
+          InputError: an image has the wrong shape, type or unit, nothing was measured, the shelf is far from where it
+            should be in it, or the search is finished.
         """
         problem, now = self.problem, self._now
         if now.finished:
@@ -414,7 +416,8 @@ class Searcher:
         """Warnings about images that do not fit camera, shelf and target."""
         problem, recogniser = self.problem, self.recogniser
         mask, colour = (None if image is None else np.asarray(image) for image in (mask, colour))
-        faults = list(image_faults(problem.camera, problem.shelf, depth, mask))
+        faults = list(placement_faults(problem.camera, problem.shelf, depth, self.workcell.calibration))
+        faults += image_faults(problem.camera, problem.shelf, depth, mask)
         # Another recogniser may identify the target in another way.
         if isinstance(recogniser, Recogniser):
             faults += identity_faults(colour, mask, target_id)

@@ -380,9 +380,44 @@ def bench_reach(
     console.print(reach_table(rows))
 
 
+def bench_calibration(
+    scenarios: Scenarios,
+    /,
+    *,
+    offsets: int = 5,
+    seed: int = 0,
+    out: JsonFile = None,
+) -> None:
+    """Measure how well the shelf in a depth image tells how far the camera's pose is off: up to 20 mm and 3 degrees.
+
+    Args:
+      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
+      offsets: random ones for each scene and sensor, and as many looks without one.
+      seed: of offsets and noise.
+      out: JSON file for the figures and for every fit's row.
+    """
+    from rich.console import Console
+
+    from mechsearch_jax.benchmarks.calibration.offsets import Bench
+    from mechsearch_jax.benchmarks.parts.images import save_rows
+    from mechsearch_jax.benchmarks.report.console_tables import calibration_table
+
+    at_least_one("bench calibration", offsets=offsets)
+    check_files(out)
+    scenes = _loaded(scenarios)
+    console = Console(highlight=False)
+    with console.status("looking") as status:
+        bench = Bench(scenes, offsets, seed=seed)
+        measured = bench.run(lambda done: status.update(f"looking {done}/{len(scenes)}"))
+    if out is not None:
+        save_rows(measured.value(), measured.rows, out)
+    console.print(calibration_table(measured))
+
+
 COMMANDS = {
     "scenes": bench_scenes,
     "reach": bench_reach,
+    "calibration": bench_calibration,
     "agreement": bench_agreement,
     "recognition": bench_recognition,
     "segmentation": bench_segmentation,

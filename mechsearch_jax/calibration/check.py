@@ -1,0 +1,152 @@
+"""The check at every look: whether the shelf in the image is where camera and shelf say that it is."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.calibration.fit import FEW_PIXELS, REACH, ShelfFit, check_in_sight, check_size, fit_shelf
+from mechsearch_jax.calibration.limits import CalibrationLimits
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+from mechsearch_jax.workspace.sight import camera_faults
+
+# A limit is passed by so many standard errors.
+CERTAIN = 3.0
+# Of what is seen through the shelf's opening: least share near the shelf, and largest share farther behind its faces
+# than this [m]. The image is thinned for it, in pixels. A face should be in sight if more than this share ends on it.
+LEAST_INSIDE, MOST_BEHIND, BEHIND, THINNED, WELL_IN_SIGHT = 0.2, 0.05, 0.03, 8, 0.1
+CAUSES = (
+    "check whether the camera or the shelf was moved, the camera's pose and focal lengths, whether the image is "
+    "turned, and the unit of the depth (metres along the camera's axis)"
+)
+REMEDY = "mechsearch calibrate --depth IMAGE --config FILE.toml (or --camera FILE.json) measures and corrects it"
+
+
+def placement_faults(
+    camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"], limits: CalibrationLimits
+) -> tuple[str, ...]:
+    """A warning if the shelf in a depth image is not where it should be; takes milliseconds.
+
+    Only directions count that the image determines; see `fit.fit_shelf`.
+
+    Args:
+      camera, shelf: as they are taken to be.
+      depth: along the camera's axis [m]; 0 or NaN where nothing was measured.
+      limits: of shift and turn.
+
+    Raises:
+      InputError: it is so far off that the image cannot be used, or hardly anything of it is the shelf.
+    """
+    check_size(camera, depth)
+    opening = _opening(camera, shelf, depth)
+    inside, behind = _shares(shelf, opening.points)
+    if inside < LEAST_INSIDE:
+        raise InputError(
+            f"depth image: {100 * inside:.0f}% of what it shows through the shelf's opening is in the shelf; {CAUSES}"
+        )
+    fit = fit_shelf(camera, shelf, depth, FEW_PIXELS)
+    check_in_sight(fit)
+    if is_beyond(fit, shelf, limits.refuse_shift, limits.refuse_turn):
+        # A mistake that the pose alone gives away explains it better.
+        cause = [
+            *camera_faults(camera, shelf),
+            f"{_appears(fit, shelf)}, which is too far to go on; {CAUSES}; {REMEDY}",
+        ][0]
+        raise InputError(cause)
+    if is_beyond(fit, shelf, limits.warn_shift, limits.warn_turn):
+        return (f"{_appears(fit, shelf)}: recognition is worse for it; {REMEDY}",)
+    if behind > MOST_BEHIND:
+        return (
+            f"depth image: {100 * behind:.0f}% of what it shows through the shelf's opening is behind the shelf's "
+            f"faces; {CAUSES}, and the shelf's measures",
+        )
+    return _unseen(fit, shelf, opening)
+
+
+class _Opening(NamedTuple):
+    """N rays through the shelf's opening: where they start, their ways at unit depth, and the points that they show."""
+
+    place: np.ndarray
+    ways: np.ndarray
+    points: np.ndarray
+
+
+def _opening(camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"]) -> _Opening:
+    """The measured rays through the shelf's opening."""
+    rows, columns = np.arange(0, camera.height, THINNED), np.arange(0, camera.width, THINNED)
+    v, u = np.meshgrid((rows + 0.5 - camera.cy) / camera.fy, (columns + 0.5 - camera.cx) / camera.fx, indexing="ij")
+    ways = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.array(camera.rotation).T
+    seen, place = np.asarray(depth[np.ix_(rows, columns)], float).ravel(), np.array(camera.position)
+    measured = np.isfinite(seen) & (seen > 0)
+    ways, points = ways[measured], place + seen[measured, None] * ways[measured]
+    low, high = _corners(shelf)
+    to_front = (shelf.front - place[0]) / np.where(ways[:, 0] > 1e-6, ways[:, 0], np.inf)
+    entry = place + to_front[:, None] * ways
+    enters = np.all((entry[:, 1:] > low[1:]) & (entry[:, 1:] < high[1:]), axis=1) & (to_front > 0)
+    return _Opening(place, ways[enters], points[enters])
+
+
+def _shares(shelf: Shelf, points: np.ndarray) -> tuple[float, float]:
+    """The shares of points that are near the shelf, and well behind its faces; 1 and 0 without points."""
+    if not len(points):
+        return 1.0, 0.0
+    low, high = _corners(shelf)
+    inside = np.all((points > low - REACH) & (points < high + REACH), axis=1)
+    # What is in front of the opening is not behind a face.
+    behind = (points[:, 0] > high[0] + BEHIND) | np.any(
+        (points[:, 1:] < low[1:] - BEHIND) | (points[:, 1:] > high[1:] + BEHIND), axis=1
+    )
+    return float(np.mean(inside)), float(np.mean(behind & (points[:, 0] > low[0])))
+
+
+def _unseen(fit: ShelfFit, shelf: Shelf, opening: _Opening) -> tuple[str, ...]:
+    """A warning about each face that should be well in sight in an empty shelf, and is not in sight at all."""
+    if not len(opening.ways):
+        return ()
+    ends = []
+    for part in fit.faces:
+        towards = -part.face.inward * opening.ways[:, part.face.axis]
+        far = part.face.inward * (opening.place[part.face.axis] - getattr(shelf, part.face.field))
+        ends.append(np.where(towards > 1e-6, far / np.where(towards > 1e-6, towards, 1.0), np.inf))
+    first = np.argmin(ends, axis=0)
+    return tuple(
+        f"depth image: the {part.face.name} should be in sight, and is not within {100 * REACH:.0f} cm of "
+        f"shelf.{part.face.field}; {CAUSES}, and the shelf's measures"
+        for i, part in enumerate(fit.faces)
+        if not part.patches and np.mean(first == i) > WELL_IN_SIGHT
+    )
+
+
+def _corners(shelf: Shelf) -> tuple[np.ndarray, np.ndarray]:
+    """The lowest and the highest corner of the shelf's space [m]."""
+    low, high = (shelf.front, shelf.right, shelf.board), (shelf.back, shelf.left, shelf.ceiling)
+    return np.array(low), np.array(high)
+
+
+def apparent(fit: ShelfFit, shelf: Shelf) -> tuple[float, float]:
+    """How far a corner of the board appears at most from its place [m], and by how much the shelf is turned [rad]."""
+    arms = np.array([(x, y, shelf.board) for x in (shelf.front, shelf.back) for y in (shelf.right, shelf.left)])
+    moves = fit.shift + np.cross(fit.turn, arms - fit.pivot)
+    return float(np.linalg.norm(moves, axis=1).max()), float(np.linalg.norm(fit.turn))
+
+
+def is_beyond(fit: ShelfFit, shelf: Shelf, shift: float, turn: float) -> bool:
+    """Whether the shelf appears farther from its place than a shift [m] or a turn [rad], for certain."""
+    errors = np.sqrt(np.diag(fit.covariance))
+    off, turned = apparent(fit, shelf)
+    return bool(
+        off > shift + CERTAIN * np.linalg.norm(errors[:3]) or turned > turn + CERTAIN * np.linalg.norm(errors[3:])
+    )
+
+
+def _appears(fit: ShelfFit, shelf: Shelf) -> str:
+    off, turned = apparent(fit, shelf)
+    return (
+        f"camera or shelf: in the depth image the shelf is up to {1000 * off:.0f} mm and {math.degrees(turned):.1f} "
+        "degrees from where camera and shelf are said to be"
+    )

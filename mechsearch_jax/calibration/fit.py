@@ -1,0 +1,314 @@
+"""Fit the shelf's inner faces to a depth image: how the camera must be moved for what it sees to lie on them.
+
+First the rotation, from the normals of flat patches; then the place of each face along its normal, the outermost plane
+with many patches, for objects stand in front of the faces; then all six numbers at once by least squares from the
+points to the planes, with Tukey's weights (Y. Chen and G. Medioni, 1992). Directions that the faces in sight do not
+determine, such as sliding along a board without walls, are left as they are.
+
+On the host, in float64; milliseconds.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from mechsearch_jax.calibration.faces import FACES, Face
+from mechsearch_jax.calibration.patches import flat_patches
+from mechsearch_jax.images.camera_pose import with_pose
+from mechsearch_jax.images.cloud import middle
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.workspace.camera import Camera
+from mechsearch_jax.workspace.shelf import Shelf
+
+# Pixels that are used: of a whole calibration, and of the check at every look.
+ALL_PIXELS, FEW_PIXELS = 1_000_000, 60_000
+# How far from its place a face is searched [m].
+REACH = 0.12
+# Angles between a patch's normal and its face's within which it may be the face's, from step to step [rad].
+TURNS = tuple(math.radians(angle) for angle in (25.0, 25.0, 15.0, 10.0, 6.0, 4.0, 4.0))
+# Distances of a point from its face within which it counts, from step to step [m].
+REACHES = (0.015, 0.015, 0.015, 0.01, 0.007, 0.005, 0.005, 0.005)
+# Angle between a point's normal and its face's in these steps [rad].
+ALIKE = math.radians(8.0)
+# Bins of the search for a face [m]; the outermost with this share of the most patches is the face.
+BIN, SHARE = 0.004, 0.2
+# A face needs so many patches, over a width, or else a height or depth, that no object has [m].
+FEWEST, WIDTH, LENGTH = 6, 0.18, 0.24
+# Two faces across an axis that contradict each other by more than this are not both fitted [m].
+CONTRADICTION = 0.006
+# A rotation counts as the shift at this distance [m].
+LEVER = 0.25
+# A direction is determined if its standard error is below this [m], with residuals of at least this [m].
+LEAST_PRECISION, LEAST_RESIDUAL = 0.001, 0.0003
+
+
+@dataclasses.dataclass(frozen=True)
+class FaceFit:
+    """A face in the image.
+
+    Attributes:
+      face: the face.
+      patches, pixels: how much of the image lies on it; 0 where it is not in sight.
+      off: how far it is in front of its place after the fit, negative behind it [m]; nearly 0 unless the shelf's
+        measures are wrong; NaN where it is not in sight.
+    """
+
+    face: Face
+    patches: int
+    pixels: int
+    off: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ShelfFit:
+    """Where the shelf is in an image, as a motion of the camera in the world that puts it in its place.
+
+    Attributes:
+      camera: as it was given.
+      pivot: the point that the motion turns about, the middle of the board [m].
+      shift: of the pivot [m].
+      turn: rotation vector [rad].
+      covariance: of shift and turn, in the directions that are determined, shape (6, 6).
+      undetermined: directions of (shift, `LEVER` * turn) that the image does not determine, as columns, shape (6, k);
+        shift and turn have no part in them.
+      faces: in the order of `FACES`.
+    """
+
+    camera: Camera
+    pivot: Float[np.ndarray, "3"]
+    shift: Float[np.ndarray, "3"]
+    turn: Float[np.ndarray, "3"]
+    covariance: Float[np.ndarray, "6 6"]
+    undetermined: Float[np.ndarray, "6 k"]
+    faces: tuple[FaceFit, ...]
+
+    @property
+    def corrected(self) -> Camera:
+        """The camera where the image says that it is."""
+        T = np.eye(4)
+        turn = Rotation.from_rotvec(self.turn).as_matrix()
+        T[:3, :3] = turn @ np.array(self.camera.rotation)
+        T[:3, 3] = turn @ (np.array(self.camera.position) - self.pivot) + self.pivot + self.shift
+        return with_pose(self.camera, T)
+
+
+class _Matched(NamedTuple):
+    """Patches with the face that each lies on: normals, heights above it and weights."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    heights: np.ndarray
+    weights: np.ndarray
+
+
+def check_size(camera: Camera, depth: np.ndarray) -> None:
+    """Check that a depth image has the camera's size.
+
+    Raises:
+      InputError: it has another.
+    """
+    size = (camera.height, camera.width)
+    if depth.shape != size:
+        turned = "; it looks transposed" if depth.shape == size[::-1] else ""
+        raise InputError(f"depth image: its shape is {depth.shape}, the camera's images are {size}{turned}")
+
+
+def check_in_sight(fit: ShelfFit) -> None:
+    """Check that an image determines anything.
+
+    Raises:
+      InputError: no face of the shelf is in sight.
+    """
+    if not any(part.patches for part in fit.faces):
+        raise InputError(
+            f"depth image: shows no face of the shelf within {100 * REACH:.0f} cm of its place; check the unit of the "
+            "depth (metres along the camera's axis), whether the image is turned, the camera's pose and focal lengths, "
+            "and the shelf"
+        )
+
+
+def fit_shelf(camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"], most: int = ALL_PIXELS) -> ShelfFit:
+    """Fit the shelf's faces to a depth image.
+
+    Args:
+      camera: as it is taken to be, at most some 10 cm and 15 degrees off.
+      shelf: as it is taken to be.
+      depth: along the camera's axis [m]; 0 or NaN where nothing was measured.
+      most: pixels that are used.
+
+    Raises:
+      InputError: the image has another size than the camera's.
+    """
+    check_size(camera, depth)
+    patches = flat_patches(camera, depth, most)
+    pivot = np.array(middle(shelf), float)
+    rotation, place = np.array(camera.rotation, float), np.array(camera.position, float)
+    points, normals = patches.point @ rotation.T + place, patches.normal @ rotation.T
+    return _Fit(shelf, pivot, points, normals, patches.pixels, place).run(camera)
+
+
+class _Fit:
+    """A fit under way: the motion `x -> turn (x - pivot) + pivot + shift` of all points."""
+
+    def __init__(
+        self,
+        shelf: Shelf,
+        pivot: np.ndarray,
+        points: np.ndarray,
+        normals: np.ndarray,
+        pixels: np.ndarray,
+        place: np.ndarray,
+    ):
+        self.shelf, self.pivot, self.pixels, self.place = shelf, pivot, pixels, place
+        self.given = points, normals
+        self.turn, self.shift = np.eye(3), np.zeros(3)
+
+    def moved(self) -> tuple[np.ndarray, np.ndarray]:
+        points, normals = self.given
+        return (points - self.pivot) @ self.turn.T + self.pivot + self.shift, normals @ self.turn.T
+
+    def run(self, camera: Camera) -> ShelfFit:
+        for within in TURNS:
+            self._turn_by_normals(within)
+        used = self._shift_to_faces()
+        covariance, free = np.zeros((6, 6)), np.eye(6)
+        for reach in REACHES:
+            covariance, free = self._step(used, reach)
+        if free.size:
+            # Objects' faces may have turned what the shelf's faces do not determine.
+            self._give_back(free)
+            for reach in REACHES:
+                covariance, free = self._step(used, reach)
+        scale = np.diag([1.0] * 3 + [1.0 / LEVER] * 3)
+        return ShelfFit(
+            camera,
+            self.pivot,
+            self.shift,
+            Rotation.from_matrix(self.turn).as_rotvec(),
+            scale @ covariance @ scale,
+            free,
+            tuple(self._seen(face) for face in FACES),
+        )
+
+    def _turn_by_normals(self, within: float) -> None:
+        """A step towards the rotation that turns the patches' normals into those of the faces nearest to them."""
+        points, normals = self.moved()
+        near = np.zeros(len(points), bool)
+        for face in FACES:
+            near |= face.across(self.shelf, points, REACH) & (np.abs(face.height(self.shelf, points)) < 2 * REACH)
+        normals, pixels = normals[near], self.pixels[near]
+        axes = np.stack([face.normal for face in FACES])
+        cosines = normals @ axes.T
+        best = cosines.argmax(axis=1) if len(cosines) else np.zeros(0, int)
+        angle = np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)) if len(cosines) else np.zeros(0)
+        weight = pixels * np.maximum(1.0 - (angle / within) ** 2, 0.0) ** 2
+        if not weight.sum() > 0:
+            return
+        weight = weight / weight.sum()
+        aim = axes[best]
+        matrix = np.eye(3) - np.einsum("n,ni,nj->ij", weight, normals, normals)
+        pull = np.einsum("n,ni->i", weight, np.cross(normals, aim))
+        values, vectors = np.linalg.eigh(matrix)
+        # One face alone leaves the rotation about its normal free, but for noise in the normals.
+        kept = values > 0.02
+        step = vectors[:, kept] @ ((vectors[:, kept].T @ pull) / values[kept])
+        turn = Rotation.from_rotvec(step).as_matrix()
+        self.turn = turn @ self.turn
+        # About the camera, which is turned about itself more often than the shelf is about its middle.
+        self.shift = turn @ (self.pivot + self.shift - self.place) + self.place - self.pivot
+
+    def _candidates(self, face: Face, points: np.ndarray, normals: np.ndarray, spare: float) -> np.ndarray:
+        return face.across(self.shelf, points, spare) & (normals @ face.normal > math.cos(ALIKE))
+
+    def _outermost(self, face: Face) -> tuple[float, float] | None:
+        """Height of the face above its place [m], and its pixels; None if it is not in sight."""
+        points, normals = self.moved()
+        heights = face.height(self.shelf, points)
+        near = self._candidates(face, points, normals, REACH) & (np.abs(heights) < REACH)
+        if near.sum() < FEWEST:
+            return None
+        edges = np.arange(-REACH, REACH + BIN / 2, BIN)
+        pixels, _ = np.histogram(heights[near], edges, weights=self.pixels[near])
+        pixels = pixels + np.append(pixels[1:], 0.0)
+        for i in np.flatnonzero(pixels >= SHARE * pixels.max()):
+            on = near & (np.abs(heights - edges[i + 1]) < 1.5 * BIN)
+            if on.sum() >= FEWEST and self._is_wide(face, points[on]):
+                return float(np.median(heights[on])), float(self.pixels[on].sum())
+        return None
+
+    def _is_wide(self, face: Face, points: np.ndarray) -> bool:
+        """Whether points spread wider than any object."""
+        low, high = np.percentile(points, (5, 95), axis=0)
+        spans = high - low
+        level = [axis for axis in (0, 1) if axis != face.axis]
+        return bool(max(spans[level]) > WIDTH or max(np.delete(spans, face.axis)) > LENGTH)
+
+    def _shift_to_faces(self) -> list[Face]:
+        """Shift the points so that the faces are in their places; return the faces that agree."""
+        seen = {face: place for face in FACES if (place := self._outermost(face)) is not None}
+        used: list[Face] = []
+        shift = np.zeros(3)
+        for axis in range(3):
+            along = sorted((face for face in seen if face.axis == axis), key=lambda face: -seen[face][1])
+            if not along:
+                # What turning about the camera moved is not known either.
+                shift[axis] = -self.shift[axis]
+                continue
+            best = along[0]
+            shift[axis] = -best.inward * seen[best][0]
+            used += [best]
+            used += [f for f in along[1:] if abs(-f.inward * seen[f][0] - shift[axis]) < CONTRADICTION]
+        self.shift = self.shift + shift
+        return used
+
+    def _matched(self, faces: list[Face], reach: float) -> _Matched:
+        points, normals = self.moved()
+        parts = []
+        for face in faces:
+            heights = face.height(self.shelf, points)
+            on = self._candidates(face, points, normals, 0.01) & (np.abs(heights) < reach)
+            weight = self.pixels[on] * (1.0 - (heights[on] / reach) ** 2) ** 2
+            parts.append((points[on], np.broadcast_to(face.normal, (on.sum(), 3)), heights[on], weight))
+        if not parts:
+            parts = [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))]
+        return _Matched(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+    def _step(self, faces: list[Face], reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """A Gauss-Newton step; returns the scaled covariance, and the directions that are left."""
+        points, normals, heights, weight = self._matched(faces, reach)
+        if len(points) < FEWEST:
+            return np.zeros((6, 6)), np.eye(6)
+        weight = weight / weight.max()
+        arm = points - self.pivot - self.shift
+        jacobian = np.concatenate([normals, np.cross(arm, normals) / LEVER], axis=1)
+        matrix = jacobian.T @ (weight[:, None] * jacobian)
+        pull = -jacobian.T @ (weight * heights)
+        residual = math.sqrt(float(weight @ heights**2) / max(float(weight.sum()), 1e-9))
+        values, vectors = np.linalg.eigh(matrix)
+        kept = np.maximum(residual, LEAST_RESIDUAL) < LEAST_PRECISION * np.sqrt(np.maximum(values, 0.0))
+        inside, values = vectors[:, kept], values[kept]
+        step = inside @ (inside.T @ pull / values)
+        self.turn = Rotation.from_rotvec(step[3:] / LEVER).as_matrix() @ self.turn
+        self.shift = self.shift + step[:3]
+        return residual**2 * (inside / values) @ inside.T, vectors[:, ~kept]
+
+    def _give_back(self, free: np.ndarray) -> None:
+        """Take the part of the motion back that lies in directions of (shift, `LEVER` * turn), as columns."""
+        motion = np.concatenate([self.shift, LEVER * Rotation.from_matrix(self.turn).as_rotvec()])
+        motion -= free @ (free.T @ motion)
+        self.shift, self.turn = motion[:3], Rotation.from_rotvec(motion[3:] / LEVER).as_matrix()
+
+    def _seen(self, face: Face) -> FaceFit:
+        place = self._outermost(face)
+        if place is None:
+            return FaceFit(face, 0, 0, math.nan)
+        points, normals = self.moved()
+        on = self._candidates(face, points, normals, 0.01)
+        on &= np.abs(face.height(self.shelf, points) - place[0]) < REACHES[-1]
+        return FaceFit(face, int(on.sum()), int(self.pixels[on].sum()), place[0])

@@ -1,0 +1,90 @@
+"""Flat patches of a depth image: small blocks of pixels, each with a point and a normal.
+
+Of a plane, the inverse of the depth is linear in the coordinates of a pixel: a patch is one linear least-squares fit,
+which averages the noise of its pixels. Blocks across an edge or on a curved surface are not flat, and are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from mechsearch_jax.workspace.camera import Camera
+
+# Side of a block in pixels of the thinned image.
+SIDE = 8
+# Least share of a block's pixels with a depth.
+LEAST_MEASURED = 0.2
+# A block is flat if its depth deviates from a plane by at most so many times the median of all blocks, and this [m].
+FLATNESS, LEAST_DEVIATION = 2.0, 0.0005
+
+
+class Patches(NamedTuple):
+    """N flat patches in the camera's frame.
+
+    Attributes:
+      point: the middle of each, on its plane [m].
+      normal: unit vectors towards the camera.
+      pixels: how many of the image's pixels each stands for.
+    """
+
+    point: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]
+    pixels: Float[np.ndarray, " n"]
+
+
+def flat_patches(camera: Camera, depth: Float[np.ndarray, "h w"], most: int) -> Patches:
+    """The flat patches of a depth image.
+
+    Args:
+      camera: of the image.
+      depth: along the camera's axis [m]; not finite or not positive where nothing was measured.
+      most: the image is thinned to at most about so many pixels.
+    """
+    stride = max(1, round(math.sqrt(depth.size / most)))
+    thin = np.asarray(depth[::stride, ::stride])
+    rows, columns = (size // SIDE for size in thin.shape)
+    blocks = thin[: rows * SIDE, : columns * SIDE].reshape(rows, SIDE, columns, SIDE).swapaxes(1, 2)
+    blocks = blocks.reshape(rows * columns, SIDE**2)
+    measured = np.isfinite(blocks) & (blocks > 0)
+    enough = measured.sum(axis=1) >= max(LEAST_MEASURED * SIDE**2, 4)
+    blocks, measured = blocks[enough], measured[enough]
+    # The middle of each block in the image, at unit depth.
+    place = (np.arange(rows), np.arange(columns))
+    down, across = ((p * SIDE + (SIDE - 1) / 2.0) * stride + 0.5 for p in place)
+    down, across = np.meshgrid((down - camera.cy) / camera.fy, (across - camera.cx) / camera.fx, indexing="ij")
+    middle = np.stack([across.ravel(), down.ravel()], axis=1)[enough]
+    # The pixels of all blocks lie alike around their middles.
+    offset = (np.arange(SIDE) - (SIDE - 1) / 2.0) * stride
+    v, u = np.meshgrid(offset / camera.fy, offset / camera.fx, indexing="ij")
+    basis = np.stack([u.ravel(), v.ravel(), np.ones(SIDE**2)], axis=1)
+    weight = measured.astype(float)
+    inverse = np.where(measured, 1.0 / np.where(measured, blocks, 1.0), 0.0)
+    products = (basis[:, :, None] * basis[:, None, :]).reshape(SIDE**2, 9)
+    matrix, right = (weight @ products).reshape(-1, 3, 3), inverse @ basis
+    # A block whose pixels lie on a line has no plane.
+    solid = np.linalg.cond(matrix * np.outer(*[1.0 / np.sqrt(np.diag(basis.T @ basis))] * 2)) < 1e4
+    slopes = np.zeros_like(right)
+    slopes[solid] = np.linalg.solve(matrix[solid], right[solid][..., None])[..., 0]
+    return _flat(middle, slopes, inverse, weight, basis, solid, stride)
+
+
+def _flat(middle, slopes, inverse, weight, basis, solid, stride) -> Patches:
+    """The blocks that are flat, from the slopes (n, 3) of their inverse depth."""
+    count = weight.sum(axis=1)
+    centre = weight @ basis[:, :2] / count[:, None]
+    at_centre = np.sum(slopes[:, :2] * centre, axis=1) + slopes[:, 2]
+    solid = solid & (at_centre > 1e-3)
+    safe = np.where(solid, at_centre, 1.0)
+    residual = weight * (inverse - slopes @ basis.T)
+    deviation = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(count - 3, 1)) / safe**2
+    usual = float(np.median(deviation[solid])) if solid.any() else 0.0
+    flat = solid & (deviation <= FLATNESS * usual + LEAST_DEVIATION)
+    ray = np.concatenate([middle + centre, np.ones((len(middle), 1))], axis=1)
+    normal = np.concatenate([slopes[:, :2], (slopes[:, 2] - np.sum(slopes[:, :2] * middle, axis=1))[:, None]], axis=1)
+    # It points away from the camera, for its product with a point is 1.
+    normal = -normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return Patches((ray / safe[:, None])[flat], normal[flat], stride**2 * count[flat])

@@ -1,0 +1,216 @@
+"""Where the shelf is in a depth image: what is found again, what is left alone, what is said, and what is written."""
+
+import dataclasses
+import json
+import tomllib
+
+import numpy as np
+import pytest
+from test_mutated_files import program
+
+from mechsearch_jax.calibration.check import placement_faults
+from mechsearch_jax.calibration.fit import FEW_PIXELS, LEVER, check_in_sight, fit_shelf
+from mechsearch_jax.calibration.limits import CalibrationLimits
+from mechsearch_jax.calibration.report import correction, report
+from mechsearch_jax.images.camera_pose import with_pose
+from mechsearch_jax.images.examples import example_images
+from mechsearch_jax.images.image_files import load_camera, save_camera, save_depth
+from mechsearch_jax.problem.settings import load_settings
+from mechsearch_jax.runtime.errors import InputError
+from mechsearch_jax.runtime.tables import with_values
+from mechsearch_jax.workspace.camera import rays
+from mechsearch_jax.workspace.shelf import Shelf
+
+IMAGES, SHELF = example_images(), Shelf()
+CAMERA, DEPTH = IMAGES.camera, IMAGES.depth
+
+
+def turned(axis, angle):
+    """A rotation by Rodrigues' formula."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis)
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
+
+
+def off_by(shift, axis=(0.0, 0.0, 1.0), degrees=0.0):
+    """The camera as it is wrongly taken to be."""
+    T = np.eye(4)
+    T[:3, :3] = turned(axis, np.radians(degrees)) @ np.array(CAMERA.rotation)
+    T[:3, 3] = np.add(CAMERA.position, shift)
+    return with_pose(CAMERA, T)
+
+
+def between(one, other):
+    """Distance [m] and angle [degrees] between two cameras."""
+    cosine = (np.trace(np.array(one.rotation) @ np.array(other.rotation).T) - 1) / 2
+    return np.linalg.norm(np.subtract(one.position, other.position)), np.degrees(np.arccos(min(cosine, 1.0)))
+
+
+def board_alone():
+    """The example's depth where it shows the board."""
+    points = np.array(CAMERA.position) + DEPTH[..., None] * np.asarray(rays(CAMERA))
+    x, y, z = np.moveaxis(points, -1, 0)
+    clear = (x < SHELF.back - 0.02) & (y > SHELF.right + 0.02) & (y < SHELF.left - 0.02)
+    return np.where((np.abs(z - SHELF.board) < 0.01) & clear, DEPTH, 0.0).astype(np.float32)
+
+
+@pytest.mark.parametrize("pixels", [1_000_000, FEW_PIXELS])
+@pytest.mark.parametrize(
+    ("shift", "axis", "degrees"),
+    [
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 0.0),
+        ((0.012, -0.009, 0.013), (1.0, 2.0, -1.0), 3.0),
+        ((-0.02, 0.0, 0.0), (0.0, 1.0, 0.0), 2.0),
+        ((0.0, 0.05, -0.05), (0.3, -0.2, 1.0), 8.0),
+    ],
+)
+def test_where_the_camera_is_is_found_again(shift, axis, degrees, pixels):
+    fit = fit_shelf(off_by(shift, axis, degrees), SHELF, DEPTH, pixels)
+    distance, angle = between(fit.corrected, CAMERA)
+    assert distance < 0.002
+    assert angle < 0.15
+    assert fit.undetermined.shape == (6, 0)
+
+
+def test_a_board_alone_tells_of_height_and_tilt_only():
+    taken = off_by((0.01, 0.01, 0.01), (1.0, 1.0, 0.0), 1.0)
+    fit = fit_shelf(taken, SHELF, board_alone())
+    _, _, determined = correction(fit, "shelf")
+    assert determined.tolist() == [[False, False, True], [True, True, False]]
+    # Sliding along the board and turning on it stay as they are.
+    assert np.abs(fit.shift[:2]).max() < 1e-4
+    assert abs(LEVER * fit.turn[2]) < 1e-4
+    assert "not determined" in report(fit, "camera")
+    points = np.array(fit.corrected.position) + DEPTH[..., None] * np.asarray(rays(fit.corrected))
+    heights = points[board_alone() > 0][:, 2] - SHELF.board
+    assert abs(np.median(heights)) < 0.001
+
+
+def test_nothing_of_the_shelf_in_sight_is_said():
+    fit = fit_shelf(CAMERA, SHELF, np.zeros_like(DEPTH))
+    assert np.abs(fit.shift).max() == np.abs(fit.turn).max() == 0.0
+    with pytest.raises(InputError, match="depth image: shows no face of the shelf"):
+        check_in_sight(fit)
+
+
+def test_a_wrong_measure_of_the_shelf_is_no_pose():
+    low = dataclasses.replace(SHELF, ceiling=SHELF.ceiling - 0.02)
+    fit = fit_shelf(CAMERA, low, DEPTH)
+    assert np.abs(fit.shift).max() < 0.001
+    assert "warning: shelf.ceiling: the upper board is 20 mm outside of its place" in report(fit, "camera")
+    assert "warning" not in report(fit_shelf(CAMERA, SHELF, DEPTH), "camera")
+
+
+def test_a_look_warns_and_then_refuses():
+    limits = CalibrationLimits()
+    assert placement_faults(CAMERA, SHELF, DEPTH, limits) == ()
+    assert placement_faults(off_by((0.001, 0.0, 0.001), degrees=0.02), SHELF, DEPTH, limits) == ()
+    (fault,) = placement_faults(off_by((0.0, 0.0, 0.006)), SHELF, DEPTH, limits)
+    assert fault.startswith("camera or shelf: in the depth image the shelf is up to 6 mm and 0.0 degrees from where")
+    assert "mechsearch calibrate" in fault
+    with pytest.raises(InputError, match=r"the shelf is up to 60 mm .* too far to go on.*mechsearch calibrate"):
+        placement_faults(off_by((0.0, 0.0, 0.06)), SHELF, DEPTH, limits)
+    lax = CalibrationLimits(warn_shift=0.5, warn_turn=1.0, refuse_shift=0.5, refuse_turn=1.0)
+    assert placement_faults(off_by((0.0, 0.0, 0.06)), SHELF, DEPTH, lax) == ()
+    with pytest.raises(InputError, match=r"refuse_shift \(0.001\) must be at least warn_shift"):
+        CalibrationLimits(refuse_shift=0.001)
+
+
+def test_a_camera_file_is_corrected(tmp_path, monkeypatch, capsys):
+    save_depth(DEPTH, tmp_path / "depth.png")
+    save_camera(off_by((0.01, -0.01, 0.01), degrees=1.0), tmp_path / "camera.json")
+    files = ("--depth", str(tmp_path / "depth.png"), "--camera", str(tmp_path / "camera.json"))
+    for name in ("new.json", "new.toml"):
+        status, message = program(monkeypatch, "calibrate", *files, "--out", str(tmp_path / name))
+        assert (status, message) == (0, "")
+    assert between(load_camera(tmp_path / "new.json"), CAMERA)[0] < 0.002
+    other = load_settings(tmp_path / "new.toml").workcell.camera
+    assert between(other, CAMERA)[0] < 0.002
+    assert (other.width, other.fx) == (CAMERA.width, CAMERA.fx)
+    status, message = program(monkeypatch, "calibrate", *files, "--out", str(tmp_path / "new.txt"))
+    assert (status, message.splitlines()) == (
+        2,
+        [f"mechsearch: calibrate: --out {tmp_path}/new.txt must end in .toml or .json"],
+    )
+
+
+CONFIG = """# My cell.
+[base]
+position = [0.1, 0.0, -0.2]  # on a table
+
+[camera]
+rotation = [
+{rows}
+]
+position = {position}
+
+[planner]
+gamma = 0.8  # stays
+"""
+
+
+def test_a_configuration_is_corrected_and_its_comments_stay(tmp_path, monkeypatch):
+    save_depth(DEPTH, tmp_path / "depth.png")
+    taken = off_by((0.01, -0.01, 0.01), degrees=1.0)
+    rows = ",\n".join(f"  {json.dumps(row)}" for row in taken.rotation)
+    position = np.add(taken.position, (0.1, 0.0, -0.2)).tolist()
+    # The shelf's place is in the file's frame, too.
+    shelf = SHELF.moved((0.1, 0.0, -0.2))
+    places = {name: getattr(shelf, name) for name in ("front", "back", "right", "left", "board", "ceiling")}
+    table = "[shelf]\n" + "".join(f"{name} = {value}\n" for name, value in places.items())
+    ranges = f"spawn_x = {list(shelf.spawn_x)}\nspawn_y = {list(shelf.spawn_y)}\n"
+    config = CONFIG.format(rows=rows, position=position) + "\n" + table + ranges
+    (tmp_path / "mine.toml").write_text(config)
+    files = ("--depth", str(tmp_path / "depth.png"), "--config", str(tmp_path / "mine.toml"))
+    assert program(monkeypatch, "calibrate", *files, "--out", str(tmp_path / "new.toml")) == (0, "")
+    text = (tmp_path / "new.toml").read_text()
+    assert "# My cell." in text
+    assert "gamma = 0.8  # stays" in text
+    loaded = load_settings(tmp_path / "new.toml")
+    distance, angle = between(loaded.workcell.camera, CAMERA)
+    assert distance < 0.002
+    assert angle < 0.15
+    before, after = tomllib.loads(config), tomllib.loads(text)
+    assert {name: part for name, part in after.items() if name != "camera"} == {
+        name: part for name, part in before.items() if name != "camera"
+    }
+
+
+def test_the_place_of_the_shelf_is_corrected(tmp_path, monkeypatch):
+    save_depth(DEPTH, tmp_path / "depth.png")
+    save_camera(CAMERA, tmp_path / "camera.json")
+    wrong = SHELF.moved((0.01, -0.015, 0.008))
+    names = ("front", "back", "right", "left", "board", "ceiling")
+    text = "[shelf]\n" + "".join(f"{name} = {getattr(wrong, name)}\n" for name in names)
+    (tmp_path / "mine.toml").write_text(text)
+    files = ("--depth", str(tmp_path / "depth.png"), "--camera", str(tmp_path / "camera.json"))
+    arguments = (
+        *files,
+        "--config",
+        str(tmp_path / "mine.toml"),
+        "--moved",
+        "shelf",
+        "--out",
+        str(tmp_path / "new.toml"),
+    )
+    assert program(monkeypatch, "calibrate", *arguments) == (0, "")
+    found = load_settings(tmp_path / "new.toml").workcell.shelf
+    assert all(getattr(found, name) == pytest.approx(getattr(SHELF, name), abs=0.001) for name in names)
+
+
+@pytest.mark.parametrize(
+    ("text", "after"),
+    [
+        ("", "[a]\nb = [1, 2]\n"),
+        ("# x\n", "# x\n\n[a]\nb = [1, 2]\n"),
+        ("[a]\nc = 1 # y\nb = [\n  3,\n]\n[d]\n", "[a]\nb = [1, 2]\nc = 1 # y\n[d]\n"),
+    ],
+)
+def test_a_table_is_changed_and_the_rest_stays(text, after):
+    assert with_values(text, "a", {"b": [1, 2]}, "f.toml") == after
+
+
+@pytest.mark.parametrize("text", ["a = {b = 1}\n", "a.b = 1\n", "[[a]]\n", "[a\n", "a = 3\n"])
+def test_a_table_that_is_not_plain_is_refused(text):
+    with pytest.raises(InputError, match=r"f\.toml: cannot be changed; write \[a\]"):
+        with_values(text, "a", {"b": [1, 2]}, "f.toml")
