@@ -500,6 +500,33 @@ def test_stored_scenes_are_those_on_record():
     assert made == on_record
 
 
+SEEN = {"in": "into the shelf", "left": "to the left", "roll": "about x", "pitch": "about y", "yaw": "about z"}
+
+
+def test_what_recognition_tolerates_is_what_is_stored():
+    stored = json.loads(read("benchmarks/results/calibration-tolerance-cpu.json"))
+    parts = {}
+    for offset, size, _, missing, phantoms, _ in stored["rows"]:
+        unit = "°" if offset in ("roll", "pitch", "yaw") else " mm"
+        parts.setdefault(SEEN.get(offset, offset), []).append(f"{size}{unit}: {missing} and {phantoms}")
+    table = rows("docs/experiments.md", "| seen | by how much: missing and phantoms |")
+    assert table == [[name, ", ".join(sizes)] for name, sizes in parts.items()]
+
+
+def test_what_calibration_finds_is_what_is_stored():
+    stored = json.loads(read("benchmarks/results/calibration-cpu.json"))
+    header = "| noise, use | x [mm] | y [mm] | z [mm] | about x [degrees] | about y [degrees] | about z [degrees] |"
+    lines = []
+    for part in stored["summary"]:
+        errors = [f"{each['median']:.3f}, {each['95th percentile']:.3f}" for each in part["errors"].values()]
+        lines.append([f"{part['noise']}, {part['use']}", *errors])
+    assert rows("docs/experiments.md", header) == lines
+    page = " ".join(read("docs/experiments.md").split())
+    usual = stored["summary"][1]
+    said = f"of {usual['without an offset']} looks without an offset {usual['false warnings']} are warned of"
+    assert said in page
+
+
 @pytest.mark.slow
 def test_the_code_of_the_python_guide_runs():
     code = re.findall(r"^```python\n(.*?)^```$", read("docs/python.md"), re.MULTILINE | re.DOTALL)

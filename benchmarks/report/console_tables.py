@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from mechsearch_jax.benchmarks.calibration import offsets
 from mechsearch_jax.benchmarks.parts import push, scenes, segmentation
 from mechsearch_jax.benchmarks.parts.agreement import Agreement, Measures
 from mechsearch_jax.benchmarks.parts.bench import Timing
@@ -155,6 +156,24 @@ def segmentation_tables(measured: segmentation.Measured) -> Group:
         f"{measured.versions['device']}."
     )
     return Group(*tables.values(), Text(explanation, style="dim"))
+
+
+def calibration_table(measured: offsets.Measured) -> Group:
+    """How well the camera's offsets are found: a table for every sensor and use of the pixels."""
+    tables, lines = [], []
+    for part in measured.summary():
+        table = plain_table(f"{part['noise']}, {part['use']}")
+        for name in ("", "determined", "median error", "95th percentile", "largest", "stated standard error"):
+            table.add_column(name, justify="right", no_wrap=True)
+        for name, errors in part["errors"].items():
+            count, *figures = errors.values()
+            table.add_row(name, str(count), *("-" if figure is None else f"{figure:.3f}" for figure in figures))
+        tables.append(table)
+        lines.append(
+            f"{part['noise']}, {part['use']}: {part['with an offset']} with an offset, of {part['without an offset']} "
+            f"without one {part['false warnings']} are warned of; {1e3 * part['median_seconds']:.0f} ms."
+        )
+    return Group(*tables, Text("\n".join(lines), style="dim"))
 
 
 def push_scores_tables(measured: push.Measured) -> Group:
