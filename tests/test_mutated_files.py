@@ -14,8 +14,11 @@ import pytest
 from flax.traverse_util import unflatten_dict
 from mutations import bomb, damaged, mutated_archive, mutated_json, mutated_toml, seeded
 
+from mechsearch_jax.calibration.check import placement_faults
+from mechsearch_jax.calibration.fit import fit_shelf
+from mechsearch_jax.calibration.report import report
 from mechsearch_jax.commands import main as cli
-from mechsearch_jax.images.examples import Images, load_images, save_images
+from mechsearch_jax.images.examples import Images, example_images, load_images, save_images
 from mechsearch_jax.images.image_files import (
     load_camera,
     load_colour,
@@ -30,12 +33,17 @@ from mechsearch_jax.images.trained_view import TrainedView
 from mechsearch_jax.networks.push import PushConfig
 from mechsearch_jax.networks.weights import load_weights, save_weights, weight_shapes
 from mechsearch_jax.problem.settings import example_config, load_settings
+from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.runtime.arrays import read_arrays
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
 from mechsearch_jax.workspace.scenario import check_name, example_scenarios, load_scenario
+from mechsearch_jax.workspace.sight import check_camera
 
 FEW, MANY = 25, 1000
+# Of what is read and used: cameras and configurations.
+SOME = 100
+SEEN, LOOK = example_images().camera.scaled(8), example_images().depth[4::8, 4::8].copy()
 SMALL = Camera(width=16, height=9, fx=7.6, fy=7.6, cx=8.0, cy=4.5)
 
 
@@ -151,6 +159,54 @@ def test_mutated_files_are_taken_or_refused_in_one_line(kind, tmp_path):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_thousand_mutated_files_are_taken_or_refused_in_one_line(kind, tmp_path):
     taken = sum(check(kind, number, tmp_path) for number in range(FEW, FEW + MANY))
+    assert 0 < taken < MANY
+
+
+def used(kind, number, folder):
+    """Read a mutated camera or configuration and look through it at the example; whether nothing was refused."""
+    inside = folder / str(number)
+    inside.mkdir()
+    load = (
+        (lambda: Workcell(camera=load_camera(mutated))) if kind == "camera" else lambda: load_settings(mutated).workcell
+    )
+    rng = seeded(f"used {kind}", number)
+    if kind == "camera":
+        mutated = inside / "file.json"
+        save_camera(SEEN, mutated)
+        mutated.write_bytes(either(rng, mutated.read_bytes(), mutated_json))
+    else:
+        mutated = inside / "file.toml"
+        text = re.sub(r"(?m)^#(?=\w|\]|  )", "", example_config())
+        for key, value in json.loads(json.dumps(vars(SEEN))).items():
+            text = re.sub(rf"(?m)^{key} = (\[\n(  .*\n)*\]|.*)$", f"{key} = {json.dumps(value)}", text, count=1)
+        mutated.write_bytes(either(rng, text.encode(), mutated_toml))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            cell = load()
+            check_camera(cell.camera, cell.shelf)
+            placement_faults(cell.camera, cell.shelf, LOOK, cell.calibration)
+            fit = fit_shelf(cell.camera, cell.shelf, LOOK)
+            assert report(fit, "camera")
+            assert np.isfinite(fit.corrected.position).all()
+        except InputError as error:
+            message = str(error)
+        else:
+            return True
+    assert len(message.splitlines()) == 1, message
+    return False
+
+
+@pytest.mark.parametrize("kind", ["camera", "configuration"])
+def test_mutated_cameras_and_configurations_are_looked_through_or_refused(kind, tmp_path):
+    taken = sum(used(kind, number, tmp_path) for number in range(SOME))
+    assert 0 < taken < SOME
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["camera", "configuration"])
+def test_a_thousand_mutated_cameras_and_configurations_are_looked_through_or_refused(kind, tmp_path):
+    taken = sum(used(kind, number, tmp_path) for number in range(SOME, SOME + MANY))
     assert 0 < taken < MANY
 
 
