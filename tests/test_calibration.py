@@ -194,8 +194,8 @@ def test_the_place_of_the_shelf_is_corrected(tmp_path, monkeypatch):
         str(tmp_path / "new.toml"),
     )
     assert program(monkeypatch, "calibrate", *arguments) == (0, "")
-    found = load_settings(tmp_path / "new.toml").workcell.shelf
-    assert all(getattr(found, name) == pytest.approx(getattr(SHELF, name), abs=0.001) for name in names)
+    corrected = load_settings(tmp_path / "new.toml").workcell.shelf
+    assert all(getattr(corrected, name) == pytest.approx(getattr(SHELF, name), abs=0.001) for name in names)
 
 
 @pytest.mark.parametrize(

@@ -523,8 +523,8 @@ def test_what_calibration_finds_is_what_is_stored():
     assert rows("docs/experiments.md", header) == lines
     page = " ".join(read("docs/experiments.md").split())
     usual = stored["summary"][1]
-    said = f"of {usual['without an offset']} looks without an offset {usual['false warnings']} are warned of"
-    assert said in page
+    statement = f"of {usual['without an offset']} looks without an offset {usual['false warnings']} are warned of"
+    assert statement in page
 
 
 @pytest.mark.slow

@@ -50,12 +50,12 @@ def look(depth=DEPTH, colour=COLOUR, mask=None, target_id=None, camera=CAMERA):
     recogniser._check(camera, *images)
     depth, colour, mask, target_id = images
     check_measured(camera, SHELF, depth)
-    found = [*camera_faults(camera, SHELF), *placement_faults(camera, SHELF, depth, CELL.calibration)]
-    found += image_faults(camera, SHELF, depth, mask)
-    found += identity_faults(colour, mask, target_id)
+    faults = [*camera_faults(camera, SHELF), *placement_faults(camera, SHELF, depth, CELL.calibration)]
+    faults += image_faults(camera, SHELF, depth, mask)
+    faults += identity_faults(colour, mask, target_id)
     if colour is not None and target_id is None:
-        found += colour_faults(camera, SHELF, CELL.target, TargetColour.lit(), depth, colour)
-    return found
+        faults += colour_faults(camera, SHELF, CELL.target, TargetColour.lit(), depth, colour)
+    return faults
 
 
 def posed(pose, **changes):
@@ -200,7 +200,7 @@ def bgr():
     return depth, colour[..., ::-1].copy()
 
 
-def said(mistake, tmp_path):
+def response(mistake, tmp_path):
     """What a mistake gets: how it is taken, and the error's message or the warnings."""
     try:
         taken, result = "warned of", MISTAKES[mistake](tmp_path)
@@ -221,7 +221,7 @@ def test_the_table_has_all_of_them():
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_mistake_gets_what_the_table_says(mistake, tmp_path):
-    taken, lines = said(mistake, tmp_path)
+    taken, lines = response(mistake, tmp_path)
     assert all(len(line.splitlines()) == 1 for line in lines)
     how, stated = re.fullmatch(r"([\w ]+): `(.+)`", table()[mistake]).groups()
     assert how == taken

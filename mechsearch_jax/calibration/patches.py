@@ -72,8 +72,26 @@ def flat_patches(camera: Camera, depth: Float[np.ndarray, "h w"], most: int) -> 
     return _flat(middle, slopes, inverse, weight, basis, solid, stride)
 
 
-def _flat(middle, slopes, inverse, weight, basis, solid, stride) -> Patches:
-    """The blocks that are flat, from the slopes (n, 3) of their inverse depth."""
+def _flat(
+    middle: np.ndarray,
+    slopes: np.ndarray,
+    inverse: np.ndarray,
+    weight: np.ndarray,
+    basis: np.ndarray,
+    solid: np.ndarray,
+    stride: int,
+) -> Patches:
+    """The blocks that are flat.
+
+    Args:
+      middle: of each block at unit depth, shape (n, 2).
+      slopes: of its inverse depth, and that at its middle, shape (n, 3).
+      inverse: its pixels' inverse depths, 0 where not measured, shape (n, p).
+      weight: 1 where measured, else 0, shape (n, p).
+      basis: offset of each pixel from the middle at unit depth, and 1, shape (p, 3).
+      solid: which blocks have a plane, shape (n,).
+      stride: thinning of the image.
+    """
     count = weight.sum(axis=1)
     centre = weight @ basis[:, :2] / count[:, None]
     at_centre = np.sum(slopes[:, :2] * centre, axis=1) + slopes[:, 2]

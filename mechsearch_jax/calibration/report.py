@@ -58,8 +58,10 @@ def report(fit: ShelfFit, moved: Moved) -> str:
         [
             axis,
             *(
-                f"{scale * value:+.{digits}f} ± {scale * error:.{digits}f} {unit}" if known else "not determined"
-                for value, error, known, scale, digits, unit in (
+                f"{scale * value:+.{digits}f} ± {scale * error:.{digits}f} {unit}"
+                if is_determined
+                else "not determined"
+                for value, error, is_determined, scale, digits, unit in (
                     (values[0, i], errors[0, i], determined[0, i], 1000.0, 1, "mm"),
                     (values[1, i], errors[1, i], determined[1, i], np.degrees(1.0), 2, "degrees"),
                 )
