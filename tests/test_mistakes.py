@@ -167,7 +167,6 @@ MISTAKES = {
         camera=posed(T, fx=CAMERA.fx / 2, fy=CAMERA.fy / 2, cx=CAMERA.cx / 2, cy=CAMERA.cy / 2)
     ),
     "intrinsics: 5% off": lambda tmp: look(camera=posed(T, fx=1.05 * CAMERA.fx, fy=1.05 * CAMERA.fy)),
-    "intrinsics: fx and cx exchanged": lambda tmp: look(camera=posed(T, fx=CAMERA.cx, cx=CAMERA.fx / 3)),
     "camera file: cut off, or no JSON": lambda tmp: (
         (tmp / "camera.json").write_text('{"width": 12') and load_camera(tmp / "camera.json")
     ),

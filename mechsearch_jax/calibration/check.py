@@ -50,14 +50,13 @@ def placement_faults(
             f"depth image: {100 * inside:.0f}% of what it shows through the shelf's opening is in the shelf; {CAUSES}"
         )
     fit = fit_shelf(camera, shelf, depth, FEW_PIXELS)
+    is_far = is_beyond(fit, shelf, limits.refuse_shift, limits.refuse_turn)
+    # A mistake that the pose alone gives away explains more.
+    if (is_far or not any(part.patches for part in fit.faces)) and (faults := camera_faults(camera, shelf)):
+        raise InputError(faults[0])
     check_in_sight(fit)
-    if is_beyond(fit, shelf, limits.refuse_shift, limits.refuse_turn):
-        # A mistake that the pose alone gives away explains it better.
-        cause = [
-            *camera_faults(camera, shelf),
-            f"{_appears(fit, shelf)}, which is too far to go on; {CAUSES}; {REMEDY}",
-        ][0]
-        raise InputError(cause)
+    if is_far:
+        raise InputError(f"{_appears(fit, shelf)}, which is too far to go on; {CAUSES}; {REMEDY}")
     if is_beyond(fit, shelf, limits.warn_shift, limits.warn_turn):
         return (f"{_appears(fit, shelf)}: recognition is worse for it; {REMEDY}",)
     if behind > MOST_BEHIND:
