@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, get_args
 import tyro
 
 from mechsearch_jax.commands.options import (
-    DEFAULTS,
-    EpisodeOptions,
     JsonFile,
     Scenarios,
     SomeScenarios,
@@ -348,76 +346,8 @@ def bench_scenes(scenarios: Scenarios, /, *, exact: bool = False, out: JsonFile 
     console.print(scenes_table(rows))
 
 
-def bench_reach(
-    *,
-    grasps: Literal["candidates", "found"] = "candidates",
-    out: JsonFile = None,
-    options: EpisodeOptions = DEFAULTS,
-) -> None:
-    """Tell where a target that stands alone on the shelf can be grasped, and what rules its grasps out elsewhere.
-
-    Args:
-      grasps: those of g at candidate poses, or the denser ones of a found target.
-      out: JSON file for the means across the shelf and for every candidate pose's row.
-      options: of shelf, gripper, target and grasps; the others do not matter here.
-    """
-    from rich.console import Console
-
-    from mechsearch_jax.benchmarks.reach.reach import reach, save_reach
-    from mechsearch_jax.benchmarks.report.console_tables import reach_table
-    from mechsearch_jax.problem.cache import keep_compilations
-
-    settings = options.settings()
-    check_files(out)
-    keep_compilations()
-    problem = settings.config.problem
-    chosen = problem.grasps if grasps == "candidates" else problem.retrieval
-    console = Console(highlight=False)
-    with console.status("reaching"):
-        rows = reach(settings.workcell, chosen)
-    if out is not None:
-        save_reach(rows, chosen, out)
-    console.print(reach_table(rows))
-
-
-def bench_calibration(
-    scenarios: Scenarios,
-    /,
-    *,
-    offsets: int = 5,
-    seed: int = 0,
-    out: JsonFile = None,
-) -> None:
-    """Measure how well the shelf in a depth image tells how far the camera's pose is off: up to 20 mm and 3 degrees.
-
-    Args:
-      scenarios: scenario files, folders of them, names of shipped ones or of scene sets.
-      offsets: random ones for each scene and sensor, and as many looks without one.
-      seed: of offsets and noise.
-      out: JSON file for the figures and for every fit's row.
-    """
-    from rich.console import Console
-
-    from mechsearch_jax.benchmarks.calibration.offsets import Bench
-    from mechsearch_jax.benchmarks.parts.images import save_rows
-    from mechsearch_jax.benchmarks.report.console_tables import calibration_table
-
-    at_least_one("bench calibration", offsets=offsets)
-    check_files(out)
-    scenes = _loaded(scenarios)
-    console = Console(highlight=False)
-    with console.status("looking") as status:
-        bench = Bench(scenes, offsets, seed=seed)
-        measured = bench.run(lambda done: status.update(f"looking {done}/{len(scenes)}"))
-    if out is not None:
-        save_rows(measured.value(), measured.rows, out)
-    console.print(calibration_table(measured))
-
-
 COMMANDS = {
     "scenes": bench_scenes,
-    "reach": bench_reach,
-    "calibration": bench_calibration,
     "agreement": bench_agreement,
     "recognition": bench_recognition,
     "segmentation": bench_segmentation,
