@@ -20,8 +20,8 @@ from mechsearch_jax.images.image_files import (
     save_camera,
     save_depth,
 )
-from mechsearch_jax.perception import recogniser
 from mechsearch_jax.perception.plausibility import check_measured, colour_faults, identity_faults, image_faults
+from mechsearch_jax.perception.recogniser import check_images
 from mechsearch_jax.problem.settings import load_settings
 from mechsearch_jax.problem.workcell import Workcell
 from mechsearch_jax.robot.free_motion import check_joints
@@ -47,10 +47,11 @@ def look(depth=DEPTH, colour=COLOUR, mask=None, target_id=None, camera=CAMERA):
     """
     check_camera(camera, SHELF)
     images = converted(depth, colour, mask, target_id)
-    recogniser._check(camera, *images)
     depth, colour, mask, target_id = images
+    check_images(camera, depth)
     check_measured(camera, SHELF, depth)
     faults = [*camera_faults(camera, SHELF), *placement_faults(camera, SHELF, depth, CELL.calibration)]
+    check_images(camera, *images)
     faults += image_faults(camera, SHELF, depth, mask)
     faults += identity_faults(colour, mask, target_id)
     if colour is not None and target_id is None:

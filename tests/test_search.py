@@ -13,6 +13,7 @@ from stage import HIDDEN, OPEN, grab, idle
 
 from mechsearch_jax.actions import Action, ActionKind
 from mechsearch_jax.belief.impasse import impasse
+from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.config.presets import standard
 from mechsearch_jax.dynamics.named import own_push_model
 from mechsearch_jax.dynamics.quasi_static import QuasiStatic
@@ -59,7 +60,7 @@ def searcher_of(problem, scenario, policy=grab, **arguments):
     """A searcher that sees what stands in a scenario, whatever the images show."""
     observation = seen(scenario) if isinstance(scenario, type(HIDDEN)) else scenario
     given = {"trajectories": TRUSTING, **arguments}
-    searcher = Searcher(policy=policy, recogniser=lambda problem: lambda *images: observation, **given)
+    searcher = Searcher(policy=policy, **{"recogniser": lambda problem: lambda *images: observation, **given})
     searcher.problem = problem
     return searcher
 
@@ -157,6 +158,49 @@ def test_an_image_without_any_depth_is_refused_and_nothing_is_forgotten(problem)
     with pytest.raises(InputError, match="depth image: nothing was measured"):
         searcher.next(np.zeros_like(IMAGES.depth))
     assert searcher.belief is before
+
+
+def unasked(problem):
+    """A recogniser that must not be called."""
+
+    def recognise(*images):
+        pytest.fail("the images were recognised")
+
+    return recognise
+
+
+def without_constants(calibration=None, **images):
+    """What a searcher says of images beyond those of its camera; it has no constants to recognise or decide with."""
+    searcher = Searcher(Workcell(calibration=calibration or CalibrationLimits()))
+    searcher.problem = types.SimpleNamespace(shelf=SHELF, **images)
+    return searcher._placement_faults(IMAGES.depth)
+
+
+LAX = CalibrationLimits(refuse_shift=0.03)
+
+
+def test_where_the_shelf_is_not_in_its_place_a_look_says_so_by_the_limits_of_the_cell():
+    assert without_constants(camera=CAMERA) == ()
+    (fault,) = without_constants(camera=moved(CAMERA, (0.005, 0.0, 0.0)))
+    assert "the shelf is up to 5 mm" in fault
+    far = moved(CAMERA, (0.02, 0.0, 0.0))
+    with pytest.raises(InputError, match=r"the shelf is up to 20 mm .* too far to go on"):
+        without_constants(camera=far)
+    (fault,) = without_constants(LAX, camera=far)
+    assert "the shelf is up to 20 mm" in fault
+
+
+def test_a_shelf_out_of_its_place_is_a_warning_of_a_step_and_is_refused_before_recognition(problem):
+    def at(shift, **arguments):
+        return searcher_of(problem.replace(camera=moved(problem.camera, (shift, 0.0, 0.0))), HIDDEN, idle, **arguments)
+
+    step = at(0.005).next(IMAGES.depth)
+    assert any("the shelf is up to 5 mm" in warning for warning in step.warnings)
+    step = at(0.02, workcell=Workcell(calibration=LAX)).next(IMAGES.depth)
+    assert any("the shelf is up to 20 mm" in warning for warning in step.warnings)
+    refusing = at(0.02, recogniser=unasked)
+    with pytest.raises(InputError, match=r"the shelf is up to 20 mm .* too far to go on"):
+        refusing.next(IMAGES.depth)
 
 
 def test_where_all_that_was_tried_out_does_harm_it_says_so_and_the_next_call_draws_others(problem):

@@ -173,7 +173,7 @@ class Recogniser:
         Raises:
           InputError: an image has the wrong shape, type or unit. Values are checked outside `jit` only.
         """
-        _check(self.camera, depth, colour, mask, target_id)
+        check_images(self.camera, depth, colour, mask, target_id)
         keys = jax.random.split(key, 3)
         image, visible = _labelled(self, keys[0], depth, colour, mask, target_id)
         # Compiled separately, since it does not depend on where the labels come from.
@@ -268,7 +268,12 @@ def _labels(
     return jnp.where(missing, MISSING, labels).astype(jnp.int8)
 
 
-def _check(camera: Camera, depth: Any, colour: Any, mask: Any, target_id: Any) -> None:
+def check_images(camera: Camera, depth: Any, colour: Any = None, mask: Any = None, target_id: Any = None) -> None:
+    """Check the images that a `Recogniser` is called with.
+
+    Raises:
+      InputError: one of them has the wrong shape, type or unit. Values are checked outside `jit` only.
+    """
     size = (camera.height, camera.width)
     for name, image, shape in (("depth", depth, size), ("colour", colour, (*size, 3)), ("mask", mask, size)):
         if image is None and name != "depth":

@@ -43,7 +43,7 @@ from mechsearch_jax.perception.plausibility import (
     image_faults,
     sight_faults,
 )
-from mechsearch_jax.perception.recogniser import Recogniser
+from mechsearch_jax.perception.recogniser import Recogniser, check_images
 from mechsearch_jax.planner.policies import Policy
 from mechsearch_jax.planner.state import Decision
 from mechsearch_jax.planner.trials import Trials, decide
@@ -288,9 +288,9 @@ class Searcher:
             joints = np.asarray(joints, float)
             check_joints("joints", joints)
         width = None if width is None else checked_width(width, problem.gripper.max_opening)
+        misplaced = self._placement_faults(depth)
         observation = self.recogniser(recognition_key, depth, colour, mask, target_id)
-        check_measured(problem.camera, problem.shelf, depth)
-        warnings = [*self._camera_faults, *self._faults(depth, colour, mask, target_id)]
+        warnings = [*self._camera_faults, *misplaced, *self._faults(depth, colour, mask, target_id)]
         unseen = sight_faults(problem.camera, problem.shelf, depth, observation)
         warnings += [*unseen, *crowd_faults(observation), *overlap_faults(problem, observation)]
         last = (now.observation, now.action) if now.acted else (None, None)
@@ -412,12 +412,22 @@ class Searcher:
             return faults
         return view_faults(recogniser.camera, recogniser.shelf, recogniser.trained)
 
+    def _placement_faults(self, depth: np.ndarray) -> tuple[str, ...]:
+        """Warnings about where the shelf is in a depth image, which no recogniser is asked for.
+
+        Raises:
+          InputError: the image cannot be used.
+        """
+        camera, shelf = self.problem.camera, self.problem.shelf
+        check_images(camera, depth)
+        check_measured(camera, shelf, depth)
+        return placement_faults(camera, shelf, depth, self.workcell.calibration)
+
     def _faults(self, depth: np.ndarray, colour: Any, mask: Any, target_id: int | None) -> list[str]:
         """Warnings about images that do not fit camera, shelf and target."""
         problem, recogniser = self.problem, self.recogniser
         mask, colour = (None if image is None else np.asarray(image) for image in (mask, colour))
-        faults = list(placement_faults(problem.camera, problem.shelf, depth, self.workcell.calibration))
-        faults += image_faults(problem.camera, problem.shelf, depth, mask)
+        faults = list(image_faults(problem.camera, problem.shelf, depth, mask))
         # Another recogniser may identify the target in another way.
         if isinstance(recogniser, Recogniser):
             faults += identity_faults(colour, mask, target_id)
