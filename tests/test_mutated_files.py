@@ -41,8 +41,8 @@ from mechsearch_jax.workspace.scenario import check_name, example_scenarios, loa
 from mechsearch_jax.workspace.sight import check_camera
 
 FEW, MANY = 25, 1000
-# Of what is read and used: cameras and configurations.
-SOME = 100
+# Of cameras and configurations, which are used, too.
+LOOKED_THROUGH = 100
 SEEN, LOOK = example_images().camera.scaled(8), example_images().depth[4::8, 4::8].copy()
 SMALL = Camera(width=16, height=9, fx=7.6, fy=7.6, cx=8.0, cy=4.5)
 
@@ -199,14 +199,14 @@ def used(kind, number, folder):
 
 @pytest.mark.parametrize("kind", ["camera", "configuration"])
 def test_mutated_cameras_and_configurations_are_looked_through_or_refused(kind, tmp_path):
-    taken = sum(used(kind, number, tmp_path) for number in range(SOME))
-    assert 0 < taken < SOME
+    taken = sum(used(kind, number, tmp_path) for number in range(LOOKED_THROUGH))
+    assert 0 < taken < LOOKED_THROUGH
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["camera", "configuration"])
 def test_a_thousand_mutated_cameras_and_configurations_are_looked_through_or_refused(kind, tmp_path):
-    taken = sum(used(kind, number, tmp_path) for number in range(SOME, SOME + MANY))
+    taken = sum(used(kind, number, tmp_path) for number in range(LOOKED_THROUGH, LOOKED_THROUGH + MANY))
     assert 0 < taken < MANY
 
 

@@ -215,7 +215,7 @@ def _appears(fit: ShelfFit, shelf: Shelf) -> tuple[float, float]:
     return round(1000 * off, 4), round(float(np.degrees(turned)), 5)
 
 
-def _between(one: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """How far one camera is from another: place [m] and rotation vector [rad] in the world."""
-    turn = Rotation.from_matrix(np.array(one.rotation) @ np.array(other.rotation).T).as_rotvec()
-    return np.subtract(one.position, other.position), turn
+def _between(camera: Camera, other: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """How far a camera is from another: place [m] and rotation vector [rad] in the world."""
+    turn = Rotation.from_matrix(np.array(camera.rotation) @ np.array(other.rotation).T).as_rotvec()
+    return np.subtract(camera.position, other.position), turn

@@ -2,8 +2,9 @@
 
 First the rotation, from the normals of flat patches; then the place of each face along its normal, the outermost plane
 with many patches, for objects stand in front of the faces; then all six numbers at once by least squares from the
-points to the planes, with Tukey's weights (Y. Chen and G. Medioni, 1992). Directions that the faces in sight do not
-determine, such as sliding along a board without walls, are left as they are.
+points to the planes, with Tukey's weights (Y. Chen and G. Medioni, 1992). The motion, which turns about the middle of
+the board, has no part in directions that the faces in sight do not determine, such as sliding along a board without
+walls.
 
 On the host, in float64; milliseconds.
 """

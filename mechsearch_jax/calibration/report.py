@@ -17,6 +17,13 @@ FREE = 0.1
 WRONG_MEASURE = 0.005
 
 Moved = Literal["camera", "shelf"]
+NOT_DETERMINED: dict[Moved, str] = {
+    "camera": (
+        "not determined: the faces in sight do not tell; what is added there comes from turning the camera about the "
+        "middle of the board"
+    ),
+    "shelf": "not determined: the faces in sight do not tell",
+}
 
 
 def correction(
@@ -46,7 +53,7 @@ def correction(
 
 
 def report(fit: ShelfFit, moved: Moved) -> str:
-    """The faces in sight, and by how much the camera's pose or the shelf's place is off, as text."""
+    """The faces in sight, and what is to be added to the camera's pose or the shelf's place, as text."""
     seen = [
         [part.face.name, part.patches and f"{part.pixels:,}", f"{1000 * part.off:+.1f} mm"]
         if part.patches
@@ -60,7 +67,7 @@ def report(fit: ShelfFit, moved: Moved) -> str:
             *(
                 f"{scale * value:+.{digits}f} ± {scale * error:.{digits}f} {unit}"
                 if is_determined
-                else "not determined"
+                else f"{scale * value:+.{digits}f} {unit}, not determined"
                 for value, error, is_determined, scale, digits, unit in (
                     (values[0, i], errors[0, i], determined[0, i], 1000.0, 1, "mm"),
                     (values[1, i], errors[1, i], determined[1, i], np.degrees(1.0), 2, "degrees"),
@@ -73,10 +80,10 @@ def report(fit: ShelfFit, moved: Moved) -> str:
     lines = [
         tabulate(seen, headers=["face", "pixels", "off after the fit"], disable_numparse=True),
         "",
-        tabulate(shown, headers=[f"{what} is off by", "along the axis", "turned about it"], disable_numparse=True),
+        tabulate(shown, headers=[f"to be added to {what}", "along the axis", "turn about it"], disable_numparse=True),
     ]
     if not determined.all():
-        lines += ["", "what is not determined by the faces in sight stays as it is"]
+        lines += ["", NOT_DETERMINED[moved]]
     lines += [_wrong_measure(part) for part in fit.faces if part.patches and abs(part.off) > WRONG_MEASURE]
     return "\n".join(lines)
 

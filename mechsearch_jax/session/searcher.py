@@ -413,7 +413,7 @@ class Searcher:
         return view_faults(recogniser.camera, recogniser.shelf, recogniser.trained)
 
     def _placement_faults(self, depth: np.ndarray) -> tuple[str, ...]:
-        """Warnings about where the shelf is in a depth image, which no recogniser is asked for.
+        """Warnings about where the shelf is in a depth image; they need no recogniser.
 
         Raises:
           InputError: the image cannot be used.
