@@ -106,7 +106,11 @@ def _base(config: Path | None) -> tuple[float, float, float]:
 
 
 def _write_values(config: Path | None, out: Path, table: str, values: Mapping[str, object]) -> None:
-    """Write the configuration with other values in a table, and check that it is read again."""
+    """Write the configuration with other values in a table.
+
+    Raises:
+      InputError: it cannot be written, or what would be written is no valid configuration; `out` stays as it was.
+    """
     from mechsearch_jax.problem.settings import load_settings
     from mechsearch_jax.runtime.files import read_text, replacing
     from mechsearch_jax.runtime.tables import with_values
@@ -114,5 +118,9 @@ def _write_values(config: Path | None, out: Path, table: str, values: Mapping[st
     text = with_values("" if config is None else read_text(config), table, values, str(config))
     with replacing(out) as file:
         file.write(text.encode())
-    load_settings(out)
+        file.flush()
+        try:
+            load_settings(file.name)
+        except InputError as error:
+            raise InputError(f"{str(error).replace(file.name, str(out))}; {out} was not written") from error
     print(out)
