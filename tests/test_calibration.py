@@ -13,6 +13,7 @@ from mechsearch_jax.calibration.check import placement_faults
 from mechsearch_jax.calibration.fit import FEW_PIXELS, LEVER, check_in_sight, fit_shelf
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.calibration.report import correction, report
+from mechsearch_jax.commands.cell.calibrate import _write_values
 from mechsearch_jax.images.camera_pose import with_pose
 from mechsearch_jax.images.examples import example_images
 from mechsearch_jax.images.image_files import load_camera, save_camera, save_depth
@@ -149,6 +150,15 @@ def test_a_look_warns_and_then_refuses():
         CalibrationLimits(refuse_shift=0.001)
 
 
+@pytest.mark.parametrize("change", [0.012, -0.012])
+def test_a_look_warns_of_a_face_that_is_not_where_the_others_put_it(change):
+    wrong = dataclasses.replace(SHELF, ceiling=SHELF.ceiling + change)
+    (fault,) = placement_faults(CAMERA, wrong, DEPTH, CalibrationLimits())
+    side = "inside" if change > 0 else "outside"
+    assert fault.startswith(f"depth image: the upper board is 12 mm {side} of shelf.ceiling")
+    assert placement_faults(CAMERA, wrong, DEPTH, CalibrationLimits(warn_shift=0.02, refuse_shift=0.02)) == ()
+
+
 def test_a_camera_file_is_corrected(tmp_path, monkeypatch, capsys):
     save_depth(DEPTH, tmp_path / "depth.png")
     save_camera(off_by((0.01, -0.01, 0.01), degrees=1.0), tmp_path / "camera.json")
@@ -207,6 +217,16 @@ def test_a_configuration_is_corrected_and_its_comments_stay(tmp_path, monkeypatc
     assert {name: part for name, part in after.items() if name != "camera"} == {
         name: part for name, part in before.items() if name != "camera"
     }
+
+
+def test_a_correction_that_cannot_be_read_leaves_the_file_as_it_was(tmp_path):
+    out = tmp_path / "mine.toml"
+    out.write_text("# My cell.\n")
+    with pytest.raises(InputError, match="front") as error:
+        _write_values(out, out, "shelf", {"front": 414.0})
+    assert str(error.value).startswith(f"{out}:4: [shelf] front")
+    assert str(error.value).endswith("was not written")
+    assert [file.read_text() for file in tmp_path.iterdir()] == ["# My cell.\n"]
 
 
 def test_the_place_of_the_shelf_is_corrected(tmp_path, monkeypatch):

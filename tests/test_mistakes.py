@@ -39,23 +39,23 @@ T = np.eye(4)
 T[:3, :3], T[:3, 3] = CAMERA.rotation, CAMERA.position
 
 
-def look(depth=DEPTH, colour=COLOUR, mask=None, target_id=None, camera=CAMERA):
+def look(depth=DEPTH, colour=COLOUR, mask=None, target_id=None, camera=CAMERA, shelf=SHELF):
     """What a searcher warns of in images before it decides.
 
     Raises:
       InputError: it refuses them.
     """
-    check_camera(camera, SHELF)
+    check_camera(camera, shelf)
     images = converted(depth, colour, mask, target_id)
     depth, colour, mask, target_id = images
     check_images(camera, depth)
-    check_measured(camera, SHELF, depth)
-    faults = [*camera_faults(camera, SHELF), *placement_faults(camera, SHELF, depth, CELL.calibration)]
+    check_measured(camera, shelf, depth)
+    faults = [*camera_faults(camera, shelf), *placement_faults(camera, shelf, depth, CELL.calibration)]
     check_images(camera, *images)
-    faults += image_faults(camera, SHELF, depth, mask)
+    faults += image_faults(camera, shelf, depth, mask)
     faults += identity_faults(colour, mask, target_id)
     if colour is not None and target_id is None:
-        faults += colour_faults(camera, SHELF, CELL.target, TargetColour.lit(), depth, colour)
+        faults += colour_faults(camera, shelf, CELL.target, TargetColour.lit(), depth, colour)
     return faults
 
 
@@ -120,6 +120,7 @@ MISTAKES = {
     "depth: whole millimetres, given to Python": lambda tmp: look((1000 * DEPTH).astype(np.uint16)),
     "depth: tenths of millimetres in a file of 16 bits": lambda tmp: look(10 * DEPTH),
     "depth: distances along the rays instead of along the camera's axis": lambda tmp: look(DEPTH * ray_lengths()),
+    "depth: its scale 1% off": lambda tmp: look(1.01 * DEPTH),
     "depth: of another camera or resolution": lambda tmp: look(DEPTH[::2, ::2]),
     "depth: transposed": lambda tmp: look(DEPTH.T.copy()),
     "depth: upside down": lambda tmp: look(DEPTH[::-1].copy()),
@@ -164,6 +165,9 @@ MISTAKES = {
     "pose: camera or shelf moved by 5 mm": lambda tmp: look(camera=posed(shifted(x=0.005) @ T)),
     "pose: camera or shelf moved by 2 cm": lambda tmp: look(camera=posed(shifted(x=0.02) @ T)),
     "pose: camera turned by 2 degrees": lambda tmp: look(camera=posed(turned(2, 2.0) @ T)),
+    "shelf: the upper board measured 12 mm too low": lambda tmp: look(
+        shelf=dataclasses.replace(SHELF, ceiling=SHELF.ceiling - 0.012)
+    ),
     "intrinsics: of another resolution": lambda tmp: look(
         camera=posed(T, fx=CAMERA.fx / 2, fy=CAMERA.fy / 2, cx=CAMERA.cx / 2, cy=CAMERA.cy / 2)
     ),

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from mechsearch_jax.calibration.fit import FEW_PIXELS, REACH, ShelfFit, check_in_sight, check_size, fit_shelf
+from mechsearch_jax.calibration.fit import FEW_PIXELS, REACH, FaceFit, ShelfFit, check_in_sight, check_size, fit_shelf
 from mechsearch_jax.calibration.limits import CalibrationLimits
 from mechsearch_jax.runtime.errors import InputError
 from mechsearch_jax.workspace.camera import Camera
@@ -22,17 +22,18 @@ CERTAIN = 3.0
 LEAST_INSIDE, MOST_BEHIND, BEHIND, THINNED, WELL_IN_SIGHT = 0.2, 0.05, 0.03, 8, 0.1
 CAUSES = (
     "check whether the camera or the shelf was moved, the camera's pose and focal lengths, whether the image is "
-    "turned, and the unit of the depth (metres along the camera's axis)"
+    "turned, and the unit and scale of the depth (metres along the camera's axis)"
 )
+MEASURES = "measure the shelf again, and check the scale of the depth and the focal lengths"
 REMEDY = "mechsearch calibrate --depth IMAGE --config FILE.toml (or --camera FILE.json) measures and corrects it"
 
 
 def placement_faults(
     camera: Camera, shelf: Shelf, depth: Float[np.ndarray, "h w"], limits: CalibrationLimits
 ) -> tuple[str, ...]:
-    """A warning if the shelf in a depth image is not where it should be; takes milliseconds.
+    """Warnings if the shelf in a depth image, or a face of it, is not where it should be; takes 15 ms.
 
-    Only directions count that the image determines; see `fit.fit_shelf`.
+    Only directions count that the image determines, and faces of which enough is in sight; see `fit.fit_shelf`.
 
     Args:
       camera, shelf: as they are taken to be.
@@ -57,8 +58,11 @@ def placement_faults(
     check_in_sight(fit)
     if is_far:
         raise InputError(f"{_appears(fit, shelf)}, which is too far to go on; {CAUSES}; {REMEDY}")
+    faults = [_misplaced(part) for part in fit.faces if part.patches and abs(part.off) > limits.warn_shift]
     if is_beyond(fit, shelf, limits.warn_shift, limits.warn_turn):
-        return (f"{_appears(fit, shelf)}: recognition is worse for it; {REMEDY}",)
+        faults.insert(0, f"{_appears(fit, shelf)}: recognition is worse for it; {REMEDY}")
+    if faults:
+        return tuple(faults)
     if behind > MOST_BEHIND:
         return (
             f"depth image: {100 * behind:.0f}% of what it shows through the shelf's opening is behind the shelf's "
@@ -101,6 +105,14 @@ def _shares(shelf: Shelf, points: np.ndarray) -> tuple[float, float]:
         (points[:, 1:] < low[1:] - BEHIND) | (points[:, 1:] > high[1:] + BEHIND), axis=1
     )
     return float(np.mean(inside)), float(np.mean(behind & (points[:, 0] > low[0])))
+
+
+def _misplaced(part: FaceFit) -> str:
+    """What is said of a face that is not where the other faces put it."""
+    return (
+        f"depth image: the {part.face.name} is {1000 * abs(part.off):.0f} mm {part.side} of shelf.{part.face.field}, "
+        f"whatever the camera's pose; {MEASURES}"
+    )
 
 
 def _unseen(fit: ShelfFit, shelf: Shelf, opening: _Opening) -> tuple[str, ...]:

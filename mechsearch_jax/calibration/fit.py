@@ -65,6 +65,11 @@ class FaceFit:
     pixels: int
     off: float
 
+    @property
+    def side(self) -> str:
+        """On which side of its place it is, in words."""
+        return "inside" if self.off > 0 else "outside"
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ShelfFit:

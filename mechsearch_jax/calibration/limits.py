@@ -15,7 +15,8 @@ FARTHEST, STEEPEST = 1.0, math.pi
 class CalibrationLimits:
     """How far the shelf in an image may be from where camera and shelf say that it is; hashable.
 
-    Shifts are those of the corner of the board that is farthest off.
+    Shifts are those of the corner of the board that is farthest off; the first also holds for each face against the
+    others.
 
     Attributes:
       warn_shift, warn_turn: beyond this there is a warning [m], [rad].

@@ -89,8 +89,7 @@ def report(fit: ShelfFit, moved: Moved) -> str:
 
 
 def _wrong_measure(part: FaceFit) -> str:
-    side = "inside" if part.off > 0 else "outside"
     return (
-        f"warning: shelf.{part.face.field}: the {part.face.name} is {1000 * abs(part.off):.0f} mm {side} of its place "
-        "whatever the camera's pose; measure the shelf again, or the focal lengths are wrong"
+        f"warning: shelf.{part.face.field}: the {part.face.name} is {1000 * abs(part.off):.0f} mm {part.side} of "
+        "its place whatever the camera's pose; measure the shelf again, or the focal lengths are wrong"
     )
