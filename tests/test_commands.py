@@ -74,7 +74,10 @@ def folder(tmp_path):
 
 WRONG = {
     "no command": ([], "Expected one of"),
-    "unknown command": (["frobnicate"], 'there is no command "mechsearch frobnicate"; known are search, plan, calibrate, inspect'),
+    "unknown command": (
+        ["frobnicate"],
+        'there is no command "mechsearch frobnicate"; known are search, plan, calibrate, inspect',
+    ),
     "mistyped command": (["serch"], "did you mean search? (mechsearch --help tells more)"),
     "mistyped command of a group": (["bench", "plam"], "did you mean plan? (mechsearch bench --help tells more)"),
     "mistyped option": (

@@ -160,7 +160,7 @@ def test_an_image_without_any_depth_is_refused_and_nothing_is_forgotten(problem)
     assert searcher.belief is before
 
 
-def unasked(problem):
+def uncalled(problem):
     """A recogniser that must not be called."""
 
     def recognise(*images):
@@ -169,10 +169,10 @@ def unasked(problem):
     return recognise
 
 
-def without_constants(calibration=None, **images):
-    """What a searcher says of images beyond those of its camera; it has no constants to recognise or decide with."""
+def placement_of(camera, calibration=None):
+    """What a searcher with a camera warns of in the example's depth; it has no constants to decide with."""
     searcher = Searcher(Workcell(calibration=calibration or CalibrationLimits()))
-    searcher.problem = types.SimpleNamespace(shelf=SHELF, **images)
+    searcher.problem = types.SimpleNamespace(camera=camera, shelf=SHELF)
     return searcher._placement_faults(IMAGES.depth)
 
 
@@ -180,13 +180,13 @@ LAX = CalibrationLimits(refuse_shift=0.03)
 
 
 def test_where_the_shelf_is_not_in_its_place_a_look_says_so_by_the_limits_of_the_cell():
-    assert without_constants(camera=CAMERA) == ()
-    (fault,) = without_constants(camera=moved(CAMERA, (0.005, 0.0, 0.0)))
+    assert placement_of(CAMERA) == ()
+    (fault,) = placement_of(moved(CAMERA, (0.005, 0.0, 0.0)))
     assert "the shelf is up to 5 mm" in fault
     far = moved(CAMERA, (0.02, 0.0, 0.0))
     with pytest.raises(InputError, match=r"the shelf is up to 20 mm .* too far to go on"):
-        without_constants(camera=far)
-    (fault,) = without_constants(LAX, camera=far)
+        placement_of(far)
+    (fault,) = placement_of(far, LAX)
     assert "the shelf is up to 20 mm" in fault
 
 
@@ -198,7 +198,7 @@ def test_a_shelf_out_of_its_place_is_a_warning_of_a_step_and_is_refused_before_r
     assert any("the shelf is up to 5 mm" in warning for warning in step.warnings)
     step = at(0.02, workcell=Workcell(calibration=LAX)).next(IMAGES.depth)
     assert any("the shelf is up to 20 mm" in warning for warning in step.warnings)
-    refusing = at(0.02, recogniser=unasked)
+    refusing = at(0.02, recogniser=uncalled)
     with pytest.raises(InputError, match=r"the shelf is up to 20 mm .* too far to go on"):
         refusing.next(IMAGES.depth)
 
