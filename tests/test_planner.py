@@ -1,7 +1,6 @@
 """The planner: equation 2, decisions that repeat, no retracing, and the rules of the two methods."""
 
 import dataclasses
-import functools
 import json
 
 import jax
@@ -67,8 +66,7 @@ def root(decision, problem):
     """The first state of the decision, brought up to date, with what can be done in it."""
     objects, belief, _ = decision
 
-    # It runs once.
-    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+    @jax.jit
     def begin(problem, belief, objects):
         rollout = rollout_of(problem, belief)
         state = rollout.root(objects)
@@ -525,7 +523,7 @@ def test_what_may_touch_the_target_has_a_penalty(decision, root, problem):
         propose=somewhere,
         predict=lambda _, state, *__: Prediction(state.scene, state.scene.valid, jnp.array(True)),
     )
-    keys = jax.random.split(jax.random.key(0), 5)
+    keys = jax.random.split(jax.random.key(0), 20)
     belief = decision[1]
     possible = possible_space(problem, belief, root.exists)
     probability = jax.jit(jax.vmap(lambda s: contact_probability(problem.space, root.scene, possible, s)))
