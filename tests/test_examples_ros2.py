@@ -104,7 +104,7 @@ class Future:
 
 
 class StandIn:
-    """What the node is told of ROS, and what it does with it.
+    """What the node gets from ROS, and what it does with it.
 
     Attributes:
       goals: in the order in which they were sent, with the name of their action.
@@ -445,7 +445,7 @@ def test_an_arm_that_stops_ends_it(start):
 
 
 class Searching:
-    """A searcher that hands out motions and is told what became of them."""
+    """A searcher that hands out motions and receives what became of them."""
 
     def __init__(self, *trajectories):
         self.left, self.outcomes, self.given = list(trajectories), [], []

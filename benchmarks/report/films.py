@@ -153,8 +153,8 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
     Raises:
       InputError: its options cannot be used today, the scenario holds something else, or the file cannot be written.
     """
-    from mechsearch_jax.envs.camera.recognisers import recogniser
-    from mechsearch_jax.envs.episode.closed_loop import RunSettings, Start
+    from mechsearch_jax.benchmarks.running.in_turn import run_settings
+    from mechsearch_jax.envs.episode.closed_loop import Start
     from mechsearch_jax.envs.episode.episodes import run_episode, target_of
     from mechsearch_jax.envs.episode.method import Method
     from mechsearch_jax.envs.recording.narration import verdict
@@ -175,13 +175,7 @@ def replay(row: Row, scenario: Scenario, file: PathLike) -> str:
         problem,
         method.policy(),
         NativeSimulator(shelf=workcell.shelf, camera=workcell.camera),
-        RunSettings(
-            recogniser=recogniser(method.recognition, target),
-            max_steps=method.config.max_steps,
-            options=method.options(),
-            protocol=method.terms,
-            trials=method.trials(),
-        ),
+        run_settings(method, target),
         watcher,
     )
     save_figure(filmstrip(watcher.frames, problem.camera, problem.shelf, problem.target, verdict(episode)), file)

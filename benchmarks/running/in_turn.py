@@ -13,6 +13,7 @@ from mechsearch_jax.envs.episode.episodes import run_episode, target_of
 from mechsearch_jax.envs.episode.method import Method
 from mechsearch_jax.envs.simulators.native import NativeSimulator
 from mechsearch_jax.problem.workcell import Workcell
+from mechsearch_jax.workspace.target import Target
 
 
 class InTurn:
@@ -52,15 +53,24 @@ class InTurn:
             self._problem(workcell, target, method.problem_config),
             self._policy(method),
             self._simulator(workcell),
-            RunSettings(
-                recogniser=recogniser(method.recognition, target),
-                max_steps=method.config.max_steps,
-                options=method.options(),
-                protocol=method.terms,
-                trials=method.trials(),
-            ),
+            run_settings(method, target),
         )
         return Row.of_episode(episode, present_code())
+
+
+def run_settings(method: Method, target: Target) -> RunSettings:
+    """How an episode of a method is run, alone and for rows.
+
+    Raises:
+      InputError: its recogniser lacks weights, or trials cannot be made.
+    """
+    return RunSettings(
+        recogniser=recogniser(method.recognition, target),
+        max_steps=method.config.max_steps,
+        options=method.options(),
+        protocol=method.terms,
+        trials=method.trials(),
+    )
 
 
 def _simulator(workcell: Workcell) -> NativeSimulator:
