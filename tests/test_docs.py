@@ -15,7 +15,9 @@ from mechsearch_jax.benchmarks.paper.paper_tables import BOTH, METHODS, TABLES, 
 from mechsearch_jax.benchmarks.paper.reproduce import CONTACT
 from mechsearch_jax.benchmarks.report import results_page
 from mechsearch_jax.benchmarks.statistics.intervals import mean_interval, share_interval, wilson
+from mechsearch_jax.benchmarks.store import runs
 from mechsearch_jax.benchmarks.store.runs import load_run
+from mechsearch_jax.benchmarks.studies import page as studies_page
 from mechsearch_jax.envs.scenes.scene_sets import SETS, digest, is_chosen_on, recorded
 from mechsearch_jax.envs.world.mismatch import ASSUMED, MISMATCH_OPTIONS
 from mechsearch_jax.planner import OPTIONS, PRESETS
@@ -162,6 +164,12 @@ def test_the_results_page_is_what_its_stored_results_say():
     written = read("docs/results.md")
     assert written == results_page.page(RESULTS), f"run `python -m {results_page.__name__}`"
     assert len(written.splitlines()) <= 150
+
+
+def test_the_page_of_studies_is_what_its_stored_runs_say():
+    shown = studies_page.shown(runs.stored_runs(RESULTS / "runs"))
+    assert read("docs/studies.md") == studies_page.page(shown), f"run `python -m {studies_page.__name__}`"
+    assert {file.stem for file in (ROOT / "docs/studies").iterdir()} == set(shown)
 
 
 def test_every_stored_result_is_linked_from_a_guide():

@@ -12,7 +12,7 @@ from pathlib import Path
 from mechsearch_jax.benchmarks.pages.pages import Block, Heading, Paragraph, Picture, Table, as_markdown
 from mechsearch_jax.benchmarks.store.runs import RUNS, StoredRun, stored_runs
 from mechsearch_jax.benchmarks.studies.comparison import HEADER, Comparison, cells, compare, sentence
-from mechsearch_jax.benchmarks.studies.declared import GROUPS
+from mechsearch_jax.benchmarks.studies.declared import GROUPS, STUDIES
 from mechsearch_jax.benchmarks.studies.pictures import picture
 from mechsearch_jax.benchmarks.studies.studies import Study
 from mechsearch_jax.envs.scenes.scene_sets import find_set, is_chosen_on
@@ -43,56 +43,60 @@ def shown_run(study: Study, runs: Sequence[StoredRun]) -> StoredRun | None:
     return runs[max(counts)[-1]] if counts else None
 
 
-def blocks(study: Study, run: StoredRun | None) -> list[Block]:
-    """What the page says of a study."""
-    heading = [Heading(study.name, 3), Paragraph(f"**{study.question}**")]
-    command = f"`mechsearch study {study.name} --out rows`"
-    comparisons = [] if run is None else compare(study, run.rows)
-    if run is None or len(comparisons) < 2:
-        return [*heading, Paragraph(f"Not run yet: {command}, on the scene set `{study.scenes}`.")]
+def blocks(study: Study, run: StoredRun, comparisons: Sequence[Comparison]) -> list[Block]:
+    """What the page says of a study of which a run has rows."""
     return [
-        *heading,
+        Heading(study.name, 3),
+        Paragraph(f"**{study.question}**"),
         Paragraph(sentence(study, comparisons)),
         Picture(f"studies/{study.name}.png", study.question),
         Table.of(HEADER, list(map(cells, comparisons))),
-        Paragraph(_source(study, run, comparisons, command)),
+        Paragraph(_source(study, run, comparisons)),
     ]
 
 
-def _source(study: Study, run: StoredRun, comparisons: Sequence[Comparison], command: str) -> str:
+def not_run(studies: Sequence[Study]) -> list[Block]:
+    """What the page says of studies of which there are no rows."""
+    if not studies:
+        return []
+    questions = [[f"`mechsearch study {study.name}`", study.question, f"`{study.scenes}`"] for study in studies]
+    return [Paragraph("Declared, and not run yet:"), Table.of(("study", "question", "scene set"), questions, texts=3)]
+
+
+def _source(study: Study, run: StoredRun, comparisons: Sequence[Comparison]) -> str:
     rows = [row for group in study.rows_of(run.rows).values() for row in group]
     seeds = sorted({row.seed for row in rows})
     first = find_set(study.scenes).blocks[0].scene_name(0)
+    ran, declared = len({row.scenario for row in rows}), find_set(study.scenes).scenes
+    part = f"{ran:,} of the {declared:,} scenes of " if ran < declared else ""
     which = "settings were chosen on" if is_chosen_on(first) else "nothing was chosen on"
     missing = [v.label for v in study.variants if v.label not in {c.variant.label for c in comparisons}]
     lacks = f" Not run: {', '.join(missing)}." if missing else ""
     devices = ", ".join(sorted({row.device or "unknown" for row in rows}))
+    with_seeds = f"seed{'s' if seeds[1:] else ''} {', '.join(map(str, seeds))}"
     return (
-        f"{command} with seed{'s' if seeds[1:] else ''} {', '.join(map(str, seeds))}; `{study.scenes}`, scenes that "
-        f"{which}; {devices}; {', '.join(sorted({row.code for row in rows}))}; "
+        f"`mechsearch study {study.name}` with {with_seeds}; {part}`{study.scenes}`, scenes that "
+        f"{which}; {devices}; {', '.join(sorted({row.code for row in rows}))}; its command stands in "
         f"[{run.name}](../benchmarks/results/runs/{run.name}.jsonl).{lacks}"
     )
 
 
-def page(runs: Sequence[StoredRun]) -> str:
-    """The page in Markdown."""
+def shown(runs: Sequence[StoredRun]) -> Mapping[str, tuple[StoredRun, Sequence[Comparison]]]:
+    """The studies that there is something to compare of, by name: the run, and what comes of its variants."""
+    picked = {name: shown_run(study, runs) for name, study in STUDIES.items()}
+    compared = {name: (run, compare(STUDIES[name], run.rows)) for name, run in picked.items() if run is not None}
+    return {name: (run, comparisons) for name, (run, comparisons) in compared.items() if len(comparisons) > 1}
+
+
+def page(compared: Mapping[str, tuple[StoredRun, Sequence[Comparison]]]) -> str:
+    """The page in Markdown, of what `shown` found."""
     parts: list[Block] = [Heading("Studies: ablations, baselines, robustness", 1), *map(Paragraph, INTRODUCTION)]
     for group, studies in GROUPS.items():
         parts.append(Heading(group))
         for study in studies:
-            parts += blocks(study, shown_run(study, runs))
+            parts += blocks(study, *compared[study.name]) if study.name in compared else []
+        parts += not_run([study for study in studies if study.name not in compared])
     return as_markdown(parts)
-
-
-def pictures(runs: Sequence[StoredRun]) -> Mapping[str, tuple[Study, Sequence[Comparison]]]:
-    """The studies of which there is a picture, with what it shows, by name."""
-    shown = {}
-    for study in (study for studies in GROUPS.values() for study in studies):
-        run = shown_run(study, runs)
-        comparisons = [] if run is None else compare(study, run.rows)
-        if len(comparisons) > 1:
-            shown[study.name] = study, comparisons
-    return shown
 
 
 def main() -> None:
@@ -109,11 +113,12 @@ def main() -> None:
         parser.error(str(error))
     folder = arguments.out.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)
-    for name, (study, comparisons) in pictures(runs).items():
+    compared = shown(runs)
+    for name, (_, comparisons) in compared.items():
         with replacing(folder / f"{name}.png") as file:
-            picture(study, comparisons).savefig(file, format="png", dpi=110)
+            picture(STUDIES[name], comparisons).savefig(file, format="png", dpi=110)
     with replacing(arguments.out) as file:
-        file.write(page(runs).encode())
+        file.write(page(compared).encode())
 
 
 if __name__ == "__main__":
